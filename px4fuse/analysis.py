@@ -95,9 +95,7 @@ class Analysis(Comparison):
         if isinstance(found, Unavailable):
             return found
         axes, left_out, noises = found
-        return explained(
-            self.flight, axes, self.segment, self.settings, outlier_time_s=left_out, **noises
-        )
+        return explained(self.flight, axes, self.settings, outlier_time_s=left_out, **noises)
 
     @cached_property
     def smoothing(self) -> Smoothing | Unavailable:

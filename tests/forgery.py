@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
+import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from pypdf import PdfWriter
+import msgspec
+from pypdf import PdfReader, PdfWriter
 from pypdf.generic import DecodedStreamObject, DictionaryObject, NameObject, NumberObject
+
+from px4fuse.errors import ResultsError
+from px4fuse.reading import files_by_sha256
+from px4fuse.report.seal import seal_of, sealed
+from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json
+from px4fuse.results.reading import read_results
+from px4fuse.verification import rerun
+from px4fuse.verification.model import Refused, Report, Verdict
+from px4fuse.verification.rerun import Recomputed
+from px4fuse.verification.verification import verify
 
 Forge = Callable[[PdfWriter], Any]
 Edit = Callable[[bytes], bytes]
@@ -105,3 +120,68 @@ def entry(key: str, value: Any) -> Callable[[Any], None]:
         holder[NameObject(key)] = NumberObject(value) if isinstance(value, int) else value
 
     return change
+
+
+# ------------------------------------------------------------------ reports that verify
+
+
+def report_of(pdf: bytes) -> Report:
+    """A report, read without care: tests of reading are elsewhere."""
+    results = read_results(PdfReader(io.BytesIO(pdf)).attachments["results.json"][0])
+    assert isinstance(results, ComparisonResults | LoopResults)
+    return Report(hashlib.sha256(pdf).hexdigest(), seal_of(pdf), results, pdf)
+
+
+def plain(report: Report) -> dict[str, Any]:
+    """The results of a report, to be changed."""
+    made: dict[str, Any] = json.loads(to_json(report.results))
+    return made
+
+
+def read_again(results: dict[str, Any]) -> Reported:
+    """Changed results, as they are read from a report."""
+    made = read_results(to_json(results).encode())
+    assert isinstance(made, ComparisonResults | LoopResults)
+    return made
+
+
+@dataclass(frozen=True)
+class Base:
+    """A report that is verified, and its analysis, computed once."""
+
+    pdf: bytes
+    results: dict[str, Any]
+    again: Recomputed
+    files: Mapping[str, Path]
+
+    def recompute(self, results: Reported, logs: Mapping[str, Path]) -> Recomputed | Refused:
+        """What a new run gives; from memory where everything that it rests on is recorded so."""
+        ours, theirs = (
+            # the recorded command is made anew from the request
+            (held.request, held.student, rerun.log_sha256(held),
+             msgspec.structs.replace(held.provenance, command=""))
+            for held in (self.again.results, results)
+        )  # fmt: skip
+        return self.again if ours == theirs else rerun.recompute(results, logs)
+
+    def verified(self, pdf: bytes) -> Verdict:
+        """The verdict on a forged report, with the log."""
+        try:
+            report = report_of(pdf)
+        except ResultsError as error:  # refused before there is anything to verify
+            return Verdict("cannot verify", (str(error),), with_log=False)
+        return verify(report, self.files, recompute=self.recompute)
+
+    def with_results(self, results: dict[str, Any]) -> bytes:
+        """The report with other results attached, and a seal that fits."""
+        return sealed(forged(self.pdf, with_results(to_json(results))))
+
+
+def base(pdf: bytes, log: Path) -> Base:
+    files = files_by_sha256([log])
+    report = report_of(pdf)
+    again = rerun.recompute(report.results, files)
+    assert isinstance(again, Recomputed), again
+    drawn = again.draw()
+    kept = Recomputed(again.results, lambda: drawn)
+    return Base(drawn, plain(report_of(drawn)), kept, files)

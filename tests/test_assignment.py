@@ -139,15 +139,20 @@ class TestDraw:
             next(c for c in CHOICES["aisle"] if c.mistake == name)
             for name in ("clock-offset", "ekf2-gate")
         )
-        # twice the limit is half as difficult; where less is plainer, half the limit
-        assert clock.difficulty(f"clock-offset=-{2 * clock.limit:g}ms") == 0.5
-        assert gate.difficulty(f"ekf2-gate={gate.limit / 2:g}") == 0.5
+        # half as difficult is twice the limit; where less is plainer, half the limit
+        assert clock.typed(0.5, -1.0) == f"clock-offset=-{2 * clock.limit:g}ms"
+        assert gate.typed(0.5) == f"ekf2-gate={gate.limit / 2:g}"
         for n in range(300):
             drawn = draw(SECRET, f"s{n}", "mixed")
-            each = [c.difficulty(t) for c, t in zip(drawn.chosen, drawn.typed, strict=True)]
-            assert drawn.difficulty == (max(each) if each else HARDEST)
+            ratios = [
+                abs(size_of(typed)) / choice.limit if choice.less_is_plainer
+                else choice.limit / abs(size_of(typed))
+                for choice, typed in zip(drawn.chosen, drawn.typed, strict=True)
+                if choice.limit is not None
+            ]  # fmt: skip
+            hardest = max([EASIEST, *ratios]) if drawn.chosen else HARDEST
+            assert drawn.difficulty == pytest.approx(hardest, abs=0.011)
             assert EASIEST <= drawn.difficulty <= HARDEST
-            assert all(EASIEST <= one <= HARDEST for one in each)
 
     def test_sizes_fill_the_band_evenly(self):
         each = [draw(SECRET, f"s{n}", "loop", 1).difficulty for n in range(500)]

@@ -17,16 +17,15 @@ import pytest
 from click.testing import CliRunner
 from conftest import page_of
 from exchange import replace
-from forgery import forged, on_page, with_results
+from forgery import Base, base, forged, on_page, read_again, report_of, with_results
 from results_tools import LOOP, SHA256, changed, decoded
-from test_verify import Base, base, read_again, report_of
 
 from px4fuse.answers import form_text
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.truth import truth_of
 from px4fuse.cli import cli
-from px4fuse.grading.model import Graded, Rubric
-from px4fuse.grading.rubric import read_rubric
+from px4fuse.grading.model import Graded
+from px4fuse.grading.rubric import Rubric, read_rubric
 from px4fuse.grading.scoring import assess, refused
 from px4fuse.report import pdf as pdf_module
 from px4fuse.report.seal import sealed

@@ -15,7 +15,7 @@ from click.testing import CliRunner
 
 from px4fuse.cli import cli
 from px4fuse.errors import SettingsError
-from px4fuse.grading import autograding
+from px4fuse.grading import gradescope
 from px4fuse.grading.gradescope import results, submission_metadata
 from px4fuse.grading.lateness import late_rule
 from px4fuse.grading.model import Entry
@@ -117,7 +117,7 @@ def test_the_autograder_holds_px4fuse_as_it_is_here(tmp_path) -> None:
 
 
 def run(folder: Path, late: str | None = None) -> dict:
-    autograding.run_autograder(folder, late_rule(late) if late else None)
+    gradescope.run_autograder(folder, late_rule(late) if late else None)
     made = json.loads((folder / "results" / "results.json").read_text())
     check(made)
     return made

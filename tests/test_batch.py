@@ -9,6 +9,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +32,6 @@ from px4fuse.fleet.logs import find_logs
 from px4fuse.fleet.rows import COLUMNS, csv_bytes, table_of
 from px4fuse.fleet.run import Fleet
 from px4fuse.fleet.terminal import print_fleet
-from px4fuse.reading import max_log_bytes
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.reading import read_results
 
@@ -130,14 +131,7 @@ def test_the_terminal_counts_what_is_wrong_with_whole_logs(capsys):
     assert f"60 logs: {(table.drop_duplicates('log')['status'] == 'done').sum()} done" in said
 
 
-def test_a_name_that_is_not_utf_8_has_its_row(tmp_path):
-    table = table_of([{"log": os.fsdecode(b"flight-\xff.ulg"), "status": "failed"}])
-    table.to_parquet(tmp_path / "fleet.parquet")
-    assert pd.read_parquet(tmp_path / "fleet.parquet")["log"].item() == "flight-?.ulg"
-    assert "flight-?.ulg" in csv_bytes(table).decode()
-
-
-def test_absent_numbers_are_empty_and_texts_are_no_formulas():
+def test_absent_numbers_are_empty_and_texts_are_no_formulas(tmp_path):
     table = table_of([{"name": "=1+1.ulg", "updates": 3, "kf_nis_mean": None}, {"reason": None}])
     assert table["kf_nis_mean"].isna().all()
     assert table["updates"].isna().tolist() == [False, True]
@@ -145,6 +139,11 @@ def test_absent_numbers_are_empty_and_texts_are_no_formulas():
     values = dict(zip(head.split(","), row.split(","), strict=True))
     assert values["name"] == "'=1+1.ulg"
     assert (values["updates"], values["kf_nis_mean"]) == ("3", "")
+    # a name that is not UTF-8 has its row
+    table = table_of([{"log": os.fsdecode(b"flight-\xff.ulg"), "status": "failed"}])
+    table.to_parquet(tmp_path / "fleet.parquet")
+    assert pd.read_parquet(tmp_path / "fleet.parquet")["log"].item() == "flight-?.ulg"
+    assert "flight-?.ulg" in csv_bytes(table).decode()
 
 
 @pytest.mark.reallogs
@@ -201,19 +200,6 @@ def test_a_killed_worker_costs_nothing(client, flights, undisturbed, tmp_path):
     client.wait_for_workers(2, timeout=60)
 
 
-@pytest.mark.usefixtures("remembered")
-def test_interrupted_and_resumed_it_is_the_same_table(client, flights, undisturbed, tmp_path):
-    def interrupt(what: str, done: int, of: int) -> None:
-        if what.startswith("comparing,"):
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        px4fuse.batch(flights, tmp_path, progress=interrupt)
-    begun = pd.read_parquet(tmp_path / "fleet.parquet")
-    assert len(set(begun["name"])) == 1
-    assert_same(px4fuse.batch(flights, tmp_path), undisturbed)
-
-
 def test_ctrl_c_at_a_terminal_keeps_what_is_done_and_says_so_on_one_line(
     client, flights, undisturbed, tmp_path
 ):
@@ -264,13 +250,15 @@ def test_a_log_that_hangs_or_crashes_costs_that_log(client, flights, tmp_path, m
     client.wait_for_workers(2, timeout=60)
 
 
+def work_on(log: Path | str, **more: Any) -> Job:
+    made = Job(str(log), ComparisonRequest(log="LOG"), False, 10**9, metadata.version("px4fuse"))
+    return replace(made, **more)
+
+
 def test_a_log_that_changes_while_it_is_read_says_so(flights, tmp_path, monkeypatch):
     log = tmp_path / "f.ulg"
     shutil.copy(flights / "f1.ulg", log)
-    work = Job(str(log), ComparisonRequest(log="LOG"), False, max_log_bytes.get(), "0.2.0")
-    work = Job(**vars(work) | {"px4fuse": run.metadata.version("px4fuse")})
-    sha256 = job.identify(work)
-    compared = job._compared
+    sha256, compared = job.identify(work_on(log)), job._compared
 
     def grows(work: Job, path: Path, sha256: str) -> job.Outcome:
         outcome = compared(work, path, sha256)
@@ -278,37 +266,39 @@ def test_a_log_that_changes_while_it_is_read_says_so(flights, tmp_path, monkeypa
             file.write(b"more")
         return outcome
 
-    assert job.analyse(work).rows[0]["status"] == "done"
+    assert job.analyse(work_on(log)).rows[0]["status"] == "done"
     monkeypatch.setattr(job, "_compared", grows)
-    (row,) = job.analyse(work).rows
+    (row,) = job.analyse(work_on(log)).rows
     assert (row["status"], row["log_sha256"]) == ("failed", sha256)
     assert row["reason"] == "it changed while it was read"
     # and between the two times that it is read
     monkeypatch.undo()
-    (row,) = job.analyse(Job(**vars(work) | {"sha256": sha256})).rows
+    (row,) = job.analyse(work_on(log, sha256=sha256)).rows
     assert row["reason"] == "it changed while it was read"
-
-
-def test_a_worker_that_comes_later_with_another_version_is_refused(flights):
-    work = Job(str(flights / "f1.ulg"), ComparisonRequest(log="LOG"), False, 10**9, "9.9")
+    # a worker that comes later may have another version
     with pytest.raises(SettingsError, match=r"a worker has px4fuse .*, not 9\.9"):
-        job.analyse(work)
+        job.analyse(work_on(log, px4fuse="9.9"))
 
 
 @pytest.mark.usefixtures("remembered")
-def test_a_full_disk_keeps_what_is_done(client, flights, undisturbed, tmp_path, monkeypatch):
+@pytest.mark.parametrize("ends", [KeyboardInterrupt, OutputError])
+def test_what_ends_a_run_keeps_what_is_done(
+    client, flights, undisturbed, tmp_path, monkeypatch, ends
+):
     write_all, written = run.write_all, []
 
     def full(contents: dict[Path, bytes]) -> None:
-        if written:
-            raise OutputError("results/f.json: cannot be written (No space left on device).")
+        if written and (ends is OutputError or len(contents) == 1):
+            raise ends("results/f.json: cannot be written (No space left on device).")
         write_all(contents)
         written.append(contents)
 
     monkeypatch.setattr(run, "write_all", full)
-    with pytest.raises(OutputError, match=r"No space left .* What is done is kept: the same"):
+    with pytest.raises(ends, match=r"No space left .*"):
         px4fuse.batch(flights, tmp_path)
     monkeypatch.undo()
+    if ends is KeyboardInterrupt:  # the table has been written
+        assert len(set(pd.read_parquet(tmp_path / "fleet.parquet")["name"])) == 1
     said: list[tuple[str, int, int]] = []
     table = px4fuse.batch(flights, tmp_path, progress=lambda *step: said.append(step))
     assert said[-1] == ("comparing, 0 failed", 2, 2)
@@ -343,9 +333,9 @@ def test_bad_input_is_one_line(tmp_path, flights):
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").touch()
     for arguments, said in (
-        ([tmp_path / "empty", "-o", tmp_path / "o"], "no logs in it"),
-        ([tmp_path / "none.ulg", "-o", tmp_path / "o"], "no such file or folder"),
-        ([tmp_path / "*.ulg", "-o", tmp_path / "o"], "no logs in it"),
+        ([tmp_path / "empty", "-o", tmp_path / "o"], "no logs there"),
+        ([tmp_path / "none.ulg", "-o", tmp_path / "o"], "no logs there"),
+        ([tmp_path / "*.ulg", "-o", tmp_path / "o"], "no logs there"),
         (["-o", tmp_path / "o"], "no logs"),
         ([flights], "-o"),
         ([flights, "-o", tmp_path / "file"], "is not a folder"),
@@ -359,19 +349,11 @@ def test_bad_input_is_one_line(tmp_path, flights):
         assert result.exit_code != 0, arguments
         assert said in str(result.exception or result.output) + result.output
     assert not (tmp_path / "o").exists()
-
-
-def test_slurm_and_kubernetes_are_told_how_to_start():
-    for name, package in (("slurm", "dask-jobqueue"), ("kubernetes", "dask-kubernetes")):
-        result = command("--scheduler", name)
-        assert result.exit_code == 0
-        assert f"pip install {package}" in result.output
-
-
-def test_settings_of_one_flight_are_refused(flights):
     for settings in ({"mavlink": "a.tlog"}, {"sigma": 1.0}, {"sigma_z_m": 0.0}):
         with pytest.raises(SettingsError):
             px4fuse.batch(flights, **settings)
+    for name, package in (("slurm", "dask-jobqueue"), ("kubernetes", "dask-kubernetes")):
+        assert f"pip install {package}" in command("--scheduler", name).output
 
 
 # ------------------------------------------------------------------ where logs lie
@@ -396,14 +378,11 @@ def test_logs_are_found_in_folders_globs_and_urls(tmp_path, monkeypatch):
     memory.pipe("/fleet/x.ulg", tiny_log(3))
     (log,) = find_logs(["memory://fleet"])
     assert (log.name, log.log) == ("x.ulg", "memory:///fleet/x.ulg")
-    work = Job(log.address, ComparisonRequest(log="LOG"), False, 10**9, "")
-    sha256 = job.identify(work)
-    version = run.metadata.version("px4fuse")
-    outcome = job.analyse(Job(**vars(work) | {"px4fuse": version}))
-    assert {row["log_sha256"] for row in outcome.rows} == {sha256}
-    assert {row["name"] for row in outcome.rows} == {"x.ulg"}
-    small = job.analyse(Job(**vars(work) | {"px4fuse": version, "max_bytes": 10}))
-    assert "more than the limit" in small.rows[0]["reason"]
+    sha256 = job.identify(work_on(log.address))
+    rows = job.analyse(work_on(log.address)).rows
+    assert {(row["name"], row["log_sha256"]) for row in rows} == {("x.ulg", sha256)}
+    (small,) = job.analyse(work_on(log.address, max_bytes=10)).rows
+    assert "more than the limit" in small["reason"]
 
 
 # ------------------------------------------------------------------ a cluster of its own

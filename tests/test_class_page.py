@@ -22,7 +22,7 @@ from pypdf import PdfReader
 
 from px4fuse.answers import Answers, Claim
 from px4fuse.grading.anonymous import NAME
-from px4fuse.grading.class_page import STATUSES, html_text
+from px4fuse.grading.class_page import html_text
 from px4fuse.grading.model import Entry, Graded, Item, Override
 from px4fuse.verification.model import Mismatch, Verdict
 from px4fuse.webpage.safe import MAX_CHARACTERS
@@ -146,23 +146,12 @@ def test_text_makes_no_elements(text: str) -> None:
     assert shape(made) == shape(page("x" if text else ""))
 
 
-def test_an_empty_class_and_numbers_that_are_none() -> None:
-    assert "0 students" in html_text([], "Class", "px4fuse 1")
-    odd = row("Odd", 3.0, numbers={"NIS": float("nan"), "gap": float("inf")})
-    assert "nan" not in html_text([odd], "Class", "px4fuse 1").lower().split("<script>")[0]
-
-
-def test_what_is_too_long_is_cut() -> None:
-    text = html_text([row("x" * 10**6, 3.0, notes="y" * 10**6)], "Class", "px4fuse 1")
-    assert len(text) < 16 * MAX_CHARACTERS
-
-
 def test_pending_points_stand_apart_from_those_that_count() -> None:
     entries = [
         row("Ada", 10.0),
         row("Bo", 20.0),
         row("Cy", 12.0, pending="Run with px4fuse 0.1.1."),
-        row("Di", 8.0, overrides={"Notes": Override(9.0, "Good.")}, total=13.0, deduction=0.0),
+        row("Di", 13.0, overrides={"Notes": Override(9.0, "Good.")}, total=13.0),
     ]
     text = html_text(entries, "Class", "px4fuse 1")
     assert "14.3 <small>of 20" in text  # of 10, 20 and 13
@@ -170,15 +159,27 @@ def test_pending_points_stand_apart_from_those_that_count() -> None:
     cells = [row[0][3] for row in content(text)["rows"]]
     assert cells[2] == ["pending", "", "12 proposed"]
     assert cells[3][:3] == ["13 / 20", 13.0, "said by you"]
-    items = next(part for part in content(text)["rows"][3][2] if part[1] == "Points")
-    assert items[3][1] == ["Notes", "9", "16", "You: 4 → 9. Good. –"]
     waits = next(part for part in content(text)["rows"][2][2] if part[1].startswith("Pending"))
     assert waits[2] == ["Run with px4fuse 0.1.1."]
-    # of 16 points for notes those that count had 6, 16 and, as the instructor says, 9
+    # of 16 points for notes those that count had 6, 16 and 9
     assert "10.3&nbsp;/&nbsp;16" in text
 
 
 SHARED = " ".join(f"word{n}" for n in range(60))
+
+
+def test_what_is_absent_not_finite_too_long_or_too_much() -> None:
+    assert "0 students" in html_text([], "Class", "px4fuse 1")
+    odd = row("Odd", 3.0, numbers={"NIS": float("nan"), "gap": float("inf")})
+    assert "nan" not in html_text([odd], "Class", "px4fuse 1").lower().split("<script>")[0]
+    text = html_text([row("x" * 10**6, 3.0, notes="y" * 10**6)], "Class", "px4fuse 1")
+    assert len(text) < 16 * MAX_CHARACTERS
+    apart = tuple(Mismatch(f"axes.{n}", "1.0", "2.0") for n in range(60))
+    one = Graded("a.pdf", "Ada", "1", Verdict("numbers differ", ("60.",), True, apart))
+    text = html_text([Entry("Ada", "1", one)], "Class", "px4fuse 1")
+    assert "axes.49" in text
+    assert "and 10 more" in text
+    assert "axes.50" not in text
 
 
 def test_texts_that_are_alike_stand_below_each_other() -> None:
@@ -191,13 +192,6 @@ def test_texts_that_are_alike_stand_below_each_other() -> None:
     shown = [[part[1] for part in one[2]] for one in made]
     assert any(re.fullmatch(r"Text of Bo, which shares \d+%", title) for title in shown[0])
     assert not any(title.startswith("Text of") for title in shown[2])
-
-
-def test_reading_time_is_of_words_and_pages() -> None:
-    one = row("Ada", 9.0, notes="word " * 400, sheets=("pages/1.png",) * 6)
-    text = html_text([one], "Class", "px4fuse 1")
-    assert content(text)["rows"][0][0][4][1] == 5.0  # 2 minutes of notes, 3 of pages
-    assert "200 words of notes a minute" in text
 
 
 PEOPLE = (
@@ -262,8 +256,8 @@ def page(browser: Browser, tmp_path: Path) -> Browser:
     return browser
 
 
-HEADS = ("Student", "Id", "Status", "Points", "Handed in", "To read", "Flags", "Pages", "Notes",
-         BREAKOUT, "mean NIS", MARKUP)  # fmt: skip
+HEADS = ("Student", "Id", "Status", "Points", "Handed in", "Flags", "Pages", "Notes", BREAKOUT,
+         "mean NIS", MARKUP)  # fmt: skip
 
 
 def head(title: str) -> str:
@@ -276,8 +270,11 @@ def test_sorts_both_ways_and_keeps_the_order_of_equals(page: Browser) -> None:
     assert page.names() == [LONG, TURNED, "ada", "Émile", "Zoë", "Bo", *absent]
     page.click(head("Points"))
     assert page.names() == ["Bo", "Zoë", "ada", "Émile", TURNED, LONG, *absent]
-    sorts = "[...document.querySelectorAll('thead [aria-sort]')].map((h) => h.ariaSort)"
-    assert page.ask(sorts)[:5] == ["none", "none", "none", "descending", "none"]
+    page.click("[data-group='numbers']")
+    page.click(head("mean NIS"))
+    assert page.names()[:3] == ["Bo", "Émile", "Zoë"]
+    page.click(head("mean NIS"))
+    assert page.names()[:3] == ["Zoë", "Émile", "Bo"]
     assert page.complaints() == []
 
 
@@ -292,14 +289,6 @@ def test_sorts_text_as_people_do_and_by_keyboard(page: Browser) -> None:
     page.click(head("Student"))
     names = [name for name in page.names() if name in ("ada", "Bo", "Émile", "Zoë", "Mia")]
     assert names == ["ada", "Bo", "Émile", "Mia", "Zoë"]
-
-
-def test_absent_numbers_come_last_both_ways(page: Browser) -> None:
-    page.click("[data-group='numbers']")
-    page.click(head("mean NIS"))
-    assert page.names()[:3] == ["Bo", "Émile", "Zoë"]
-    page.click(head("mean NIS"))
-    assert page.names()[:3] == ["Zoë", "Émile", "Bo"]
 
 
 def test_filters_by_text_and_status_with_a_count(page: Browser) -> None:
@@ -323,23 +312,12 @@ def test_filters_by_text_and_status_with_a_count(page: Browser) -> None:
         ("to read", [MARKUP]),
         ("late", ["ada"]),
         ("nothing handed in", ["Mia"]),
+        ("", [TURNED if one.student == REVERSED else one.called for one in CLASS]),
     ):
         page.choose("#filter-0", status)
         assert page.names() == names
-    assert page.complaints() == []
-
-
-def test_who_missed_which_mistake_filters_and_opens(page: Browser) -> None:
-    told = page.ask("document.querySelector('[data-tag=\"missed:positions that jump\"]')"
-                    ".closest('li').innerText.replace(/\\s+/g, ' ')")  # fmt: skip
-    assert told == "positions that jump 1 of 2 named it Not named by ada."
-    page.click('[data-tag="missed:outliers"]')
+    page.choose("#filter-1", "missed:outliers")
     assert page.names() == ["ada"]
-    assert page.ask("document.querySelector('#filter-1').value") == "missed:outliers"
-    page.click('[data-tag="missed:outliers"]')
-    assert len(page.names()) == len(CLASS)
-    page.click('[data-open="1"]')
-    assert page.ask("document.querySelector('.more').previousElementSibling.dataset.row") == "1"
     assert page.complaints() == []
 
 
@@ -410,7 +388,7 @@ def test_what_students_wrote_stays_text(page: Browser) -> None:
     )
     assert row == [BREAKOUT, FORMULA, "2 flags", "5 proposed", MARKUP, MARKUP]
     shown = page.ask("document.querySelector('[data-row=\"5\"]').nextSibling.textContent")
-    assert shown.count(BREAKOUT) >= 4  # reason, notes, item, what is to be judged
+    assert shown.count(BREAKOUT) >= 4  # reason, notes, item, comment
     assert shown.count(MARKUP) >= 4  # flag, comment, pending, name
     assert LONG in page.ask("document.querySelector('.list > tbody').textContent")
     assert page.ask("document.querySelectorAll('b, svg[onload], img[onerror]').length") == 0
@@ -435,29 +413,6 @@ def test_the_policy_stops_what_would_come_to_life(page: Browser) -> None:
     assert any("img-src" in text and "127.0.0.1" in text for text in refusals)
 
 
-def test_without_scripts_it_is_a_plain_table(browser: Browser, tmp_path: Path) -> None:
-    file = tmp_path / "class.html"
-    file.write_bytes(html_text(CLASS, "Class", "px4fuse 1").encode())
-    browser.open(file, scripts=False)
-    browser.call("Emulation.setScriptExecutionDisabled", value=False)
-    assert not browser.ask("document.querySelector('.controls').checkVisibility()")
-    text = browser.ask("document.body.innerText")
-    for one in CLASS:
-        assert (one.counting.verdict.status if one.counting else "nothing handed in") in text
-    assert "The same log as Zoë." in text
-    assert "18.5 / 20" in text
-    assert "All rows are in class.csv." in text
-
-
-@pytest.mark.parametrize("width", [360, 800, 1400])
-def test_nothing_sticks_out_of_the_window(page: Browser, width: int) -> None:
-    page.resize(width, 800)
-    page.click("[data-row='5'] .name")
-    assert page.ask("document.documentElement.scrollWidth") <= width
-    page.click("[data-group='items']")
-    assert page.ask("document.documentElement.scrollWidth") <= width
-
-
 def test_printed_every_page_has_the_table_s_head(browser: Browser, tmp_path: Path) -> None:
     file = tmp_path / "class.html"
     many = [row(f"Student {n}", 9.0, flags=("Look here.",)) for n in range(130)]
@@ -471,51 +426,6 @@ def test_printed_every_page_has_the_table_s_head(browser: Browser, tmp_path: Pat
     assert not any("Find" in text for text in pages)
     # all of them, not those on screen
     assert "Student 129" in "".join(pages)
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_contrast_is_enough_for_weak_eyes(page: Browser, scheme: str) -> None:
-    page.click("tbody tr:nth-child(2) .name")
-    found = page.contrasts(scheme)
-    assert len(found) > 10
-    assert all(value >= 4.5 for value in found.values()), found
-
-
-def test_three_hundred_are_one_page_of_a_megabyte(browser: Browser, tmp_path: Path) -> None:
-    many = [
-        row(
-            f"Student {n * 7 % 300}", 4.0 + n * 13 % 160 / 10.0, id=str(n),
-            status=STATUSES[n % 4], sheets=tuple(f"pages/{n}-{k}.png" for k in range(9)),
-            numbers={f"number {k}": float(n * k) for k in range(6)}, notes="word " * 200,
-            items=tuple(Item(f"item {k}", float(n % 3), 2.0, "Why.") for k in range(10)),
-        )
-        for n in range(300)
-    ]  # fmt: skip
-    text = html_text(many, "Class", "px4fuse 1").encode()
-    assert len(text) < 2_000_000
-    file = tmp_path / "class.html"
-    file.write_bytes(text)
-    browser.open(file)
-    assert len(browser.names()) == 100
-    browser.click(head("Points"))
-    points = browser.ask(
-        "[...document.querySelectorAll('.list > tbody > tr')]"
-        ".map((row) => Number(row.cells[3].textContent.split(' /')[0]))"
-    )
-    assert points == sorted(entry.total for entry in many if entry.total is not None)[:100]
-
-
-def test_differences_are_listed(browser: Browser, tmp_path: Path) -> None:
-    apart = tuple(Mismatch(f"axes.{n}", "1.0", "2.0") for n in range(60))
-    one = Graded("a.pdf", "Ada", "1", Verdict("numbers differ", ("60.",), True, apart))
-    file = tmp_path / "class.html"
-    file.write_bytes(html_text([Entry("Ada", "1", one)], "Class", "px4fuse 1").encode())
-    browser.open(file)
-    browser.click(".name")
-    text = browser.ask("document.querySelector('.more').innerText")
-    assert "axes.49" in text
-    assert "and 10 more" in text
-    assert "axes.50" not in text
 
 
 def test_points_and_words_of_the_instructor_are_downloaded_as_a_table(page: Browser) -> None:

@@ -5,11 +5,22 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import numpy as np
-import pandas as pd
 import pytest
 from exchange import replace
-from flights import aisle_flight, table, unavailable
-from numpy.typing import NDArray
+from filter_tools import (
+    GRAVITY,
+    IMU_HZ,
+    SETTINGS,
+    SIGMA_A,
+    SIGMA_Z,
+    UWB_HZ,
+    acceleration,
+    attitude,
+    attitude_table,
+    imu_table,
+    made_flight,
+)
+from flights import unavailable
 from scipy.integrate import cumulative_trapezoid
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
@@ -19,9 +30,9 @@ from scipy.stats import binom, chi2
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import noises_and_clock
+from px4fuse.filter import clock
 from px4fuse.filter.clock import (
     CHANGE_P,
-    MIN_MEASUREMENTS,
     ClockOffset,
     PartOffset,
     _drift,
@@ -31,103 +42,21 @@ from px4fuse.filter.clock import (
 )
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.likelihood import PROFILE_DROP, profile_interval
-from px4fuse.filter.motion import CONSTANT_SIGMA, START_PRECISION, STEP_S, _signals, motion
-from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Segment
-from px4fuse.flight import (
-    ANGULAR_RATE_COLUMNS,
-    POSITION_COLUMNS,
-    POSITION_VARIANCE_COLUMNS,
-    QUATERNION_COLUMNS,
-    SPECIFIC_FORCE_COLUMNS,
-    Flight,
-    Unavailable,
+from px4fuse.filter.motion import (
+    CONSTANT_SIGMA,
+    MIN_MEASUREMENTS,
+    START_PRECISION,
+    STEP_S,
+    Signals,
+    motion,
+    signals_of,
 )
+from px4fuse.filter.signals import Segment
+from px4fuse.flight import POSITION_COLUMNS, Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.report.words import clock_advice
 
-GRAVITY = np.array([0.0, 0.0, 9.80665])
-AMPLITUDE = np.array([4.0, 1.0, 0.3])
-PULSATION = 2.0 * np.pi / np.array([12.0, 7.0, 9.0])
-IMU_HZ, UWB_HZ = 100.0, 5.0
-SIGMA_A, SIGMA_Z, DT = 0.1, 0.1, 0.1
-SCATTER_SEEDS = 30
-SETTINGS = Settings(sigma_a_m_s2=SIGMA_A, sigma_z_m=SIGMA_Z, dt_s=DT)
-
-
-def position(time_s: Array) -> Array:
-    """Truth: from rest, swinging in all three directions."""
-    return AMPLITUDE * (1.0 - np.cos(np.outer(time_s, PULSATION)))
-
-
-def acceleration(time_s: Array) -> Array:
-    return AMPLITUDE * PULSATION**2 * np.cos(np.outer(time_s, PULSATION))
-
-
-def attitude(time_s: Array) -> Rotation:
-    """Truth, body to NED: yaw swings by 20°, pitch and roll by 10°."""
-    phase = np.outer(time_s, 2.0 * np.pi / np.array([25.0, 6.0, 8.0]))
-    angles = np.radians([30.0, 0.0, 5.0]) + np.radians([20.0, 10.0, 10.0]) * np.sin(phase)
-    return Rotation.from_euler("ZYX", angles)
-
-
-def made_flight(
-    seed: int = 1,
-    *,
-    offset_s: float = 0.0,
-    duration_s: float = 60.0,
-    moving: float = 1.0,
-    jump_s: float = 0.0,
-    drift_ppm: float = 0.0,
-    outliers: int = 0,
-    biased: bool = True,
-    sigma_a: float = SIGMA_A,
-    hole_s: float = 0.0,
-) -> tuple[Flight, NDArray[np.bool_]]:
-    """A flight to whose stamps ``offset_s`` must be added, and which positions are outliers.
-
-    All sensor noise is white. The jump comes in mid-flight; the drift is zero there. The IMU's hole
-    begins there.
-    """
-    rng = np.random.default_rng(seed)
-    scale = 1.0 if biased else 0.0
-    tilt, gyro_bias, force_bias = (
-        scale * rng.normal(0.0, sigma, 3) for sigma in (0.02, 0.002, 0.1)
-    )
-    time = np.arange(round(duration_s * IMU_HZ) + 1) / IMU_HZ
-    h = 0.25 / IMU_HZ
-    rate = (attitude(time - h).inv() * attitude(time + h)).as_rotvec() / (2.0 * h)
-    force = attitude(time).inv().apply(moving * acceleration(time) - GRAVITY)
-    rate += gyro_bias + rng.normal(0.0, 0.002, rate.shape)
-    # averaged over DT it must be sigma_a
-    force += force_bias + rng.normal(0.0, sigma_a * np.sqrt(DT * IMU_HZ), force.shape)
-    logged = np.arange(round(duration_s * 50.0) + 1) / 50.0
-    quaternion = (Rotation.from_rotvec(tilt) * attitude(logged)).as_quat(scalar_first=True)
-    true = np.arange(round(duration_s * UWB_HZ)) / UWB_HZ + rng.uniform(0.0, 0.05)
-    measured = moving * position(true) + rng.normal(0.0, SIGMA_Z, (len(true), 3))
-    outlier = np.zeros(len(true), dtype=bool)
-    outlier[rng.choice(np.arange(10, len(true) - 10), outliers, replace=False)] = True
-    measured[outlier, :2] += 1.5
-    middle = duration_s / 2.0
-    stamps = true - offset_s - jump_s * (true > middle) - drift_ppm * 1e-6 * (true - middle)
-    base = aisle_flight(seed=seed, duration_s=duration_s, ekf2=None, truth=False)
-    track = replace(
-        base.positions[0],
-        samples=table(
-            stamps,
-            np.hstack([measured, np.full(measured.shape, np.nan)]),
-            POSITION_COLUMNS + POSITION_VARIANCE_COLUMNS,
-        ),
-    )
-    imu = imu_table(time, force, rate)
-    imu = imu[(time <= middle) | (time >= middle + hole_s)]
-    flight = replace(
-        base,
-        imu=imu,
-        attitude=table(logged, quaternion, QUATERNION_COLUMNS),
-        positions=(track,),
-    )
-    return flight, outlier
+DT = SETTINGS.dt_s
 
 
 def estimate(flight: Flight, **options: object) -> ClockOffset | Unavailable:
@@ -143,130 +72,96 @@ def covers(found: ClockOffset, true_s: float) -> bool:
 # --- what the IMU says ---
 
 
-def imu_table(time: Array, force: Array, rate: Array) -> pd.DataFrame:
-    return table(time, np.hstack([force, rate]), SPECIFIC_FORCE_COLUMNS + ANGULAR_RATE_COLUMNS)
-
-
 def heading(angle: Array) -> Rotation:
     return Rotation.from_rotvec(np.outer(angle, [0.0, 0.0, 1.0]))
 
 
-def attitude_table(time: Array, turn: Rotation) -> pd.DataFrame:
-    return table(time, turn.as_quat(scalar_first=True), QUATERNION_COLUMNS)
+def felt(
+    force: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    *,
+    turn: float = 0.0,
+    interval: float = 0.01,
+) -> Signals:
+    """Signals of a level vehicle that turns steadily, with a constant acceleration of its body."""
+    time = np.arange(0.0, 20.0, interval)
+    still = np.zeros((len(time), 3))
+    logged = heading(turn * time)
+    # of the attitude, only the beginning is used: what EKF2 made of it later must not matter
+    spoiled = Rotation.concatenate([logged[:300], heading(np.full(len(time) - 300, -0.3))])
+    imu = imu_table(time, still + np.array(force) - GRAVITY, still + np.array([0.0, 0.0, turn]))
+    return signals_of(imu, attitude_table(time, spoiled), (0.5, 19.0))
 
 
 def test_a_level_vehicle_at_rest_accelerates_in_no_direction() -> None:
-    time = np.arange(0.0, 10.0, 0.01)
-    still = np.zeros((len(time), 3))
-    level = heading(np.full(len(time), 0.7))
-    signals = _signals(
-        imu_table(time, still - GRAVITY, still), attitude_table(time, level), (1.0, 9.0)
-    )
-    assert signals.table.shape == (len(signals.time_s), 3, 3, len(CONSTANT_SIGMA))
+    signals = felt()
+    t, g = signals.time_s - signals.time_s[0], GRAVITY[2]
+    _, speed, value = np.moveaxis(signals.table, 1, 0)
+    assert signals.table.shape == (len(t), 3, 3, len(CONSTANT_SIGMA))
     np.testing.assert_allclose(signals.table[..., 0], 0.0, atol=1e-10)
-    value = signals.table[:, 2]
     # tilt θ about north and east moves it sideways by θ × f, f = [0, 0, -g]; heading does not
-    g = GRAVITY[2]
-    np.testing.assert_allclose(
-        value[:, :, 1:4],
-        np.tile([[0, -g, 0], [g, 0, 0], [0, 0, 0]], (len(signals.time_s), 1, 1)),
-        atol=1e-12,
-    )
+    tilted = np.tile([[0, -g, 0], [g, 0, 0], [0, 0, 0]], (len(t), 1, 1))
+    np.testing.assert_allclose(value[:, :, 1:4], tilted, atol=1e-12)
+    # a gyro bias b about north for t seconds tilts by -b t: (-t, 0, 0) × f, in each step's middle
+    np.testing.assert_allclose(value[:, 1, 4], -g * (t + STEP_S / 2.0), atol=1e-9)
+    np.testing.assert_allclose(value[:, [0, 2], 4], 0.0, atol=1e-9)
+    np.testing.assert_allclose(speed[:, 1, 4], -g * t**2 / 2.0, atol=1e-9)
     # an accelerometer bias b adds -R b
-    np.testing.assert_allclose(
-        value[:, :, 7:10],
-        np.tile(-level[0].as_matrix(), (len(signals.time_s), 1, 1)),
-        atol=1e-12,
-    )
-
-
-def test_a_gyro_bias_tilts_a_level_vehicle_ever_further() -> None:
-    """Bias b about body x for t seconds tilts by -b t: -g b t sideways, -g b t²/2 in velocity."""
-    time = np.arange(0.0, 10.0, 0.01)
-    still = np.zeros((len(time), 3))
-    level = heading(np.zeros(len(time)))
-    signals = _signals(
-        imu_table(time, still - GRAVITY, still), attitude_table(time, level), (1.0, 9.0)
-    )
-    t = signals.time_s - signals.time_s[0]
-    by_bias = np.zeros((len(t), 3))
-    # (-t, 0, 0) × (0, 0, -g), in the middle of each step
-    by_bias[:, 1] = -GRAVITY[2] * (t + STEP_S / 2.0)
-    np.testing.assert_allclose(signals.table[:, 2, :, 4], by_bias, atol=1e-9)
-    np.testing.assert_allclose(signals.table[:, 1, 1, 4], -GRAVITY[2] * t**2 / 2.0, atol=1e-9)
+    np.testing.assert_allclose(value[:, :, 7:10], np.tile(-np.eye(3), (len(t), 1, 1)), atol=1e-12)
 
 
 def test_a_constant_turn_goes_round_in_a_circle() -> None:
     """Yaw rate ω with a body acceleration s to the right: a = s (-sin ωt, cos ωt)."""
     omega, sideways = 0.5, 2.0
-    time = np.arange(0.0, 20.0, 0.004)
-    rate = np.tile([0.0, 0.0, omega], (len(time), 1))
-    force = np.tile([0.0, sideways, 0.0], (len(time), 1)) - GRAVITY
-    turn = heading(omega * time)
-    # of the attitude, only the beginning is used: what EKF2 made of it later must not matter
-    spoiled = Rotation.concatenate([turn[:300], heading(np.full(len(time) - 300, -0.3))])
-    known = attitude_table(time, spoiled)
-    signals = _signals(imu_table(time, force, rate), known, (0.5, 19.0))
-    t = signals.time_s
-    middle = omega * (t + STEP_S / 2.0)
+    signals = felt((0.0, sideways, 0.0), turn=omega, interval=0.004)
+    t, middle = signals.time_s, omega * (signals.time_s + STEP_S / 2.0)
     circle = sideways * np.stack([-np.sin(middle), np.cos(middle), 0.0 * t], 1)
     np.testing.assert_allclose(signals.table[:, 2, :, 0], circle, atol=2e-5)
-    radius = sideways / omega**2
-    start = t[0]
-    speed = (
-        radius
-        * omega
-        * np.stack(
-            [np.cos(omega * t) - np.cos(omega * start), np.sin(omega * t) - np.sin(omega * start)],
-            1,
-        )
-    )
+    round_it = np.stack([np.cos(omega * t), np.sin(omega * t)], 1)
+    speed = sideways / omega * (round_it - round_it[0])
     np.testing.assert_allclose(signals.table[:, 1, :2, 0], speed, atol=1e-4)
 
 
 def test_at_any_time_the_signals_give_the_way_of_constant_acceleration() -> None:
-    time = np.arange(0.0, 10.0, 0.01)
-    still = np.zeros((len(time), 3))
-    force = still + np.array([1.5, 0.0, -0.5]) - GRAVITY
-    level = heading(np.zeros(len(time)))
-    signals = _signals(imu_table(time, force, still), attitude_table(time, level), (0.0, 9.9))
+    signals = felt((1.5, 0.0, -0.5))
     at = np.array([[0.5, 0.733, 4.0, 9.0], [0.617, 0.85, 4.117, 9.117]])
-    way, speed, value = signals.at(at)
-    since, felt = (at - signals.time_s[0])[..., None], np.array([1.5, 0.0, -0.5])
-    np.testing.assert_allclose(value[..., 0], np.broadcast_to(felt, (2, 4, 3)), atol=1e-9)
-    np.testing.assert_allclose(speed[..., 0], since * felt, atol=1e-9)
-    np.testing.assert_allclose(way[..., 0], since**2 / 2.0 * felt, atol=1e-9)
+    way, speed = signals.at(at)
+    since, push = (at - signals.time_s[0])[..., None], np.array([1.5, 0.0, -0.5])
+    np.testing.assert_allclose(speed[..., 0], since * push, atol=1e-9)
+    np.testing.assert_allclose(way[..., 0], since**2 / 2.0 * push, atol=1e-9)
 
 
 def test_legs_are_the_way_beyond_what_the_velocity_makes() -> None:
-    """Of sideways acceleration s over dt: s dt²/2 and s dt, at every offset; none crosses a cut."""
-    time = np.arange(0.0, 80.0, 0.01)
+    """Of sideways acceleration s over dt: s dt²/2 and s dt, at every offset, in each stretch."""
+    time, stamps = np.arange(0.0, 80.0, 0.01), np.arange(0.0, 80.0, 0.25)
     still = np.zeros((len(time), 3))
-    force = still + np.array([0.0, 1.5, 0.0]) - GRAVITY
-    level = attitude_table(time, heading(np.zeros(len(time))))
-    stamps = np.arange(0.0, 80.0, 0.25)
-    moved = motion(imu_table(time, force, still), level, stamps)
+    flight = replace(
+        made_flight()[0],
+        imu=imu_table(time, still + np.array([0.0, 1.5, 0.0]) - GRAVITY, still),
+        attitude=attitude_table(time, heading(np.zeros(len(time)))),
+    )
+    measured = np.column_stack([stamps, np.full(len(stamps), np.nan)])
+    measured[:5, 0] = np.nan
+    moved = motion(flight, stamps, measured, directions=np.eye(3)[:2], dt_s=DT)
     assert len(moved.signals) == 3
     assert moved.time_s[[0, -1]] == pytest.approx([0.75, 79.25])
-    np.testing.assert_array_equal(stamps[moved.row], moved.time_s)
-    way, speed = moved.legs(np.eye(3)[:2], np.array([-0.3, 0.0, 0.21]))
+    positions = moved.positions(np.array([-0.3, 0.0, 0.21]))
+    way, speed = positions.delta_position_m, positions.delta_velocity_m_s
     assert way.shape == (2, 3, 1 + len(CONSTANT_SIGMA), len(moved.time_s) - 1)
-    inside = np.setdiff1d(np.arange(1, len(moved.time_s)), moved.edges) - 1
+    inside = np.flatnonzero(positions.joined)
     np.testing.assert_allclose(way[0, :, 0], 0.0, atol=1e-9)
     np.testing.assert_allclose(way[1, :, 0, inside], 1.5 * 0.25**2 / 2.0, atol=1e-9)
     np.testing.assert_allclose(speed[1, :, 0, inside], 1.5 * 0.25, atol=1e-9)
-    assert not way[..., moved.edges[1:-1] - 1].any()
-    measured = np.column_stack([stamps, np.full(len(stamps), np.nan)])
-    measured[:5, 0] = np.nan
-    positions = moved.positions(measured, DT)
-    np.testing.assert_array_equal(np.setdiff1d(np.arange(len(moved.time_s)), positions.chain.end),
-                                  positions.start)  # fmt: skip
+    np.testing.assert_array_equal(np.flatnonzero(~positions.joined) + 1, moved.edges[1:-1])
     # from the first that is measured in each stretch
-    for begin, end in zip(moved.edges, moved.edges[1:], strict=False):
+    for begin, end in positions.stretches:
         known = positions.measurement_m[begin:end, 0]
         known = known[np.isfinite(known)]
         np.testing.assert_allclose(known, 0.25 * np.arange(len(known)), atol=1e-12)
     assert np.all(np.isnan(positions.measurement_m[:, 1]))
+    # a third of them, in every stretch
+    some = moved.thinned(len(moved.time_s) // 3)
+    np.testing.assert_array_equal(some.time_s, moved.time_s[::3])
+    assert len(some.edges) == 4
 
 
 # --- the likelihood of an offset ---
@@ -427,17 +322,21 @@ def test_drift_is_weighted_least_squares_of_the_parts() -> None:
 
 @pytest.mark.parametrize("offset_s", [0.0, -0.2, -0.21, 0.333])
 @pytest.mark.parametrize("factor", [1.0, 2.5])
-def test_parts_and_change_are_those_of_their_profiles(offset_s: float, factor: float) -> None:
+def test_parts_and_change_are_those_of_their_profiles(
+    monkeypatch: pytest.MonkeyPatch, offset_s: float, factor: float
+) -> None:
     """Profiles that are parabolas, about multiples of the grid's step from the whole's offset."""
     shift, sigma = np.array([-0.05, 0.025, 0.0, 0.0]), np.array([0.03, 0.02, 0.03, 0.5])
 
-    def fitted(grid: Array, _: Noises) -> SimpleNamespace:
+    def fitted(grid: Array, *_: object) -> SimpleNamespace:
         square = (grid - offset_s - shift[:, None]) ** 2 / sigma[:, None] ** 2
-        return SimpleNamespace(by_stretch=lambda: 0.5 * square)
+        return SimpleNamespace(by_stretch=lambda: 0.5 * square[None])
 
-    moved = SimpleNamespace(edges=np.arange(5) * 2, time_s=np.arange(8.0))
-    problem = SimpleNamespace(motion=moved, fitted=fitted)
-    parts, p = _parts(problem, offset_s, Noises(0.1, 0.1), factor)
+    monkeypatch.setattr(clock, "fitted", fitted)
+    moved = SimpleNamespace(
+        edges=np.arange(5) * 2, time_s=np.arange(8.0), blocks=lambda grid: grid, weight=None
+    )
+    parts, p = _parts(moved, offset_s, Noises(0.1, 0.1), factor)
     # the last one says too little
     assert [(part.start_s, part.end_s) for part in parts] == [(0.0, 1.0), (2.0, 3.0), (4.0, 5.0)]
     assert [part.offset_s for part in parts] == pytest.approx(offset_s + shift[:3])

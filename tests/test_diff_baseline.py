@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -67,16 +66,13 @@ def test_a_log_is_held_against_itself_whatever_its_settings():
     assert change == f"NIS of EKF2 4, was {was:.3g}"  # a smaller noise is better
 
 
-def test_the_same_table_is_not_worse_than_itself():
-    assert changes_of(BEFORE) == {}
-
-
 def test_a_log_that_fails_now_is_worse():
-    lost = table_of(
-        [{"log": "3.ulg", "name": "3.ulg", "status": "failed", "reason": "ended after 5 s"}]
+    assert changes_of(BEFORE) == {}
+    lost, new = (
+        table_of([{"log": name, "name": name, "status": "failed", "reason": "ended after 5 s"}])
+        for name in ("3.ulg", "99.ulg")
     )
     assert changes_of(lost) == {("3.ulg", ""): "fails, and was compared before"}
-    new = table_of([{"log": "99.ulg", "name": "99.ulg", "status": "failed", "reason": "damaged"}])
     assert changes_of(new) == {}
 
 
@@ -103,19 +99,16 @@ def test_what_lies_outside_the_range_of_the_vehicle_is_worse(values, said):
     assert ";" not in found["50.ulg", "north"]
 
 
-def test_what_is_better_is_not_marked():
-    assert changes_of(fleet(flight(50, sigma_z_m=0.04), flight(51, ekf2_nis_mean=1.0))) == {}
-
-
-def test_with_a_truth_the_distance_of_the_two_filters_says_nothing():
+def test_some_differences_say_nothing():
+    better = fleet(flight(50, sigma_z_m=0.04), flight(51, ekf2_nis_mean=1.0))
+    assert changes_of(better) == {}
+    # with a truth the distance of the two filters
     known = {"ekf2_position_rmse_to_truth_m": 0.05}
     before = fleet(*(flight(number, **known) for number in range(12)))
     assert changes_of(fleet(flight(50, position_rmse_m=0.3, **known)), before) == {}
     worse = fleet(flight(50, ekf2_position_rmse_to_truth_m=0.06))
     assert "error of EKF2" in changes_of(worse, before)["50.ulg", "north"]
-
-
-def test_other_vehicles_other_settings_and_few_flights_say_nothing():
+    # other vehicles, other settings and few flights
     bad = {"sigma_z_m": 0.5}
     table = fleet(flight(50, vehicle="hexa", **bad), flight(51, settings="other", **bad))
     found, against = marked(table, BEFORE)
@@ -150,18 +143,14 @@ def test_the_baseline_is_a_table_of_batch(tmp_path):
 
 
 def test_what_is_no_table_of_batch_is_refused(tmp_path):
-    other, text = tmp_path / "other.parquet", tmp_path / "text.parquet"
-    pd.DataFrame({"log": ["a"]}).to_parquet(other)
-    text.write_text("hello", encoding="utf-8")
-    with pytest.raises(SettingsError, match="has no column axis"):
-        read_baseline(other)
-    with pytest.raises(SettingsError, match="cannot be read as a table"):
-        read_baseline(text)
-    with pytest.raises(SettingsError, match="cannot be read"):
-        read_baseline(tmp_path / "missing.parquet")
-
-
-def test_worse_than_nothing_is_refused(tmp_path):
+    pd.DataFrame({"log": ["a"]}).to_parquet(tmp_path / "other.parquet")
+    (tmp_path / "text.parquet").write_text("hello", encoding="utf-8")
+    for name, said in (
+        ("other", "has no column axis"), ("text", "cannot be read as a table"),
+        ("missing", "cannot be read"),
+    ):  # fmt: skip
+        with pytest.raises(SettingsError, match=said):
+            read_baseline(tmp_path / f"{name}.parquet")
     done = CliRunner().invoke(cli, ["batch", "x.ulg", "-o", str(tmp_path), "--fail-on", "worse"])
     assert "requires --baseline" in str(done.exception)
 
@@ -222,36 +211,30 @@ def test_a_log_is_a_test_case_which_fails_where_it_is_worse_or_failed():
     assert worse.text.splitlines()[1].startswith("east: SIGMA_Z found 0.3 m")
     assert failed.attrib == {"type": "failed", "message": "ended after 5 s. Cut it."}
     assert cases["50.ulg"].attrib["classname"] == "quad"
-
-
-def test_names_that_xml_cannot_hold_are_written_without_what_it_cannot():
+    # names that XML cannot hold are written without what it cannot
     table = table_of([{"log": "a\x00<&\x1b.ulg", "status": "failed", "reason": "\x07no"}])
     (case,) = made(table)
-    assert case.attrib["name"] == "a<&.ulg"
-    assert case[0].attrib["message"] == "no"
+    assert (case.attrib["name"], case[0].attrib["message"]) == ("a<&.ulg", "no")
 
 
-@pytest.fixture
-def worker() -> Iterator[None]:
-    """One for all commands of a test: they take the session's own."""
-    with connected(workers=1):
-        yield
-
-
-@pytest.mark.usefixtures("worker")
 def test_the_command_marks_writes_and_fails(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     tiny_logs(tmp_path / "logs", 1)
     common = ["batch", "logs", "--axis", "north"]
-    first = CliRunner().invoke(cli, [*common, "-o", "before"])
-    assert first.exit_code == 0, first.output
     options = ["--baseline", "before/fleet.parquet", "--junit", "j.xml", "--fail-on", "worse"]
-    same = CliRunner().invoke(cli, [*common, "-o", "after", *options])
-    assert same.exit_code == 0, same.output
-    assert "Held against the baseline: 1 by the same log" in same.output
-    assert made(pd.read_parquet("after/fleet.parquet")).get("failures") == "0"
-    worse = CliRunner().invoke(cli, [*common, "-o", "worse", "--sigma-z", "0.3", *options])
-    assert worse.exit_code == 1, worse.output
+
+    def ran(code: int, *more: str) -> str:
+        done = CliRunner().invoke(cli, [*common, *more])
+        assert done.exit_code == code, done.output
+        return done.output
+
+    with connected(workers=1):  # of the session, which every run takes
+        ran(0, "-o", "before")
+        same = ran(0, "-o", "after", *options)
+        unchanged = Path("j.xml").read_bytes()
+        ran(1, "-o", "worse", "--sigma-z", "0.3", *options)
+    assert "Held against the baseline: 1 by the same log" in same
+    assert b'failures="0"' in unchanged
     table = pd.read_parquet("worse/fleet.parquet")
     assert table["change"].iloc[0].startswith("NIS of ours")
     assert Path("j.xml").read_bytes() == junit(table)

@@ -17,7 +17,7 @@ from page_tools import every
 from PIL import Image
 from pypdf import PdfReader
 from scipy.spatial.transform import Rotation
-from test_evaluation import PUBLISHED, flight, moved, published
+from trajectory_tools import PUBLISHED, flight, moved, published
 
 from px4fuse.loop.sources import read_source
 from px4fuse.report.document import EvaluationDocument

@@ -55,15 +55,13 @@ def test_layout_is_no_matter() -> None:
     equal(parse_g2o(messy.removeprefix("\ufeff"), "a.g2o"), parse_g2o(PLANE, "a.g2o"))
 
 
-def test_byte_order_mark_and_comment_behind_a_line(tmp_path: Path) -> None:
+def test_marks_comments_and_order_are_no_matter(tmp_path: Path) -> None:
     file = tmp_path / "a.g2o"
-    file.write_text("\ufeff" + PLANE.replace("0 0 0\n", "0 0 0 # start\n"), encoding="utf-8")
+    lines = PLANE.replace("0 0 0\n", "0 0 0 # start\n")
+    file.write_text("\ufeff" + lines, encoding="utf-8")
     equal(read_g2o(file), parse_g2o(PLANE, "a.g2o"))
-
-
-def test_vertices_are_put_in_order() -> None:
-    lines = PLANE.splitlines()
-    equal(parse_g2o("\n".join([lines[2], lines[1], lines[0]]), "a"), parse_g2o(PLANE, "a"))
+    vertices_last = "\n".join(PLANE.splitlines()[::-1])
+    equal(parse_g2o(vertices_last, "a"), parse_g2o(PLANE, "a"))
 
 
 def test_quaternions_are_normalised() -> None:
@@ -194,34 +192,28 @@ def test_the_work_per_line_is_little_and_does_not_grow(count: int) -> None:
 
 
 @pytest.mark.reallogs
-def test_public_graphs_come_back_the_same(pose_graphs: list[Path]) -> None:
-    for file in pose_graphs:
-        once = read_g2o(file)
-        equal(once, parse_g2o(g2o_text(once), file.name))
-
-
-@pytest.fixture(scope="module")
-def pose_graphs() -> list[Path]:
+def test_public_graphs_come_back_the_same() -> None:
     folder = Path(__file__).resolve().parents[2] / "shared" / "pose_graphs"
     if not folder.is_dir():
         pytest.skip("the public pose graphs (../shared/pose_graphs) are not beside the repository")
-    return sorted(folder.glob("*.g2o"))
+    for file in sorted(folder.glob("*.g2o")):
+        once = read_g2o(file)
+        equal(once, parse_g2o(g2o_text(once), file.name))
 
 
 # --- numbers that cannot be computed with ---
 
 SQUARE = "".join(f"EDGE_SE2 {i} {i + 1} 1 0 1.57 {{}}\n" for i in range(4))
-UNIT = "1 0 0 1 0 1"
 
 
 def square(information: str, edge: int) -> str:
     """A path around a square that closes twice, with another information in one edge."""
     text = SQUARE + "EDGE_SE2 0 4 0.1 0.1 6.2 {}\nEDGE_SE2 0 3 0.1 1.1 4.7 {}\n"
-    return text.format(*[information if edge == one else UNIT for one in range(6)])
+    return text.format(*[information if edge == one else UNIT_2 for one in range(6)])
 
 
 @pytest.mark.parametrize("edge", [1, 4])
-@pytest.mark.parametrize("entry", ["1e-320", "5e-324", "1e-300", "1e-51", "1e51", "1e300"])
+@pytest.mark.parametrize("entry", ["5e-324", "1e-300", "1e-51", "1e51", "1e300"])
 def test_information_that_overflows_is_refused_with_its_line(
     tmp_path, monkeypatch, capsys, entry, edge
 ) -> None:
@@ -229,9 +221,8 @@ def test_information_that_overflows_is_refused_with_its_line(
     path.write_text(square(f"{entry} 0 0 1 0 1", edge))
     code, out, err = run_main(monkeypatch, capsys, "loop", path)
     assert (code, out) == (2, "")
-    assert f"g.g2o, line {edge + 1}: the information matrix has the entry {entry}" in err.replace(
-        "e+", "e"
-    ).replace("4.94e-324", "5e-324").replace("9.99989e-321", "1e-320")
+    said = f"g.g2o, line {edge + 1}: the information matrix has the entry {float(entry):.3g}, which"
+    assert said in err
     assert len(err.splitlines()) == 1
 
 
@@ -242,7 +233,7 @@ def test_information_of_any_size_that_is_read_gives_numbers(
     tmp_path, monkeypatch, capsys, entry, row, edge
 ) -> None:
     """Warnings are errors in these tests, and JSON holds neither NaN nor infinity."""
-    numbers = UNIT.split()
+    numbers = UNIT_2.split()
     numbers[row] = entry
     path = tmp_path / "g.g2o"
     path.write_text(square(" ".join(numbers), edge))

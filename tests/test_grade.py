@@ -82,9 +82,6 @@ def test_everything_that_was_handed_in_stands_in_the_table(handed_in, tmp_path) 
     assert "<img src=x" not in page
     assert "<title>Lab: fusion and loop closure</title>" in page  # the rubric's
     assert len(list((output / "feedback").glob("*.txt"))) == 6
-    for results in (output / "gradescope").rglob("results.json"):
-        found = json.loads(results.read_text(encoding="utf-8"))
-        assert found["score"] >= 0.0
 
 
 @pytest.mark.usefixtures("at_once", "drawn_once")

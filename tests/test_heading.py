@@ -63,54 +63,43 @@ def test_a_constant_turn_comes_back_and_is_called_constant(turn_deg):
     assert found.sigma_deg < 3.0
 
 
-def test_a_heading_that_wanders_is_followed():
-    flight, turn = wandering(flown(passes=6))
+@pytest.mark.parametrize("by", ["positions", "orientation"])
+def test_a_heading_that_wanders_is_followed(by):
+    """By the positions; a source's own orientation tells it at once, and closer."""
+    plain = flown(passes=6 if by == "positions" else 4)
+    flight, turn = wandering(plain)
+    if by == "orientation":
+        oriented = plain.attitude.iloc[::4].assign(**dict.fromkeys(ROTATION_VARIANCE_COLUMNS, 1e-4))
+        tracks = tuple(replace(track, orientation=oriented) for track in flight.positions)
+        flight = replace(flight, positions=tracks)
     found = estimated(flight)
     assert isinstance(found, HeadingError)
-    assert found.by == "positions"
-    assert found.drift_p < DRIFT_P
+    assert found.by == by
     assert found.drifts
+    assert found.drift_p < DRIFT_P
     for part in found.parts:
         middle = (part.start_s + part.end_s) / 2.0
         expected = -np.interp(middle, flight.attitude.index, turn)
-        assert part.heading_error_deg == pytest.approx(expected, abs=3.5 * part.sigma_deg)
+        within = 0.5 if by == "orientation" else 3.5 * part.sigma_deg
+        assert part.heading_error_deg == pytest.approx(expected, abs=within)
     first, last = found.ends
     assert first.start_s < last.start_s
     assert first.heading_error_deg > last.heading_error_deg
 
 
-def test_the_sources_own_orientation_tells_it_at_once():
-    flight, turn = wandering(flown())
-    true = pd.DataFrame(flown().attitude).iloc[::4]
-    oriented = true.assign(**dict.fromkeys(ROTATION_VARIANCE_COLUMNS, 1e-4))
-    tracks = tuple(replace(track, orientation=oriented) for track in flight.positions)
-    found = estimated(replace(flight, positions=tracks))
-    assert isinstance(found, HeadingError)
-    assert found.by == "orientation"
-    assert found.drifts
-    for part in found.parts:
-        middle = (part.start_s + part.end_s) / 2.0
-        expected = -np.interp(middle, flight.attitude.index, turn)
-        assert part.heading_error_deg == pytest.approx(expected, abs=0.5)
-
-
 def test_what_cannot_be_told_says_why():
     flight = flown()
-    assert isinstance(
-        estimated(replace(flight, attitude=Unavailable("attitude", "", ""))), Unavailable
-    )
-    assert isinstance(estimated(replace(flight, imu=Unavailable("IMU", "", ""))), Unavailable)
-    slow = replace(flight, imu=flight.imu.iloc[::10])
-    found = estimated(slow)
-    assert isinstance(found, Unavailable)
-    assert "too slow" in found.reason
-    found = estimated(replace(flight, attitude=flight.attitude.iloc[::25]))
-    assert isinstance(found, Unavailable)
-    assert "attitude is too slow" in found.reason
     few = tuple(replace(t, samples=t.samples.iloc[:40]) for t in flight.positions)
-    found = estimated(replace(flight, positions=few))
-    assert isinstance(found, Unavailable)
-    assert "too few" in found.reason
+    for changed, reason in (
+        ({"attitude": Unavailable("attitude", "not logged", "")}, "not logged"),
+        ({"imu": Unavailable("IMU", "not logged", "")}, "not logged"),
+        ({"imu": flight.imu.iloc[::10]}, "the IMU is too slow"),
+        ({"attitude": flight.attitude.iloc[::25]}, "the attitude is too slow"),
+        ({"positions": few}, "too few"),
+    ):
+        found = estimated(replace(flight, **changed))
+        assert isinstance(found, Unavailable)
+        assert reason in found.reason
 
 
 @pytest.mark.reallogs

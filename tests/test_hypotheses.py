@@ -19,16 +19,9 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import noises_and_clock
 from px4fuse.filter import hypotheses
 from px4fuse.filter.causes import Explained, explained
-from px4fuse.filter.hypotheses import (
-    HypothesisFit,
-    HypothesisSignals,
-    Whitened,
-    fit,
-    gains,
-    respond,
-)
+from px4fuse.filter.hypotheses import fit
 from px4fuse.filter.kalman import replay
-from px4fuse.filter.likelihood import preintegrate
+from px4fuse.filter.likelihood import innovations, innovations_of_signals, preintegrate
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.smoothing import Smoothing, smoothing
 from px4fuse.findings import Finding, imu, source_intervals, source_positions, source_stamps
@@ -66,52 +59,53 @@ def found(analysis: Analysis) -> dict[str, Finding]:
 # ------------------------------------------------------------------ the tool
 
 
-def test_a_response_is_what_the_filter_itself_makes_of_a_signal() -> None:
-    """Of a step of the measurements, against two replays with filterpy."""
-    north = compare(aisle_flight(duration_s=30.0), RIGHT, axes=("north",))["north"]
-    time = north.axis.measurement_time_s
-    step = np.where(time >= 12.0, 0.7, 0.0)
-    moved = replace(north.axis, measurement_m=north.axis.measurement_m + step)
-    expected = (
-        replay(moved, RIGHT).updates["innovation_m"] - north.replay.updates["innovation_m"]
-    ) / np.sqrt(north.replay.updates["innovation_variance_m2"])
-    legs = preintegrate(north.axis, RIGHT)
-    still = np.zeros((len(legs.length_s), 1))
-    signals = HypothesisSignals(still, still, step[1:, None], step[:1])
-    none = np.zeros(len(still), dtype=bool)
-    s, gain = gains(legs, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, none)
-    response = respond(legs, signals, s, gain)
-    np.testing.assert_allclose(response[:, 0], expected, atol=1e-9)
-    np.testing.assert_allclose(s, north.replay.updates["innovation_variance_m2"], rtol=1e-9)
+def test_responses_are_what_the_filter_itself_makes_of_signals() -> None:
+    """Of the measurements, and of these with a step in them, against replays with filterpy."""
+    north = compare(aisle_flight(duration_s=30.0), RIGHT, axes=("north",))["north"].axis
+    step = np.where(north.measurement_time_s >= 12.0, 0.7, 0.0)
+    legs = preintegrate(north, RIGHT)
+    none = np.zeros(len(legs.measurement_m), dtype=bool)
+    measured = legs.measurement_m - legs.initial.position_m
+    both = replace(
+        legs,
+        delta_position_m=np.outer(legs.delta_position_m, [1.0, 1.0]),
+        delta_velocity_m_s=np.outer(legs.delta_velocity_m_s, [1.0, 1.0]),
+        measurement_m=np.stack([measured, measured + step[1:]], 1),
+        initial=replace(legs.initial, position_m=0.0),
+    )
+    nu, s = innovations_of_signals(both, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, none)
+    for column, added in zip(nu.T, (0.0, step), strict=True):
+        moved = replace(north, measurement_m=north.measurement_m + added)
+        updates = replay(moved, RIGHT).updates
+        np.testing.assert_allclose(column, updates["innovation_m"], atol=1e-9)
+        np.testing.assert_allclose(s, updates["innovation_variance_m2"], rtol=1e-9)
+    # what is not fused, as the filter of the likelihood leaves it out
+    skip = np.arange(len(none)) % 7 == 3
+    nu, s = innovations_of_signals(both, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, skip)
+    expected = innovations(legs, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, skip)
+    np.testing.assert_allclose([nu[:, 0], s], expected, atol=1e-9)
 
 
 def test_a_fit_is_least_squares_with_the_prior_as_one_more_measurement() -> None:
     rng = np.random.default_rng(1)
     columns, data = rng.normal(size=(40, 2)), rng.normal(size=40)
-    # of two axes, of which the second has a column more
-    columns[:15, 1] = 0.0
-    parts = (data[:15], data[15:]), (columns[:15, :1], columns[15:])
-    white = Whitened(*parts, (np.array([0]), np.array([0, 1])), 0.0)
-    made = fit(white, np.array([np.inf, 0.5]))
-    np.testing.assert_allclose(
-        np.concatenate(white.rest(made.coefficients)), data - columns @ made.coefficients
-    )
+    made = fit(data, columns, np.repeat([0, 1], [15, 25]), np.array([np.inf, 0.5]), 0.0)
     rows = np.vstack([columns, [0.0, 1.0 / 0.5]])
     expected, *_ = np.linalg.lstsq(rows, np.append(data, 0.0), rcond=None)
     np.testing.assert_allclose(made.coefficients, expected, rtol=1e-9)
+    np.testing.assert_allclose(made.rest, data - columns @ expected)
     np.testing.assert_allclose(made.covariance, np.linalg.inv(rows.T @ rows), rtol=1e-9)
     assert made.square == pytest.approx(np.sum((np.append(data, 0.0) - rows @ expected) ** 2))
-
-
-def test_sigma_is_widened_where_more_remains_than_the_noises_say() -> None:
-    large = HypothesisFit(np.zeros(1), np.array([[0.04]]), 0.0, 0.0, 3.0)
-    assert large.estimate(0).sigma == pytest.approx(0.6)
-    assert replace(large, spread=0.5).estimate(0).sigma == pytest.approx(0.2)
+    # a sigma is widened where more remains than the noises say
+    sigma = np.sqrt(made.covariance[0, 0])
+    for spread, widened in ((3.0, 3.0), (0.5, 1.0)):
+        assert replace(made, spread=spread).estimate(0).sigma == pytest.approx(widened * sigma)
 
 
 def test_hats_make_up_every_slow_signal() -> None:
-    hats = hypotheses._hats(10.0, 100.0)
-    np.testing.assert_allclose(sum(hat.value_m_s2 for hat in hats), 1.0)
+    time, hats = hypotheses._hats(10.0, 100.0)
+    assert time[[0, -1]].tolist() == [10.0, 100.0]
+    np.testing.assert_allclose(np.sum(hats, axis=0), 1.0)
 
 
 # ------------------------------------------------------------------ the causes
@@ -156,7 +150,6 @@ def test_a_scale_is_not_drawn_to_zero_by_the_noise_of_the_acceleration() -> None
         found = explained(
             comparison.flight,
             tuple(result.axis for result in comparison.axes.values()),
-            comparison.segment,
             RIGHT,
             sigma_a_m_s2=0.2,
             sigma_z_m=0.1,

@@ -9,17 +9,15 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from filterpy.kalman import KalmanFilter
+from filter_tools import any_axis, any_settings, sample_axes
 from flights import line
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from px4fuse.comparison.preparation import choose_segment, choose_source
 from px4fuse.errors import SettingsError
 from px4fuse.filter.kalman import Replay, replay, state_at, variance_at
-from px4fuse.filter.model import H, matrix, noise
 from px4fuse.filter.settings import InitialState, Settings
-from px4fuse.filter.signals import Axis, make_axes
+from px4fuse.filter.signals import Axis
 from px4fuse.flight import Flight
 
 SAME_TIME_S = 5e-7
@@ -105,31 +103,6 @@ def assert_equals_plain_recursion(axis: Axis, chosen: Settings) -> None:
     np.testing.assert_allclose(run.updates[UPDATE], updates, rtol=1e-9, atol=1e-9)
 
 
-def sample_axes(flight: Flight) -> tuple[Axis, ...]:
-    track, _ = choose_source(flight)
-    return make_axes(flight, track, choose_segment(flight, track))
-
-
-log_uniform = st.floats(-2.0, 1.0).map(lambda exponent: 10.0**exponent)
-any_settings = st.builds(
-    Settings,
-    sigma_a_m_s2=log_uniform,
-    sigma_z_m=log_uniform,
-    dt_s=st.floats(0.02, 1.0),
-    input=st.sampled_from(["imu", "zero"]),
-)
-
-
-@st.composite
-def any_axis(draw: st.DrawFn) -> Axis:
-    """Measurements at irregular times, under an acceleration sampled at 50 Hz."""
-    intervals = draw(st.lists(st.floats(0.005, 0.7), min_size=3, max_size=20))
-    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
-    measured = draw(st.floats(0.0, 500.0)) + np.cumsum(intervals)
-    imu = np.arange(measured[0] - 0.05, measured[-1] + 0.05, 0.02)
-    return line(measured, rng.normal(0.0, 5.0, len(measured)), (imu, rng.normal(0, 3, len(imu))))
-
-
 @pytest.fixture
 def axis() -> Axis:
     """Twenty measurements at 4 Hz on a constant acceleration of 0.3 m/s²."""
@@ -188,42 +161,6 @@ def test_updates_report_the_textbook_gain_and_prior(axis: Axis) -> None:
     )
 
 
-@pytest.mark.parametrize(("dt", "sigma_a"), [(0.1, 0.5), (0.02, 2.0), (1.0, 0.05)])
-def test_process_noise_at_dt_is_the_lessons(dt: float, sigma_a: float) -> None:
-    q = sigma_a**2
-    lessons = [[q * dt**4 / 4, q * dt**3 / 2], [q * dt**3 / 2, q * dt**2]]
-    np.testing.assert_allclose(q * dt * matrix(noise(dt)), lessons, rtol=1e-14)
-
-
-def test_velocity_noise_per_second_does_not_depend_on_the_step() -> None:
-    per_second = [noise(dt)[2] / dt for dt in (0.001, 0.004, 0.1, 0.37)]
-    np.testing.assert_allclose(per_second, 1.0, rtol=1e-12)
-
-
-@settings(max_examples=40)
-@given(axis=any_axis(), chosen=any_settings)
-def test_replay_is_filterpys_predict_and_update(axis: Axis, chosen: Settings) -> None:
-    run = replay(axis, chosen)
-    kalman = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
-    kalman.x = np.array([[axis.measurement_m[0]], [0.0]])
-    kalman.P, kalman.H = np.diag([0.5**2, 1.0**2]), H
-    kalman.R = np.array([[chosen.sigma_z_m**2]])
-    expected = [[*kalman.x[:, 0], *kalman.P[[0, 0, 1], [0, 1, 1]]]]
-    accelerations = run.steps["acceleration_m_s2"].tolist()
-    added = run.steps["input_variance_m2_s4"].tolist()
-    for (before, now), a, extra in zip(
-        pairwise(run.steps.index), accelerations[:-1], added[:-1], strict=True
-    ):
-        dt = now - before
-        q = (chosen.sigma_a_m_s2**2 + extra) * chosen.dt_s
-        f, b = np.array([[1.0, dt], [0.0, 1.0]]), np.array([[dt**2 / 2.0], [dt]])
-        kalman.predict(u=np.array([[a]]), B=b, F=f, Q=q * matrix(noise(dt)))
-        if now in run.updates.index:
-            kalman.update(run.updates["measurement_m"][now])
-        expected.append([*kalman.x[:, 0], *kalman.P[[0, 0, 1], [0, 1, 1]]])
-    np.testing.assert_allclose(run.steps[STATE], expected, rtol=1e-12, atol=1e-12)
-
-
 NOT_FINITE = (math.nan, math.inf, -math.inf)
 
 
@@ -249,14 +186,11 @@ def test_imu_input_without_an_imu_is_refused() -> None:
         replay(line([0.0, 0.2, 0.4], [0.0, 0.0, 0.0]), Settings(input="imu"))
 
 
-def test_first_measurement_is_the_start_and_is_not_fused_again(axis: Axis) -> None:
+def test_the_first_measurement_or_a_given_state_is_the_start(axis: Axis) -> None:
     run = replay(axis, Settings())
     assert run.steps.index[0] == axis.measurement_time_s[0]
     assert run.steps[STATE].iloc[0].tolist() == [axis.measurement_m[0], 0.0, 0.25, 0.0, 1.0]
     assert run.updates.index.tolist() == axis.measurement_time_s[1:].tolist()
-
-
-def test_given_start_fuses_every_measurement_after_it(axis: Axis) -> None:
     run = replay(axis, Settings(), InitialState(1.9, -1.0, 0.5))
     assert run.steps[STATE].iloc[0].tolist() == [-1.0, 0.5, 0.25, 0.0, 1.0]
     assert run.steps.index[0] == 1.9
@@ -272,20 +206,19 @@ def test_exact_input_keeps_the_state_exact() -> None:
     np.testing.assert_allclose(run.updates["innovation_m"], 0.0, atol=1e-12)
 
 
-def test_state_at_step_times_is_the_step(axis: Axis) -> None:
+def test_the_state_is_predicted_from_the_step_before(axis: Axis) -> None:
+    """At a step it is the step's, between two by the input; outside the replay not a number."""
     run = replay(axis, Settings())
-    position, velocity = state_at(run, run.steps.index.to_numpy())
-    np.testing.assert_array_equal(position, run.steps["position_m"])
-    np.testing.assert_array_equal(velocity, run.steps["velocity_m_s"])
-
-
-def test_state_between_steps_is_predicted_from_the_step_before(axis: Axis) -> None:
-    run = replay(axis, Settings())
+    edges = run.steps.index.to_numpy()
+    np.testing.assert_array_equal(np.transpose(state_at(run, edges)), run.steps[STATE[:2]])
     step = run.steps.iloc[30]
-    position, velocity = state_at(run, np.array([run.steps.index[30] + 0.01]))
+    position, velocity = state_at(run, edges[[30]] + 0.01)
     expected = step["position_m"] + 0.01 * step["velocity_m_s"] + 0.5 * 0.01**2 * 0.3
     assert position[0] == pytest.approx(expected, abs=1e-12)
     assert velocity[0] == pytest.approx(step["velocity_m_s"] + 0.01 * 0.3, abs=1e-12)
+    around = np.array([edges[0] - 0.01, edges[0], edges[-1], edges[-1] + 0.01])
+    for part in (*state_at(run, around), *variance_at(run, around)):
+        assert np.isnan(part).tolist() == [True, False, False, True]
 
 
 @pytest.mark.parametrize("dt", [0.02, 0.1, 0.4])
@@ -327,21 +260,6 @@ def test_variance_just_before_a_measurement_is_that_of_its_prior(axis: Axis) -> 
     np.testing.assert_allclose(velocity, run.updates["prior_velocity_variance_m2_s2"], rtol=1e-9)
 
 
-def test_variance_outside_the_replay_is_not_a_number(axis: Axis) -> None:
-    run = replay(axis, Settings())
-    first, last = run.steps.index[[0, -1]]
-    for variance in variance_at(run, np.array([first - 0.01, first, last, last + 0.01])):
-        assert np.isnan(variance).tolist() == [True, False, False, True]
-
-
-def test_state_outside_the_replay_is_not_a_number(axis: Axis) -> None:
-    run = replay(axis, Settings())
-    first, last = run.steps.index[[0, -1]]
-    position, velocity = state_at(run, np.array([first - 0.01, first, last, last + 0.01]))
-    assert np.isnan(position).tolist() == [True, False, False, True]
-    assert np.isnan(velocity).tolist() == [True, False, False, True]
-
-
 @settings(max_examples=30)
 @given(axis=any_axis(), chosen=any_settings, data=st.data())
 def test_a_later_measurement_does_not_change_earlier_output(
@@ -361,25 +279,6 @@ def test_a_later_measurement_does_not_change_earlier_output(
     before, after = output(replay(axis, chosen)), output(replay(other, chosen))
     np.testing.assert_array_equal(before[:, :-1], after[:, :-1])
     assert abs(after[0, -1] - before[0, -1]) > 0.0
-
-
-def test_replay_does_not_change_its_input(axis: Axis) -> None:
-    arrays = (
-        axis.measurement_time_s,
-        axis.measurement_m,
-        axis.direction,
-        axis.acceleration.time_s,
-        axis.acceleration.value_m_s2,
-        axis.acceleration.integral_m_s,
-    )
-    copies = [array.copy() for array in arrays]
-    for array in arrays:
-        array.setflags(write=False)
-    first = replay(axis, Settings())
-    second = replay(axis, Settings())
-    np.testing.assert_array_equal(first.steps, second.steps)
-    for array, copy in zip(arrays, copies, strict=True):
-        np.testing.assert_array_equal(array, copy)
 
 
 def test_imu_gap_raises_the_process_noise_by_the_inputs_mean_square() -> None:

@@ -10,12 +10,11 @@ from conftest import REPOSITORY
 from exchange import replace
 from pyulog import ULog
 from scipy.spatial.transform import Rotation, Slerp
-from test_lesson import EXAMPLE_2
 
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.findings import find_loop
 from px4fuse.flight import Unavailable
-from px4fuse.lesson import ODOMETRY_M
+from px4fuse.lesson import ODOMETRY_M, loop_lines
 from px4fuse.loop.analysis import analyse, loop_in
 from px4fuse.loop.corrections import BY_DISTANCE, PLAIN, SINGLE_LOOP
 from px4fuse.loop.loop import Loop, close_loop
@@ -45,15 +44,27 @@ def sample_loop(sample: LoopSource) -> Loop:
     return analyse(sample, reference=read_source(str(SLAM)).trajectory)
 
 
-def score(correction: CorrectedPath | Unavailable, index: int = 0) -> Evaluation:
-    assert isinstance(correction, CorrectedPath)
-    found = list(correction.scores.values())[index]
+def path(loop: Loop, way: str) -> CorrectedPath:
+    """The path that was corrected in this way; a pose graph's by the name of its solution."""
+    ways: dict[str, CorrectedPath | Unavailable] = dict(loop.corrections.items())  # type: ignore[arg-type]
+    found = ways.get(way, ways.get(f"pose_graph_{way}"))
+    assert isinstance(found, CorrectedPath)
+    return found
+
+
+def score(loop: Loop, way: str, index: int = 0) -> Evaluation:
+    found = list(path(loop, way).scores.values())[index]
     assert isinstance(found, Evaluation)
     return found
 
 
-def rmse(correction: CorrectedPath | Unavailable, index: int = 0) -> float:
-    return score(correction, index).ate.translation_m.rmse
+def rmse(loop: Loop, way: str, index: int = 0) -> float:
+    return score(loop, way, index).ate.translation_m.rmse
+
+
+def missed(loop: Loop) -> np.ndarray:
+    assert loop.closure_error_axes_m is not None
+    return np.array(list(loop.closure_error_axes_m.values()))
 
 
 # ------------------------------------------------------------------ the sample flight
@@ -61,29 +72,22 @@ def rmse(correction: CorrectedPath | Unavailable, index: int = 0) -> float:
 
 def true_closure_error_m() -> float:
     """How far the odometry is from the vehicle at its landing, straight from the log's topics."""
-    log = ULog(str(SAMPLE))
-    topics = {topic.name: topic.data for topic in log.data_list}
-    odometry, truth = (
-        topics["vehicle_visual_odometry"],
-        topics["vehicle_local_position_groundtruth"],
-    )
+    topics = {topic.name: topic.data for topic in ULog(str(SAMPLE)).data_list}
     landed = topics["vehicle_land_detected"]
-    time = odometry["timestamp_sample"].astype(float)
-    true_time = truth["timestamp_sample"].astype(float)
-    up = landed["timestamp"][np.flatnonzero(np.diff(landed["landed"].astype(int)) == -1)[0] + 1]
-    down = landed["timestamp"][np.flatnonzero(np.diff(landed["landed"].astype(int)) == 1)[-1] + 1]
-
-    def rest(times: np.ndarray, data: dict, names: tuple[str, ...], low: float) -> np.ndarray:
-        inside = (times >= low) & (times <= low + 1e6)
-        return np.array([data[name][inside].mean() for name in names])
-
-    moved = [
-        rest(times, data, names, float(down)) - rest(times, data, names, float(up) - 1e6)
-        for times, data, names in (
-            (time, odometry, ("position[0]", "position[1]", "position[2]")),
-            (true_time, truth, ("x", "y", "z")),
+    changes = np.diff(landed["landed"].astype(int))
+    up = landed["timestamp"][np.flatnonzero(changes == -1)[0] + 1] - 1e6
+    down = landed["timestamp"][np.flatnonzero(changes == 1)[-1] + 1]
+    moved = []
+    for topic, columns in (
+        ("vehicle_visual_odometry", ("position[0]", "position[1]", "position[2]")),
+        ("vehicle_local_position_groundtruth", ("x", "y", "z")),
+    ):
+        time = topics[topic]["timestamp_sample"].astype(float)
+        start, end = (
+            [topics[topic][c][(time >= low) & (time <= low + 1e6)].mean() for c in columns]
+            for low in (up, down)
         )
-    ]
+        moved.append(np.subtract(end, start))
     return float(np.linalg.norm(moved[0] - moved[1]))
 
 
@@ -95,56 +99,55 @@ def test_the_samples_closure_error_is_the_true_one(sample_loop: Loop) -> None:
     assert sample_loop.part_reason == "from take-off to landing, by the land detector"
 
 
-@pytest.mark.parametrize("reference", [0, 1], ids=["truth", "SLAM"])
-def test_both_corrections_bring_the_sample_closer(sample_loop: Loop, reference: int) -> None:
-    before = rmse(sample_loop.odometry, reference)
-    assert rmse(sample_loop.corrections["by_distance"], reference) < 0.8 * before
-    assert rmse(sample_loop.corrections["pose_graph_gated"], reference) < 0.8 * before
+def test_both_corrections_bring_the_sample_closer_and_end_where_the_vehicle_did(
+    sample_loop: Loop,
+) -> None:
+    for reference in (0, 1):  # truth and SLAM
+        before = rmse(sample_loop, "uncorrected", reference)
+        for way in ("by_distance", "gated"):
+            assert rmse(sample_loop, way, reference) < 0.8 * before
+    assert not isinstance(sample_loop.known_end, Unavailable)
+    end = sample_loop.known_end.displacement
+    for way, within in (("by_distance_plain", 1e-9), ("by_distance", 1e-9), ("gated", 0.02)):
+        position = path(sample_loop, way).trajectory.position_m
+        assert np.linalg.norm(position[-1] - position[0] - end) < within
+    for way in ("pose_graph_dcs", "pose_graph_gnc"):
+        robust = sample_loop.corrections[way]  # type: ignore[index]
+        assert isinstance(robust, Unavailable)
+        assert robust.reason == SINGLE_LOOP
 
 
 def test_example_2_through_the_loop_is_the_lessons_digit_for_digit() -> None:
     corners = np.column_stack([np.array(ODOMETRY_M), np.zeros(len(ODOMETRY_M))])
-    path = Trajectory("corners", "vio", np.arange(5.0), corners, None, "FRD")
-    found = close_loop(path)
-    assert isinstance(found.corrections["by_distance_plain"], CorrectedPath)
-    error, total = list((found.closure_error_axes_m or {}).values()), found.path_length_m
-    lines = [
+    found = close_loop(Trajectory("corners", "vio", np.arange(5.0), corners, None, "FRD"))
+    error, total = missed(found), found.path_length_m
+    assert found.closure_error_m is not None
+    corrected = path(found, "by_distance_plain").trajectory.position_m
+    assert list(loop_lines()) == [
         f"loop closure error ({error[0]:.1f}, {error[1]:.1f}) m over {total:.1f} m = "
         f"{found.closure_error_m / total:.1%}",
         *(
             f"({x:5.1f}, {y:5.1f}) -> ({a:5.2f}, {b:5.2f})"
-            for (x, y), (a, b, _) in zip(
-                ODOMETRY_M,
-                found.corrections["by_distance_plain"].trajectory.position_m,
-                strict=True,
-            )
+            for (x, y), (a, b, _) in zip(ODOMETRY_M, corrected, strict=True)
         ),
     ]
-    assert lines == EXAMPLE_2.splitlines()
 
 
 def test_the_plain_correction_moves_each_pose_by_its_share_and_turns_none(
     sample_loop: Loop,
 ) -> None:
-    plain, path = sample_loop.corrections["by_distance_plain"], sample_loop.odometry.trajectory
-    assert isinstance(plain, CorrectedPath)
+    plain, odometry = path(sample_loop, "by_distance_plain"), sample_loop.odometry.trajectory
     share = sample_loop.distance_m / sample_loop.distance_m[-1]
-    moved = path.position_m - plain.trajectory.position_m
-    np.testing.assert_allclose(
-        moved, np.outer(share, list((sample_loop.closure_error_axes_m or {}).values())), atol=1e-12
-    )
-    assert plain.trajectory.rotation is path.rotation
+    moved = odometry.position_m - plain.trajectory.position_m
+    np.testing.assert_allclose(moved, np.outer(share, missed(sample_loop)), atol=1e-12)
+    assert plain.trajectory.rotation is odometry.rotation
 
 
 def test_headings_too_keep_the_shape_that_positions_alone_bend(sample_loop: Loop) -> None:
     """The sample's heading drifts: over 10 m only the one that turns is as good as the odometry."""
     over = [
-        next(e.translation_m for e in score(part).rpe if e.delta_words == "10 m")
-        for part in (
-            sample_loop.odometry,
-            sample_loop.corrections["by_distance"],
-            sample_loop.corrections["by_distance_plain"],
-        )
+        next(e.translation_m for e in score(sample_loop, way).rpe if e.delta_words == "10 m")
+        for way in ("uncorrected", "by_distance", "by_distance_plain")
     ]
     before, turned, plain = (e.rmse for e in over if isinstance(e, Statistics))
     assert turned < 1.05 * before
@@ -160,33 +163,8 @@ def test_without_a_known_heading_there_is_one_correction_by_distance(
     names = [part.name for part in found.reported]
     assert PLAIN in names
     assert BY_DISTANCE not in names
-    assert isinstance(found.corrections["by_distance_plain"], CorrectedPath)
-    assert isinstance(found.corrections["by_distance"], CorrectedPath)
-    np.testing.assert_allclose(
-        found.corrections["by_distance_plain"].trajectory.position_m,
-        found.corrections["by_distance"].trajectory.position_m,
-        atol=1e-9,
-    )
-
-
-def test_a_corrected_path_ends_where_the_vehicle_did(sample_loop: Loop) -> None:
-    assert not isinstance(sample_loop.known_end, Unavailable)
-    end = np.array(sample_loop.known_end.displacement)
-    for part, within in (
-        (sample_loop.corrections["by_distance_plain"], 1e-9),
-        (sample_loop.corrections["by_distance"], 1e-9),
-        (sample_loop.corrections["pose_graph_gated"], 0.02),
-    ):
-        assert isinstance(part, CorrectedPath)
-        moved = part.trajectory.position_m[-1] - part.trajectory.position_m[0]
-        assert np.linalg.norm(moved - end) < within
-
-
-def test_a_single_loop_says_that_it_has_no_redundancy(sample_loop: Loop) -> None:
-    for name in ("dcs", "gnc"):
-        robust = sample_loop.corrections[f"pose_graph_{name}"]
-        assert isinstance(robust, Unavailable)
-        assert robust.reason == SINGLE_LOOP
+    plain, turned = (path(found, way).trajectory for way in ("by_distance_plain", "by_distance"))
+    np.testing.assert_allclose(plain.position_m, turned.position_m, atol=1e-9)
 
 
 def test_a_tape_gives_what_the_truth_gives(sample: LoopSource, sample_loop: Loop) -> None:
@@ -199,14 +177,10 @@ def test_a_tape_gives_what_the_truth_gives(sample: LoopSource, sample_loop: Loop
     assert taped.heading_error_deg == pytest.approx(sample_loop.heading_error_deg, abs=1e-6)
 
 
+@pytest.mark.reallogs
 def test_the_tlog_of_the_flight_gives_the_same_loop(shared_logs: Path) -> None:
     found = analyse(read_source(str(shared_logs / "mavlink" / "v1.16.1_loop_vio.tlog")))
     assert found.closure_error_m == pytest.approx(true_closure_error_m(), abs=0.05)
-
-
-test_the_tlog_of_the_flight_gives_the_same_loop = pytest.mark.reallogs(
-    test_the_tlog_of_the_flight_gives_the_same_loop
-)
 
 
 def test_an_absolute_track_is_not_taken_for_odometry() -> None:
@@ -280,17 +254,15 @@ def test_one_false_closure_among_true_ones(seed: int) -> None:
     assert false.p < 0.001
     assert not false.accepted
     assert all(judged.accepted for judged in true)
-    without = rmse(clean.corrections["pose_graph_all"])
-    assert without < 0.6 * rmse(clean.odometry)
+    without = rmse(clean, "all")
+    assert without < 0.6 * rmse(clean, "uncorrected")
     # trusting it warps the path; the gate and both ways of robust solving do not
-    assert rmse(fooled.corrections["pose_graph_all"]) > 3.0 * without
+    assert rmse(fooled, "all") > 3.0 * without
     for name in ("gated", "dcs", "gnc"):
-        assert rmse(fooled.corrections[f"pose_graph_{name}"]) == pytest.approx(without, rel=0.05), (
-            name
-        )
-    for name in ("dcs", "gnc"):
-        assert getattr(false, f"weight_{name}") < 0.05
-        assert min(getattr(judged, f"weight_{name}") for judged in true) > 0.5
+        assert rmse(fooled, name) == pytest.approx(without, rel=0.05), name
+    for name in ("weight_dcs", "weight_gnc"):
+        assert getattr(false, name) < 0.05
+        assert min(getattr(judged, name) for judged in true) > 0.5
     named = [finding.id for finding in find_loop(fooled)]
     assert named[0] == "false_loop_closure"
     assert "loop_closure_doubtful" not in named
@@ -398,15 +370,20 @@ def test_reported_variances_count_where_they_grow() -> None:
 
 
 def test_poses_between_key_frames_move_with_them(sample_loop: Loop) -> None:
-    solved = sample_loop.corrections["pose_graph_gated"]
-    assert isinstance(solved, CorrectedPath)
+    solved, before = path(sample_loop, "gated"), sample_loop.odometry.trajectory
+    after, nodes = solved.trajectory, sample_loop.nodes
     assert solved.solution is not None
-    at_nodes = solved.trajectory.position_m[sample_loop.nodes]
-    np.testing.assert_allclose(at_nodes, solved.solution.poses[:, :3], atol=1e-9)
+    poses = solved.solution.poses
+    np.testing.assert_allclose(after.position_m[nodes], poses[:, :3], atol=1e-9)
     # and no jump between them that the odometry does not have
-    jump = np.linalg.norm(np.diff(solved.trajectory.position_m, axis=0), axis=1)
-    before = np.linalg.norm(np.diff(sample_loop.odometry.trajectory.position_m, axis=0), axis=1)
-    assert np.max(np.abs(jump - before)) < 0.02
+    jumps = [np.linalg.norm(np.diff(one.position_m, axis=0), axis=1) for one in (after, before)]
+    assert np.max(np.abs(jumps[0] - jumps[1])) < 0.02
+    # orientations are corrected along the geodesic of their neighbours' corrections
+    assert after.rotation is not None
+    assert before.rotation is not None
+    turn, (a, b) = after.rotation * before.rotation.inv(), nodes[40:42]
+    expected = Slerp(before.time_s[[a, b]], turn[[a, b]])(before.time_s[a:b])
+    assert np.max((turn[a:b] * expected.inv()).magnitude()) < 1e-9
 
 
 # ------------------------------------------------------------------ what is given
@@ -431,19 +408,12 @@ def test_the_slam_file_is_levelled_and_closes_better_than_the_odometry() -> None
     assert found.path_length_m == pytest.approx(86.0, abs=5.0)
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [("1,2", (1.0, 2.0, 0.10)), (" 1.5 , 20,0.3", (1.5, 20.0, 0.3))],
-)
-def test_a_closure_is_read(text: str, expected: tuple[float, float, float]) -> None:
-    found = parse_closure(text)
-    assert (found.time_1_s, found.time_2_s, found.sigma_m) == expected
-
-
 @pytest.mark.parametrize("text", ["", "1", "1,2,3,4", "a,b", "1,nan", "1;2", "inf,2"])
 def test_what_is_no_closure_is_refused(text: str) -> None:
     with pytest.raises(TrajectoryError, match="T1,T2"):
         parse_closure(text)
+    assert parse_closure("1,2") == GivenClosure(1.0, 2.0, 0.10)
+    assert parse_closure(" 1.5 , 20,0.3") == GivenClosure(1.5, 20.0, 0.3)
 
 
 def test_a_file_of_closures(tmp_path: Path) -> None:
@@ -495,17 +465,3 @@ def test_a_part_of_a_log_is_named_after_a_colon(tmp_path: Path) -> None:
     assert split_part(str(odd)) == (odd, None)
     with pytest.raises(TrajectoryError, match="'slam' is not a part of a flight"):
         split_part(f"{SAMPLE}:slam")
-
-
-def test_slerp_is_what_the_turn_between_nodes_is(sample_loop: Loop) -> None:
-    """Orientation corrections between nodes are on the geodesic of their neighbours'."""
-    solved = sample_loop.corrections["pose_graph_gated"]
-    assert isinstance(solved, CorrectedPath)
-    after, before = solved.trajectory, sample_loop.odometry.trajectory
-    assert after.rotation is not None
-    assert before.rotation is not None
-    turn = after.rotation * before.rotation.inv()
-    a, b = sample_loop.nodes[40], sample_loop.nodes[41]
-    ends = Rotation.concatenate([turn[a], turn[b]])
-    expected = Slerp(before.time_s[[a, b]], ends)(before.time_s[a:b])
-    assert np.max((turn[a:b] * expected.inv()).magnitude()) < 1e-9

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from px4fuse.filter import model
-from px4fuse.filter.likelihood import Preintegrated, recursion
-from px4fuse.filter.settings import InitialState
 
 P = (0.5, -0.2, 0.7)
 
@@ -45,13 +43,3 @@ def test_many_short_steps_add_the_limit() -> None:
 def test_the_start_is_the_lessons() -> None:
     np.testing.assert_array_equal(model.matrix(model.INITIAL_COVARIANCE), np.diag([0.5**2, 1.0**2]))
     np.testing.assert_array_equal(model.H, [[1.0, 0.0]])
-
-
-def test_a_grid_of_settings_has_its_shape_before_anything_is_fused() -> None:
-    one = np.ones(2)
-    legs = Preintegrated(
-        one, one, one, np.ones((2, 3)), np.zeros((2, 3)), one, InitialState(0.0, 0.5)
-    )
-    skip = np.array([True, False])
-    for step in recursion(legs, np.ones((2, 1)), np.ones((1, 3)), skip):
-        assert {np.shape(part) for part in (*step[:5], *step[5])} == {(2, 3)}

@@ -15,7 +15,6 @@ from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import (
     Finding,
-    ekf2_ev_delay_wrong,
     sigma,
     source_clock,
     source_frame,
@@ -26,7 +25,7 @@ from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
-DETECTORS = (source_clock, source_frame, source_positions, sigma, ekf2_ev_delay_wrong)
+DETECTORS = (source_clock, source_frame, source_positions, sigma)
 RIGHT = Settings(sigma_a_m_s2=0.27, sigma_z_m=0.10)
 SEED = 3
 
@@ -120,7 +119,7 @@ def test_no_delay_is_negative(offset_s, says, remedy) -> None:
     assert isinstance(clean.clock, ClockOffset)
     interval = offset_s - 0.01, offset_s + 0.01
     clock = replace(clean.clock, offset_s=offset_s, interval_s=interval, sigma_s=0.005)
-    (finding,) = ekf2_ev_delay_wrong.detect(replace(clean, clock=clock))
+    (finding,) = source_clock.delay(clean, clock)
     assert says in finding.message
     assert remedy in finding.remedy
     assert "EKF2_EV_DELAY to -" not in finding.remedy

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
+from trajectory_tools import GTSAM_ORDER, gtsam_optimiser, gtsam_problem
 
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.g2o import parse_g2o, read_g2o
@@ -32,8 +33,6 @@ from px4fuse.trajectory.graph.solver import solve
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "pose_graphs"
 TANGENT = {2: 3, 3: 6}
 SEEDS = 4
-# GTSAM has rotation before translation
-GTSAM_ORDER = [3, 4, 5, 0, 1, 2]
 # Seconds each on one core; torus3D from its own vertices does not converge in 100 steps
 FILES = (
     "SE-Sync_CSAIL", "SE-Sync_MIT", "SE-Sync_intel", "SE-Sync_kitti_00", "SE-Sync_manhattan",
@@ -124,41 +123,6 @@ def test_chordal_initialisation_is_two_dense_least_squares(dimension: int, seed:
 
 
 # --- GTSAM ---------------------------------------------------------------------------------------
-
-
-def gtsam_pose(gtsam: Any, pose: np.ndarray) -> Any:
-    if len(pose) == 3:
-        return gtsam.Pose2(*pose)
-    return gtsam.Pose3(gtsam.Rot3.Quaternion(pose[6], *pose[3:6]), pose[:3])
-
-
-def gtsam_problem(gtsam: Any, graph: PoseGraph) -> tuple[Any, Any]:
-    factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    order = GTSAM_ORDER if graph.dimension == 3 else [0, 1, 2]
-    between = gtsam.BetweenFactorPose2 if graph.dimension == 2 else gtsam.BetweenFactorPose3
-    for k, pose in enumerate(graph.poses):
-        values.insert(k, gtsam_pose(gtsam, pose))
-    for i, j, z, omega in zip(
-        graph.first.tolist(), graph.second.tolist(), graph.measurements, graph.information,
-        strict=True,
-    ):  # fmt: skip
-        noise = gtsam.noiseModel.Gaussian.Information(omega[np.ix_(order, order)])
-        factors.add(between(i, j, gtsam_pose(gtsam, z), noise))
-    return factors, values
-
-
-def gtsam_optimiser(gtsam: Any, graph: PoseGraph, iterations: int = 100) -> tuple[Any, Any]:
-    """GTSAM's factors, and its optimiser from the same start with tolerances as tight as ours."""
-    factors, values = gtsam_problem(gtsam, graph)
-    kind = "Pose2" if graph.dimension == 2 else "Pose3"
-    held = getattr(values, f"at{kind}")(0)
-    whole = gtsam.NonlinearFactorGraph(factors)
-    whole.add(getattr(gtsam, f"NonlinearEquality{kind}")(0, held))
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(1e-10)
-    parameters.setAbsoluteErrorTol(1e-10)
-    parameters.setMaxIterations(iterations)
-    return factors, gtsam.LevenbergMarquardtOptimizer(whole, values, parameters)
 
 
 def gtsam_cost(gtsam: Any, graph: PoseGraph, iterations: int = 100) -> float:

@@ -30,7 +30,7 @@ from px4fuse.ekf2.model import Model, replay_settings
 from px4fuse.ekf2.whatif import AxisSummary, Summary, what_if
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.settings import Settings
-from px4fuse.findings import Finding, ekf2_ev_delay_wrong, ekf2_rejecting, find, source_clock
+from px4fuse.findings import Finding, ekf2_rejecting, find, source_clock
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight
@@ -326,14 +326,19 @@ def test_a_noise_that_the_sender_reports_is_overruled(sample: Analysis) -> None:
     assert delay_change(model, 400.0) == {}
 
 
-def only(file: ModuleType, analysis: Analysis) -> Finding:
-    (finding,) = file.detect(analysis)
+def only(name: str, analysis: Analysis) -> Finding:
+    (finding,) = [
+        each
+        for file in (ekf2_rejecting, source_clock)
+        for each in file.detect(analysis)
+        if each.id == name
+    ]
     return finding
 
 
 def test_a_delay_that_the_replay_refutes_is_not_proposed(sample: Analysis) -> None:
     """The stamps of the sample are right; a clock estimate that says otherwise is refuted."""
-    finding = only(ekf2_ev_delay_wrong, offset(sample, -0.15))
+    finding = only("ekf2_ev_delay_wrong", offset(sample, -0.15))
     assert finding.remedy.startswith("Correct the stamps at the sender: EKF2_EV_DELAY 150 is no")
     # neither is ours, which the truth refutes as well
     assert list(source_clock.detect(offset(sample, -0.15))) == []
@@ -345,7 +350,7 @@ def test_a_delay_that_the_replay_confirms_is(sample: Analysis) -> None:
     wrong = replace(flight, log=replace(flight.log, parameters=parameters))
     late = flown_with(offset(sample, 0.0), EKF2_EV_DELAY=150.0)
     late = replace(late, flight=wrong)
-    remedy = only(ekf2_ev_delay_wrong, late).remedy
+    remedy = only("ekf2_ev_delay_wrong", late).remedy
     assert remedy.startswith("Set EKF2_EV_DELAY to 0 ms: mean NIS")
     assert remedy.endswith("(replayed).")
 
@@ -355,7 +360,7 @@ def test_a_delay_that_the_replay_confirms_is(sample: Analysis) -> None:
     [(0.2, "no parameter for stamps that are early"), (-0.4, "PX4 allows 300")],
 )
 def test_what_px4_cannot_set_is_not_proposed(sample: Analysis, offset_s: float, said: str) -> None:
-    assert said in only(ekf2_ev_delay_wrong, offset(sample, offset_s)).remedy
+    assert said in only("ekf2_ev_delay_wrong", offset(sample, offset_s)).remedy
 
 
 def rejecting(comparison: Comparison) -> Comparison:
@@ -371,14 +376,14 @@ def rejecting(comparison: Comparison) -> Comparison:
 def test_rejections_are_ended_by_the_noise_that_the_data_ask_for(sample: Analysis) -> None:
     north = rejecting(replace(sample, axes={"north": sample.axes["north"]}))
     sure = flown_with(replace(sample, axes=north.axes), EKF2_EVP_NOISE=0.03)
-    remedy = only(ekf2_rejecting, sure).remedy
+    remedy = only("ekf2_rejecting", sure).remedy
     assert remedy.startswith("Set EKF2_EVP_NOISE to 0.098 m: rejected")
-    right = only(ekf2_rejecting, replace(sample, axes=north.axes)).remedy
+    right = only("ekf2_rejecting", replace(sample, axes=north.axes)).remedy
     assert right.startswith("With what the data ask for (EKF2_EVP_NOISE to 0.098 m) the rejections")
     assert "Remove the outliers" in right
     assert "A wider EKF2_EVP_GATE is no remedy; at 10:" in right
     silent = replace(sample, axes=north.axes, tuning={})
-    assert "does not tell its noise" in only(ekf2_rejecting, silent).remedy
+    assert "does not tell its noise" in only("ekf2_rejecting", silent).remedy
 
 
 def test_without_a_replay_the_order_of_doing_is_given() -> None:

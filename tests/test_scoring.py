@@ -2,7 +2,6 @@
 
 import copy
 import json
-import pickle
 import random
 import re
 from pathlib import Path
@@ -16,7 +15,6 @@ from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.truth import FormTruth, VerdictTruth, Wrong
 from px4fuse.errors import ResultsError
 from px4fuse.findings import NAMES
-from px4fuse.grading.evidence import values_at
 from px4fuse.grading.feedback import returned_text
 from px4fuse.grading.flags import chosen_settings, class_flags, own_flags
 from px4fuse.grading.model import Entry, Graded, Item
@@ -64,226 +62,113 @@ def filled(kinds, results=EXAMPLE, **values):
 # ------------------------------------------------------------------ checks
 
 
-class TestVerified:
-    def test_with_the_log(self):
-        assert checked("verified")[0] == 1.0
-
-    def test_a_file_that_is_not_at_hand(self):
-        read = read_report((ROOT / "reports" / "aisle_uwb.pdf").read_bytes(), "aisle_uwb.pdf")
-        verdict = verify(read)
-        points, comment = checked("verified", verdict=verdict)
-        assert points == 0.5
-        assert "not at hand (aisle_uwb.ulg)" in comment
-        text = fed_back(graded(verdict=verdict))
-        assert "was not at hand" in text
-        assert "Make it again" not in text
-        other = replace(verdict, reasons=("made with another version",), missing="")
-        assert checked("verified", verdict=other)[0] == 0.0
-
-    def test_other_verdicts_say_why(self):
-        verdict = Verdict("cannot verify", ("the log is not here",), with_log=False)
-        points, comment = checked("verified", verdict=verdict)
-        assert points == 0.0
-        assert comment == "Your report could not be verified (the log is not here)."
+def test_a_file_that_is_not_at_hand():
+    read = read_report((ROOT / "reports" / "aisle_uwb.pdf").read_bytes(), "aisle_uwb.pdf")
+    verdict = verify(read)
+    points, comment = checked("verified", verdict=verdict)
+    assert points == 0.5
+    assert "not at hand (aisle_uwb.ulg)" in comment
+    text = fed_back(graded(verdict=verdict))
+    assert "was not at hand" in text
+    assert "Make it again" not in text
+    other = replace(verdict, reasons=("made with another version",), missing="")
+    points, comment = checked("verified", verdict=other)
+    assert points == 0.0
+    assert comment == "Your report could not be verified (made with another version)."
 
 
-class TestStudent:
-    def test_both_one_none(self):
-        both = changed(student={"name": "Ann", "id": "7", "notes": ""})
-        assert checked("student", both)[0] == 1.0
-        points, comment = checked("student", changed(student__name="Ann"))
-        assert points == 0.5
-        assert "--id" in comment
-        assert checked("student")[0] == 0.0
-        assert checked("student", changed(LOOP, student__name="Ann", student__id="7"))[0] == 1.0
-        assert checked("student", changed(student__name="Ann"), id=False)[0] == 1.0
+RMSE = "axes.north.filters.kf.truth.position_rmse_m"
+BLIND = changed(axes__north__filters__kf__truth=NONE)
+NORTH = changed(axes={"north": EXAMPLE["axes"]["north"]}, tuning={}, horizontal={})
+SIGMA_Z = "tuning__horizontal__sigma_z_m"
+UNCLEAR = changed(clock__determinable=False, clock__reason="no acceleration.")
+JUMPS = {"clock__applied_s": 0.25, "findings": [finding("source_clock_changes")]}
+UNDERSTATED = {"horizontal__kf__verdict": "variance understated", "horizontal__kf__nis_mean": 3.0}
+AFTER = "loop__corrections__by_distance"
+WORSE = {"slam.tum": to_plain(correction(0.5, 1.4))["scores"]["slam.tum"]}
+REJECTED = changed(LOOP, loop__closures=[{**LOOP["loop"]["closures"][0], "accepted": False}])
+# Check, results, parameters, the points of 1, and what the comment says
+CHECKED = [
+    ("verified", EXAMPLE, {}, 1.0, "computed again"),
+    ("student", changed(student={"name": "Ann", "id": "7", "notes": ""}), {}, 1.0, "Ann, 7"),
+    ("student", changed(student__name="Ann"), {}, 0.5, "--id"),
+    ("student", EXAMPLE, {}, 0.0, "--student"),
+    ("student", changed(LOOP, student__name="Ann", student__id="7"), {}, 1.0, "Ann"),
+    ("student", changed(student__name="Ann"), {"id": False}, 1.0, "Ann"),
+    ("sections", EXAMPLE, {"results": ["axes.*.filters.kf", "clock"]}, 1.0, "2 of 2"),
+    ("sections", EXAMPLE, {"results": ["loop", "axes.north"]}, 0.5,
+     "no external vision with orientation"),
+    ("tuning", EXAMPLE, {"settings": ["sigma_z_m"]}, 1.0, "within"),
+    ("tuning", EXAMPLE, {"settings": ["sigma_a_m_s2"]}, 0.72, "0.5 m/s² is above"),
+    ("tuning", EXAMPLE, {}, 0.86, "SIGMA_A"),
+    ("tuning", changed(settings__sigma_a_m_s2=0.1), {"settings": ["sigma_a_m_s2"]}, 0.0, "below"),
+    ("tuning", changed(**{SIGMA_Z: ..., f"{SIGMA_Z}_interval": [0.0, 0.2]}),
+     {"settings": ["sigma_z_m"]}, 1.0, "within"),
+    ("tuning", changed(tuning__horizontal=NONE), {}, 0.0, "too few of them"),
+    ("tuning", NORTH, {"settings": ["sigma_z_m"]}, 0.0, "leave --axis out"),
+    ("number", EXAMPLE, {"path": RMSE, "at_most": 0.15}, 1.0, RMSE),
+    ("number", EXAMPLE, {"path": RMSE, "at_most": 0.05, "name": "the error"}, 0.0,
+     "The error is 0.06499; at most 0.05 was asked for."),
+    ("number", EXAMPLE, {"path": RMSE, "at_most": 0.06, "zero_at": 0.07}, 0.5, ""),
+    ("number", EXAMPLE, {"path": RMSE, "at_least": 0.07, "zero_at": 0.06}, 0.5, ""),
+    ("number", EXAMPLE, {"path": "axes.*.filters.kf.nis_mean", "at_least": 0.82}, 0.0,
+     "axes.north"),  # the worst of several
+    ("number", EXAMPLE, {"path": ["nothing.here", "log.duration_s"], "at_least": 100}, 1.0, ""),
+    ("number", LOOP, {"path": 'loop.corrections.by_distance.scores."slam.tum".ate.translation_m.'
+                              "rmse", "at_most": 0.3}, 1.0, ""),
+    ("number", EXAMPLE, {"path": "clock.interval_s.1", "at_most": 0.1}, 1.0, ""),
+    *(("number", BLIND, {"path": path, "at_most": 1.0}, 0.0, "has no number for")
+      for path in ("log", "log.name", "log.dropouts", "nothing")),
+    ("number", BLIND, {"path": RMSE, "at_most": 1.0}, 0.0,
+     f"Your report has no number for {RMSE} (too few of them)."),
+    ("number", NORTH, {"path": "tuning.horizontal.held_out.gain_nats", "at_most": 1.0}, 0.0,
+     "leave --axis out"),
+    ("consistent", changed(horizontal__kf__verdict="consistent"), {}, 1.0, "is consistent"),
+    ("consistent", EXAMPLE, {}, 0.7, "overstated by a factor of 1.13"),
+    ("consistent", changed(horizontal__kf__nis_mean=2.0), {}, 0.0, "factor of 2"),
+    ("consistent", EXAMPLE, {"filter": "ekf2", "axes": ["horizontal", "east"]}, 1.0, "EKF2"),
+    ("consistent", EXAMPLE, {"filter": "ekf2", "axes": ["down"]}, 0.0, "never fused"),
+    ("consistent", NORTH, {}, 0.0, "leave --axis out"),
+    ("consistent", changed(**UNDERSTATED), {}, 0.0, "understated by"),
+    ("consistent", changed(**UNDERSTATED, settings__sigma_a_m_s2=0.36), {}, 1.0,
+     "what is left no setting fixes"),
+    ("clock", EXAMPLE, {}, 1.0, "what the data ask for"),
+    ("clock", changed(clock__applied_s=0.25), {}, 0.0, "0.250 s"),
+    ("clock", UNCLEAR, {}, 0.5, "no acceleration); fly"),
+    ("clock", changed(clock=NONE), {}, 0.0, "too few of them"),
+    ("clock", LOOP, {}, 0.0, "nothing about the clock"),
+    ("clock", changed(**JUMPS), {}, 0.5, "say in your form"),
+    ("clock", filled(["clock-jump"], **JUMPS), {}, 1.0, "as your form says"),
+    ("clock", filled(["dropout"], **JUMPS), {}, 0.5, "say in your form"),
+    ("loop", LOOP, {}, 1.0, "from 0.41 m to 0.26 m"),
+    ("loop", changed(LOOP, **{f"{AFTER}__scores": WORSE}), {}, 0.67, "makes it worse"),
+    ("loop", changed(LOOP, **{f"{AFTER}__scores": {}}), {}, 0.83, "--reference"),
+    ("loop", changed(LOOP, **{AFTER: NONE}), {}, 0.33, "not corrected"),
+    ("loop", EXAMPLE, {}, 0.0, "no external vision with orientation"),
+    ("loop", changed(LOOP, loop__absolute=True), {}, 0.0, "does not drift"),
+    ("loop", REJECTED, {}, 0.67, "rejected as false"),
+    ("loop", filled(["open-end"], REJECTED), {}, 1.0, "as your form says"),
+    ("loop", changed(LOOP, loop__closure_error_m=..., loop__known_end=NONE), {}, 0.0,
+     "too few of them"),
+    ("flight", EXAMPLE, {}, 1.0, "which is enough"),
+    ("flight", LOOP, {}, 1.0, "m of path"),
+    ("flight", changed(settings__end_s=31.848858), {}, 0.5, "30 s"),
+    ("flight", LOOP, {"min_path_m": 175.4}, 0.5, "175.4 m of path"),
+    ("flight", changed(findings=[finding("no_motion")]), {}, 0.0, "hardly moved"),
+]  # fmt: skip
 
 
-class TestSections:
-    def test_pages_and_results(self):
-        assert checked("sections", results=["axes.*.filters.kf", "clock"])[0] == 1.0
-
-    def test_missing_ones_are_named_with_their_reason(self):
-        points, comment = checked("sections", results=["loop", "axes.north"])
-        assert points == 0.5
-        assert "no external vision with orientation" in comment
+@pytest.mark.parametrize(("check", "results", "given", "points", "said"), CHECKED)
+def test_what_a_check_gives(check, results, given, points, said):
+    found, comment = checked(check, results, **given)
+    assert found == pytest.approx(points, abs=0.01), comment
+    assert said in comment
 
 
-class TestTuning:
-    def test_within(self):
-        assert checked("tuning", settings=["sigma_z_m"])[0] == 1.0
-
-    def test_outside_falls_to_zero_at_the_factor(self):
-        points, comment = checked("tuning", settings=["sigma_a_m_s2"])
-        assert 0.5 < points < 0.9
-        assert "0.5 m/s²" in comment
-        assert "above" in comment
-        small = changed(settings__sigma_a_m_s2=0.1)
-        points, comment = checked("tuning", small, settings=["sigma_a_m_s2"])
-        assert points == 0.0
-        assert "below" in comment
-        assert checked("tuning")[0] > 0.5
-
-    def test_a_bound_and_nothing(self):
-        where = "tuning__horizontal__sigma_z_m"
-        results = changed(**{where: ..., f"{where}_interval": [0.0, 0.2]})
-        assert checked("tuning", results, settings=["sigma_z_m"])[0] == 1.0
-        points, comment = checked("tuning", changed(tuning__horizontal=NONE))
-        assert points == 0.0
-        assert "too few of them" in comment
-
-
-class TestNumber:
-    PATH = "axes.north.filters.kf.truth.position_rmse_m"
-
-    def test_below_and_above(self):
-        assert checked("number", path=self.PATH, at_most=0.15)[0] == 1.0
-        points, comment = checked("number", path=self.PATH, at_most=0.05, name="the error")
-        assert (points, comment) == (0.0, "The error is 0.06499; at most 0.05 was asked for.")
-
-    def test_part_of_the_points(self):
-        assert checked("number", path=self.PATH, at_most=0.06, zero_at=0.07)[0] == 0.5
-        assert checked("number", path=self.PATH, at_least=0.07, zero_at=0.06)[0] == 0.5
-
-    def test_the_worst_of_several_counts(self):
-        points, comment = checked("number", path="axes.*.filters.kf.nis_mean", at_least=0.82)
-        assert points == 0.0
-        assert "axes.north" in comment
-
-    def test_first_path_that_is_there(self):
-        paths = ["nothing.here", "log.duration_s"]
-        assert checked("number", path=paths, at_least=100)[0] == 1.0
-
-    def test_lists_and_names_with_dots(self):
-        path = 'loop.corrections.by_distance.scores."slam.tum".ate.translation_m.rmse'
-        assert checked("number", LOOP, path=path, at_most=0.3)[0] == 1.0
-        assert checked("number", path="clock.interval_s.1", at_most=0.1)[0] == 1.0
-
-    @pytest.mark.parametrize("path", [PATH, "log", "log.name", "log.dropouts", "nothing"])
-    def test_what_is_no_number_gives_nothing(self, path):
-        results = changed(axes__north__filters__kf__truth=NONE)
-        points, comment = checked("number", results, path=path, at_most=1.0)
-        assert points == 0.0
-        assert "has no number for" in comment
-
-    def test_why_there_is_no_number(self):
-        path = "axes.north.filters.kf.truth.position_rmse_m"
-        results = changed(axes__north__filters__kf__truth=NONE)
-        comment = checked("number", results, path=path, at_most=1.0)[1]
-        assert comment == f"Your report has no number for {path} (too few of them)."
-
-
-class TestConsistent:
-    def test_verdicts(self):
-        good = changed(horizontal__kf__verdict="consistent")
-        assert checked("consistent", good)[0] == 1.0
-        points, comment = checked("consistent")
-        assert 0.5 < points < 1.0
-        assert "overstated by a factor of 1.13" in comment
-        assert checked("consistent", changed(horizontal__kf__nis_mean=2.0))[0] == 0.0
-        assert checked("consistent", filter="ekf2", axes=["horizontal", "east"])[0] == 1.0
-
-    def test_absent(self):
-        points, comment = checked("consistent", axes=["down"], filter="ekf2")
-        assert points == 0.0
-        assert "never fused" in comment
-
-    def test_what_no_setting_mends_is_excused_where_both_noises_are_right(self):
-        understated = {
-            "horizontal__kf__verdict": "variance understated",
-            "horizontal__kf__nis_mean": 3.0,
-        }
-        assert checked("consistent", changed(**understated))[0] == 0.0
-        right = understated | {"settings__sigma_a_m_s2": 0.36}
-        points, comment = checked("consistent", changed(**right))
-        assert points == 1.0
-        assert "what is left no setting fixes" in comment
-
-
-class TestClock:
-    def test_applied_or_not(self):
-        assert checked("clock")[0] == 1.0
-        points, comment = checked("clock", changed(clock__applied_s=0.25))
-        assert points == 0.0
-        assert "0.250 s" in comment
-        assert "--clock-offset" in comment
-
-    def test_undetermined_and_absent(self):
-        results = changed(clock__determinable=False, clock__reason="no acceleration.")
-        points, comment = checked("clock", results)
-        assert points == 0.5
-        assert "no acceleration" in comment
-        points, comment = checked("clock", changed(clock=NONE))
-        assert (points, "too few of them" in comment) == (0.0, True)
-        assert checked("clock", LOOP)[0] == 0.0
-
-    def test_flight_that_was_handed_out_is_not_the_student_s_choice(self):
-        results = changed(clock__determinable=False, clock__reason="no acceleration.")
-        points, comment = checked("clock", results, key=key())
-        assert points == 1.0
-        assert "fly" not in comment.replace("flight", "")
-
-    def test_a_clock_that_jumps_has_no_single_offset(self):
-        late = {"clock__applied_s": 0.25, "findings": [finding("source_clock_changes")]}
-        assert checked("clock", changed(**late))[0] == 0.5
-        assert checked("clock", filled(["clock-jump"], **late))[0] == 1.0
-        assert checked("clock", filled(["dropout"], **late))[0] == 0.5
-
-
-class TestLoop:
-    def test_corrected(self):
-        points, comment = checked("loop", LOOP)
-        assert points == 1.0
-        assert "from 0.41 m to 0.26 m" in comment
-
-    def test_worse_without_reference_uncorrected_and_none(self):
-        after = "loop__corrections__by_distance"
-        worse = {"slam.tum": to_plain(correction(0.5, 1.4))["scores"]["slam.tum"]}
-        assert checked("loop", changed(LOOP, **{f"{after}__scores": worse}))[0] == 0.67
-        assert checked("loop", changed(LOOP, **{f"{after}__scores": {}}))[0] == 0.83
-        assert checked("loop", changed(LOOP, **{after: NONE}))[0] == 0.33
-        points, comment = checked("loop")
-        assert points == 0.0
-        assert "no external vision with orientation" in comment
-        assert checked("loop", changed(LOOP, loop__absolute=True))[0] == 0.0
-
-    def test_false_closure_is_rejected_for_a_reason(self):
-        rejected = copy.deepcopy(LOOP)
-        rejected["loop"]["closures"] = [{**LOOP["loop"]["closures"][0], "accepted": False}]
-        assert checked("loop", rejected)[0] == 0.67
-        why = filled(["open-end"], rejected)
-        assert checked("loop", why)[0] == 1.0
-
-    def test_why_there_is_no_error(self):
-        open_ = changed(LOOP, loop__closure_error_m=..., loop__known_end=NONE)
-        assert "too few of them" in checked("loop", open_)[1]
-
-
-class TestOneAxisOnly:
-    def test_why_there_is_nothing_horizontal(self):
-        north = {"axes": {"north": EXAMPLE["axes"]["north"]}, "tuning": {}, "horizontal": {}}
-        for check, more in (
-            ("tuning", {"settings": ["sigma_z_m"]}),
-            ("consistent", {}),
-            ("number", {"path": "tuning.horizontal.held_out.gain_nats", "at_most": 1.0}),
-        ):
-            points, comment = checked(check, changed(**north), **more)
-            assert points == 0.0
-            assert "leave --axis out" in comment
-
-
-class TestFlight:
-    def test_enough_and_too_little(self):
-        assert checked("flight")[0] == 1.0
-        assert checked("flight", LOOP)[0] == 1.0
-        points, comment = checked("flight", changed(settings__end_s=31.848858))
-        assert points == 0.5
-        assert "30 s" in comment
-        assert checked("flight", LOOP, min_path_m=175.4)[0] == 0.5
-
-    def test_no_motion(self):
-        still = changed(findings=[finding("no_motion")])
-        assert checked("flight", still)[0] == 0.0
+def test_the_clock_of_a_flight_that_was_handed_out_is_not_the_student_s_choice():
+    points, comment = checked("clock", UNCLEAR, key=key())
+    assert points == 1.0
+    assert "fly" not in comment.replace("flight", "")
 
 
 # ------------------------------------------------------------------ mistakes
@@ -422,10 +307,6 @@ class TestScore:
         assert sum(item.of for item in items) == 65
         assert {item.points for item in items} == {0.0}
 
-    def test_rubric_and_key_go_to_other_processes(self):
-        for one in (read_rubric(None), key("source_gap")):
-            assert pickle.loads(pickle.dumps(one)) == one
-
     @pytest.mark.parametrize("results", [EXAMPLE, LOOP], ids=["compare", "loop"])
     def test_whatever_can_be_read_can_be_scored(self, results):
         """Extreme values, and parts that are absent, wherever the contract allows them."""
@@ -457,20 +338,6 @@ class TestScore:
                 assert item.comment.isprintable()
             list(own_flags(found))
         assert read > 40
-
-    def test_paths_that_lead_nowhere(self):
-        for path in (
-            "",
-            ".",
-            "*",
-            "*.*.*",
-            "axes..north",
-            "a.0.b",
-            '"',
-            '""',
-            "clock.interval_s.9",
-        ):
-            list(values_at(EXAMPLE, path))
 
 
 def fed_back(one, title=""):
@@ -695,7 +562,6 @@ class TestClassFlags:
             ("Student1_Name1/1002.pdf", False),
             ("1001.pdf", False),
             ("lab report.pdf", False),
-            ("2222.pdf", True),
             ("report-1002-1001.pdf", False),
             ("", False),
             ("/", False),
@@ -704,11 +570,6 @@ class TestClassFlags:
     def test_file_of_another_name(self, file, flagged):
         made = class_flags([of(1, submission=file), of(2)])
         assert (0 in made) == flagged
-
-    def test_leading_zeros_are_no_other_name(self):
-        answers = AnswerKey("aisle", (Answer("0106", "Bob Bold", "0106.ulg", "a" * 64),))
-        bob = {"student": "Bob <b>Bold</b>", "student_id": "106", "log_sha256": "a" * 64}
-        assert class_flags([of(1, submission="late_0106.pdf", **bob)], answers) == {}
 
     def test_three_hundred_take_seconds(self):
         many = [of(n, notes=text_of(n % 290, 1500), log_sha256=f"{n}") for n in range(300)]

@@ -80,34 +80,22 @@ def flight_of(*, imu=ABSENT, attitude=ABSENT, track=None, duration_s=10.0, airbo
 # ---- acceleration in NED ----------------------------------------------------------------------
 
 
-def test_a_level_still_vehicle_does_not_accelerate():
-    time = np.arange(0.0, 5.0, 0.01)
-    level = attitude_of(time[::5], Rotation.identity(len(time[::5])))
-    acceleration = ned_acceleration(flight_of(imu=still_imu(time), attitude=level))
-    assert list(acceleration.columns) == list(AXIS_NAMES)
-    np.testing.assert_array_equal(acceleration, 0.0)
-    np.testing.assert_array_equal(acceleration.index, time[time <= time[::5][-1]])
+def felt(time, force, attitude):
+    """Acceleration in NED that a specific force in the body gives."""
+    return ned_acceleration(flight_of(imu=still_imu(time, force), attitude=attitude))
 
 
-@pytest.mark.parametrize("angles_deg", [(40.0, 0.0, 0.0), (0.0, 25.0, 0.0), (120.0, -10.0, 170.0)])
-def test_a_tilted_still_vehicle_does_not_accelerate(angles_deg):
-    """Gravity is what the accelerometer feels at rest, whichever way it is turned."""
+@pytest.mark.parametrize(
+    "angles_deg", [(0.0, 0.0, 0.0), (40.0, 0.0, 0.0), (0.0, 25.0, 0.0), (120.0, -10.0, 170.0)]
+)
+def test_a_still_vehicle_does_not_accelerate_whichever_way_it_is_turned(angles_deg):
     time = np.arange(0.0, 5.0, 0.01)
     tilt = Rotation.from_euler("ZYX", angles_deg, degrees=True)
-    imu = still_imu(time, tilt.inv().apply([0.0, 0.0, -GRAVITY]))
     attitude = attitude_of(time[::5], Rotation.concatenate([tilt] * len(time[::5])))
-    np.testing.assert_allclose(
-        ned_acceleration(flight_of(imu=imu, attitude=attitude)), 0, atol=1e-12
-    )
-
-
-def test_forward_is_where_the_nose_points():
-    """1 m/s² forward while heading east is 1 m/s² east."""
-    time = np.arange(0.0, 2.0, 0.01)
-    east = Rotation.from_euler("Z", np.full((len(time), 1), 90.0), degrees=True)
-    imu = still_imu(time, (1.0, 0.0, -GRAVITY))
-    acceleration = ned_acceleration(flight_of(imu=imu, attitude=attitude_of(time, east)))
-    np.testing.assert_allclose(acceleration, np.tile([0.0, 1.0, 0.0], (len(time), 1)), atol=1e-12)
+    acceleration = felt(time, tilt.inv().apply([0.0, 0.0, -GRAVITY]), attitude)
+    assert list(acceleration.columns) == list(AXIS_NAMES)
+    np.testing.assert_allclose(acceleration, 0, atol=1e-12)
+    np.testing.assert_array_equal(acceleration.index, time[time <= time[::5][-1]])
 
 
 @pytest.mark.parametrize("axis", [(0, 0, 1), (0, 1, 0), (0.6, 0.0, 0.8)])
@@ -126,8 +114,7 @@ def test_constant_acceleration_of_a_turning_body(axis, rate_rad_s):
 
     time = np.arange(0.0, 5.0, 0.005)
     force = body_to_ned(time).inv().apply(truth - [0.0, 0.0, GRAVITY])
-    attitude = attitude_of(time[::10], body_to_ned(time[::10]))
-    acceleration = ned_acceleration(flight_of(imu=still_imu(time, force), attitude=attitude))
+    acceleration = felt(time, force, attitude_of(time[::10], body_to_ned(time[::10])))
     assert len(acceleration) > 980
     np.testing.assert_allclose(acceleration, np.tile(truth, (len(acceleration), 1)), atol=1e-9)
 
@@ -137,27 +124,19 @@ def test_the_sign_and_length_of_a_quaternion_do_not_matter():
     time = np.arange(0.0, 4.0, 0.01)
     turning = Rotation.from_euler("Z", 0.3 * time[::5, None])
     attitude = attitude_of(time[::5], turning)
-    imu = still_imu(time, (0.5, 0.0, -GRAVITY))
-    expected = ned_acceleration(flight_of(imu=imu, attitude=attitude))
     flips = np.where(np.arange(len(attitude)) % 2, -1.001, 0.999)
-    flipped = attitude.mul(flips, axis=0)
-    result = ned_acceleration(flight_of(imu=imu, attitude=flipped))
+    expected, result = (
+        felt(time, (0.5, 0.0, -GRAVITY), each) for each in (attitude, attitude.mul(flips, axis=0))
+    )
     np.testing.assert_allclose(result, expected, atol=1e-12)
 
 
-def test_no_acceleration_without_imu_or_attitude():
+def test_no_acceleration_without_imu_and_attitude_at_the_same_time():
     time = np.arange(0.0, 1.0, 0.01)
     level = attitude_of(time, Rotation.identity(len(time)))
     assert ned_acceleration(flight_of(attitude=level)) is ABSENT
     assert ned_acceleration(flight_of(imu=still_imu(time))) is ABSENT
-
-
-def test_imu_and_attitude_at_different_times_give_no_acceleration():
-    time = np.arange(0.0, 1.0, 0.01)
-    later = attitude_of(time + 100.0, Rotation.identity(len(time)))
-    result = ned_acceleration(flight_of(imu=still_imu(time), attitude=later))
-    assert isinstance(result, Unavailable)
-    assert "overlap" in result.reason
+    assert "overlap" in felt(time, (0.0, 0.0, 0.0), level.set_axis(time + 100.0)).reason
 
 
 # ---- averages over steps ----------------------------------------------------------------------
@@ -200,34 +179,26 @@ def test_step_means_between_samples_err_by_less_than_half_a_sample(slope, level,
     np.testing.assert_allclose(gap, 0.0, atol=1e-9)
 
 
-def test_means_over_all_steps_add_up_to_the_change_of_velocity():
-    time = np.arange(0.0, 10.0, 0.004)
-    edges = np.arange(0.0, 9.95, 0.1)
-    mean, _ = step_means(acceleration_of(time, np.cos(time)), edges)
-    assert np.sum(mean * np.diff(edges)) == pytest.approx(np.sin(edges[-1]), abs=1e-5)
-
-
-def test_gap_fraction_is_the_share_of_the_step_without_imu():
-    time = np.arange(0.0, 10.0, 0.01)
-    time = time[(time < 2.005) | (time > 2.995)]  # nothing strictly between 2 s and 3 s
-    acceleration = acceleration_of(time, np.ones(len(time)))
-    mean, gap = step_means(acceleration, [0.0, 1.0, 1.5, 2.5, 2.7, 2.9, 4.0, 5.0])
-    np.testing.assert_allclose(gap, [0.0, 0.0, 0.5, 1.0, 1.0, 0.1 / 1.1, 0.0], atol=1e-9)
-    np.testing.assert_allclose(mean, 1.0)  # a gap between equal values says the same value
-
-
-def test_outside_the_imu_all_is_gap_and_the_mean_is_zero():
-    time = np.arange(1.0, 2.001, 0.01)
-    mean, gap = step_means(acceleration_of(time, np.ones(len(time))), [0.0, 0.5, 1.5, 2.5, 3.0])
-    np.testing.assert_allclose(gap, [1.0, 0.5, 0.5, 1.0], atol=1e-9)
-    np.testing.assert_allclose(mean[[0, 3]], 0.0)
-
-
-def test_a_slow_imu_is_slow_and_has_no_gaps():
-    """8.6 Hz as in a real log: every interval is long, none is longer than the rest."""
-    time = np.arange(0.0, 20.0, 1 / 8.6)
-    _, gap = step_means(acceleration_of(time, np.ones(len(time))), np.arange(0.0, 19.0, 0.1))
-    np.testing.assert_allclose(gap, 0.0, atol=1e-12)
+@pytest.mark.parametrize(
+    ("time", "edges", "gaps"),
+    [
+        # nothing strictly between 2 s and 3 s
+        (
+            np.r_[0.0:2.005:0.01, 3.0:10.0:0.01],
+            [0.0, 1.0, 1.5, 2.5, 2.7, 2.9, 4.0, 5.0],
+            [0.0, 0.0, 0.5, 1.0, 1.0, 0.1 / 1.1, 0.0],
+        ),
+        (np.r_[1.0:2.001:0.01], [0.0, 0.5, 1.5, 2.5, 3.0], [1.0, 0.5, 0.5, 1.0]),
+        # 8.6 Hz as in a real log: every interval is long, none is longer than the rest
+        (np.r_[0.0 : 20.0 : 1 / 8.6], np.arange(0.0, 19.0, 0.1), np.zeros(189)),
+    ],
+)
+def test_a_gap_is_the_share_of_the_step_without_imu(time, edges, gaps):
+    """A gap between equal values says the same value; outside the mean is zero."""
+    mean, gap = step_means(acceleration_of(time, np.ones(len(time))), edges)
+    np.testing.assert_allclose(gap, gaps, atol=1e-9)
+    inside = np.clip(np.diff(np.clip(edges, time[0], time[-1])) / np.diff(edges), 0.0, 1.0)
+    np.testing.assert_allclose(mean, inside, atol=1e-9)
 
 
 def test_rms_counts_only_the_segment():
@@ -235,12 +206,7 @@ def test_rms_counts_only_the_segment():
     table = frame(time, np.outer(np.where(time < 5.0, 100.0, 2.0), NORTH), list(AXIS_NAMES))
     inside = project_acceleration(table, NORTH, Segment(5.0, 9.0, ""))
     assert inside.rms_m_s2 == pytest.approx(2.0)
-
-
-def test_no_imu_sample_in_the_segment_is_said():
-    time = np.arange(0.0, 1.0, 0.01)
-    table = frame(time, 0.0, list(AXIS_NAMES))
-    assert isinstance(project_acceleration(table, NORTH, Segment(5.0, 9.0, "")), Unavailable)
+    assert isinstance(project_acceleration(table, NORTH, Segment(15.0, 19.0, "")), Unavailable)
 
 
 # ---- axes -------------------------------------------------------------------------------------
@@ -265,17 +231,13 @@ def test_heading_of_a_straight_line(heading_deg):
     assert elongation > 1e6
 
 
-def test_flying_the_other_way_is_the_same_aisle():
-    heading, _ = aisle_heading(line_track(210.0, noise=0.1)[0], ALL)
-    assert heading == pytest.approx(30.0, abs=0.5)
-
-
 def test_the_sample_flights_aisle_points_30_degrees_east_of_north(sample_flight):
     track, _ = choose_source(sample_flight)
-    segment = choose_segment(sample_flight, track)
-    heading, elongation = aisle_heading(track, segment)
+    heading, elongation = aisle_heading(track, choose_segment(sample_flight, track))
     assert heading == pytest.approx(30.0, abs=1.0)
     assert elongation > 10.0
+    # flying the other way is the same aisle
+    assert aisle_heading(line_track(210.0, noise=0.1)[0], ALL)[0] == pytest.approx(30.0, abs=0.5)
 
 
 def test_axes_project_the_positions():
@@ -290,25 +252,20 @@ def test_axes_project_the_positions():
     np.testing.assert_allclose(axes["aisle"].measurement_m, along + offset, atol=1e-9)
 
 
-def test_a_given_heading_is_used():
-    track, _ = line_track(30.0)
-    (axis,) = make_axes(flight_of(track=track), track, ALL, names=("aisle",), heading_deg=45.0)
-    expected = (track.samples["north_m"] + track.samples["east_m"]) / np.sqrt(2.0)
-    np.testing.assert_allclose(axis.measurement_m, expected, atol=1e-12)
-    assert axis.heading_deg == 45.0
-    assert "--heading" in axis.note
-
-
-def test_acceleration_is_projected_on_the_same_axis_as_the_positions():
+def test_positions_and_acceleration_are_projected_on_a_given_heading():
     time = np.arange(0.0, 10.0, 0.01)
-    level = attitude_of(time, Rotation.identity(len(time)))
-    imu = still_imu(time, (3.0, 4.0, -GRAVITY))
     track, _ = line_track(30.0, count=50)
-    flight = flight_of(imu=imu, attitude=level, track=track)
-    (axis,) = make_axes(
-        flight, track, ALL, names=("aisle",), heading_deg=np.degrees(np.arctan2(4, 3))
+    flight = flight_of(
+        imu=still_imu(time, (3.0, 4.0, -GRAVITY)),
+        attitude=attitude_of(time, Rotation.identity(len(time))),
     )
+    heading = float(np.degrees(np.arctan2(4, 3)))
+    (axis,) = make_axes(flight, track, ALL, names=("aisle",), heading_deg=heading)
+    expected = 0.6 * track.samples["north_m"] + 0.8 * track.samples["east_m"]
+    np.testing.assert_allclose(axis.measurement_m, expected, atol=1e-12)
     np.testing.assert_allclose(axis.acceleration.value_m_s2, 5.0, atol=1e-12)
+    assert axis.heading_deg == heading
+    assert "--heading" in axis.note
 
 
 @pytest.mark.parametrize("offset_s", [0.25, -0.1, 0.0])
@@ -322,7 +279,7 @@ def test_a_clock_offset_moves_the_times_and_nothing_else(offset_s):
     pd.testing.assert_frame_equal(track.samples, before)
 
 
-def test_a_source_without_height_has_no_down_axis():
+def test_axes_hold_what_the_source_measures_in_the_segment():
     track, _ = line_track(30.0)
     track.samples["down_m"] = np.nan
     axes = make_axes(flight_of(track=track), track, ALL)
@@ -331,22 +288,16 @@ def test_a_source_without_height_has_no_down_axis():
     with pytest.raises(MissingDataError, match="down"):
         make_axes(flight_of(track=track), track, ALL, names=("down",))
 
-
-def test_axes_hold_only_the_segment():
-    track, _ = line_track(30.0)
     (axis,) = make_axes(flight_of(track=track), track, Segment(4.0, 8.0, ""), names=("east",))
     assert (axis.measurement_time_s[0], axis.measurement_time_s[-1]) == (4.0, 8.0)
 
 
-# ---- the segment ------------------------------------------------------------------------------
+# ---- position sources and the segment -----------------------------------------------------------
 
 
 def straight(first_s, last_s):
     time = np.arange(first_s, last_s + 0.1, 0.2)
     return track_of(time, np.zeros((len(time), 3)))
-
-
-# ---- position sources and the segment -----------------------------------------------------------
 
 
 @pytest.mark.parametrize("origin", ORIGINS)
@@ -395,17 +346,15 @@ def test_the_segment_is_where_the_source_runs_and_the_vehicle_flies(airborne, ex
     assert segment.reason
 
 
-def test_each_rule_of_the_segment_has_its_own_reason():
-    track = straight(2.0, 18.0)
-    spans = [((4.0, 12.0),), (), ((19.0, 20.0),), ABSENT]
-    flights = [flight_of(track=track, duration_s=20.0, airborne=airborne) for airborne in spans]
-    assert len({choose_segment(flight, track).reason for flight in flights}) == len(spans)
-
-
-def test_the_segment_stays_inside_the_data():
+def test_the_segment_stays_inside_the_data_and_each_rule_has_its_own_reason():
     track = straight(-1.0, 25.0)
-    segment = choose_segment(flight_of(track=track, duration_s=20.0), track)
-    assert (segment.start_s, segment.end_s) == (0.0, 20.0)
+    spans = [((4.0, 12.0),), (), ((25.0, 26.0),), ABSENT]
+    segments = [
+        choose_segment(flight_of(track=track, duration_s=20.0, airborne=airborne), track)
+        for airborne in spans
+    ]
+    assert len({segment.reason for segment in segments}) == len(spans)
+    assert (segments[-1].start_s, segments[-1].end_s) == (0.0, 20.0)
 
 
 @pytest.mark.parametrize(("start_s", "end_s", "expected"), [
@@ -458,30 +407,25 @@ def noisy_track():
 WHOLE = Segment(0.0, 19.9, "")
 
 
-@pytest.mark.parametrize("reset_s", [2.0, 6.0, 10.0, 14.0, 17.0])
-def test_a_reset_that_changes_the_frame_is_undone_exactly(reset_s):
-    delta = np.array([2.0, -1.0, 0.0])
-    offset = np.where(STATE_TIME[:, None] >= reset_s, delta, 0.0)
-    ekf2 = ekf2_of(offset, [Reset(reset_s, "position", tuple(delta))])
+@pytest.mark.parametrize(
+    ("at", "good"),
+    [([2.0], 0), ([6.0], 0), ([17.0], 0), *(([5.0, 15.0], good) for good in range(3))],
+)
+def test_resets_that_change_the_frame_are_undone_exactly(at, good):
+    """The source is in the frame of the first, middle or last stretch, which fits it."""
+    deltas = np.array([[1.0, 0.5, 0.0], [-3.0, 2.0, 0.0]])[: len(at)]
+    later = STATE_TIME[:, None] >= np.array(at)
+    offset = later @ deltas - deltas[:good].sum(axis=0)
+    resets = [Reset(t, "position", tuple(d)) for t, d in zip(at, deltas, strict=True)]
+    ekf2 = ekf2_of(offset, resets)
+    before = ekf2.state.copy(deep=True)
     state, statement = continuous_state(ekf2, noisy_track(), WHOLE)
     np.testing.assert_allclose(state[POSITION_COLUMNS], truth_at(STATE_TIME), atol=1e-12)
+    assert f"{len(at)} of horizontal position" in statement
     assert "undone" in statement
     assert "kept" not in statement
-
-
-@pytest.mark.parametrize("good", [0, 1, 2])
-def test_the_stretch_that_fits_the_source_gives_the_frame(good):
-    """Two changes of frame; the source is in the frame of the first, middle or last stretch."""
-    deltas = np.array([[1.0, 0.5, 0.0], [-3.0, 2.0, 0.0]])
-    at = [5.0, 15.0]
-    offset = sum(
-        np.where(STATE_TIME[:, None] >= t, delta, 0.0) for t, delta in zip(at, deltas, strict=True)
-    )
-    offset = offset - deltas[:good].sum(axis=0)
-    resets = [Reset(t, "position", tuple(d)) for t, d in zip(at, deltas, strict=True)]
-    state, statement = continuous_state(ekf2_of(offset, resets), noisy_track(), WHOLE)
-    np.testing.assert_allclose(state[POSITION_COLUMNS], truth_at(STATE_TIME), atol=1e-12)
-    assert "2 of horizontal position" in statement
+    # what was published stays as it is
+    pd.testing.assert_frame_equal(ekf2.state, before)
 
 
 @pytest.mark.parametrize("reset_s", [4.0, 10.0, 15.0])
@@ -555,12 +499,3 @@ def test_nothing_changes_its_input(sample_flight):
     continuous_state(shifted, track, segment)
     for part, copy in zip(parts, before, strict=True):
         pd.testing.assert_frame_equal(part, copy)
-
-
-def test_undoing_a_reset_leaves_what_was_published():
-    offset = np.where(STATE_TIME[:, None] >= 6.0, [2.0, -1.0, 0.0], 0.0)
-    ekf2 = ekf2_of(offset, [Reset(6.0, "position", (2.0, -1.0, 0.0))])
-    before = ekf2.state.copy(deep=True)
-    state, _ = continuous_state(ekf2, noisy_track(), WHOLE)
-    assert not state.equals(before)
-    pd.testing.assert_frame_equal(ekf2.state, before)

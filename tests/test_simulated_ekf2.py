@@ -20,7 +20,7 @@ from px4fuse.ekf2.whatif import WhatIf, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.settings import Settings
-from px4fuse.findings import ekf2_ev_delay_wrong, find
+from px4fuse.findings import find, source_clock
 from px4fuse.flight import Ekf2, Flight, FusionRecord, Truth, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_ekf2 import samples_per_step
@@ -246,7 +246,7 @@ def test_a_delay_in_force_is_asked_away() -> None:
     ahead = rmse(flight, 10.0, 110.0)
     assert ahead > 1.3 * rmse(flown(scenario=Scenario(seed=100)), 10.0, 110.0)
     analysis = explain(compare(flight, RIGHT, axes=("north", "east")))
-    (finding,) = ekf2_ev_delay_wrong.detect(analysis)
+    (finding,) = [f for f in source_clock.detect(analysis) if f.id == "ekf2_ev_delay_wrong"]
     assert finding.evidence["ekf2_ev_delay_ms"] == 175.0
     assert finding.evidence["asked_ms"] == pytest.approx(0.0, abs=60.0)
     assert "EKF2_EV_DELAY" in finding.remedy

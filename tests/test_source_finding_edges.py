@@ -37,7 +37,6 @@ from px4fuse.filter.settings import Settings
 from px4fuse.filter.smoothing import Smoothing
 from px4fuse.filter.tuning import Noise
 from px4fuse.findings import (
-    ekf2_ev_delay_wrong,
     imu,
     source_clock,
     source_intervals,
@@ -105,7 +104,13 @@ def no_truth(monkeypatch: pytest.MonkeyPatch) -> None:
 
 BIAS, JUMPS, SCALE = imu.bias, source_positions.jumps, source_positions.scale
 ARRIVALS, THINNED, CLOCK = source_stamps.arrivals, source_intervals.thinning, source_clock.detect
-STATED, DELAY = source_positions.stated_variance, ekf2_ev_delay_wrong.detect
+
+
+def wrong_delay(one: Any) -> Any:
+    return source_clock.delay(one, one.clock)
+
+
+STATED = source_positions.stated_variance
 EDGES = [
     *((BIAS, analysis(explained=with_bias(sign * bias, sigma)), expected)
       for sign in (1.0, -1.0)
@@ -183,12 +188,12 @@ EDGES = [
     *((CLOCK, analysis(**{"clock": late(0.2), **parts}), None) for parts in (
         {"clock": late(0.2, determinable=False)}, MADE_OF_EKF2, {"ekf2": ages(20, 20)},
         {"smoothing": Smoothing(0.5, 0.2, 99.0, 0.1)})),
-    *((DELAY, delayed(delay_ms, late(0.0, sigma_s)), expected)
+    *((wrong_delay, delayed(delay_ms, late(0.0, sigma_s)), expected)
       for delay_ms, sigma_s, expected in (
           (30.0, 0.001, "warning"), (29.0, 0.001, None), (40.0, 0.01, "warning"),
           (39.0, 0.01, None), (None, 0.001, None))),
-    (DELAY, delayed(90.0, late(0.0, determinable=False)), None),
-    (DELAY, delayed(90.0, late(0.0), **MADE_OF_EKF2), None),
+    (CLOCK, delayed(90.0, late(0.0, determinable=False)), None),
+    (CLOCK, delayed(90.0, late(0.0), **MADE_OF_EKF2), None),
 ]  # fmt: skip
 
 
@@ -383,7 +388,7 @@ def test_what_a_clock_offset_asks_of_ekf2(monkeypatch: pytest.MonkeyPatch) -> No
     ],
 )  # fmt: skip
 def test_a_delay_stays_in_px4s_range(clock: Any, delay_ms: float, says: str, remedy: str) -> None:
-    finding = only(ekf2_ev_delay_wrong.detect, delayed(delay_ms, clock))
+    finding = only(wrong_delay, delayed(delay_ms, clock))
     assert says in finding.message
     assert remedy in finding.remedy
     assert finding.evidence["asked_ms"] == pytest.approx(-1e3 * clock.offset_s)
@@ -396,4 +401,4 @@ def test_a_delay_stays_in_px4s_range(clock: Any, delay_ms: float, says: str, rem
 def test_a_delay_is_set_in_whole_milliseconds(
     asked_ms: float, flown_ms: float, remedy: str
 ) -> None:
-    assert remedy in ekf2_ev_delay_wrong.delay_remedy(analysis(), asked_ms, flown_ms)
+    assert remedy in source_clock.delay_remedy(analysis(), asked_ms, flown_ms)

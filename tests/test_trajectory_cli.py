@@ -14,13 +14,10 @@ import jsonschema
 import numpy as np
 import pypdf
 import pytest
-from click.testing import CliRunner, Result
+from cli_tools import contents, run, run_main
+from click.testing import Result
 from conftest import REPOSITORY
-from test_cli import run, run_main
-from test_lesson import EXAMPLE_2
-from test_outputs import contents
 
-from px4fuse.cli import cli
 from px4fuse.loop.corrections import BY_DISTANCE, PLAIN
 from px4fuse.results.contract import schema
 
@@ -34,7 +31,7 @@ ROWS = [line for line in SLAM.read_text().splitlines() if not line.startswith("#
 
 def results(*arguments: str | Path) -> dict[str, Any]:
     """What a command prints with ``--json -``."""
-    result: Result = CliRunner().invoke(cli, [*map(str, arguments), "--json", "-"])
+    result = run(*arguments, "--json", "-")
     assert result.exit_code == 0, result.output
     assert result.stderr == ""
     found: dict[str, Any] = json.loads(result.stdout)
@@ -132,41 +129,33 @@ def found(made: tuple[Path, Result]) -> dict[str, Any]:
     return read
 
 
-def test_loop_writes_report_results_path_and_graph(made) -> None:
+def test_loop_writes_report_results_path_and_graph(made, found) -> None:
     folder, result = made
     assert result.exit_code == 0, result.output
-    assert sorted(path.name for path in folder.iterdir()) == ["r.g2o", "r.json", "r.pdf", "r.tum"]
-    assert "1.42 m" in result.output
-    assert "REJECTED" in result.output  # 10,60 is no closure
+    names = ["r.g2o", "r.json", "r.pdf", "r.tum"]
+    assert sorted(path.name for path in folder.iterdir()) == names
+    for said in ("1.42 m", "REJECTED", "Example 2", *(f"Wrote    {folder / n}" for n in names)):
+        assert said in result.output
     for name in (PLAIN, BY_DISTANCE):  # with the score of each against the truth and against SLAM
         assert len(re.findall(rf"^{name} +0\.[23]", result.output, re.MULTILINE)) == 2
-    assert "Example 2" in result.output
-    for name in ("r.g2o", "r.json", "r.pdf", "r.tum"):
-        assert f"Wrote    {folder / name}" in result.output
-
-
-def test_loop_results_are_in_the_report_and_validate(made, found) -> None:
-    folder, _ = made
-    attached = pypdf.PdfReader(folder / "r.pdf").attachments["results.json"]
-    assert attached == [(folder / "r.json").read_bytes()]
+    reader = pypdf.PdfReader(folder / "r.pdf")
+    assert reader.attachments["results.json"] == [(folder / "r.json").read_bytes()]
     jsonschema.validate(found, schema())
     assert found["loop"]["closure_error_m"] == pytest.approx(1.42, abs=0.05)
     assert [each["accepted"] for each in found["loop"]["closures"]] == [True, False]
 
 
-def test_loop_report_names_whom_was_asked_and_no_folder(made) -> None:
+def test_loop_report_names_whom_was_asked_and_no_folder_and_is_the_same_again(
+    made, tmp_path
+) -> None:
     folder, _ = made
     pages = "".join(page.extract_text() for page in pypdf.PdfReader(folder / "r.pdf").pages)
     assert "Ana $x$ Müller" in pages
-    for path in folder.iterdir():
-        content = path.read_bytes()
+    for content in contents(folder).values():
         assert str(folder).encode() not in content
         assert str(REPOSITORY).encode() not in content
-
-
-def test_loop_gives_the_same_bytes_again(made, tmp_path) -> None:
     assert make(tmp_path).exit_code == 0
-    assert contents(tmp_path) == contents(made[0])
+    assert contents(tmp_path) == contents(folder)
 
 
 @pytest.mark.parametrize("reference", [f"{LOG}:truth", str(LOG)])
@@ -179,45 +168,35 @@ def test_the_written_path_scores_as_the_loop_said(made, found, reference) -> Non
     assert again["association"]["poses"] == gated["association"]["poses"]
 
 
-def test_the_written_graph_is_solved_already(tmp_path) -> None:
+def test_the_written_graph_is_solved_already(made, found, tmp_path) -> None:
     """A graph whose closures are all accepted; with a rejected one it would move."""
     graph = tmp_path / "g.g2o"
     loop = results("loop", LOG, "--g2o", graph)["loop"]
-    again = results("loop", graph)
-    before, after = loop["corrections"]["pose_graph_gated"], again["graph"]["solutions"]["all"]
-    assert after["cost"] == pytest.approx(before["cost"], rel=1e-6)
-    assert after["cost_initial"] == pytest.approx(after["cost"], rel=1e-6)
-    assert [gate["accepted"] for gate in again["graph"]["gates"]] == [True]
-
-
-def test_the_graph_with_a_rejected_closure_still_holds_it(made, found) -> None:
-    again = results("loop", made[0] / "r.g2o")
-    assert [gate["accepted"] for gate in again["graph"]["gates"]] == [True, False]
-    judged = found["loop"]["closures"][1]
-    all_closures = found["loop"]["corrections"]["pose_graph_all"]
-    assert again["graph"]["gates"][1]["degrees_of_freedom"] == judged["degrees_of_freedom"]
-    assert again["graph"]["solutions"]["all"]["cost"] == pytest.approx(
-        all_closures["cost"], rel=1e-3
+    again = results("loop", graph)["graph"]
+    solved = again["solutions"]["all"]
+    assert solved["cost"] == pytest.approx(
+        loop["corrections"]["pose_graph_gated"]["cost"], rel=1e-6
+    )
+    assert solved["cost_initial"] == pytest.approx(solved["cost"], rel=1e-6)
+    assert [gate["accepted"] for gate in again["gates"]] == [True]
+    rejected = results("loop", made[0] / "r.g2o")["graph"]
+    assert [gate["accepted"] for gate in rejected["gates"]] == [True, False]
+    judged, corrections = found["loop"]["closures"][1], found["loop"]["corrections"]
+    assert rejected["gates"][1]["degrees_of_freedom"] == judged["degrees_of_freedom"]
+    assert rejected["solutions"]["all"]["cost"] == pytest.approx(
+        corrections["pose_graph_all"]["cost"], rel=1e-3
     )
 
 
 def test_loop_of_a_graph_writes_both_files(desk, tmp_path) -> None:
     result = run("loop", desk / "g.g2o", "--g2o", tmp_path / "s.g2o", "--json", tmp_path / "s.json")
     assert result.exit_code == 0, result.output
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["s.g2o", "s.json"]
-    found = json.loads((tmp_path / "s.json").read_text(encoding="utf-8"))
-    assert found["graph"]["poses"] == 3
+    assert set(contents(tmp_path)) == {"s.g2o", "s.json"}
+    assert json.loads((tmp_path / "s.json").read_text(encoding="utf-8"))["graph"]["poses"] == 3
     assert run("loop", tmp_path / "s.g2o").exit_code == 0
 
 
-def test_results_alone_on_standard_output_beside_written_files(desk, tmp_path) -> None:
-    found = results("loop", desk / "s.tum", "--tum", tmp_path / "o.tum")
-    assert found["schema"]["name"] == "px4fuse-loop"
-    assert found["provenance"]["command"] == "px4fuse loop s.tum"
-    assert [path.name for path in tmp_path.iterdir()] == ["o.tum"]
-
-
-def test_the_results_keep_the_command_that_makes_them_again(desk) -> None:
+def test_the_results_keep_the_command_that_makes_them_again(desk, tmp_path) -> None:
     given = ["--landed-at", "0.1,-0.2,5", "--closures", desk / "closures.txt", "--drift", "2"]
     found = results("loop", desk / "s.tum", *given)
     assert found["provenance"]["command"] == (
@@ -225,24 +204,12 @@ def test_the_results_keep_the_command_that_makes_them_again(desk) -> None:
         "--drift 2"
     )
     assert len(found["loop"]["closures"]) == 3
-
-
-def test_evaluate_writes_what_it_prints(desk, tmp_path) -> None:
-    out = tmp_path / "e.json"
-    command = ["evaluate", desk / "s.tum", desk / "l.ulg:truth", "--rpe", "5m", "--rpe", "10s",
-               "--rpe", "1f"]  # fmt: skip
-    printed = run(*command, "--json", out)
-    assert printed.exit_code == 0
-    assert "ATE (m)" in printed.output
-    found = json.loads(out.read_text(encoding="utf-8"))
-    assert found == results(*command)
-    assert found["schema"]["name"] == "px4fuse-evaluation"
-    assert found["alignment"] == "se3"
-    assert found["ate"]["translation_m"]["rmse"] == pytest.approx(0.060, abs=0.01)
-    assert found["time_offset"]["determinable"]
-    assert [(one["delta"], one["unit"]) for one in found["rpe"]] == [
-        (5.0, "m"), (10.0, "s"), (1.0, "frames"),
-    ]  # fmt: skip
+    opened = results("loop", desk / "s.tum", "--open")
+    assert opened["provenance"]["command"] == "px4fuse loop s.tum --open"
+    beside = results("loop", desk / "s.tum", "--tum", tmp_path / "o.tum")
+    assert beside["schema"]["name"] == "px4fuse-loop"
+    assert beside["provenance"]["command"] == "px4fuse loop s.tum"
+    assert set(contents(tmp_path)) == {"o.tum"}
 
 
 def test_evaluate_writes_page_picture_and_results(desk, tmp_path, monkeypatch) -> None:
@@ -250,6 +217,7 @@ def test_evaluate_writes_page_picture_and_results(desk, tmp_path, monkeypatch) -
     command = ["evaluate", desk / "s.tum", desk / "l.ulg:truth"]
     result = run(*command)
     assert result.exit_code == 0, result.output
+    assert "ATE (m)" in result.output
     name = "s_against_l_truth"
     assert set(contents(tmp_path)) == {f"{name}.pdf", f"{name}.png", f"{name}.json"}
     for end in ("pdf", "png", "json"):
@@ -259,12 +227,20 @@ def test_evaluate_writes_page_picture_and_results(desk, tmp_path, monkeypatch) -
     reader = pypdf.PdfReader(folder / f"{name}.pdf")
     text = (folder / f"{name}.json").read_bytes()
     assert reader.attachments["results.json"] == [text]
-    jsonschema.validate(json.loads(text), schema())
-    assert json.loads(text) == results(*command)
+    found = json.loads(text)
+    jsonschema.validate(found, schema())
+    assert found == results(*command)
+    assert found["schema"]["name"] == "px4fuse-evaluation"
+    assert found["alignment"] == "se3"
+    assert found["ate"]["translation_m"]["rmse"] == pytest.approx(0.060, abs=0.01)
+    assert found["time_offset"]["determinable"]
     assert str(tmp_path) not in "".join(page.extract_text() for page in reader.pages)
     before = contents(tmp_path)
     assert run(*command).exit_code == 0
     assert contents(tmp_path) == before
+    deltas = results(*command, "--rpe", "5m", "--rpe", "10s", "--rpe", "1f")["rpe"]
+    units = [(5.0, "m"), (10.0, "s"), (1.0, "frames")]
+    assert [(one["delta"], one["unit"]) for one in deltas] == units
 
 
 @pytest.mark.usefixtures("no_drawing")
@@ -274,37 +250,35 @@ def test_evaluate_with_other_settings_or_files_writes_over_no_page(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "other").mkdir()
     write(tmp_path / "other" / "s.tum", ROWS[:-50])
-    commands = [
-        ("evaluate", desk / "s.tum", desk / "s.tum"),
-        ("evaluate", desk / "s.tum", desk / "s.tum", "--rpe", "5m", "--consecutive"),
-        ("evaluate", tmp_path / "other" / "s.tum", desk / "s.tum"),
-    ]
-    names = ["s_against_s", "s_against_s_rpe-5-m_consecutive", "s_against_s_2"]
-    for count, command in enumerate(commands, start=1):
-        assert run(*command).exit_code == 0
+    commands = {
+        "s_against_s": [desk / "s.tum"],
+        "s_against_s_rpe-5-m_consecutive": [desk / "s.tum", "--rpe", "5m", "--consecutive"],
+        "s_against_s_2": [tmp_path / "other" / "s.tum"],
+    }
+    for count, (estimate, *options) in enumerate(commands.values(), start=1):
+        assert run("evaluate", estimate, desk / "s.tum", *options).exit_code == 0
         written = {Path(name).stem for name in contents(tmp_path / "reports")}
-        assert written == set(names[:count])
+        assert written == set(list(commands)[:count])
 
 
 @pytest.mark.usefixtures("no_drawing")
 @pytest.mark.parametrize(
     ("options", "written"),
     [
-        (["-o", "p.pdf"], {"p.pdf", "p.png", "p.json"}),
-        (["-o", "p.pdf", "--picture", "q.png", "--json", "r.json"], {"p.pdf", "q.png", "r.json"}),
-        (["--picture", "q.png"], {"q.png"}),
-        (["--json", "r.json"], {"r.json"}),
-        (["--json", "-"], set()),
-        (["--json", "-", "--picture", "q.png"], {"q.png"}),
+        ("-o p.pdf", {"p.pdf", "p.png", "p.json"}),
+        ("-o p.pdf --picture q.png --json r.json", {"p.pdf", "q.png", "r.json"}),
+        ("--picture q.png", {"q.png"}),
+        ("--json r.json", {"r.json"}),
+        ("--json -", set()),
+        ("--json - --picture q.png", {"q.png"}),
     ],
-    ids=["page", "all", "picture", "results", "printed", "printed with picture"],
 )
 def test_evaluate_writes_what_is_named(desk, tmp_path, monkeypatch, options, written) -> None:
     monkeypatch.chdir(tmp_path)
-    result = run("evaluate", desk / "s.tum", desk / "l.ulg:truth", *options)
+    result = run("evaluate", desk / "s.tum", desk / "l.ulg:truth", *options.split())
     assert result.exit_code == 0, result.output
     assert set(contents(tmp_path)) == written
-    alone = "-" in options
+    alone = "--json -" in options
     assert alone == result.output.startswith("{")
     assert alone == ("ATE (m)" not in result.output)
 
@@ -323,17 +297,19 @@ def test_the_clocks_of_another_day_are_matched(desk, tmp_path) -> None:
     assert found["ate"]["translation_m"]["rmse"] < 0.01
 
 
-def test_a_reference_without_overlap_is_stated_and_fails_nothing(desk) -> None:
-    scores = results("loop", desk / "s.tum", "--reference", desk / "line.tum")["loop"][
-        "corrections"
-    ]["uncorrected"]["scores"]
-    assert "no poses match in time" in json.dumps(scores["line.tum"])
+def test_a_loop_is_scored_against_what_is_given(desk) -> None:
+    """Itself, a flight with other stamps, and a path without overlap, which fails nothing."""
 
+    def scores(reference: str, way: str = "uncorrected") -> dict[str, Any]:
+        found = results("loop", desk / "s.tum", "--reference", desk / reference)["loop"]
+        score: dict[str, Any] = found["corrections"][way]["scores"][reference]
+        return score
 
-def test_a_loop_against_itself_is_zero_before_it_is_corrected(desk) -> None:
-    found = results("loop", desk / "s.tum", "--reference", desk / "s.tum")["loop"]["corrections"]
-    assert found["uncorrected"]["scores"]["s.tum"]["ate"]["translation_m"]["rmse"] < 1e-5
-    assert found["pose_graph_gated"]["scores"]["s.tum"]["ate"]["translation_m"]["rmse"] > 0.05
+    assert scores("s.tum")["ate"]["translation_m"]["rmse"] < 1e-5
+    assert scores("s.tum", "pose_graph_gated")["ate"]["translation_m"]["rmse"] > 0.05
+    flown = scores("l.ulg:truth")["ate"]["translation_m"]["rmse"]
+    assert flown == pytest.approx(0.060, abs=0.01)
+    assert "no poses match in time" in json.dumps(scores("line.tum"))
 
 
 # ------------------------------------------------------------------ odd files that are right
@@ -349,236 +325,17 @@ def test_a_loop_against_itself_is_zero_before_it_is_corrected(desk) -> None:
     ids=["BOM and CRLF", "UTF-16 of a Windows shell", "nanoseconds"],
 )
 def test_other_ways_to_write_the_same_trajectory(desk, tmp_path, rows, newline, encoding) -> None:
-    file = tmp_path / "s.tum"
+    """And a name with a colon, and closures, as Windows writes them."""
+    file = tmp_path / "a:vio"
     write(file, rows, newline, encoding)
-    same, other = results("loop", desk / "s.tum"), results("loop", file)
-    for each in (same, other):
-        del each["loop"]["notes"]
+    write(tmp_path / "c.txt", ["10,50", "20,60"], newline, encoding)
+    closures = ["--closures", tmp_path / "c.txt"]
+    same, other = (results("loop", path, *closures) for path in (desk / "s.tum", file))
+    assert other["track"]["name"] == "a:vio"
+    assert len(other["loop"]["closures"]) == 3
     # nanoseconds are rounded elsewhere
     assert other["loop"]["closure_error_m"] == same["loop"]["closure_error_m"]
     assert other["loop"]["start_s"] == pytest.approx(same["loop"]["start_s"], abs=1e-6)
-
-
-@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
-def test_closures_as_windows_writes_them(desk, tmp_path, encoding) -> None:
-    write(tmp_path / "c.txt", ["10,50", "20,60"], "\r\n", encoding)
-    found = results("loop", desk / "s.tum", "--closures", tmp_path / "c.txt")
-    assert len(found["loop"]["closures"]) == 3
-
-
-def test_a_file_with_a_colon_in_its_name_is_a_file(desk, tmp_path) -> None:
-    (tmp_path / "a:vio").write_bytes((desk / "s.tum").read_bytes())
-    assert results("loop", tmp_path / "a:vio")["track"]["name"] == "a:vio"
-
-
-# ------------------------------------------------------------------ what is refused
-
-# Command and a part of what it must say
-REFUSED = {
-    "missing": ("loop absent.ulg", "absent.ulg: cannot be read (No such file or directory)"),
-    "missing part": ("loop absent.ulg:vio", "absent.ulg: cannot be read"),
-    "no name": ("loop ''", "the name is empty"),
-    "no name but a part": ("loop :vio", "is a folder"),
-    "folder": ("loop folder", "folder: is a folder"),
-    "folder with a part": ("loop folder:vio", "folder: is a folder"),
-    "empty log": ("loop empty.ulg", "empty.ulg: the file is empty"),
-    "empty trajectory": ("loop empty.tum", "empty.tum: the file is empty"),
-    "binary junk": ("loop junk.bin", "junk.bin: not a PX4 ULog"),
-    "text junk": ("loop junk.txt", "junk.txt: not a trajectory file"),
-    "another table": ("loop uwb.csv", "uwb.csv: 4 columns"),
-    "PDF": ("loop f.pdf", "f.pdf: not a PX4 ULog"),
-    "DataFlash": ("loop df.BIN", "df.BIN: not a PX4 ULog but an ArduPilot DataFlash"),
-    "cut log": ("loop cut.ulg", "cut.ulg: a ULog without any data"),
-    "two poses": ("loop two.tum", "two.tum: poses: 2"),
-    "times that go back": ("loop nonmono.tum", "nonmono.tum, line 102"),
-    "not a number": ("loop nan.tum", "nan.tum, line 51"),
-    "zero quaternion": ("loop zero.tum", "zero.tum, line 51: columns 5 to 8 are not a quaternion"),
-    "commas": ("loop comma.tum", "comma.tum: 8 columns between commas"),
-    "no motion": ("loop still.tum", "still.tum: the path is 0.00 m long"),
-    "closure outside": ("loop s.tum --closure 10,5000", "outside the path"),
-    "closure of one time": ("loop s.tum --closure 10", "closure '10' is not T1,T2"),
-    "closure of words": ("loop s.tum --closure abc", "closure 'abc' is not T1,T2"),
-    "closure of NaN": ("loop s.tum --closure 10,nan", "is not T1,T2"),
-    "closure of nothing": ("loop s.tum --closure ''", "is not T1,T2"),
-    "closure of four": ("loop s.tum --closure 1,2,3,4", "is not T1,T2"),
-    "closure backwards": ("loop s.tum --closure 50,10", "first time must be before the second"),
-    "closure at once": ("loop s.tum --closure 10,10", "first time must be before the second"),
-    "closure of no width": ("loop s.tum --closure 10,50,0", "SIGMA 0 is outside"),
-    "closures of junk": ("loop s.tum --closures junk_closures.txt", "junk_closures.txt, line 2"),
-    "closures of bytes": ("loop s.tum --closures closures.bin", "closures.bin: not a text file"),
-    "closures of none": ("loop s.tum --closures no_closures.txt", "no_closures.txt: 0 closures"),
-    "closures missing": ("loop s.tum --closures absent.txt", "absent.txt: cannot be read"),
-    "closures a folder": ("loop s.tum --closures folder", "folder: is a folder"),
-    "landing of words": ("loop s.tum --landed-at junk", "'junk' is not FORWARD,RIGHT"),
-    "landing of one": ("loop s.tum --landed-at 1", "'1' is not FORWARD,RIGHT"),
-    "landing of four": ("loop s.tum --landed-at 1,2,3,4", "is not FORWARD,RIGHT"),
-    "landing of NaN": ("loop s.tum --landed-at nan,1", "is not FORWARD,RIGHT"),
-    "landing on the moon": ("loop s.tum --landed-at 1e300,1", "is not FORWARD,RIGHT"),
-    "landing, and open": ("loop s.tum --landed-at 1,2 --open", "exclude each other"),
-    "open, and nothing to correct": ("loop s.tum --open --tum o.tum", "no corrected path"),
-    "no drift": ("loop s.tum --drift 0", "--drift 0 is outside"),
-    "drift of NaN": ("loop s.tum --drift nan", "--drift nan is outside"),
-    "negative drift": ("loop s.tum --drift -1", "--drift -1 is outside"),
-    "no heading drift": ("loop s.tum --heading-drift 0", "--heading-drift 0 is outside"),
-    "from after to": ("loop s.tum --from 50 --to 40", "Change --from or --to"),
-    "from NaN": ("loop s.tum --from nan", "--from nan is not a finite number"),
-    "to infinity": ("loop s.tum --to -inf", "--to -inf is not a finite number"),
-    "from after the end": ("loop s.tum --from 5000", "Change --from or --to"),
-    "no key frames": ("loop s.tum --key-frames 0", "--key-frames 0 is outside"),
-    "key frames of NaN": ("loop s.tum --key-frames nan", "--key-frames nan is outside"),
-    "no such part": ("loop l.ulg:slam", "'slam' is not a part of a flight"),
-    "part of a trajectory": ("loop s.tum:vio", "s.tum: a trajectory file has no part 'vio'"),
-    "frame of a flight": ("loop l.ulg --frame enu", "--frame enu is for trajectory files"),
-    "no such frame": ("loop s.tum --frame up", "'up' is not one of"),
-    "notes missing": ("loop s.tum --notes absent.md", "absent.md: cannot be read"),
-    "no PDF": ("loop s.tum -o r.txt", "r.txt: the report is a PDF"),
-    "report and results": ("loop s.tum -o r.pdf --json r.pdf", "same file"),
-    "results and path": ("loop s.tum --json x --tum ./x", "two outputs name the same file"),
-    "report's results and path": ("loop s.tum -o r.pdf --tum r.json", "two outputs"),
-    "path and graph": ("loop s.tum --tum x --g2o x", "two outputs name the same file"),
-    "path to standard output": ("loop s.tum --tum -", "only --json can print"),
-    "graph to standard output": ("loop s.tum --g2o -", "only --json can print"),
-    "path into a file": ("loop s.tum --tum n.md/r.tum", "cannot be written"),
-    "path over a folder": ("loop s.tum --json j.json --tum folder", "folder: is a folder"),
-    "reference missing": ("loop s.tum --reference absent.tum", "absent.tum: cannot be read"),
-    "reference of junk": ("loop s.tum --reference junk.txt", "junk.txt: not a trajectory file"),
-    "reference a graph": ("loop s.tum --reference g.g2o", "g.g2o: a pose graph, not a trajectory"),
-    "graph with a bad edge": ("loop bad.g2o", "bad.g2o, line 2"),
-    "graph of words": ("loop text.g2o", "text.g2o, line 1"),
-    "part of a graph": ("loop g.g2o:vio", "a pose graph has no part 'vio'"),
-    "report of a graph": ("loop g.g2o -o r.pdf", "not for a pose graph"),
-    "path of a graph": ("loop g.g2o --tum r.tum", "not for a pose graph"),
-    "closure of a graph": ("loop g.g2o --closure 1,2", "not for a pose graph"),
-    "reference of a graph": ("loop g.g2o --reference s.tum", "not for a pose graph"),
-    "graph's outputs the same": ("loop g.g2o --json x --g2o ./x", "two outputs name the same file"),
-    "graph's outputs half good": ("loop g.g2o --g2o x --json folder", "folder: is a folder"),
-    "nothing": ("loop", "Missing argument 'SOURCE'"),
-    "evaluate nothing": ("evaluate s.tum", "Missing argument 'REFERENCE'"),
-    "evaluate missing": ("evaluate s.tum absent.tum", "absent.tum: cannot be read"),
-    "evaluate empty": ("evaluate empty.tum s.tum", "empty.tum: the file is empty"),
-    "evaluate a folder": ("evaluate folder s.tum", "folder: is a folder"),
-    "evaluate junk": ("evaluate s.tum junk.bin", "junk.bin: not a PX4 ULog"),
-    "evaluate a table": ("evaluate uwb.csv s.tum", "uwb.csv: 4 columns"),
-    "evaluate a graph": ("evaluate s.tum g.g2o", "g.g2o: a pose graph, not a trajectory"),
-    "evaluate another flight": ("evaluate s.tum still.tum", "no poses match in time"),
-    "evaluate apart": ("evaluate s.tum l.ulg --time-offset 0", "no poses match in time"),
-    "evaluate a line": ("evaluate line.tum line.tum", "--alignment yaw"),
-    "evaluate no such part": ("evaluate s.tum l.ulg:slam", "'slam' is not a part of a flight"),
-    "gap of nothing": ("evaluate s.tum s.tum --max-gap 0", "--max-gap"),
-    "gap of NaN": ("evaluate s.tum s.tum --max-gap nan", "--max-gap nan is not a finite"),
-    "endless gap": ("evaluate s.tum s.tum --max-gap inf", "--max-gap inf is not a finite"),
-    "offset of NaN": ("evaluate s.tum s.tum --time-offset nan", "--time-offset nan is not"),
-    "endless offset": ("evaluate s.tum s.tum --time-offset inf", "--time-offset inf is not"),
-    "offset of words": ("evaluate s.tum s.tum --time-offset abc", "give seconds, as 0.1, or auto"),
-    "RPE over km": ("evaluate s.tum s.tum --rpe 5km", "'5km' is not a distance"),
-    "RPE over nothing": ("evaluate s.tum s.tum --rpe 0m", "'0m' is not a distance"),
-    "RPE backwards": ("evaluate s.tum s.tum --rpe -1m", "'-1m' is not a distance"),
-    "RPE over half a frame": ("evaluate s.tum s.tum --rpe 1.5f", "frames come whole"),
-    "RPE over too many": (f"evaluate s.tum s.tum --rpe {'9' * 26}f", "is not a distance"),
-    "results into a file": ("evaluate s.tum s.tum --json n.md/e.json", "cannot be written"),
-    "page as text": ("evaluate s.tum s.tum -o page.txt", "ends in .pdf"),
-    "picture as JPEG": ("evaluate s.tum s.tum --picture p.jpg", "ends in .png"),
-    "picture to print": ("evaluate s.tum s.tum --picture -", "ends in .png"),
-    "picture for results": ("evaluate s.tum s.tum --picture p.png --json p.png", "Give two names"),
-    "picture into a file": ("evaluate s.tum s.tum --picture n.md/e.png", "cannot be written"),
-}
-
-
-@pytest.mark.parametrize(("command", "said"), REFUSED.values(), ids=REFUSED)
-def test_bad_input_gives_one_line_and_writes_nothing(
-    desk, monkeypatch, capsys, command, said
-) -> None:
-    refused(desk, monkeypatch, capsys, command, said)
-
-
-SPARED = {
-    "report": "loop s.pdf -o s.pdf",
-    "path": "loop s.tum --tum s.tum",
-    "path by another spelling": "loop s.tum --tum ./s.tum",
-    "path of a part": "loop l.ulg:vio --tum l.ulg",
-    "graph": "loop s.tum --g2o s.tum",
-    "results": "loop s.tum --json s.tum",
-    "results by hard link": "loop s.tum --json hard.json",
-    "results by soft link of a part": "loop l.ulg:vio --json soft.json",
-    "results of the report": "loop l.ulg -o r.pdf --json l.ulg",
-    "reference": "loop l.ulg --reference s.tum --tum s.tum",
-    "part of a reference": "loop s.tum --reference l.ulg:truth --json l.ulg",
-    "closures": "loop s.tum --closures closures.txt --json closures.txt",
-    "notes": "loop s.tum --notes n.md --json n.md",
-    "pose graph": "loop g.g2o --g2o g.g2o",
-    "pose graph by its results": "loop g.g2o --json ./g.g2o",
-    "estimate": "evaluate s.tum s.tum --json s.tum",
-    "reference of evaluate": "evaluate s.tum l.ulg:truth --json l.ulg",
-    "estimate by its page": "evaluate s.pdf s.tum -o s.pdf",
-    "estimate by its picture": "evaluate s.tum s.tum --picture hard.png",
-    "estimate by the page's picture": "evaluate s.tum s.tum -o hard.pdf",
-}
-
-
-@pytest.mark.parametrize("command", SPARED.values(), ids=SPARED)
-def test_no_command_writes_over_what_it_reads(desk, monkeypatch, capsys, command) -> None:
-    refused(desk, monkeypatch, capsys, command, "not overwritten")
-
-
-def refused(desk, monkeypatch, capsys, command: str, said: str) -> None:
-    monkeypatch.chdir(desk)
-    before = contents(desk)
-    code, out, err = run_main(monkeypatch, capsys, *shlex.split(command))
-    assert (code, out) == (2, ""), err
-    assert err.startswith("px4fuse: ")
-    assert len(err.splitlines()) == 1
-    assert said in err
-    assert contents(desk) == before
-
-
-def test_an_older_report_survives_a_failed_run(desk, tmp_path, monkeypatch, capsys) -> None:
-    old = tmp_path / "r.pdf"
-    old.write_text("an older report")
-    code, _, _ = run_main(monkeypatch, capsys, "loop", desk / "nan.tum", "-o", old)
-    assert code == 2
-    assert contents(tmp_path) == {"r.pdf": b"an older report"}
-
-
-@pytest.mark.parametrize("command", ["loop s.tum", "evaluate s.tum s.tum", "loop g.g2o"])
-def test_a_reader_that_leaves_is_no_error(desk, command) -> None:
-    """As in px4fuse loop s.tum | head -1, when head has gone before anything is printed."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "px4fuse", *command.split()],
-        cwd=desk, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
-    assert process.stdout is not None
-    assert process.stderr is not None
-    process.stdout.close()
-    complaint = process.stderr.read()
-    process.stderr.close()
-    assert (process.wait(), complaint) == (0, b"")
-
-
-# ------------------------------------------------------------------ the other commands
-
-
-def test_lesson_loop_prints_the_lesson() -> None:
-    result = run("lesson", "loop")
-    assert (result.exit_code, result.output) == (0, EXAMPLE_2)
-
-
-def test_help_of_both_commands() -> None:
-    for command in ("loop", "evaluate"):
-        result = run(command, "--help")
-        assert result.exit_code == 0
-        assert "Usage:" in result.output
-
-
-@pytest.mark.usefixtures("no_drawing")
-def test_compare_reports_the_loop_of_the_sample_flight(tmp_path) -> None:
-    result = run("compare", LOG, "--axis", "down", "-o", tmp_path / "r.pdf")
-    assert result.exit_code == 0, result.output
-    found = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))
-    jsonschema.validate(found, schema())
-    assert found["loop"]["closure_error_m"] == pytest.approx(1.42, abs=0.05)
-
-
-# ------------------------------------------------------------------ not right yet
 
 
 def turned_up(rows: list[str]) -> list[str]:
@@ -591,7 +348,7 @@ def turned_up(rows: list[str]) -> list[str]:
     return turned
 
 
-def test_a_track_with_z_up_scores_in_the_loop_as_evaluate_does(desk, tmp_path) -> None:
+def test_a_track_with_z_up_scores_in_the_loop_as_evaluate_does(tmp_path) -> None:
     for name in ("a.tum", "truth.tum"):
         write(tmp_path / name, turned_up(ROWS))
     found = results("loop", tmp_path / "a.tum", "--reference", tmp_path / "truth.tum")["loop"]
@@ -600,23 +357,141 @@ def test_a_track_with_z_up_scores_in_the_loop_as_evaluate_does(desk, tmp_path) -
     assert score["rpe"][0]["translation_m"]["max"] < 0.01
 
 
-def test_a_flight_is_a_reference_for_slam_with_unix_stamps(desk) -> None:
-    found = results("loop", desk / "s.tum", "--reference", desk / "l.ulg:truth")["loop"]
-    score = found["corrections"]["uncorrected"]["scores"]["l.ulg:truth"]
-    assert score["ate"]["translation_m"]["rmse"] == pytest.approx(0.060, abs=0.01)
-
-
-def test_a_flag_is_kept_as_it_is_typed(desk) -> None:
-    found = results("loop", desk / "s.tum", "--open")
-    assert found["provenance"]["command"] == "px4fuse loop s.tum --open"
-
-
-@pytest.mark.parametrize("options", [["--closure", "10,5000"], ["--from", "50", "--to", "40"]])
-def test_times_in_messages_can_be_told_apart(desk, monkeypatch, capsys, options) -> None:
-    _, _, err = run_main(monkeypatch, capsys, "loop", desk / "s.tum", *options)
-    assert "1.79525e+09" not in err
-
-
 def test_a_part_beyond_the_data_is_cut(desk) -> None:
     found = results("loop", desk / "s.tum", "--from", "5", "--to", "5000")["loop"]
     assert found["end_s"] - found["start_s"] < 90.0
+
+
+# ------------------------------------------------------------------ what is refused
+
+# Command and a part of what it must say
+REFUSED = {
+    "missing": ("loop absent.ulg", "absent.ulg: cannot be read (No such file or directory)"),
+    "no name": ("loop ''", "the name is empty"),
+    "folder": ("loop folder", "folder: is a folder"),
+    "empty trajectory": ("loop empty.tum", "empty.tum: the file is empty"),
+    "text junk": ("loop junk.txt", "junk.txt: not a trajectory file"),
+    "another table": ("loop uwb.csv", "uwb.csv: 4 columns"),
+    "PDF": ("loop f.pdf", "f.pdf: not a PX4 ULog"),
+    "DataFlash": ("loop df.BIN", "df.BIN: not a PX4 ULog but an ArduPilot DataFlash"),
+    "cut log": ("loop cut.ulg", "cut.ulg: a ULog without any data"),
+    "two poses": ("loop two.tum", "two.tum: poses: 2"),
+    "times that go back": ("loop nonmono.tum", "nonmono.tum, line 102"),
+    "not a number": ("loop nan.tum -o f.pdf", "nan.tum, line 51"),
+    "zero quaternion": ("loop zero.tum", "zero.tum, line 51: columns 5 to 8 are not a quaternion"),
+    "commas": ("loop comma.tum", "comma.tum: 8 columns between commas"),
+    "no motion": ("loop still.tum", "still.tum: the path is 0.00 m long"),
+    "closure outside": ("loop s.tum --closure 10,5000", "outside the path"),
+    "closure of one time": ("loop s.tum --closure 10", "closure '10' is not T1,T2"),
+    "closure of four": ("loop s.tum --closure 1,2,3,4", "is not T1,T2"),
+    "closure backwards": ("loop s.tum --closure 50,10", "first time must be before the second"),
+    "closure of no width": ("loop s.tum --closure 10,50,0", "SIGMA 0 is outside"),
+    "closures of junk": ("loop s.tum --closures junk_closures.txt", "junk_closures.txt, line 2"),
+    "closures of bytes": ("loop s.tum --closures closures.bin", "closures.bin: not a text file"),
+    "closures of none": ("loop s.tum --closures no_closures.txt", "no_closures.txt: 0 closures"),
+    "landing of words": ("loop s.tum --landed-at junk", "'junk' is not FORWARD,RIGHT"),
+    "landing of four": ("loop s.tum --landed-at 1,2,3,4", "is not FORWARD,RIGHT"),
+    "landing on the moon": ("loop s.tum --landed-at 1e300,1", "is not FORWARD,RIGHT"),
+    "landing, and open": ("loop s.tum --landed-at 1,2 --open", "exclude each other"),
+    "open, and nothing to correct": ("loop s.tum --open --tum o.tum", "no corrected path"),
+    "no drift": ("loop s.tum --drift 0", "--drift 0 is outside"),
+    "no heading drift": ("loop s.tum --heading-drift 0", "--heading-drift 0 is outside"),
+    "from after to": ("loop s.tum --from 50 --to 40", "Change --from or --to"),
+    "from NaN": ("loop s.tum --from nan", "--from nan is not a finite number"),
+    "no key frames": ("loop s.tum --key-frames 0", "--key-frames 0 is outside"),
+    "no such part": ("loop l.ulg:slam", "'slam' is not a part of a flight"),
+    "part of a trajectory": ("loop s.tum:vio", "s.tum: a trajectory file has no part 'vio'"),
+    "frame of a flight": ("loop l.ulg --frame enu", "--frame enu is for trajectory files"),
+    "no such frame": ("loop s.tum --frame up", "'up' is not one of"),
+    "no PDF": ("loop s.tum -o r.txt", "r.txt: the report is a PDF"),
+    "results and path": ("loop s.tum --json x --tum ./x", "two outputs name the same file"),
+    "path and graph": ("loop s.tum --tum x --g2o x", "two outputs name the same file"),
+    "path to standard output": ("loop s.tum --tum -", "only --json can print"),
+    "path into a file": ("loop s.tum --tum n.md/r.tum", "cannot be written"),
+    "path over a folder": ("loop s.tum --json j.json --tum folder", "folder: is a folder"),
+    "reference a graph": ("loop s.tum --reference g.g2o", "g.g2o: a pose graph, not a trajectory"),
+    "graph with a bad edge": ("loop bad.g2o", "bad.g2o, line 2"),
+    "graph of words": ("loop text.g2o", "text.g2o, line 1"),
+    "part of a graph": ("loop g.g2o:vio", "a pose graph has no part 'vio'"),
+    "report of a graph": ("loop g.g2o -o r.pdf", "not for a pose graph"),
+    "graph's outputs the same": ("loop g.g2o --json x --g2o ./x", "two outputs name the same file"),
+    "nothing": ("loop", "Missing argument 'SOURCE'"),
+    "evaluate nothing": ("evaluate s.tum", "Missing argument 'REFERENCE'"),
+    "evaluate missing": ("evaluate s.tum absent.tum", "absent.tum: cannot be read"),
+    "evaluate junk": ("evaluate s.tum junk.bin", "junk.bin: not a PX4 ULog"),
+    "evaluate a graph": ("evaluate s.tum g.g2o", "g.g2o: a pose graph, not a trajectory"),
+    "evaluate another flight": ("evaluate s.tum still.tum", "no poses match in time"),
+    "evaluate apart": ("evaluate s.tum l.ulg --time-offset 0", "no poses match in time"),
+    "evaluate a line": ("evaluate line.tum line.tum", "--alignment yaw"),
+    "gap of NaN": ("evaluate s.tum s.tum --max-gap nan", "--max-gap nan is not a finite"),
+    "offset of NaN": ("evaluate s.tum s.tum --time-offset nan", "--time-offset nan is not"),
+    "offset of words": ("evaluate s.tum s.tum --time-offset abc", "give seconds, as 0.1, or auto"),
+    "RPE over nothing": ("evaluate s.tum s.tum --rpe 0m", "'0m' is not a distance"),
+    "RPE over half a frame": ("evaluate s.tum s.tum --rpe 1.5f", "frames come whole"),
+    "RPE over too many": (f"evaluate s.tum s.tum --rpe {'9' * 26}f", "is not a distance"),
+    "page as text": ("evaluate s.tum s.tum -o page.txt", "ends in .pdf"),
+    "picture as JPEG": ("evaluate s.tum s.tum --picture p.jpg", "ends in .png"),
+    "picture to print": ("evaluate s.tum s.tum --picture -", "ends in .png"),
+    "picture for results": ("evaluate s.tum s.tum --picture p.png --json p.png", "Give two names"),
+    "picture into a file": ("evaluate s.tum s.tum --picture n.md/e.png", "cannot be written"),
+}
+
+# What a command reads, it does not write over
+SPARED = {
+    "report": "loop s.pdf -o s.pdf",
+    "path": "loop s.tum --tum s.tum",
+    "path of a part": "loop l.ulg:vio --tum l.ulg",
+    "graph": "loop s.tum --g2o s.tum",
+    "results": "loop s.tum --json s.tum",
+    "results by soft link of a part": "loop l.ulg:vio --json soft.json",
+    "results of the report": "loop l.ulg -o r.pdf --json l.ulg",
+    "reference": "loop l.ulg --reference s.tum --tum s.tum",
+    "closures": "loop s.tum --closures closures.txt --json closures.txt",
+    "notes": "loop s.tum --notes n.md --json n.md",
+    "pose graph": "loop g.g2o --g2o g.g2o",
+    "estimate": "evaluate s.tum s.tum --json s.tum",
+    "reference of evaluate": "evaluate s.tum l.ulg:truth --json l.ulg",
+    "estimate by its page": "evaluate s.pdf s.tum -o s.pdf",
+    "estimate by the page's picture": "evaluate s.tum s.tum -o hard.pdf",
+}
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [*REFUSED.values(), *((command, "not overwritten") for command in SPARED.values())],
+    ids=[*REFUSED, *(f"over {name}" for name in SPARED)],
+)
+def test_bad_input_gives_one_line_and_writes_nothing(
+    desk, monkeypatch, capsys, command, said
+) -> None:
+    monkeypatch.chdir(desk)
+    before = contents(desk)
+    code, out, err = run_main(monkeypatch, capsys, *shlex.split(command))
+    assert (code, out) == (2, ""), err
+    assert err.startswith("px4fuse: ")
+    assert len(err.splitlines()) == 1
+    assert said in err
+    assert "1.79525e+09" not in err  # times can be told apart
+    assert contents(desk) == before
+
+
+@pytest.mark.parametrize("command", ["loop s.tum", "evaluate s.tum s.tum", "loop g.g2o"])
+def test_a_reader_that_leaves_is_no_error(desk, command) -> None:
+    """As in px4fuse loop s.tum | head -1, when head has gone before anything is printed."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "px4fuse", *command.split()],
+        cwd=desk, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    assert process.stdout is not None
+    process.stdout.close()
+    _, complaint = process.communicate()
+    assert (process.returncode, complaint) == (0, b"")
+
+
+@pytest.mark.usefixtures("no_drawing")
+def test_compare_reports_the_loop_of_the_sample_flight(tmp_path) -> None:
+    result = run("compare", LOG, "--axis", "down", "-o", tmp_path / "r.pdf")
+    assert result.exit_code == 0, result.output
+    found = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))
+    jsonschema.validate(found, schema())
+    assert found["loop"]["closure_error_m"] == pytest.approx(1.42, abs=0.05)

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from exchange import replace
+from filter_tools import COUNT, SETTINGS, TRUE, made_flight, modelled
 from flights import line
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.stats import binom, norm
-from test_clock import SETTINGS, made_flight
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import compare
@@ -32,25 +32,7 @@ from px4fuse.filter.tuning import (
 from px4fuse.flight import POSITION_COLUMNS, Flight, Unavailable
 from px4fuse.readers import read_log
 
-SIGMA_A, SIGMA_Z = 0.5, 0.10
-DT, INTERVAL_S = 0.1, 0.2
-TRUE = Settings(sigma_a_m_s2=SIGMA_A, sigma_z_m=SIGMA_Z, dt_s=DT, input="zero")
-SEEDS, COUNT = 40, 300
-
-
-def modelled(
-    seed: int, count: int = COUNT, *, sigma_a: float = SIGMA_A, sigma_z: float = SIGMA_Z
-) -> Axis:
-    """Make an axis exactly as the filter assumes it: even the start is of its initial P."""
-    rng = np.random.default_rng(seed)
-    per_leg = round(INTERVAL_S / DT)
-    pushed = rng.normal(0.0, sigma_a, count * per_leg)
-    velocity = rng.normal(0.0, 1.0) + DT * np.concatenate([[0.0], np.cumsum(pushed)])
-    way = velocity[:-1] * DT + pushed * DT**2 / 2.0
-    position = rng.normal(0.0, 0.5) + np.concatenate([[0.0], np.cumsum(way)])
-    measured = position[::per_leg] + rng.normal(0.0, sigma_z, count + 1)
-    measured[0] = 0.0  # the filter starts there, wrong by 0.5 m
-    return line(INTERVAL_S * np.arange(count + 1), measured)
+SIGMA_A, SIGMA_Z, SEEDS = TRUE.sigma_a_m_s2, TRUE.sigma_z_m, 40
 
 
 def tuned(*axes: Axis, chosen: Settings = TRUE) -> AxisTuning:
@@ -106,7 +88,7 @@ def test_true_settings_have_nothing_to_gain_on_unseen_data() -> None:
 
 
 def test_bad_settings_lose_on_unseen_data() -> None:
-    bad = Settings(sigma_a_m_s2=5.0, sigma_z_m=0.02, dt_s=DT, input="zero")
+    bad = Settings(sigma_a_m_s2=5.0, sigma_z_m=0.02, input="zero")
     found = tuned(modelled(1), chosen=bad)
     assert found.held_out.gain_nats > 0.1
     assert found.held_out.count == COUNT // 2

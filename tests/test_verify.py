@@ -3,30 +3,32 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 import io
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
 from class_tools import in_this_process
 from click.testing import CliRunner
 from forgery import (
+    Base,
     Edit,
     Forge,
+    base,
     edited,
     entry,
     font,
     forged,
     glyphs,
     on_page,
+    plain,
+    read_again,
     replaced,
+    report_of,
     seal,
     text,
     with_results,
@@ -46,14 +48,11 @@ from pypdf.generic import (
 
 from px4fuse.cli import cli
 from px4fuse.cli.verify import verify as verify_command
-from px4fuse.errors import ResultsError
-from px4fuse.reading import files_by_sha256
-from px4fuse.report.seal import seal_of, sealed
-from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json, to_plain
-from px4fuse.results.reading import read_results
+from px4fuse.report.seal import sealed
+from px4fuse.results.contract import to_json, to_plain
 from px4fuse.verification import pages, rerun, verification
 from px4fuse.verification.intake import read_report
-from px4fuse.verification.model import Refused, Report, Verdict
+from px4fuse.verification.model import Refused, Report
 from px4fuse.verification.rerun import Recomputed
 from px4fuse.verification.verification import (
     ESTIMATE_RELATIVE,
@@ -73,13 +72,6 @@ LOOP_LOG = REPOSITORY / "sample_logs" / "loop_vio.ulg"
 SHIPPED = REPOSITORY / "reports" / "aisle_uwb.pdf"
 
 
-def report_of(pdf: bytes) -> Report:
-    """A report, read without care: tests of reading are elsewhere."""
-    results = read_results(PdfReader(io.BytesIO(pdf)).attachments["results.json"][0])
-    assert isinstance(results, ComparisonResults | LoopResults)
-    return Report(hashlib.sha256(pdf).hexdigest(), seal_of(pdf), results, pdf)
-
-
 @pytest.fixture(autouse=True, scope="module")
 def _looked_at_once() -> Iterator[None]:
     """The redrawn report is the same in most tests: it is rasterised once, in this process."""
@@ -88,61 +80,6 @@ def _looked_at_once() -> Iterator[None]:
         patch.setattr(pages, "looks", lru_cache(8)(pages.looks))
         patch.setattr(pages, "bounded", lambda function, job, *_: function(job))
         yield
-
-
-def plain(report: Report) -> dict[str, Any]:
-    """The results of a report, to be changed."""
-    made: dict[str, Any] = json.loads(to_json(report.results))
-    return made
-
-
-def read_again(results: dict[str, Any]) -> Reported:
-    """Changed results, as they are read from a report."""
-    made = read_results(to_json(results).encode())
-    assert isinstance(made, ComparisonResults | LoopResults)
-    return made
-
-
-@dataclass(frozen=True)
-class Base:
-    """A report that is verified, and its analysis, computed once."""
-
-    pdf: bytes
-    results: dict[str, Any]
-    again: Recomputed
-    files: Mapping[str, Path]
-
-    def recompute(self, results: Reported, logs: Mapping[str, Path]) -> Recomputed | Refused:
-        """What a new run gives; from memory where everything that it rests on is recorded so."""
-        ours, theirs = (
-            # the recorded command is made anew from the request
-            (held.request, held.student, rerun.log_sha256(held),
-             msgspec.structs.replace(held.provenance, command=""))
-            for held in (self.again.results, results)
-        )  # fmt: skip
-        return self.again if ours == theirs else rerun.recompute(results, logs)
-
-    def verified(self, pdf: bytes) -> Verdict:
-        """The verdict on a forged report, with the log."""
-        try:
-            report = report_of(pdf)
-        except ResultsError as error:  # refused before there is anything to verify
-            return Verdict("cannot verify", (str(error),), with_log=False)
-        return verify(report, self.files, recompute=self.recompute)
-
-    def with_results(self, results: dict[str, Any]) -> bytes:
-        """The report with other results attached, and a seal that fits."""
-        return sealed(forged(self.pdf, with_results(to_json(results))))
-
-
-def base(pdf: bytes, log: Path) -> Base:
-    files = files_by_sha256([log])
-    report = report_of(pdf)
-    again = rerun.recompute(report.results, files)
-    assert isinstance(again, Recomputed), again
-    drawn = again.draw()
-    kept = Recomputed(again.results, lambda: drawn)
-    return Base(drawn, plain(report_of(drawn)), kept, files)
 
 
 @pytest.fixture(scope="module")
@@ -189,12 +126,6 @@ def test_nothing_is_verified_without_the_log(aisle: Base, loop: Base) -> None:
         assert verdict.reasons == (NO_LOG,)
         assert verdict.redrawn == b""
         assert not verdict.with_log
-
-
-def test_the_real_reader_gives_the_same(aisle: Base) -> None:
-    read = read_report(aisle.pdf, "aisle.pdf")
-    assert isinstance(read, Report)
-    assert verify(read, aisle.files, recompute=aisle.recompute).outcome == "verified"
 
 
 def nudged(value: Any, share: float) -> Any:
@@ -284,6 +215,7 @@ def one_of_each_kind() -> list[tuple[Any, ...]]:
 
 
 KINDS = one_of_each_kind()
+assert len(KINDS) >= 100
 
 
 def changed(results: dict[str, Any], path: tuple[Any, ...]) -> dict[str, Any]:
@@ -305,26 +237,11 @@ def changed(results: dict[str, Any], path: tuple[Any, ...]) -> dict[str, Any]:
     return forged
 
 
-def test_a_hundred_kinds_of_numbers_and_words() -> None:
-    assert len(KINDS) >= 100
-
-
 @pytest.mark.parametrize("path", KINDS, ids=lambda path: ".".join(map(str, path)))
 def test_a_changed_leaf_of_the_results(aisle: Base, path: tuple[Any, ...]) -> None:
     found = compare_results(changed(aisle.results, path), to_plain(aisle.again.results))
     (difference,) = found.differences
     assert difference.path.replace("[0]", ".0").startswith(".".join(map(str, path)))
-
-
-def test_a_changed_number_in_the_file(aisle: Base) -> None:
-    other = aisle.with_results(changed(aisle.results, (*KF, "nis_mean")))
-    for pdf in (other, other.removesuffix(seal(other)) + seal(aisle.pdf)):
-        verdict = aisle.verified(pdf)
-        if verdict.reasons[0].startswith("results.json does not follow the schema"):
-            assert verdict.status == "cannot verify"  # a word or number that the contract has not
-            continue
-        assert verdict.status == verdict.outcome == "numbers differ", verdict
-        assert verdict.redrawn == aisle.pdf
 
 
 def without(*path: Any) -> Change:
@@ -356,27 +273,17 @@ STRUCTURE: dict[str, tuple[Change, str]] = {
     "a finding more": (
         lambda r: r["findings"].append(copy.deepcopy(r["findings"][0])), "numbers differ",
     ),
-    "findings in another order": (lambda r: r["findings"].reverse(), "numbers differ"),
-    "another severity": (put("error", "findings", 0, "severity"), "numbers differ"),
     "an axis less": (without("axes", "down"), "numbers differ"),
     "an axis more": (
         lambda r: r["axes"].update(up=copy.deepcopy(r["axes"]["down"])), "cannot verify",
-    ),
-    "two axes exchanged": (
-        lambda r: r["axes"].update(north=r["axes"]["east"], east=r["axes"]["north"]),
-        "numbers differ",
     ),
     "a filter's part as if it were not available": (
         put({"what": "a", "reason": "b", "remedy": "c"}, "axes", "north", "filters", "ekf2"),
         "numbers differ",
     ),
     "a parameter more": (put(1.0, "log", "parameters", "EKF2_HACK"), "numbers differ"),
-    "a dropout": (put([{"time_s": 1.0, "duration_s": 1.0}], "log", "dropouts"), "cannot verify"),
     "a note more": (put("all is well", "notes", 1), "numbers differ"),
     "a number as a text": (put("0.5", "settings", "sigma_a_m_s2"), "cannot verify"),
-    "a number as true": (put(True, *KF, "nis_mean"), "cannot verify"),
-    "a number as a list": (put([0.8], *KF, "nis_mean"), "cannot verify"),
-    "a part deep down": (put({"a": {"b": [[[[]]]]}}, "settings", "more"), "cannot verify"),
     "an interval narrower": (
         lambda r: r["tuning"]["horizontal"].update(
             sigma_z_m_interval=[r["tuning"]["horizontal"]["sigma_z_m"]] * 2
@@ -388,50 +295,22 @@ STRUCTURE: dict[str, tuple[Change, str]] = {
         "cannot verify",
     ),
     "another log": (put("0" * 64, "log", "sha256"), "other log"),
-    "no log": (without("log"), "cannot verify"),
-    "the log as a number": (put(7, "log", "sha256"), "cannot verify"),
     "another version": (put("0.0.9", "provenance", "px4fuse"), "cannot verify"),
-    "no version": (without("provenance", "px4fuse"), "cannot verify"),
-    "no provenance": (without("provenance"), "cannot verify"),
-    "another schema": (put("px4fuse-graph", "schema", "name"), "cannot verify"),
     "another version of the schema": (put("0.9", "schema", "version"), "cannot verify"),
-    "no schema": (without("schema"), "cannot verify"),
-    "no student": (without("student"), "cannot verify"),
-    "the student as a number": (put(7, "student", "name"), "cannot verify"),
     "notes without an end": (put("x\n" * 200_000, "student", "notes"), "cannot verify"),
     "no libraries": (put({}, "provenance", "libraries"), "cannot verify"),
     "a library of no version": (
         put("1\n2", "provenance", "libraries", "numpy"), "cannot verify",
     ),
 }  # fmt: skip
-COMMANDS = {
-    "no command": "",
-    "another program": "rm -rf aisle_uwb.ulg",
-    "another command": "px4fuse tune aisle_uwb.ulg",
-    "help": "px4fuse compare aisle_uwb.ulg --help",
-    "an unknown option": "px4fuse compare aisle_uwb.ulg --please",
-    "an output": "px4fuse compare aisle_uwb.ulg -o evil.pdf",
-    "results": "px4fuse compare aisle_uwb.ulg --json evil.json",
-    "notes of this machine": "px4fuse compare aisle_uwb.ulg --notes /etc/passwd",
-    "a student in the command": "px4fuse compare aisle_uwb.ulg --student Eve",
-    "an open quote": "px4fuse compare 'aisle_uwb.ulg",
-    "a path": "px4fuse compare ../../etc/passwd",
-    "an absolute path": "px4fuse compare /etc/passwd",
-    "a path of Windows": "px4fuse compare '..\\aisle_uwb.ulg'",
-    "two logs": "px4fuse compare aisle_uwb.ulg aisle_uwb.ulg",
-    "no log": "px4fuse compare",
-    "a recording that was not joined": "px4fuse compare aisle_uwb.ulg --mavlink /etc/passwd",
-    "a position file that was not joined": "px4fuse compare aisle_uwb.ulg --position x.csv",
-    "a value out of range": "px4fuse compare aisle_uwb.ulg --sigma-a 1e9",
-    "a value that is none": "px4fuse compare aisle_uwb.ulg --sigma-a much",
-    "a value without an end": "px4fuse compare aisle_uwb.ulg --start nan",
-    "a million words": "px4fuse compare " + "a " * 1_000_000,
-    "axes of a file": "px4fuse loop aisle_uwb.ulg --frame ned",
-}
 # Only the request is run again; the command is for people, and one that is not made from it differs
 STRUCTURE |= {
-    f"command: {name}": (put(command, "provenance", "command"), "numbers differ")
-    for name, command in COMMANDS.items()
+    f"command: {command[:40]}": (put(command, "provenance", "command"), "numbers differ")
+    for command in (
+        "",
+        "px4fuse compare aisle_uwb.ulg -o evil.pdf",
+        "px4fuse compare " + "a " * 10**6,
+    )
 }
 REQUESTS: dict[str, tuple[Change, str]] = {
     "no request": (without("request"), "numbers differ"),
@@ -466,7 +345,7 @@ def test_changed_results(aisle: Base, name: str, monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.parametrize(
     "path",
-    [("student", "name"), ("student", "notes"), ("provenance", "libraries", "numpy")],
+    [("student", "name"), ("student", "notes"), ("provenance", "libraries", "matplotlib")],
 )
 def test_what_is_printed_from_the_record(loop: Base, path: tuple[str, ...]) -> None:
     results = copy.deepcopy(loop.results)
@@ -475,14 +354,9 @@ def test_what_is_printed_from_the_record(loop: Base, path: tuple[str, ...]) -> N
     verdict = verify(report_of(loop.with_results(results)), loop.files, recompute=lambda *_: again)
     assert (verdict.status, verdict.outcome) == ("verified", "page differs"), verdict
     assert verdict.redrawn != loop.pdf
-
-
-def test_another_matplotlib_is_no_accusation(loop: Base) -> None:
-    results = copy.deepcopy(loop.results)
-    results["provenance"]["libraries"]["matplotlib"] = "3.10.0"
-    verdict = verify(report_of(loop.with_results(results)), loop.files)
-    assert (verdict.status, verdict.outcome) == ("verified", "page differs")
-    assert any("matplotlib 3.10.0" in reason for reason in verdict.reasons)
+    # another version of a library is no accusation
+    named = any("matplotlib 9.9.9 (here" in reason for reason in verdict.reasons)
+    assert named == (path[-1] == "matplotlib")
 
 
 # -- what is changed on the pages ------------------------------------------------------------------
@@ -710,15 +584,23 @@ def test_a_letter_drawn_as_another_is_found_on_every_page(aisle: Base) -> None:
     assert min(one.picture for one in found) > pages.DISTANCE
 
 
-def appended_version(pdf: bytes) -> bytes:
-    """A second version of the first page, appended as an incremental update."""
-    writer = PdfWriter(io.BytesIO(pdf), incremental=True)
-    writer.pages[0][NameObject("/Contents")] = writer._add_object(
-        edited(writer.pages[0]["/Contents"].get_object(), lambda _: b" ")
-    )
+def saved(writer: PdfWriter) -> bytes:
     out = io.BytesIO()
     writer.write(out)
     return out.getvalue()
+
+
+def appended(pdf: bytes, change: Forge) -> bytes:
+    """An incremental update, as viewers append one."""
+    writer = PdfWriter(io.BytesIO(pdf), incremental=True)
+    change(writer)
+    return saved(writer)
+
+
+def emptied(writer: PdfWriter) -> None:
+    """The first page without what it draws."""
+    stream = edited(writer.pages[0]["/Contents"].get_object(), lambda _: b" ")
+    writer.pages[0][NameObject("/Contents")] = writer._add_object(stream)
 
 
 def pages_of_another(one: Base, other: Base) -> bytes:
@@ -726,60 +608,40 @@ def pages_of_another(one: Base, other: Base) -> bytes:
     writer = PdfWriter(clone_from=io.BytesIO(one.pdf))
     writer.remove_page(PAGES - 1)
     writer.add_page(PdfReader(io.BytesIO(other.pdf)).pages[-1])
-    out = io.BytesIO()
-    writer.write(out)
-    return out.getvalue()
+    return saved(writer)
 
 
-def packed(pdf: bytes) -> bytes:
+def packed(writer: PdfWriter) -> None:
     """As programs that save a PDF again pack it: object streams, other compression, a link."""
-    writer = PdfWriter(clone_from=io.BytesIO(pdf))
     writer.compress_identical_objects(remove_duplicates=True)
     for page in writer.pages:
         page.compress_content_streams(level=9)
     writer.add_metadata({"/Producer": "Another program", "/Author": "Ada"})
-    link = Link(rect=(50, 50, 200, 70), url="http://example.org")
-    writer.add_annotation(0, link)
-    out = io.BytesIO()
-    writer.write(out)
-    return out.getvalue()
+    writer.add_annotation(0, Link(rect=(50, 50, 200, 70), url="http://example.org"))
 
 
-def unpacked(pdf: bytes) -> bytes:
+def unpacked(writer: PdfWriter) -> None:
     """Every stream as it is, without a filter."""
-    writer = PdfWriter(clone_from=io.BytesIO(pdf))
     for place, held in enumerate(writer._objects):
         if isinstance(held, EncodedStreamObject):
-            plain = DecodedStreamObject()
-            plain.update({k: v for k, v in held.items() if k not in ("/Filter", "/Length")})
-            plain.set_data(held.get_data())
-            writer._objects[place] = plain
-    out = io.BytesIO()
-    writer.write(out)
-    return out.getvalue()
-
-
-def with_metadata(pdf: bytes) -> bytes:
-    """An incremental update with another author, as viewers append one."""
-    writer = PdfWriter(io.BytesIO(pdf), incremental=True)
-    writer.add_metadata({"/Author": "Ada"})
-    out = io.BytesIO()
-    writer.write(out)
-    return out.getvalue()
+            bare = DecodedStreamObject()
+            bare.update({k: v for k, v in held.items() if k not in ("/Filter", "/Length")})
+            bare.set_data(held.get_data())
+            writer._objects[place] = bare
 
 
 FILES: dict[str, tuple[Callable[[Base, Base], bytes], set[str]]] = {
     "saved again": (lambda a, _: forged(a.pdf), {"verified"}),
     "saved again twice": (lambda a, _: forged(forged(a.pdf)), {"verified"}),
-    "packed in another way": (lambda a, _: packed(a.pdf), {"verified"}),
-    "not packed at all": (lambda a, _: unpacked(a.pdf), {"verified"}),
-    "metadata appended": (lambda a, _: with_metadata(a.pdf), {"verified"}),
+    "packed in another way": (lambda a, _: forged(a.pdf, packed), {"verified"}),
+    "not packed at all": (lambda a, _: forged(a.pdf, unpacked), {"verified"}),
+    "metadata appended": (lambda a, _: appended(a.pdf, titled(Author="Ada")), {"verified"}),
     "the seal removed": (lambda a, _: a.pdf.removesuffix(seal(a.pdf)), {"verified"}),
     "the seal of another": (
         lambda a, b: a.pdf.removesuffix(seal(a.pdf)) + seal(b.pdf), {"verified"},
     ),
     "bytes appended": (lambda a, _: a.pdf + b"\n% Eve\n", {"verified"}),
-    "a version appended": (lambda a, _: appended_version(a.pdf), {"page differs"}),
+    "a version appended": (lambda a, _: appended(a.pdf, emptied), {"page differs"}),
     "a page of another report": (pages_of_another, {"page differs"}),
     "a link": (
         lambda a, _: forged(a.pdf, root("/URI", TextStringObject("http://example.org"))),
@@ -804,30 +666,11 @@ def test_a_changed_file(aisle: Base, loop: Base, name: str) -> None:
     assert verdict.redrawn == (aisle.pdf if verdict.status == "verified" else b"")
 
 
-def test_printed_to_pdf_says_what_to_hand_in(aisle: Base) -> None:
-    """What a browser's print to PDF leaves: the pages, without what is attached."""
-    writer = PdfWriter()
-    for page in PdfReader(io.BytesIO(aisle.pdf)).pages:
-        writer.add_page(page)
-    out = io.BytesIO()
-    writer.write(out)
-    read = read_report(out.getvalue(), "r.pdf")
-    assert isinstance(read, Refused)
-    assert read.reason.endswith("Hand in the original file that px4fuse wrote.")
-
-
 def test_another_log(aisle: Base) -> None:
-    for files in ([LOOP_LOG], [Path(__file__)], [LOOP_LOG, Path(__file__)]):
+    for files in ([LOOP_LOG], [LOOP_LOG, Path(__file__)]):
         verdict = verify(report_of(aisle.pdf), files)
         assert verdict.status == "other log"
         assert not verdict.with_log
-
-
-def test_the_name_of_the_log_does_not_matter(aisle: Base, tmp_path: Path) -> None:
-    """Nor is a file taken for the log since it is called so."""
-    wrong = tmp_path / "aisle_uwb.ulg"
-    wrong.write_bytes(LOOP_LOG.read_bytes())
-    assert verify(report_of(aisle.pdf), [wrong]).status == "other log"
 
 
 @pytest.mark.usefixtures("drawn_once")
@@ -901,9 +744,3 @@ def test_bad_input_is_one_line(words: list[str]) -> None:
     outcome = CliRunner().invoke(cli, ["verify", *words], standalone_mode=False)
     assert outcome.exception is not None
     assert "\n" not in str(outcome.exception)
-
-
-def test_help_states_the_limit() -> None:
-    code, output = run("--help")
-    assert code == 0
-    assert "not who wrote them" in " ".join(output.split())

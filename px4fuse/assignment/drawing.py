@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import hmac
 import math
-import re
 from bisect import bisect
 from dataclasses import dataclass
 from functools import partial
@@ -24,7 +23,6 @@ from px4fuse.simulation.scenario import KINDS, Kind, Scenario
 Kinds = Literal["aisle", "loop", "mixed"]
 
 MIN_SECRET = 8
-_SIZE = re.compile(r"[\w-]+=([-+]?[\d.]+)")
 # Named in every draw: another text gives other flights, and keys of another text cannot be extended
 DRAWN = "px4fuse assignment 2"
 # What is drawn, and from where to where, with the decimals that are kept
@@ -109,17 +107,6 @@ class AssignableMistake:
         first, last = self.at_s
         return f"{text},{first + at * (last - first):.0f}s"
 
-    def difficulty(self, typed: str) -> float:
-        """From ``EASIEST`` to ``HARDEST``: the limit over the size, or the size over the limit.
-
-        What has no size cannot be missed for being small, and is the easiest.
-        """
-        size = _SIZE.match(typed)
-        if self.limit is None or size is None:
-            return EASIEST
-        ratio = self.limit / abs(float(size[1]))
-        return round(1.0 / ratio if self.less_is_plainer else ratio, 2)
-
 
 # Clock and heading are estimated from the IMU. A gap of the IMU is not among the choices: it passes
 # for a change of the clock in every second flight. Outliers make EKF2 reject and its NIS grow too,
@@ -162,21 +149,16 @@ class Drawn:
     ----------
     typed : tuple of str
         The mistakes as typed, in the same order.
+    difficulty : float
+        That of the hardest mistake; what has no size cannot be missed for being small. Only a
+        student who has looked for the smallest can say that there is none: such a flight is among
+        the hardest.
     """
 
     scenario: Scenario
     chosen: tuple[AssignableMistake, ...]
     typed: tuple[str, ...]
-
-    @property
-    def difficulty(self) -> float:
-        """That of the hardest mistake.
-
-        Only a student who has looked for the smallest can say that there is none: such a flight is
-        among the hardest.
-        """
-        each = [one.difficulty(text) for one, text in zip(self.chosen, self.typed, strict=True)]
-        return max(each, default=HARDEST)
+    difficulty: float
 
     @property
     def findings(self) -> tuple[str, ...]:
@@ -214,16 +196,21 @@ def draw(
     for choice in sorted(CHOICES[kind], key=lambda c: one(f"order {c.mistake}")):
         if len(chosen) < count and all(map(choice.goes_with, chosen)):
             chosen.append(choice)
+    hard = [
+        EASIEST if choice.limit is None
+        else EASIEST + (HARDEST - EASIEST) * one(f"size {choice.mistake}")
+        for choice in chosen
+    ]  # fmt: skip
     typed = tuple(
         choice.typed(
-            EASIEST + (HARDEST - EASIEST) * one(f"size {choice.mistake}"),
+            difficulty,
             -1.0 if choice.either_sign and one(f"sign {choice.mistake}") < 0.5 else 1.0,
             one(f"at {choice.mistake}"),
         )
-        for choice in chosen
+        for choice, difficulty in zip(chosen, hard, strict=True)
     )
     scenario = draw_scenario(secret, student_id, kind, truth)
-    return Drawn(scenario, tuple(chosen), typed)
+    return Drawn(scenario, tuple(chosen), typed, round(max(hard, default=HARDEST), 2))
 
 
 def draw_scenario(secret: bytes, student_id: str, kind: Kind, truth: bool = True) -> Scenario:

@@ -47,7 +47,7 @@ DID: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "nlos": ((), ("followed the wrong positions",)),
     "decimate": ((), ("never fused",)),
 }
-UNUSUAL_NOTHING = (("nothing unusual",), ("followed the positions",))
+NOTHING: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
 
 
 class Wrong(Record, frozen=True):
@@ -110,14 +110,13 @@ def truth_of(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
     mistakes = tuple(
         _wrong(name, given, known["truth"], comparison) for name, given in known["mistakes"].items()
     )
-    did, also = _ekf2_did(comparison, mistakes, known["truth"]["sigma_z_m"])
+    sigma_z_m = known["truth"]["sigma_z_m"]
     return FormTruth(
         mistakes,
-        known["truth"]["sigma_z_m"],
+        sigma_z_m,
         _verdict(comparison, "kf"),
         _verdict(comparison, "ekf2"),
-        did,
-        also,
+        *_ekf2_did(comparison, mistakes, sigma_z_m),
         tuple(quantity_truth(comparison.main, each) for each in asked(log_sha256)),
     )
 
@@ -136,18 +135,20 @@ def _wrong(
         if isinstance(found, ClockOffset) and found.determinable:
             low, high = min(low, -found.interval_s[1]), max(high, -found.interval_s[0])
     start_s, end_s = truth["airborne_s"]
-    spans: dict[str, tuple[float | None, float | None]] = {
-        "clock-jump": (None, TIMESYNC_CONVERGED_S),
-        "open-end": (end_s, None),
-    }
-    if name == "nlos" and truth["outlier_time_s"]:
-        spans[name] = truth["outlier_time_s"][0], truth["outlier_time_s"][-1]
-    if name in ("dropout", "imu-dropout", "jump"):
-        at_s = given[arguments[1].field]
-        share = 2.0 / 3.0 if name == "jump" else 0.5
-        at_s = start_s + share * (end_s - start_s) if at_s is None else at_s
-        spans[name] = at_s, None if name == "jump" else at_s + abs(size)
-    from_s, until_s = spans.get(name, (None, None))
+    from_s: float | None = None
+    until_s: float | None = None
+    match name:
+        case "clock-jump":
+            until_s = TIMESYNC_CONVERGED_S
+        case "open-end":
+            from_s = end_s
+        case "nlos" if truth["outlier_time_s"]:
+            from_s, *_, until_s = truth["outlier_time_s"] * 2
+        case "dropout" | "imu-dropout" | "jump":
+            share = 2.0 / 3.0 if name == "jump" else 0.5
+            from_s = given[arguments[1].field]
+            from_s = start_s + share * (end_s - start_s) if from_s is None else from_s
+            until_s = None if name == "jump" else from_s + abs(size)
     return Wrong(name, size, low, high, from_s, until_s)
 
 
@@ -155,42 +156,35 @@ def _verdict(comparison: Comparison, which: FilterName) -> VerdictTruth:
     judged = comparison.main.filters[which]
     if not isinstance(judged, FilterSummary):
         return VerdictTruth("")
-    for word in ("overstated", "understated"):
-        if word in judged.verdict:
-            factor = judged.variance_factor
-            return VerdictTruth(word, max(factor, 1.0 / factor))
-    return VerdictTruth("consistent")
+    word = judged.verdict.removeprefix("variance ")
+    if word == "consistent":
+        return VerdictTruth(word)
+    return VerdictTruth(word, max(judged.variance_factor, 1.0 / judged.variance_factor))
 
 
 def _ekf2_did(
     comparison: Comparison, mistakes: tuple[Wrong, ...], sigma_z_m: float
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What EKF2 did in this flight: by what is wrong with it, and by what the log shows."""
-    must: list[str] = []
-    also: list[str] = []
     by_kind = {wrong.kind: wrong for wrong in mistakes}
-    for kind in by_kind:
-        said, allowed = DID.get(kind, ((), ()))
-        must += said
-        also += allowed
+    must = [said for kind in by_kind for said in DID.get(kind, NOTHING)[0]]
+    also = [said for kind in by_kind for said in DID.get(kind, NOTHING)[1]]
     noise = by_kind.get("ekf2-noise")
     if noise is not None and (noise.size or 0.0) > sigma_z_m:
         must.append("trusted the positions too little")
-    ekf2 = comparison.flight.ekf2
     innovations = comparison.main.ekf2_innovations
     if not isinstance(innovations, Unavailable):
-        rejected = float((innovations["rejected"] > 0).mean())
-        if rejected > REJECTED:
-            bad = "nlos" in by_kind or "jump" in by_kind
+        bad = "nlos" in by_kind or "jump" in by_kind
+        if (innovations["rejected"] > 0).mean() > REJECTED:
             must.append("rejected the bad samples" if bad else "rejected good samples")
-    if isinstance(ekf2, Ekf2) and any(
-        reset.quantity == "position" and math.hypot(*reset.delta[:2]) > RESET_M
-        for reset in ekf2.resets
-        if comparison.segment.start_s + SETTLED_S < reset.time_s
-    ):
-        must.append("coasted, then reset")
+    ekf2 = comparison.flight.ekf2
+    since_s = comparison.segment.start_s + SETTLED_S
+    for reset in ekf2.resets if isinstance(ekf2, Ekf2) else ():
+        large = reset.quantity == "position" and math.hypot(*reset.delta[:2]) > RESET_M
+        if large and reset.time_s > since_s:
+            must.append("coasted, then reset")
     if not must:
-        must, also = list(UNUSUAL_NOTHING[0]), [*UNUSUAL_NOTHING[1], *also]
+        must, also = ["nothing unusual"], ["followed the positions", *also]
     return tuple(dict.fromkeys(must)), tuple(one for one in dict.fromkeys(also) if one not in must)
 
 

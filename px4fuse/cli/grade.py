@@ -125,12 +125,12 @@ def grade(
         return
     rule = late_rule(late) if late else None
     if gradescope is not None:
-        from px4fuse.grading.autograding import run_autograder
+        from px4fuse.grading.gradescope import run_autograder
 
         run_autograder(gradescope, rule)
         return
     if write_autograder is not None:
-        from px4fuse.grading.autograding import autograder_zip
+        from px4fuse.grading.gradescope import autograder_zip
 
         _write_new(write_autograder, autograder_zip(logs, rubric, key, rule))
         return

@@ -21,7 +21,7 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.filter.clock import MAX_HALF_INTERVAL_S, ClockOffset, estimate_clock_offset
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.heading import HeadingError, heading_error
-from px4fuse.filter.motion import MAX_IMU_INTERVAL_S, Made
+from px4fuse.filter.motion import MAX_IMU_INTERVAL_S, SignalCache
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise, tune
 from px4fuse.flight import Flight, Unavailable
 
@@ -53,7 +53,7 @@ def tuned(
     comparison: Comparison,
     names: tuple[str, ...] | None = None,
     progress: Progress = silent,
-    made: Made | None = None,
+    cache: SignalCache | None = None,
 ) -> dict[str, AxisTuning | Unavailable]:
     """Most likely noises of a comparison's axes; an IMU too slow to tell biases is left out.
 
@@ -64,14 +64,14 @@ def tuned(
         Axis names and "horizontal"; by default all that there are.
     progress : callable
         Is given what is being done.
-    made : dict, optional
+    cache : dict, optional
         As :func:`px4fuse.filter.motion.motion` has it.
     """
     flight, slow = comparison.flight, imu_too_slow_for_clocks(comparison.flight)
     return tune(
         comparison.lines, comparison.settings, names, lambda name: progress(f"tuning {name}"),
         flight if slow is None else replace(flight, imu=slow),
-        comparison.source.origin.may_drift, made,
+        comparison.source.origin.may_drift, cache,
     )  # fmt: skip
 
 
@@ -84,8 +84,8 @@ def noises_and_clock(
 
     Beyond the offset that was set. Parameters are those of :func:`tuned`.
     """
-    made: Made = {}  # both need the same signals of the IMU
-    tuning = tuned(comparison, names, progress, made)
+    cache: SignalCache = {}  # both need the same signals of the IMU
+    tuning = tuned(comparison, names, progress, cache)
     if slow := imu_too_slow_for_clocks(comparison.flight):
         return tuning, slow
     settings = comparison.settings
@@ -97,7 +97,7 @@ def noises_and_clock(
     clock = estimate_clock_offset(
         comparison.flight, comparison.source, comparison.segment, settings,
         known[0].noises if known else Noises(settings.sigma_a_m_s2, settings.sigma_z_m),
-        known[0].outlier_time_s if known else None, progress, made,
+        known[0].outlier_time_s if known else None, progress, cache,
     )  # fmt: skip
     drifts = comparison.source.origin.may_drift
     return tuning, with_drift(clock) if drifts and isinstance(clock, ClockOffset) else clock

@@ -17,20 +17,15 @@ from px4fuse.filter.hypotheses import (
     RIGHT,
     TURN,
     Estimate,
+    Hypotheses,
     HypothesisFit,
-    HypothesisSignals,
-    Lines,
-    fit,
-    gains,
-    lines_of,
-    respond,
-    same_gains,
+    hypotheses_of,
     steps,
     too_few,
 )
 from px4fuse.filter.likelihood import parabola_vertex
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis, Segment
+from px4fuse.filter.signals import Axis
 from px4fuse.flight import Flight, Unavailable
 
 # With biases and tilt taken out, less noise of the acceleration is left than the filter needs
@@ -39,7 +34,7 @@ SCALES = np.linspace(0.7, 1.3, 7)
 # A step is sought at no more times than these
 MAX_STEPS = 800
 # So many of them are tried together: the responses of all would be the largest arrays of a run
-STEPS_AT_ONCE = 50
+STEPS_AT_ONCE = 200
 # The vehicle's own reading is relied on across this time, in which bursts of outliers end
 BURST_S = 1.0
 # A run of outliers that begins within this time after a step belongs to it
@@ -95,7 +90,6 @@ class Explained:
 def explained(
     flight: Flight,
     axes: tuple[Axis, ...],
-    segment: Segment,
     settings: Settings,
     *,
     sigma_a_m_s2: float,
@@ -110,7 +104,6 @@ def explained(
     flight : Flight
     axes : tuple of Axis
         Horizontal, with the same measurement times.
-    segment : Segment
     settings : Settings
         ``dt_s`` gives SIGMA_A its meaning.
     sigma_a_m_s2, sigma_z_m : float
@@ -124,7 +117,7 @@ def explained(
     -------
     Explained, or Unavailable where there is no acceleration or too few measurements.
     """
-    lines = lines_of(flight, axes, segment, settings, sigma_z_m, clock_offset_s)
+    lines = hypotheses_of(flight, axes, settings, sigma_z_m, clock_offset_s)
     if isinstance(lines, Unavailable):
         return lines
     skip = np.isin(axes[0].measurement_time_s[-len(lines.time_s) :], outlier_time_s)
@@ -139,15 +132,11 @@ def explained(
         lines = replace(lines, steps=steps(lines.time_s, [jump.time_s for jump in jumps]))
         sigma_a, found = _fit_noise(lines, levels, skip)
     return Explained(
-        found.estimate(FORWARD),
-        found.estimate(RIGHT),
-        _scale(lines, sigma_a, skip),
-        jumps,
-        sigma_a,
+        found.estimate(FORWARD), found.estimate(RIGHT), _scale(lines, sigma_a, skip), jumps, sigma_a
     )
 
 
-def _fit_noise(lines: Lines, levels: Array, skip: BoolArray) -> tuple[float, HypothesisFit]:
+def _fit_noise(lines: Hypotheses, levels: Array, skip: BoolArray) -> tuple[float, HypothesisFit]:
     """The most likely of some SIGMA_A, and what is fitted with it."""
     fitted = cache(lambda at: lines.fit(float(levels[at]), skip))
     best = _lowest(lambda at: fitted(at).score, len(levels))
@@ -163,7 +152,7 @@ def _lowest(score: Callable[[int], float], count: int) -> int:
     return at
 
 
-def _scale(lines: Lines, sigma_a: float, skip: BoolArray) -> Estimate:
+def _scale(lines: Hypotheses, sigma_a: float, skip: BoolArray) -> Estimate:
     """Scale of the source minus 1, from the likelihood of a few; a turn's share is put back."""
     fitted = cache(lambda at: lines.fit(sigma_a, skip, float(SCALES[at])))
     # with S's logarithm, which grows with the scale, this would be biased towards zero
@@ -180,7 +169,7 @@ def _scale(lines: Lines, sigma_a: float, skip: BoolArray) -> Estimate:
     return Estimate(float(found * turned - 1.0), float(sigma))
 
 
-def _jumps(lines: Lines, sigma_a: float, skip: BoolArray) -> tuple[Jump, ...]:
+def _jumps(lines: Hypotheses, sigma_a: float, skip: BoolArray) -> tuple[Jump, ...]:
     """Steps of the source that stay, the largest first found, in order of time.
 
     Times are proposed by a scan over all, and by where runs of outliers begin: a step begins with
@@ -209,38 +198,23 @@ def _from(time_s: Array, start_s: float, length_s: float) -> BoolArray:
     return np.asarray((time_s >= start_s) & (time_s < start_s + length_s))
 
 
-def _scan(lines: Lines, sigma_a: float, skip: BoolArray) -> list[float]:
+def _scan(lines: Hypotheses, sigma_a: float, skip: BoolArray) -> list[float]:
     """The time at which a step would explain most, where that is more than chance would."""
-    white = lines.whiten(sigma_a, skip)
-    base = fit(white, lines.priors)
+    base = lines.fit(sigma_a, skip)
     times = lines.time_s[EDGE:-EDGE]
     times = times[:: max(1, -(-len(times) // MAX_STEPS))]
     if not len(times):
         return []
-    rest = white.rest(base.coefficients)
-    together = same_gains(lines.legs)
-    made = [
-        gains(legs, sigma_a, lines.sigma_z_m, skip)
-        for legs in lines.legs[: 1 if together else None]
-    ]
-
-    def explains(block: Array) -> Array:
-        """χ² that a step at each of some times takes away."""
-        candidates = steps(lines.time_s, block)
-        still = np.broadcast_to(0.0, candidates.shape)
-        signals = HypothesisSignals(still, still, candidates, np.zeros(len(block)))
-        chi_square = np.zeros(len(block))
-        for at, legs in enumerate(lines.legs):
-            if at == 0 or not together:
-                response = respond(legs, signals, *made[at])[~skip]
-            mixed = white.columns[at].T @ response
-            covariance = base.covariance[np.ix_(white.which[at], white.which[at])]
-            size = np.sum(response**2, axis=0) - np.sum(mixed * (covariance @ mixed), axis=0)
-            chi_square += (rest[at] @ response) ** 2 / np.maximum(size, 1e-9)
-        return chi_square
-
-    blocks = np.array_split(times, -(-len(times) // STEPS_AT_ONCE))
-    chi_square = np.concatenate([explains(block) for block in blocks])
+    # what a step at each time takes away of the squares, summed over the axes
+    chi_square = np.zeros(len(times))
+    for axis in range(len(lines.legs)):
+        rows = base.axis == axis
+        columns, rest = base.columns[rows], base.rest[rows]
+        for few in np.array_split(np.arange(len(times)), -(-len(times) // STEPS_AT_ONCE)):
+            response = lines.respond(axis, steps(lines.time_s, times[few]), sigma_a, skip)
+            mixed = columns.T @ response
+            size = np.sum(response**2, axis=0) - np.sum(mixed * (base.covariance @ mixed), axis=0)
+            chi_square[few] += (rest @ response) ** 2 / np.maximum(size, 1e-9)
     chi_square /= max(base.spread, 1.0) ** 2
     best = int(np.argmax(chi_square))
     if chi_square[best] < chdtri(len(lines.legs), STEP_FALSE_ALARM / len(lines.time_s)):
@@ -249,7 +223,7 @@ def _scan(lines: Lines, sigma_a: float, skip: BoolArray) -> list[float]:
 
 
 def _judge(
-    lines: Lines, sigma_a: float, skip: BoolArray, time_s: float, chance: float
+    lines: Hypotheses, sigma_a: float, skip: BoolArray, time_s: float, chance: float
 ) -> Jump | None:
     """A step at a time, where what comes later still asks for it; None where that is chance."""
     after = _from(lines.time_s, time_s, AFTER_STEP_S)
@@ -260,15 +234,13 @@ def _judge(
     before = np.count_nonzero(~later & (lines.time_s < time_s))
     if min(before, np.count_nonzero(~later & (lines.time_s >= time_s))) < EDGE:
         return None
-    white = lines.whiten(sigma_a, later)
-    found = fit(white, lines.priors)
+    found = lines.fit(sigma_a, later)
     size, covariance = found.coefficients[columns], found.covariance[np.ix_(columns, columns)]
     chi_square = float(size @ np.linalg.solve(covariance, size)) / max(found.spread, 1.0) ** 2
     if chi_square < chdtri(len(columns), chance):
         return None
-    near = after[~later]
-    rest = np.concatenate([own[near] for own in white.rest(found.coefficients)])
-    if np.mean(rest**2) > STEP_NIS * max(found.spread, 1.0) ** 2:
+    near = np.tile(after[~later], len(lines.legs))
+    if np.mean(found.rest[near] ** 2) > STEP_NIS * max(found.spread, 1.0) ** 2:
         return None
     # its size from all, now that it is known to be one
     whole = lines.fit(sigma_a, skip & ~after)

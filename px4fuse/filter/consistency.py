@@ -6,22 +6,14 @@ Navigation, section 5.4; Ljung and Box (1978), Biometrika 65(2).
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.special import chdtrc, gammaincinv, stdtr
 
 from px4fuse.arrays import Array
 from px4fuse.display import Shown
-from px4fuse.record import (
-    Correlation,
-    Count,
-    NotNegative,
-    Positive,
-    Record,
-    Share,
-    Unavailable,
-)
+from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Unavailable
 
 Verdict = Literal["consistent", "variance overstated", "variance understated"]
 
@@ -32,23 +24,42 @@ LJUNG_BOX_LAGS = 10
 GATE_SIGMA = 5.0  # EKF2_EVP_GATE's default, used where no gate is in force
 
 
-class Consistency(Shown, Record, frozen=True, kw_only=True):
-    """Whether a filter's innovations are what its own variances say.
+class NisVerdict(Record, frozen=True, kw_only=True):
+    """What the mean NIS of a filter's innovations says of their variance.
 
     Attributes
     ----------
     count : int
         Innovations used.
-    innovation_mean_m, innovation_std_m : float
-    sqrt_s_median_m : float
-        Median of √S, what the filter expected of the standard deviation.
     nis_mean : float
-        Mean of ν²/S; 1 is consistent.
+        Mean of ν²/S over its degrees of freedom; 1 is consistent.
     nis_band : (float, float)
         Two-sided 95 % chi-square band of that mean, for white innovations.
     sigma_factor : float
         Claimed over shown standard deviation, 1/√nis_mean: above 1 √S is too large.
     verdict : str
+    """
+
+    count: Count
+    nis_mean: Positive
+    nis_band: tuple[NotNegative, NotNegative]
+    sigma_factor: Positive
+    verdict: Verdict
+
+    @property
+    def variance_factor(self) -> float:
+        """How many times S is overstated (above 1) or understated (below 1)."""
+        return 1.0 / self.nis_mean
+
+
+class Consistency(Shown, NisVerdict, frozen=True, kw_only=True):
+    """Whether a filter's innovations are what its own variances say.
+
+    Attributes
+    ----------
+    innovation_mean_m, innovation_std_m : float
+    sqrt_s_median_m : float
+        Median of √S, what the filter expected of the standard deviation.
     outside_two_sigma : float
         Fraction outside ±2√S; 0.046 is expected.
     outside_gate : float
@@ -62,14 +73,9 @@ class Consistency(Shown, Record, frozen=True, kw_only=True):
     ljung_box_lags : int
     """
 
-    count: Count
     innovation_mean_m: float
     innovation_std_m: NotNegative
     sqrt_s_median_m: Positive
-    nis_mean: Positive
-    nis_band: tuple[NotNegative, NotNegative]
-    sigma_factor: Positive
-    verdict: Verdict
     outside_two_sigma: Share
     outside_gate: Share
     bias_t: float
@@ -78,10 +84,12 @@ class Consistency(Shown, Record, frozen=True, kw_only=True):
     ljung_box_p: Share
     ljung_box_lags: Count
 
-    @property
-    def variance_factor(self) -> float:
-        """How many times S is overstated (above 1) or understated (below 1)."""
-        return 1.0 / self.nis_mean
+
+class HorizontalNis(NisVerdict, frozen=True, kw_only=True):
+    """NIS of north and east together, two degrees of freedom, divided by two.
+
+    EKF2 logs no covariance between the two, so their correlation is left out for both filters.
+    """
 
 
 def nis_band(count: int, dimensions: int = 1) -> tuple[float, float]:
@@ -106,6 +114,18 @@ def verdict_of(nis_mean: float, band: tuple[float, float]) -> Verdict:
     if nis_mean > band[1]:
         return "variance understated"
     return "consistent"
+
+
+def _verdict_fields(nis: Array, dimensions: int = 1) -> dict[str, Any]:
+    """Fields of :class:`NisVerdict`."""
+    mean, band = float(np.mean(nis)) / dimensions, nis_band(len(nis), dimensions)
+    return {
+        "count": len(nis),
+        "nis_mean": mean,
+        "nis_band": band,
+        "sigma_factor": float(np.sqrt(1.0 / mean)),
+        "verdict": verdict_of(mean, band),
+    }
 
 
 def autocorrelation(values: Array, lags: int) -> Array:
@@ -147,22 +167,16 @@ def assess(
             "Analyse a longer segment, or log the source at a higher rate.",
         )
     normalised = nu / np.sqrt(s)
-    nis_mean = float(np.mean(normalised**2))
-    band = nis_band(count)
     std = float(np.std(nu, ddof=1))
     bias_t = float(np.sqrt(count) * np.mean(nu) / std)
     lags = min(LJUNG_BOX_LAGS, count // 5)
     r = autocorrelation(normalised, lags)
     q = count * (count + 2) * float(np.sum(r**2 / (count - np.arange(1, lags + 1))))
     return Consistency(
-        count=count,
+        **_verdict_fields(normalised**2),
         innovation_mean_m=float(np.mean(nu)),
         innovation_std_m=std,
         sqrt_s_median_m=float(np.median(np.sqrt(s))),
-        nis_mean=nis_mean,
-        nis_band=band,
-        sigma_factor=float(np.sqrt(1.0 / nis_mean)),
-        verdict=verdict_of(nis_mean, band),
         outside_two_sigma=float(np.mean(np.abs(normalised) > 2.0)),
         outside_gate=float(np.mean(np.abs(normalised) > gate)),
         bias_t=bias_t,
@@ -171,24 +185,6 @@ def assess(
         ljung_box_p=float(chdtrc(lags, q)),
         ljung_box_lags=lags,
     )
-
-
-class HorizontalNis(Record, frozen=True):
-    """NIS of north and east together, two degrees of freedom, divided by two.
-
-    EKF2 logs no covariance between the two, so their correlation is left out for both filters.
-    """
-
-    count: Count
-    nis_mean: Positive
-    nis_band: tuple[NotNegative, NotNegative]
-    sigma_factor: Positive
-    verdict: Verdict
-
-    @property
-    def variance_factor(self) -> float:
-        """How many times S is overstated (above 1) or understated (below 1)."""
-        return 1.0 / self.nis_mean
 
 
 def assess_horizontal(
@@ -207,12 +203,7 @@ def assess_horizontal(
     if len(north[0]) != len(east[0]):
         return None
     usable = (north[1] > 0) & (east[1] > 0) & np.isfinite(north[0]) & np.isfinite(east[0])
-    count = int(np.count_nonzero(usable))
-    if count < MIN_INNOVATIONS:
+    nis = np.sum([nu[usable] ** 2 / s[usable] for nu, s in (north, east)], axis=0)
+    if len(nis) < MIN_INNOVATIONS or not nis.any():
         return None
-    nis = sum(nu[usable] ** 2 / s[usable] for nu, s in (north, east))
-    mean = float(np.mean(nis)) / 2.0
-    if mean == 0.0:
-        return None
-    band = nis_band(count, 2)
-    return HorizontalNis(count, mean, band, float(np.sqrt(1.0 / mean)), verdict_of(mean, band))
+    return HorizontalNis(**_verdict_fields(nis, 2))

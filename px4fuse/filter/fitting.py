@@ -8,18 +8,16 @@ and maximisation, one decision for all axes of a sample, with what *all* data sa
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache
 from math import floor, log
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.special import comb, expit, gammaincinv
+from scipy.special import chdtri, comb, expit
 
 from px4fuse.arrays import Array
-from px4fuse.filter.chain import Chain
-from px4fuse.filter.lanes import MIN_LANES, Lanes, gains, lanes
 from px4fuse.filter.likelihood import Preintegrated
 from px4fuse.filter.marginal import Fitted, Positions, centred, fit, squares
 from px4fuse.filter.model import INITIAL_COVARIANCE
@@ -43,20 +41,6 @@ SLOPE_STEP = 1e-4
 NODES, ROUGH_NODES = (10, 0.25), (6, 0.2)
 # Precision of a start that is known (1/m² and s²/m²): to a micrometre
 KNOWN = 1e12
-
-
-@dataclass(frozen=True)
-class Part:
-    """Axes that are fitted together, with the legs under them, shape (a, T, 1 + c, n)."""
-
-    positions: Positions
-    delta_position_m: Array
-    delta_velocity_m_s: Array
-
-    @cached_property
-    def lanes(self) -> Lanes | None:
-        """The same, stretches side by side, where that can be done."""
-        return lanes(self.positions, self.delta_position_m, self.delta_velocity_m_s)
 
 
 @dataclass(frozen=True)
@@ -87,7 +71,7 @@ class Likelihood:
 
     Parameters
     ----------
-    parts : sequence of Part
+    parts : sequence of Positions
         With one choice of the legs.
     weight : ndarray, shape (m,)
     sigma_z_m : float
@@ -97,10 +81,10 @@ class Likelihood:
     """
 
     def __init__(
-        self, parts: Sequence[Part], weight: Array, sigma_z_m: float, rough: bool = False
+        self, parts: Sequence[Positions], weight: Array, sigma_z_m: float, rough: bool = False
     ) -> None:
         self.parts, self.weight, self.sigma_z_m = parts, weight, sigma_z_m
-        self.tabulated = not any(part.positions.chain.noise_fixed.any() for part in parts)
+        self.tabulated = not any(part.noise_fixed.any() for part in parts)
         self.nodes, self.step = ROUGH_NODES if rough else NODES
         self._fits: dict[int, tuple[Fitted, ...]] = {}
         self._rows: dict[tuple[int, int], Array] = {}
@@ -125,12 +109,12 @@ class Likelihood:
         rows = range(of_ratio, of_ratio + self.nodes)
         new = [row for row in rows if row not in self._fits]
         ratios = np.exp(self.step * np.array(new)).tolist()
-        fits = [of_ratios(part, ratios, 0.0, self.weight, self.sigma_z_m) for part in self.parts]
+        fits = [of_ratios([part], ratios, 0.0, self.weight, self.sigma_z_m) for part in self.parts]
         self._fits |= dict(zip(new, zip(*fits, strict=True), strict=True))
         scales = np.exp(self.step * (of_z + np.arange(self.nodes)))
         for row in rows:
             if (row, of_z) not in self._rows:
-                totals = [fitted.totals(scales)[:, 0] for fitted in self._fits[row]]
+                totals = [each.totals(scales)[:, 0] for each in self._fits[row]]
                 self._rows[row, of_z] = np.sum(totals, axis=0)
         return np.array([self._rows[row, of_z] for row in rows])
 
@@ -151,13 +135,18 @@ def _between(at: float, count: int) -> Array:
 
 
 def of_ratios(
-    part: Part, ratios: Sequence[float], walk: float, weight: Array, sigma_z_m: float
+    blocks: Iterable[Positions],
+    ratios: Sequence[float],
+    walk: float,
+    weight: Array,
+    sigma_z_m: float,
 ) -> list[Fitted]:
     """Fit with noises over SIGMA_Z; what is fixed is taken at a SIGMA_Z.
 
     Parameters
     ----------
-    part : Part
+    blocks : iterable of Positions
+        The same ones at other clock offsets.
     ratios : sequence of float
         SIGMA_A / SIGMA_Z, 1/s².
     walk : float
@@ -165,33 +154,24 @@ def of_ratios(
     weight : ndarray, shape (m,)
     sigma_z_m : float
     """
-    positions, variance = over_sigma_z(part.positions, walk, weight, sigma_z_m)
-    legs = part.delta_position_m, part.delta_velocity_m_s
-    axes, signals = legs[0].shape[:2]
-    many = len(ratios) * len(positions.start) * axes * signals >= MIN_LANES
-    if many and part.lanes is not None:
-        return part.lanes.fit(gains(positions, ratios, variance))
-    return [fit(positions, *legs, ratio, variance) for ratio in ratios]
+    scaled = (positions.over(sigma_z_m, walk, weight) for positions in blocks)
+    fits = [[fit(few, ratio, variance) for ratio in ratios] for few, variance in scaled]
+    return [
+        replace(of_one[0], gram=np.concatenate([each.gram for each in of_one], axis=1))
+        for of_one in zip(*fits, strict=True)
+    ]
 
 
-def over_sigma_z(
-    positions: Positions, walk: float, weight: Array, sigma_z_m: float
-) -> tuple[Positions, Array]:
-    """Positions and variances over SIGMA_Z; what is fixed is taken at a SIGMA_Z.
+def fitted(blocks: Iterable[Positions], noises: Noises, weight: Array) -> Fitted:
+    """Fit with some noises and weights."""
+    sigma = noises.sigma_z_m
+    ratio, walk = noises.sigma_a_m_s2 / sigma, noises.walk_m / sigma
+    return of_ratios(blocks, [ratio], walk, weight, sigma)[0].scaled(sigma)
 
-    Parameters
-    ----------
-    positions : Positions
-    walk, weight, sigma_z_m
-        As :func:`of_ratios` takes them.
-    """
-    chain = positions.chain
-    fixed = chain.noise_fixed / sigma_z_m**2
-    chain = replace(chain, noise_fixed=fixed + np.outer(chain.length_s * walk**2, [1.0, 0.0, 0.0]))
-    positions = replace(positions, chain=chain, initial=positions.initial * sigma_z_m**2)
-    # the filter's start is not measured
-    extra = np.ones(len(positions.measurement_m) - len(weight))
-    return positions, 1.0 / np.concatenate([extra, weight])
+
+def negative_log_likelihood(parts: Sequence[Positions], noises: Noises, weight: Array) -> float:
+    """-ln p of the measurements of all parts but for a constant."""
+    return float(sum(fitted([part], noises, weight).totals()[0, 0] for part in parts))
 
 
 @dataclass(frozen=True)
@@ -219,66 +199,39 @@ class NoiseFit:
     widening: float
 
 
-def filter_part(legs: Preintegrated) -> Part:
+def filter_part(legs: Preintegrated) -> Positions:
     """The lesson's filter of one axis: its constants are the errors of its start, with P₀."""
     count = len(legs.measurement_m)
     initial = np.zeros((count + 1, 2))
     initial[0] = KNOWN
     measured = np.concatenate([[np.nan], legs.measurement_m - legs.initial.position_m])[:, None]
-    chain = Chain(np.arange(1, count + 1), legs.length_s, legs.noise_unit, legs.noise_fixed)
-    sigma = np.sqrt([INITIAL_COVARIANCE[0], INITIAL_COVARIANCE[2]])
-    positions = Positions(chain, measured, np.array([0]), initial, sigma)
     dp, dv = np.zeros((2, 1, 1, 3, count))
     dp[0, 0, 0], dv[0, 0, 0] = legs.delta_position_m, legs.delta_velocity_m_s
     # an error of the start moves the first leg
     dp[0, 0, 1:, 0], dv[0, 0, 2, 0] = (1.0, legs.length_s[0]), 1.0
-    return Part(*centred(positions, dp, dv))
-
-
-def negative_log_likelihood(parts: Sequence[Part], noises: Noises, weight: Array) -> float:
-    """-ln p of the measurements but for a constant.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-    noises : Noises
-    weight : ndarray, shape (m,)
-    """
-    return float(sum(fitted(part, noises, weight).total()[0] for part in parts))
-
-
-def fitted(part: Part, noises: Noises, weight: Array) -> Fitted:
-    """Fit a part with some noises and weights."""
-    sigma = noises.sigma_z_m
-    ratio, walk = noises.sigma_a_m_s2 / sigma, noises.walk_m / sigma
-    return of_ratios(part, [ratio], walk, weight, sigma)[0].scaled(sigma)
-
-
-def arguments(
-    part: Part, noises: Noises, weight: Array
-) -> tuple[Positions, Array, Array, float, Array]:
-    """What :func:`px4fuse.filter.marginal.fit` takes."""
-    variance = noises.sigma_z_m**2 / weight
-    positions = part.positions
-    extra = len(positions.measurement_m) - len(variance)
-    if extra:  # the filter's start, which is not measured
-        variance = np.concatenate([np.ones(extra), variance])
-    if noises.walk_m:
-        chain = positions.chain
-        walk = np.outer(chain.length_s * noises.walk_m**2, [1.0, 0.0, 0.0])
-        positions = replace(positions, chain=replace(chain, noise_fixed=chain.noise_fixed + walk))
-    legs = part.delta_position_m, part.delta_velocity_m_s
-    return positions, *legs, noises.sigma_a_m_s2, variance
+    return centred(
+        Positions(
+            measurement_m=measured,
+            start=np.array([0]),
+            length_s=legs.length_s,
+            noise_unit=legs.noise_unit.T,
+            noise_fixed=legs.noise_fixed.T,
+            initial=initial,
+            constant_sigma=np.sqrt([INITIAL_COVARIANCE[0], INITIAL_COVARIANCE[2]]),
+            delta_position_m=dp,
+            delta_velocity_m_s=dv,
+        )
+    )
 
 
 def most_likely(
-    parts: Sequence[Part], start: Noises, weight: Array, outliers: bool = True
+    parts: Sequence[Positions], start: Noises, weight: Array, outliers: bool = True
 ) -> NoiseFit:
     """Fit the noises, and find the outliers.
 
     Parameters
     ----------
-    parts : sequence of Part
+    parts : sequence of Positions
         With the same measurements.
     start : Noises
         To start with. A walk is fitted where this one is not zero.
@@ -294,7 +247,7 @@ def most_likely(
         noises = _maximise(likelihood, noises, ROUGH_STEPS if again else MAX_STEPS)
         square, count = _squares(parts, noises, weight)
         # outliers raise the noise that hides them: the median does not follow them
-        bulk = float(np.median(square / count) / (chi_square_median(count[0]) / count[0]))
+        bulk = float(np.median(square / count) / (chdtri(count[0], 0.5) / count[0]))
         if bulk > SIGMA_Z_SEARCH_M[1] ** 2:  # noise beyond the search is not outliers
             break
         variance = min(noises.sigma_z_m**2, BULK**2 * bulk)
@@ -319,24 +272,15 @@ def most_likely(
     return NoiseFit(noises, weight, outlier, likelihood, widening)
 
 
-def _squares(parts: Sequence[Part], noises: Noises, weight: Array) -> tuple[Array, Array]:
-    found = [
-        squares(
-            *arguments(part, noises, weight),
-            fitted(part, noises, weight).constants()[0][:, 0],
-        )
-        for part in parts
-    ]
-    size = len(weight)
-    return (
-        np.sum([square[-size:] for square, _ in found], axis=0),
-        np.sum([count[-size:] for _, count in found], axis=0),
-    )
-
-
-def chi_square_median(freedom: float) -> float:
-    """Median of chi-square."""
-    return 2.0 * float(gammaincinv(freedom / 2.0, 0.5))
+def _squares(parts: Sequence[Positions], noises: Noises, weight: Array) -> tuple[Array, Array]:
+    """:func:`squares` of all parts together, at the most likely constants."""
+    found = []
+    for part in parts:
+        constants = fitted([part], noises, weight).constants()[:, 0]
+        own, variance = part.over(1.0, noises.walk_m, weight / noises.sigma_z_m**2)
+        found.append(squares(own, noises.sigma_a_m_s2, variance, constants))
+    square, count = np.sum(found, axis=0)[:, -len(weight) :]
+    return square, count
 
 
 def _outlier_probability(square: Array, count: Array, share: float, width: float) -> Array:

@@ -11,9 +11,8 @@ Whether it walks is told by the likelihood ratio.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import product
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -26,13 +25,7 @@ from px4fuse.filter.model import INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, noise_o
 from px4fuse.filter.motion import MAX_IMU_INTERVAL_S
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import IMU_GAP_S, Segment, ned_acceleration, within
-from px4fuse.flight import (
-    POSITION_COLUMNS,
-    QUATERNION_COLUMNS,
-    Flight,
-    PositionTrack,
-    Unavailable,
-)
+from px4fuse.flight import POSITION_COLUMNS, QUATERNION_COLUMNS, Flight, PositionTrack, Unavailable
 from px4fuse.record import NotNegative, Record, Share
 
 PART_S = 2.0
@@ -55,8 +48,8 @@ SMALL_TURN_RAD = 0.01
 STATE_COUNT = 7
 TURN = 6
 CROSSED = np.array([[1.0, -1.0], [-1.0, 1.0]])
-INITIAL_SIGMA_BIAS_M_S2 = 0.3
-INITIAL_SIGMA_TURN_RAD = 0.6
+# Of the start: position (m), velocity (m/s), acceleration's error (m/s²) and turn (rad)
+INITIAL_SIGMAS = np.repeat([INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, 0.3, 0.6], [2, 2, 2, 1])
 GAP_SIGMA = 5.0  # m and m/s, over a gap of the IMU
 # Walks over one second: of the turn (rad; none first), of the acceleration's error (m/s²), and
 # SIGMA_A (m/s²)
@@ -231,64 +224,55 @@ def _by_orientation(
     return turned(parts, float(chdtrc(len(parts) - 1, square)), "orientation")
 
 
-@dataclass(frozen=True)
-class _Legs:
-    """What the acceleration adds between measurements, and F and Q without the turn.
-
-    ``moved`` has shape (n, 4): north and east of position (m), then of velocity (m/s).
-    """
-
-    moved: Array
-    dt_s: Array
-    gap: Array
-
-
 def _by_positions(
     acceleration: pd.DataFrame, samples: pd.DataFrame, dt_s: float, sigma_z: float
 ) -> HeadingError:
+    """The turn as a state that may walk, by the most likely of some walks and noises."""
     time, measured = samples.index.to_numpy(), samples.to_numpy()
     legs = _legs(acceleration, time)
     grid = np.array(list(product(TURN_WALKS, BIAS_WALKS, SIGMA_AS)))
-    still = grid[grid[:, 0] == 0.0]
-
+    still = grid[:, 0] == 0.0
     turn = 0.0
     for _ in range(LINEARISATIONS):
-        run = _filter(legs, measured, turn, still, sigma_z, dt_s)
-        step = float(run.last[np.argmax(run.log_p), TURN])
+        log_p, _, steps = _filter(legs, measured, turn, grid[still], sigma_z, dt_s)
+        step = float(steps[-1].x[np.argmax(log_p), TURN])
         turn += step
         if abs(step) < SMALL_TURN_RAD:
             break
     turn = float(np.angle(np.exp(1j * turn)))
-    run = _filter(legs, measured, turn, grid, sigma_z, dt_s)
-    best = int(np.argmax(run.log_p))
-    ratio = 2.0 * (run.log_p[best] - run.log_p[grid[:, 0] == 0.0].max())
-    smoothed, sigma = _smooth(run, measured, best)
+    log_p, scale, steps = _filter(legs, measured, turn, grid, sigma_z, dt_s)
+    best = int(np.argmax(log_p))
+    ratio = 2.0 * (log_p[best] - log_p[still].max())
+    smoothed, variance = _smooth(steps, best)
     # at the end of its range a walk is half of the time none
     p = 0.5 * float(chdtrc(1, ratio)) if ratio > 0.0 else 1.0
+    sigma = np.sqrt(scale[best] * np.maximum(variance, 0.0))
     return turned(_parts(time, turn + smoothed, sigma), p, "positions")
 
 
-def _legs(acceleration: pd.DataFrame, time: Array) -> _Legs:
+def _legs(acceleration: pd.DataFrame, time: Array) -> tuple[Array, Array, Array]:
+    """What the acceleration adds between measurements; how long that is; whether the IMU was there.
+
+    The first has shape (n, 4): north and east of position (m), then of velocity (m/s).
+    """
     known, value = acceleration.index.to_numpy(), acceleration.to_numpy()[:, :2]
     speed = cumulative_integral(value, known)
-    way = cumulative_integral(speed, known)
-    v, p = (
-        np.column_stack([np.interp(time, known, one) for one in both.T]) for both in (speed, way)
-    )
+    both = np.hstack([speed, cumulative_integral(speed, known)])
+    both = np.column_stack([np.interp(time, known, one) for one in both.T])
     dt = np.diff(time)
     gaps = np.concatenate([[0.0], np.cumsum(np.diff(known) > IMU_GAP_S)])
     passed = np.diff(np.interp(time, known, gaps)) > 0.0
-    moved = np.hstack([np.diff(p, axis=0) - v[:-1] * dt[:, None], np.diff(v, axis=0)])
-    return _Legs(moved, dt, passed)
+    change = np.diff(both, axis=0)
+    return np.hstack([change[:, 2:] - both[:-1, :2] * dt[:, None], change[:, :2]]), dt, passed
 
 
-def _transitions(legs: _Legs, turn: float) -> tuple[Array, Array]:
+def _transitions(moved: Array, dt_s: Array, turn: float) -> tuple[Array, Array]:
     """F and the input of every leg, the rotation to first order about ``turn``."""
-    count, dt = len(legs.dt_s), legs.dt_s[:, None, None]
+    count, dt = len(dt_s), dt_s[:, None, None]
     cosine, sine = np.cos(turn), np.sin(turn)
     rotation = np.array([[cosine, -sine], [sine, cosine]])
     slope = np.array([[-sine, -cosine], [cosine, -sine]])
-    moved = legs.moved.reshape(count, 2, 2)
+    moved = moved.reshape(count, 2, 2)
     F = np.tile(np.eye(STATE_COUNT), (count, 1, 1))
     F[:, :2, 2:4] = F[:, 2:4, 4:6] = dt * np.eye(2)
     F[:, :2, 4:6] = dt**2 / 2.0 * np.eye(2)
@@ -298,11 +282,11 @@ def _transitions(legs: _Legs, turn: float) -> tuple[Array, Array]:
     return F, push
 
 
-def _noise(legs: _Legs, noises: Array, dt_s: float) -> Array:
+def _noise(dt_s: Array, gap: Array, noises: Array, dt_of_sigma_s: float) -> Array:
     """Q of every leg for each of k settings, shape (n, k, 7, 7)."""
     position, velocity, bias = (slice(axis, axis + 2) for axis in (0, 2, 4))
     pair, count = np.eye(2), len(noises)
-    level = (noises[:, 2] ** 2 * dt_s)[:, None, None] * pair
+    level = (noises[:, 2] ** 2 * dt_of_sigma_s)[:, None, None] * pair
     # of each: what is added for one of q00, q01, q11, a second and a gap
     of_00, of_01, of_11, of_second, of_gap = made = np.zeros((5, count, STATE_COUNT, STATE_COUNT))
     of_00[:, position, position] = of_11[:, velocity, velocity] = level
@@ -310,82 +294,71 @@ def _noise(legs: _Legs, noises: Array, dt_s: float) -> Array:
     of_second[:, bias, bias] = (noises[:, 1] ** 2)[:, None, None] * pair
     of_second[:, TURN, TURN] = noises[:, 0] ** 2
     of_gap[:, position, position] = of_gap[:, velocity, velocity] = GAP_SIGMA**2 * pair
-    amounts = np.stack([*noise_of_many_steps(legs.dt_s), legs.dt_s, legs.gap], axis=1)
+    amounts = np.stack([*noise_of_many_steps(dt_s), dt_s, gap], axis=1)
     return np.asarray((amounts @ made.reshape(5, -1)).reshape(-1, *made.shape[1:]))
 
 
-def _start(measured: Array, count: int) -> tuple[Array, Array]:
-    x = np.zeros((count, STATE_COUNT))
-    x[:, :2] = measured[0]
-    sigmas = np.repeat(
-        [INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, INITIAL_SIGMA_BIAS_M_S2, INITIAL_SIGMA_TURN_RAD],
-        [2, 2, 2, 1],
-    )
-    return x, np.broadcast_to(np.diag(sigmas**2), (count, STATE_COUNT, STATE_COUNT)).copy()
+class _Step(NamedTuple):
+    """F of one leg, and the states and covariances of k filters before and after their update."""
 
-
-@dataclass(frozen=True)
-class _Run:
-    """What k filters with other noises made of the measurements.
-
-    Attributes
-    ----------
-    log_p : ndarray, shape (k,)
-        With the best scale of all noises.
-    scale : ndarray, shape (k,)
-        That scale, of their variances.
-    last : ndarray, shape (k, 7)
-        The last state.
-    steps : list
-        Of every step F, prior states and covariances, and posterior ones.
-    """
-
-    log_p: Array
-    scale: Array
-    last: Array
-    steps: list[tuple[Array, Array, Array, Array, Array]]
+    F: Array
+    x_prior: Array
+    P_prior: Array
+    x: Array
+    P: Array
 
 
 def _filter(
-    legs: _Legs, measured: Array, turn: float, noises: Array, sigma_z: float, dt_s: float
-) -> _Run:
-    x, P = _start(measured, len(noises))
-    square, log_s = np.zeros(len(noises)), np.zeros(len(noises))
-    steps = []
+    legs: tuple[Array, Array, Array],
+    measured: Array,
+    turn: float,
+    noises: Array,
+    sigma_z: float,
+    dt_s: float,
+) -> tuple[Array, Array, list[_Step]]:
+    """Ln p of k filters with the best scale of all noises, that of the variances, and all steps.
+
+    The first step is the start.
+    """
+    moved, length, gap = legs
+    count = len(noises)
+    x = np.zeros((count, STATE_COUNT))
+    x[:, :2] = measured[0]
+    P = np.tile(np.diag(INITIAL_SIGMAS**2), (count, 1, 1))
+    steps = [_Step(np.eye(STATE_COUNT), x, P, x, P)]
+    square, log_s = np.zeros(count), np.zeros(count)
     R = sigma_z**2 * np.eye(2)
-    each = zip(*_transitions(legs, turn), _noise(legs, noises, dt_s), strict=True)
-    for k, (F, push, Q) in enumerate(each):
-        x = x @ F.T + push
-        P = F @ P @ F.T + Q
-        prior = x, P
-        S = P[:, :2, :2] + R
+    F_of, push_of = _transitions(moved, length, turn)
+    for z, F, push, Q in zip(
+        measured[1:], F_of, push_of, _noise(length, gap, noises, dt_s), strict=True
+    ):
+        x_prior, P_prior = x @ F.T + push, F @ P @ F.T + Q
+        S = P_prior[:, :2, :2] + R
         # S⁻¹ of two rows and columns, written out
         determinant = S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] ** 2
         inverse = S[:, ::-1, ::-1] * CROSSED / determinant[:, None, None]
-        gain = np.swapaxes(P[:, :2, :], 1, 2) @ inverse
-        nu = (measured[k + 1] - x[:, :2])[..., None]
-        square += (np.swapaxes(nu, 1, 2) @ inverse @ nu)[:, 0, 0]
+        K = np.swapaxes(P_prior[:, :2, :], 1, 2) @ inverse
+        y = (z - x_prior[:, :2])[..., None]
+        square += (np.swapaxes(y, 1, 2) @ inverse @ y)[:, 0, 0]
         log_s += np.log(determinant)
-        x = x + (gain @ nu)[..., 0]
-        P = P - gain @ P[:, :2, :]
+        x = x_prior + (K @ y)[..., 0]
+        P = P_prior - K @ P_prior[:, :2, :]
         P = (P + np.swapaxes(P, 1, 2)) / 2.0
-        steps.append((F, *prior, x, P))
-    count = 2 * len(legs.dt_s)
-    scale = square / count
-    return _Run(-0.5 * (count * np.log(scale) + log_s), scale, x, steps)
+        steps.append(_Step(F, x_prior, P_prior, x, P))
+    size = 2 * len(length)
+    scale = square / size
+    return -0.5 * (size * np.log(scale) + log_s), scale, steps
 
 
-def _smooth(run: _Run, measured: Array, which: int) -> tuple[Array, Array]:
-    """Turn at every measurement by all of them, and its standard deviation (Rauch et al. 1965)."""
-    x, P = _start(measured, 1)
-    before = [(x[0], P[0]), *((step[3][which], step[4][which]) for step in run.steps)]
-    state, covariance = before[-1]
-    turns, variances = [state[TURN]], [covariance[TURN, TURN]]
-    for (x_k, P_k), (F, prior, spread, _, _) in zip(before[-2::-1], run.steps[::-1], strict=True):
-        gain = np.linalg.solve(spread[which], F @ P_k).T
-        state = x_k + gain @ (state - prior[which])
-        covariance = P_k + gain @ (covariance - spread[which]) @ gain.T
-        turns.append(state[TURN])
-        variances.append(covariance[TURN, TURN])
-    variance = run.scale[which] * np.maximum(np.array(variances[::-1]), 0.0)
-    return np.array(turns[::-1]), np.sqrt(variance)
+def _smooth(steps: list[_Step], which: int) -> tuple[Array, Array]:
+    """Turn at every measurement by all of them, and its variance (Rauch et al. 1965)."""
+    state, covariance = steps[-1].x[which], steps[-1].P[which]
+    found = [(state[TURN], covariance[TURN, TURN])]
+    for now, after in zip(steps[-2::-1], steps[:0:-1], strict=True):
+        P_prior, P = after.P_prior[which], now.P[which]
+        gain = np.linalg.solve(P_prior, after.F @ P).T
+        state = now.x[which] + gain @ (state - after.x_prior[which])
+        covariance = P + gain @ (covariance - P_prior) @ gain.T
+        found.append((state[TURN], covariance[TURN, TURN]))
+    turn, variance = np.array(found[::-1]).T
+    return turn, variance

@@ -14,28 +14,21 @@ in variables): what remains is weighed by the variance that it has at each scale
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 from scipy import constants
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
-from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.filter.banded import driven
-from px4fuse.filter.likelihood import Preintegrated, moved, preintegrate, recursion
+from px4fuse.arrays import Array, BoolArray, IntArray, cumulative_integral
+from px4fuse.filter.likelihood import Preintegrated, innovations_of_signals, moved, preintegrate
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import (
-    Acceleration,
-    Axis,
-    Segment,
-    ned_acceleration,
-    project_acceleration,
-    step_means,
-)
+from px4fuse.filter.signals import Axis, ned_acceleration
 from px4fuse.filter.steps import Timeline, timeline
 from px4fuse.flight import AXIS_NAMES, QUATERNION_COLUMNS, Flight, Unavailable
 
@@ -57,60 +50,29 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class HypothesisSignals:
-    """Signals of one axis, of which the first is what was measured, the others columns.
-
-    Attributes
-    ----------
-    position_m, velocity_m_s : ndarray, shape (m, k)
-        What the acceleration of each adds between consecutive measurements.
-    measured_m : ndarray, shape (m, k)
-    start_m : ndarray, shape (k,)
-    """
-
-    position_m: Array
-    velocity_m_s: Array
-    measured_m: Array
-    start_m: Array
-
-
-@dataclass(frozen=True)
-class Whitened:
-    """Innovations over √S of some axes, each of which most columns are not about.
-
-    Attributes
-    ----------
-    data : tuple of ndarray, shape (n,)
-        Of each axis.
-    columns : tuple of ndarray, shape (n, k)
-        Those that are about it.
-    which : tuple of ndarray of int, shape (k,)
-        Which of all columns these are.
-    log_s : float
-        Σ ln S over all.
-    """
-
-    data: tuple[Array, ...]
-    columns: tuple[Array, ...]
-    which: tuple[IntArray, ...]
-    log_s: float
-
-    def rest(self, coefficients: Array) -> list[Array]:
-        """What the columns, so many times each, leave of the data of each axis."""
-        return [
-            data - columns @ coefficients[which]
-            for data, columns, which in zip(self.data, self.columns, self.which, strict=True)
-        ]
-
-
-@dataclass(frozen=True)
 class HypothesisFit:
-    """Generalised least squares: coefficients, their covariance, and what remains.
+    """Generalised least squares of whitened innovations on their columns.
 
-    ``square`` is the sum of squares that remains, ``spread`` their root mean, 1 where the noises
-    are right, and ``score`` the restricted negative log-likelihood.
+    Attributes
+    ----------
+    columns : ndarray, shape (n, k)
+        Of all axes, one after the other.
+    axis : ndarray of int, shape (n,)
+        Which axis each row is of.
+    rest : ndarray, shape (n,)
+        What the columns leave of the innovations.
+    coefficients, covariance : ndarray, shape (k,) and (k, k)
+    square : float
+        Sum of squares that remains, what the prior adds included.
+    score : float
+        Restricted negative log-likelihood.
+    spread : float
+        Root mean square that remains, 1 where the noises are right.
     """
 
+    columns: Array
+    axis: IntArray
+    rest: Array
     coefficients: Array
     covariance: Array
     square: float
@@ -123,90 +85,54 @@ class HypothesisFit:
         return Estimate(float(self.coefficients[column]), sigma)
 
 
-def gains(
-    legs: Preintegrated, sigma_a: float, sigma_z: float, skip: BoolArray
-) -> tuple[Array, Array]:
-    """S, shape (m,), and K, shape (m, 2), of a filter; K is zero for what is not fused.
-
-    Parameters
-    ----------
-    legs : Preintegrated
-        Of the axis: its lengths and noises are used.
-    sigma_a, sigma_z : float
-        m/s² and m.
-    skip : ndarray of bool, shape (m,)
-        Measurements that are not fused.
-    """
-    made = np.array(
-        [
-            (s, k0, covariance[1] / sigma_z**2)
-            for _, s, k0, _, _, covariance in recursion(legs, sigma_a, sigma_z, skip)
-        ]
-    )
-    return made[:, 0], np.where(skip[:, None], 0.0, made[:, 1:])
-
-
-def respond(legs: Preintegrated, signals: HypothesisSignals, s: Array, gain: Array) -> Array:
-    """Innovations over √S of many signals, all by the gains of one filter, shape (m, k).
-
-    Parameters
-    ----------
-    legs : Preintegrated
-        Of the axis: its lengths are used.
-    signals : HypothesisSignals
-        k of them.
-    s, gain : ndarray
-        As :func:`gains` returns them.
-    """
-    start = np.stack([signals.start_m, np.zeros_like(signals.start_m)])
-    pushed = signals.position_m, signals.velocity_m_s
-    prior, _ = driven(legs.length_s, gain, *pushed, signals.measured_m, start)
-    return (signals.measured_m - prior) / np.sqrt(s)[:, None]
-
-
-def fit(white: Whitened, prior: Array) -> HypothesisFit:
+def fit(data: Array, columns: Array, axis: IntArray, prior: Array, log_s: float) -> HypothesisFit:
     """Regress whitened innovations on their columns.
 
     Parameters
     ----------
-    white : Whitened
+    data : ndarray, shape (n,)
+    columns, axis
+        As :class:`HypothesisFit` has them.
     prior : ndarray, shape (k,)
         Standard deviation of each coefficient before the data, infinite where nothing is known.
+    log_s : float
+        Σ ln S over all.
     """
-    information, moment = np.diag(prior**-2.0), np.zeros(len(prior))
-    for y, X, which in zip(white.data, white.columns, white.which, strict=True):
-        information[np.ix_(which, which)] += X.T @ X
-        moment[which] += X.T @ y
+    information = np.diag(prior**-2.0) + columns.T @ columns
     # a column that nothing excites (a turn in hover) must not stop the others
     information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(len(prior))
+    moment = columns.T @ data
     factor = cho_factor(information)
     covariance = cho_solve(factor, np.eye(len(prior)))
     coefficients = covariance @ moment
-    square = float(sum(y @ y for y in white.data) - coefficients @ moment)
-    log_determinant = float(np.sum(np.log(np.diag(factor[0]))))
+    square = float(data @ data - coefficients @ moment)
     return HypothesisFit(
+        columns,
+        axis,
+        data - columns @ coefficients,
         coefficients,
         covariance,
         square,
-        0.5 * (square + white.log_s) + log_determinant,
-        float(np.sqrt(max(square, 0.0) / max(sum(map(len, white.data)) - CONSTANTS, 1))),
+        0.5 * (square + log_s) + float(np.sum(np.log(np.diag(factor[0])))),
+        float(np.sqrt(max(square, 0.0) / max(len(data) - CONSTANTS, 1))),
     )
 
 
 @dataclass(frozen=True)
-class Lines:
+class Hypotheses:
     """Axes with their columns: what every hypothesis is fitted on.
 
     Attributes
     ----------
     time_s : ndarray, shape (m,)
         Of the measurements, as they were stamped.
-    legs, signals : tuple of Preintegrated and of HypothesisSignals
-        Of each axis.
-    hats : HypothesisSignals
-        Slow accelerations, the same for each axis, but with coefficients for each.
+    legs : tuple of Preintegrated
+        Of each axis, with several signals: what was measured, then what each constant adds.
+    hats : (ndarray, ndarray), shape (m, h)
+        Position and velocity that slow accelerations add, with coefficients of their own for each
+        axis.
     prior : ndarray, shape (k,)
-        Standard deviations of the columns' coefficients before the data.
+        Standard deviations of the columns' coefficients before the data, steps left out.
     sigma_z_m : float
     steps : ndarray, shape (m, j)
         Added to the measurements, in j more columns for each axis.
@@ -214,99 +140,59 @@ class Lines:
 
     time_s: Array
     legs: tuple[Preintegrated, ...]
-    signals: tuple[HypothesisSignals, ...]
-    hats: HypothesisSignals
+    hats: tuple[Array, Array]
     prior: Array
     sigma_z_m: float
     steps: Array
 
+    def respond(self, axis: int, added: Array, sigma_a: float, skip: BoolArray) -> Array:
+        """Whitened innovations of one axis to signals that only its measurements have, (m, k)."""
+        still = np.zeros_like(added)
+        own = _with_signals(self.legs[axis], still, still, added)
+        nu, s = innovations_of_signals(own, sigma_a, self.sigma_z_m, skip)
+        return np.asarray((nu / np.sqrt(s)[:, None])[~skip])
+
     def fit(self, sigma_a: float, skip: BoolArray, scale: float = 1.0) -> HypothesisFit:
-        """Fit all columns."""
-        return fit(self.whiten(sigma_a, skip, scale), self.priors)
+        """Fit all columns, with the acceleration (and its noise) scaled.
 
-    @property
-    def priors(self) -> Array:
-        """Of all columns, those of the steps included."""
-        return np.append(self.prior, np.full(len(self.legs) * self.steps.shape[1], np.inf))
-
-    def whiten(self, sigma_a: float, skip: BoolArray, scale: float = 1.0) -> Whitened:
-        """Whitened innovations with the acceleration (and its noise) scaled."""
-        width, extra = len(self.prior), self.steps.shape[1]
-        own_hats = len(self.hats.start_m)
-        signals = [_scaled(each, scale) for each in self.signals]
-        # the same for every axis
-        shared = _joined([self.hats, _measured(self.steps)])
-        data, columns, which, log_s = [], [], [], 0.0
-        for at, (normalised, s) in enumerate(
-            respond_each(self.legs, signals, shared, scale * sigma_a, self.sigma_z_m, skip)
-        ):
-            own = normalised[~skip]
-            first, step = CONSTANTS + own_hats * at, width + extra * at
-            data.append(own[:, 0])
-            columns.append(own[:, 1:])
-            which.append(np.r_[:CONSTANTS, first : first + own_hats, step : step + extra])
+        Parameters
+        ----------
+        sigma_a : float
+        skip : ndarray of bool, shape (m,)
+            Measurements that are neither fused nor fitted.
+        scale : float
+        """
+        hats, steps, axes = self.hats[0].shape[1], self.steps.shape[1], len(self.legs)
+        width = len(self.prior)
+        kept = np.count_nonzero(~skip)
+        data = np.empty((axes, kept))
+        columns = np.zeros((axes, kept, width + axes * steps))
+        log_s = 0.0
+        for at, legs in enumerate(self.legs):
+            # acceleration in the source's own length: of what was measured, and of a turn of it
+            factor = np.ones(1 + CONSTANTS)
+            factor[[0, 1 + TURN]] = scale
+            still = np.zeros_like(self.hats[0])
+            signals = (
+                [factor * legs.delta_position_m, self.hats[0], 0.0 * self.steps],
+                [factor * legs.delta_velocity_m_s, self.hats[1], 0.0 * self.steps],
+                [legs.measurement_m, still, self.steps],
+            )
+            own = _with_signals(legs, *map(np.hstack, signals))
+            nu, s = innovations_of_signals(own, scale * sigma_a, self.sigma_z_m, skip)
+            normalised = (nu / np.sqrt(s)[:, None])[~skip]
+            data[at] = normalised[:, 0]
+            first, step = CONSTANTS + hats * at, width + steps * at
+            which = np.r_[:CONSTANTS, first : first + hats, step : step + steps]
+            columns[at][:, which] = normalised[:, 1:]
             log_s += float(np.sum(np.log(s[~skip])))
-        return Whitened(tuple(data), tuple(columns), tuple(which), log_s)
+        prior = np.append(self.prior, np.full(axes * steps, np.inf))
+        axis = np.repeat(np.arange(axes), kept)
+        return fit(data.ravel(), columns.reshape(axes * kept, -1), axis, prior, log_s)
 
 
-def respond_each(
-    legs: Sequence[Preintegrated],
-    signals: Sequence[HypothesisSignals],
-    shared: HypothesisSignals,
-    sigma_a: float,
-    sigma_z: float,
-    skip: BoolArray,
-) -> list[tuple[Array, Array]]:
-    """:func:`respond` of each axis to its own signals, then to those that all axes share.
-
-    Axes with the same legs go through one filter together.
-    """
-    if not same_gains(legs):
-        made = [gains(leg, sigma_a, sigma_z, skip) for leg in legs]
-        return [
-            (respond(leg, _joined([each, shared]), *own), own[0])
-            for leg, each, own in zip(legs, signals, made, strict=True)
-        ]
-    s, gain = gains(legs[0], sigma_a, sigma_z, skip)
-    normalised = respond(legs[0], _joined([*signals, shared]), s, gain)
-    widths = np.cumsum([len(each.start_m) for each in signals])
-    *own_parts, of_shared = np.split(normalised, widths, axis=1)
-    return [(np.hstack([own, of_shared]), s) for own in own_parts]
-
-
-def same_gains(legs: Sequence[Preintegrated]) -> bool:
-    """Whether the filters of some axes have the same gains."""
-    return all(
-        np.array_equal(getattr(legs[0], name), getattr(each, name))
-        for each in legs[1:]
-        for name in ("length_s", "noise_unit", "noise_fixed")
-    )
-
-
-def _scaled(signals: HypothesisSignals, scale: float) -> HypothesisSignals:
-    """Acceleration in the source's own length: of what was measured, and of a turn of it."""
-    factor = np.ones(signals.position_m.shape[1])
-    factor[[0, 1 + TURN]] = scale
-    return replace(
-        signals,
-        position_m=signals.position_m * factor,
-        velocity_m_s=signals.velocity_m_s * factor,
-    )
-
-
-def _joined(signals: Sequence[HypothesisSignals]) -> HypothesisSignals:
-    return HypothesisSignals(
-        np.hstack([each.position_m for each in signals]),
-        np.hstack([each.velocity_m_s for each in signals]),
-        np.hstack([each.measured_m for each in signals]),
-        np.hstack([each.start_m for each in signals]),
-    )
-
-
-def _measured(added: Array) -> HypothesisSignals:
-    """Signals that only the measurements have."""
-    still = np.broadcast_to(0.0, added.shape)
-    return HypothesisSignals(still, still, added, np.zeros(added.shape[1]))
+def _with_signals(legs: Preintegrated, dp: Array, dv: Array, measured_m: Array) -> Preintegrated:
+    return replace(legs, delta_position_m=dp, delta_velocity_m_s=dv, measurement_m=measured_m)
 
 
 def too_few(count: int) -> Unavailable:
@@ -318,14 +204,13 @@ def too_few(count: int) -> Unavailable:
     )
 
 
-def lines_of(
+def hypotheses_of(
     flight: Flight,
     axes: tuple[Axis, ...],
-    segment: Segment,
     settings: Settings,
     sigma_z: float,
     clock_offset_s: float,
-) -> Lines | Unavailable:
+) -> Hypotheses | Unavailable:
     """Lay out the axes with the columns that every hypothesis is fitted beside.
 
     Parameters
@@ -333,7 +218,6 @@ def lines_of(
     flight : Flight
     axes : tuple of Axis
         Horizontal, with the same measurement times.
-    segment : Segment
     settings : Settings
         ``dt_s`` gives SIGMA_A its meaning.
     sigma_z : float
@@ -341,55 +225,50 @@ def lines_of(
     clock_offset_s : float
         Added to the stamps first.
     """
-    acceleration = ned_acceleration(flight)
-    if isinstance(acceleration, Unavailable):
-        return acceleration
-    if isinstance(axes[0].acceleration, Unavailable):
-        return axes[0].acceleration
-    if isinstance(flight.attitude, Unavailable):
-        return flight.attitude
+    acceleration, attitude = ned_acceleration(flight), flight.attitude
+    for needed in (acceleration, axes[0].acceleration, attitude):
+        if isinstance(needed, Unavailable):
+            return needed
+    assert isinstance(acceleration, pd.DataFrame)
+    assert isinstance(attitude, pd.DataFrame)
     if len(axes[0].measurement_time_s) <= MIN_MEASUREMENTS:
         return too_few(len(axes[0].measurement_time_s))
     shifted = [
         replace(axis, measurement_time_s=axis.measurement_time_s + clock_offset_s) for axis in axes
     ]
     settings = replace(settings, input="imu")
-    legs = tuple(preintegrate(axis, settings) for axis in shifted)
-    time_s = axes[0].measurement_time_s[-len(legs[0].measurement_m) :]
-    common = _common_columns(flight.attitude, acceleration)
-    hats = _hats(time_s[0] + clock_offset_s, time_s[-1] + clock_offset_s)
-    prior = np.concatenate(
-        [np.full(CONSTANTS, np.inf), np.full(len(axes) * len(hats), TILT_SIGMA_RAD * constants.g)]
-    )
-    signals = []
     line = timeline(shifted[0], settings)
-    ramps = [moved(line, _step_means(hat, line)) for hat in hats]
-    slow = [np.stack(part, axis=1) for part in zip(*ramps, strict=True)]
-    for axis, own in zip(shifted, legs, strict=True):
+    common = _common_columns(attitude, acceleration)
+    legs = []
+    for axis in shifted:
+        own = preintegrate(axis, settings)
         columns = [(own.delta_position_m, own.delta_velocity_m_s)]
-        for frame in common:
-            pushed = project_acceleration(frame, axis.direction, segment)
-            columns.append(moved(line, _step_means(pushed, line)))
-        position, velocity = (np.stack(part, axis=1) for part in zip(*columns, strict=True))
-        measured, start = np.zeros_like(position), np.zeros(position.shape[1])
-        measured[:, 0], start[0] = own.measurement_m, own.initial.position_m
-        signals.append(HypothesisSignals(position, velocity, measured, start))
-    return Lines(
-        time_s,
-        legs,
-        tuple(signals),
-        HypothesisSignals(slow[0], slow[1], np.zeros_like(slow[0]), np.zeros(len(hats))),
-        prior,
-        sigma_z,
-        steps(time_s, []),
+        columns += [
+            _added(frame.to_numpy() @ axis.direction, frame.index, line) for frame in common
+        ]
+        dp, dv = (np.stack(part, axis=1) for part in zip(*columns, strict=True))
+        measured = np.zeros_like(dp)
+        # the filter starts at the first one
+        measured[:, 0] = own.measurement_m - own.initial.position_m
+        start = replace(own.initial, position_m=0.0)
+        legs.append(replace(_with_signals(own, dp, dv, measured), initial=start))
+    time_s = axes[0].measurement_time_s[-len(measured) :]
+    fine, hats = _hats(time_s[0] + clock_offset_s, time_s[-1] + clock_offset_s)
+    slow = [_added(hat, fine, line) for hat in hats]
+    slow_position, slow_velocity = (np.stack(part, axis=1) for part in zip(*slow, strict=True))
+    prior = np.append(
+        np.full(CONSTANTS, np.inf), np.full(len(axes) * len(hats), TILT_SIGMA_RAD * constants.g)
+    )
+    return Hypotheses(
+        time_s, tuple(legs), (slow_position, slow_velocity), prior, sigma_z, steps(time_s, [])
     )
 
 
-def _step_means(acceleration: Acceleration | Unavailable, line: Timeline) -> Array:
-    """Over each step; zero where there is none."""
-    if isinstance(acceleration, Unavailable):
-        return np.zeros(len(line.time_s) - 1)
-    return step_means(acceleration, line.time_s)[0]
+def _added(acceleration_m_s2: Array, time_s: ArrayLike, line: Timeline) -> tuple[Array, Array]:
+    """Position and velocity that an acceleration adds between the measurements."""
+    time = np.asarray(time_s, dtype=np.float64)
+    velocity = np.interp(line.time_s, time, cumulative_integral(acceleration_m_s2, time))
+    return moved(line, np.diff(velocity) / np.diff(line.time_s))
 
 
 def _common_columns(attitude: pd.DataFrame, acceleration: pd.DataFrame) -> list[pd.DataFrame]:
@@ -407,15 +286,12 @@ def _common_columns(attitude: pd.DataFrame, acceleration: pd.DataFrame) -> list[
     return [*biases, pd.DataFrame(turned, index=acceleration.index, columns=names)]
 
 
-def _hats(start_s: float, end_s: float) -> list[Acceleration | Unavailable]:
-    """Hat functions between knots, of which any slow signal is made."""
+def _hats(start_s: float, end_s: float) -> tuple[Array, Array]:
+    """Hat functions between knots, of which any slow signal is made, at times so fine (n, h)."""
     count = int(np.clip(np.ceil((end_s - start_s) / KNOT_S), 1, MAX_KNOTS)) + 1
-    knots = np.linspace(start_s, end_s, count)
-    # so fine that no interval passes for a gap
     time = np.linspace(start_s, end_s, 20 * (count - 1) + 1)
-    between = Segment(start_s, end_s, "between the knots")
-    hats = (pd.DataFrame(np.interp(time, knots, hat), time) for hat in np.eye(count))
-    return [project_acceleration(hat, np.ones(1), between) for hat in hats]
+    knots = np.linspace(start_s, end_s, count)
+    return time, np.array([np.interp(time, knots, hat) for hat in np.eye(count)])
 
 
 def steps(time_s: Array, starts_s: Iterable[float]) -> Array:

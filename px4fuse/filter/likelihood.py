@@ -8,12 +8,13 @@ Agrees with the filterpy replay to 1e-9 for SIGMA_A and SIGMA_Z from 1e-3.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import lapack
 from scipy.optimize import brentq
 from scipy.special import chdtri
 
@@ -56,6 +57,12 @@ class Preintegrated:
     noise_fixed: Array
     measurement_m: Array
     initial: InitialState
+
+    def first(self, count: int) -> Preintegrated:
+        """The first measurements only."""
+        each = {field.name: getattr(self, field.name) for field in fields(self)}
+        initial = each.pop("initial")
+        return Preintegrated(**{name: of[:count] for name, of in each.items()}, initial=initial)
 
 
 def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:
@@ -131,9 +138,9 @@ def innovations(
     -------
     innovation_m, innovation_variance_m2 : ndarray, shape (m, ...)
     """
-    made = np.array([step[:2] for step in recursion(legs, sigma_a_m_s2, sigma_z_m, skip)])
-    made = made.reshape(-1, 2, *np.broadcast(sigma_a_m_s2, sigma_z_m).shape)
-    return made[:, 0], made[:, 1]
+    made = [step[:2] for step in recursion(legs, sigma_a_m_s2, sigma_z_m, skip)]
+    nu, s = (np.array(part) for part in zip(*made, strict=True))
+    return nu, s
 
 
 @dataclass(frozen=True)
@@ -225,29 +232,50 @@ def recursion(
         yield nu, s, k0, p, v, covariance
 
 
-def filtered(
-    legs: Preintegrated, settings: Settings, skip: BoolArray | None = None
+def innovations_of_signals(
+    legs: Preintegrated, sigma_a_m_s2: float, sigma_z_m: float, skip: BoolArray
 ) -> tuple[Array, Array]:
-    """Position and velocity at the start and after each measurement, for one pair of settings.
+    """Innovations of many signals by the gains of one filter, and their variance.
+
+    With the gains given, x = Fx + [Δp, Δv] and x = x + K(z - Hx) are linear in what drives them: a
+    triangular system with three bands below the diagonal, which LAPACK solves for all signals at
+    once, by the very recursion from front to back.
 
     Parameters
     ----------
     legs : Preintegrated
-    settings : Settings
-        ``sigma_a_m_s2`` and ``sigma_z_m`` are used.
-    skip : ndarray of bool, shape (m,), optional
+        Δp, Δv and measurements of shape (m, k), with a start at zero.
+    sigma_a_m_s2, sigma_z_m : float
+    skip : ndarray of bool, shape (m,)
         Measurements that are not fused.
 
     Returns
     -------
-    position_m, velocity_m_s : ndarray, shape (m + 1,)
+    innovation_m, innovation_variance_m2 : ndarray, shape (m, k) and (m,)
     """
-    start = legs.initial
-    run: list[tuple[Any, Any]] = [(start.position_m, start.velocity_m_s)]
-    steps = recursion(legs, settings.sigma_a_m_s2, settings.sigma_z_m, skip)
-    run += [(position, velocity) for _, _, _, position, velocity, _ in steps]
-    position_m, velocity_m_s = np.array(run).T
-    return position_m, velocity_m_s
+    parts = legs.delta_position_m, legs.delta_velocity_m_s, legs.measurement_m
+    dp, dv, z = (np.ascontiguousarray(part.T) for part in parts)
+    still = np.zeros(z.shape[1])
+    one = replace(legs, delta_position_m=still, delta_velocity_m_s=still, measurement_m=still)
+    s, *gain = np.array(
+        [
+            (s, k0, covariance[1] / sigma_z_m**2)
+            for _, s, k0, _, _, covariance in recursion(one, sigma_a_m_s2, sigma_z_m, skip)
+        ]
+    ).T
+    k0, k1 = np.where(skip, 0.0, gain)
+    bands = np.zeros((4, 2 * len(s) + 2))
+    # p = (1 - K₀)(p + dt v + Δp) + K₀ z,  v = v + Δv + K₁(z - (p + dt v + Δp))
+    bands[2, 0:-2:2] = k0 - 1.0
+    bands[1, 1:-1:2] = (k0 - 1.0) * legs.length_s
+    bands[3, 0:-2:2] = k1
+    bands[2, 1:-1:2] = k1 * legs.length_s - 1.0
+    right = np.zeros((len(z), len(s) + 1, 2))
+    right[:, 1:, 0] = dp + k0 * (z - dp)
+    right[:, 1:, 1] = dv + k1 * (z - dp)
+    after, _ = lapack.dtbtrs(bands, right.reshape(len(z), -1).T, uplo="L", diag="U", overwrite_b=1)
+    position, velocity = np.moveaxis(after.T.reshape(right.shape)[:, :-1], -1, 0)
+    return (z - position - legs.length_s * velocity - dp).T, s
 
 
 def total_over_grid(
@@ -316,14 +344,13 @@ def profile_interval(
     return ends[0], ends[1]
 
 
-def profile_end(
+def profile_ends(
     score: Callable[[float, float], float],
     best: tuple[float, float],
-    side: float,
-    bound: float,
+    bounds: tuple[float, float],
     widening: float = 1.0,
-) -> float | None:
-    """End of a 95 % profile-likelihood interval, None where it lies beyond a bound.
+) -> tuple[float | None, float | None]:
+    """Ends of a 95 % profile-likelihood interval, None where they lie beyond a bound.
 
     Parameters
     ----------
@@ -332,42 +359,46 @@ def profile_end(
         one.
     best : (float, float)
         Where it is least.
-    side : float
-        -1.0 for the low end, +1.0 for the high one.
-    bound : float
-        Of ln of the parameter.
+    bounds : (float, float)
+        Of the parameter itself.
     widening : float
         Of the variance, by what the score does not hold.
     """
-    least, other, root = score(*best), best[1], float(np.sqrt(PROFILE_DROP * widening))
+    least, root = score(*best), float(np.sqrt(PROFILE_DROP * widening))
 
-    @cache  # where the other parameter is sought from depends on the call before
-    def excess(distance: float) -> float:
-        """How far √(drop), which is nearly a line, lies above that of the interval's end."""
-        nonlocal other
-        if distance == 0.0:
-            return -root
-        lowest, other = _lowest(lambda at: score(best[0] + side * distance, at), other)
-        return float(np.sqrt(max(lowest - least, 0.0)) - root)
+    def end(side: float, bound: float) -> float | None:
+        other = best[1]
 
-    reach = side * (bound - best[0])
-    far = min(FIRST_REACH, reach)
-    while excess(far) < 0.0:
-        if far == reach:
-            return None
-        far = min(2.0 * far, reach)
-    return float(best[0] + side * brentq(excess, 0.0, far, xtol=1e-3 * far))
+        @cache  # where the other parameter is sought from depends on the call before
+        def excess(distance: float) -> float:
+            """How far √(drop), which is nearly a line, lies above that of the interval's end."""
+            nonlocal other
+            if distance == 0.0:
+                return -root
+            lowest, other = _lowest(lambda at: score(best[0] + side * distance, at), other)
+            return float(np.sqrt(max(lowest - least, 0.0)) - root)
+
+        reach = side * (float(np.log(bound)) - best[0])
+        far = min(FIRST_REACH, reach)
+        while excess(far) < 0.0:
+            if far == reach:
+                return None
+            far = min(2.0 * far, reach)
+        return float(best[0] + side * brentq(excess, 0.0, far, xtol=1e-3 * far))
+
+    return end(-1.0, bounds[0]), end(1.0, bounds[1])
 
 
 def _lowest(score: Callable[[float], float], near: float) -> tuple[float, float]:
     """Least value of a score and where it is, by parabolas from near there."""
     for _ in range(PARABOLAS):
-        left, middle, right = (score(near + k * BEND_STEP) for k in (-1.0, 0.0, 1.0))
-        if left == middle == right:  # there is no other parameter
+        profile = np.array([score(near + k * BEND_STEP) for k in (-1.0, 0.0, 1.0)])
+        middle = float(profile[1])
+        if np.ptp(profile) == 0.0:  # there is no other parameter
             return middle, near
-        bend = left - 2.0 * middle + right
-        step = 0.5 * (left - right) / bend if bend > 0.0 else np.sign(left - right) * FAR_STEPS
+        shift, bend = parabola_vertex(profile, 1)
+        step = shift if bend > 0.0 else np.sign(profile[0] - profile[2]) * FAR_STEPS
         near += float(np.clip(step, -FAR_STEPS, FAR_STEPS)) * BEND_STEP
         if bend > 0.0 and abs(step) <= 1.0:
-            return middle - 0.125 * (left - right) ** 2 / bend, near
+            return middle - 0.5 * shift**2 * bend, near
     return score(near), near

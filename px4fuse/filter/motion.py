@@ -12,8 +12,8 @@ sought, and would pass much of it off as scale (errors in variables, Fuller 1987
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -21,11 +21,17 @@ from scipy import constants
 from scipy.spatial.transform import Rotation, Slerp
 
 from px4fuse.arrays import Array, IntArray, cumulative_integral
-from px4fuse.filter.chain import Chain
-from px4fuse.filter.marginal import Positions
+from px4fuse.filter.fitting import Noises, of_ratios
+from px4fuse.filter.marginal import Positions, centred
 from px4fuse.filter.model import noise_of_many_steps
 from px4fuse.filter.signals import imu_gaps
-from px4fuse.flight import ANGULAR_RATE_COLUMNS, QUATERNION_COLUMNS, SPECIFIC_FORCE_COLUMNS
+from px4fuse.flight import (
+    ANGULAR_RATE_COLUMNS,
+    QUATERNION_COLUMNS,
+    SPECIFIC_FORCE_COLUMNS,
+    Flight,
+    Unavailable,
+)
 from px4fuse.trajectory.rotation import from_vector, matrix, multiply, running_product
 
 # Standard deviations of the constants, wide for consumer sensors: tilt and heading (rad), gyro
@@ -35,7 +41,12 @@ CONSTANT_SIGMA = np.repeat([0.05, 0.004, 0.3, 0.1], [3, 3, 3, 1])
 # bias of 0.004 rad/s turns by 0.12 rad in one, whose square costs 0.07 m/s².
 STRETCH_S = 30.0
 SEARCH_S = 0.6
-MIN_MEASUREMENTS = 15
+# The whole search is gone through in so many steps
+COARSE_POINTS = 25
+# Numbers of signals that are made at once
+BLOCK = 2**16
+# Of all stretches together, and of one
+MIN_MEASUREMENTS, MIN_STRETCH_MEASUREMENTS = 30, 15
 # Of a stretch of which only some are taken
 FEW_MEASUREMENTS = 5
 # The IMU is averaged to this interval before it is integrated
@@ -59,179 +70,185 @@ class Signals:
     time_s: Array
     table: Array
 
-    def at(self, time_s: Array, axes: slice = slice(None)) -> tuple[Array, Array, Array]:
-        """Position, velocity and acceleration at other times, shape (..., axes, constants)."""
+    def at(self, time_s: Array) -> tuple[Array, Array]:
+        """Position and velocity at other times, shape (..., 3, constants)."""
         last = len(self.time_s) - 1
         at = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last)
         ahead = (time_s - self.time_s[at])[..., None, None]
-        rows = np.moveaxis(self.table[at, :, axes], -3, 0)
-        position, velocity, value = rows
+        position, velocity, value = np.moveaxis(self.table[at], -3, 0)
         position += ahead * (velocity + (0.5 * ahead) * value)
         velocity += ahead * value
-        return position, velocity, value
+        return position, velocity
+
+
+# Signals of one flight by their span, which are made once and used again
+SignalCache = dict[tuple[float, float], Signals]
 
 
 @dataclass(frozen=True)
 class PreparedMotion:
-    """The IMU's signals under the measurements of one source, in stretches.
+    """Positions of one source over the IMU's motion, in stretches, at any clock offset.
 
     Attributes
     ----------
     time_s : ndarray, shape (m,)
         Stamps of the measurements that lie in a stretch.
-    row : ndarray of int, shape (m,)
-        Which of the given measurements they are.
+    measurement_m : ndarray, shape (m, a)
+        NaN where there is none.
+    weight : ndarray, shape (m,)
+        What each counts.
     edges : ndarray of int, shape (s + 1,)
         First measurement of each stretch, and their number.
     signals : tuple of Signals
         Of each stretch.
+    directions : ndarray, shape (a, 3)
+        Unit vectors in NED.
+    dt_s : float
+        DT, which gives SIGMA_A its meaning.
+    imu_interval_s : float
     """
 
     time_s: Array
-    row: IntArray
+    measurement_m: Array
+    weight: Array
     edges: IntArray
     signals: tuple[Signals, ...]
+    directions: Array
+    dt_s: float
+    imu_interval_s: float
 
-    def thinned(self, count: int) -> PreparedMotion | None:
-        """About so many of the measurements, in the stretches that keep a few; None without one.
-
-        Parameters
-        ----------
-        count : int
-        """
+    def thinned(self, count: int) -> PreparedMotion:
+        """About so many of the measurements, in the stretches that keep a few; all without one."""
         kept = np.arange(len(self.time_s)) % max(1, len(self.time_s) // count) == 0
         counts = np.add.reduceat(kept.astype(int), self.edges[:-1])
         enough = counts >= FEW_MEASUREMENTS
         if not enough.any():
-            return None
-        kept = kept & np.repeat(enough, np.diff(self.edges))
-        return PreparedMotion(
-            self.time_s[kept],
-            self.row[kept],
-            np.cumsum([0, *counts[enough]]),
-            tuple(each for each, good in zip(self.signals, enough, strict=True) if good),
+            return self
+        kept &= np.repeat(enough, np.diff(self.edges))
+        return replace(
+            self,
+            time_s=self.time_s[kept],
+            measurement_m=self.measurement_m[kept],
+            weight=self.weight[kept],
+            edges=np.cumsum([0, *counts[enough]]),
+            signals=tuple(each for each, good in zip(self.signals, enough, strict=True) if good),
         )
 
-    def positions(self, measurement_m: Array, dt_s: float) -> Positions:
-        """Positions along some axes, ready to be fitted.
+    def positions(self, offset_s: Array) -> Positions:
+        """Positions, with what moves them where their stamps are corrected by each offset.
+
+        The signal of the scale is zero.
 
         Parameters
         ----------
-        measurement_m : ndarray, shape (given, a)
-            All that were given; NaN where there is none.
-        dt_s : float
-            DT, which gives SIGMA_A its meaning.
+        offset_s : ndarray, shape (T,)
         """
-        end = np.setdiff1d(np.arange(1, len(self.time_s)), self.edges)
-        length = np.diff(self.time_s)[end - 1]
-        unit = dt_s * np.stack(noise_of_many_steps(length), 1)
-        measured = measurement_m[self.row]
+        length = np.diff(self.time_s)
+        unit = self.dt_s * np.stack(noise_of_many_steps(length))
         # from the first of each stretch, whose place nothing says: numbers stay small
         stretch = np.repeat(np.arange(len(self.signals)), np.diff(self.edges))
-        measured = measured - pd.DataFrame(measured).groupby(stretch).transform("first").to_numpy()
-        start = np.zeros((len(measured), 2))
-        start[self.edges[:-1]] = START_PRECISION
-        chain = Chain(end, length, unit, np.zeros_like(unit))
-        return Positions(chain, measured, self.edges[:-1], start, CONSTANT_SIGMA)
+        first = pd.DataFrame(self.measurement_m).groupby(stretch).transform("first").to_numpy()
+        initial = np.zeros((len(self.time_s), 2))
+        initial[self.edges[:-1]] = START_PRECISION
+        shape = len(self.directions), len(offset_s), 1 + len(CONSTANT_SIGMA), len(length)
+        dp, dv = np.zeros((2, *shape))
+        for begin, end, signals in zip(self.edges, self.edges[1:], self.signals, strict=False):
+            time = self.time_s[begin:end]
+            # by axis, offset, constant and time
+            position, velocity = (
+                np.moveaxis(self.directions @ part, (2, 0, 3, 1), range(4))
+                for part in signals.at(time + offset_s[:, None])
+            )
+            leg = np.s_[:, :, :-1, begin : end - 1]
+            dv[leg] = np.diff(velocity)
+            dp[leg] = np.diff(position) - velocity[..., :-1] * np.diff(time)
+        return Positions(
+            measurement_m=self.measurement_m - first,
+            start=self.edges[:-1],
+            length_s=length,
+            noise_unit=unit,
+            noise_fixed=np.zeros_like(unit),
+            initial=initial,
+            constant_sigma=CONSTANT_SIGMA,
+            delta_position_m=dp,
+            delta_velocity_m_s=dv,
+        )
 
-    def legs(self, directions: Array, offset_s: Array) -> tuple[Array, Array]:
-        """What the acceleration adds on each leg where stamps are corrected by each offset.
+    def at(self, offset_s: float) -> Positions:
+        """The same at one offset, about a smooth path whose scale is the last constant."""
+        return next(self.blocks(np.array([offset_s])))
+
+    def blocks(self, offset_s: Array, *, scaled: bool = True) -> Iterator[Positions]:
+        """The same at some offsets, a few at a time, with the scale as a constant or without."""
+        signals = len(self.time_s) * len(self.directions) * (1 + len(CONSTANT_SIGMA))
+        at_once = max(1, BLOCK // signals)
+        for few in np.split(offset_s, range(at_once, len(offset_s), at_once)):
+            positions = self.positions(few)
+            yield centred(positions, scaled=True) if scaled else positions
+
+    def search(
+        self, count: int, noises: Noises, factors: Sequence[float] = (1.0,), *, scaled: bool = True
+    ) -> tuple[float, Noises]:
+        """The most likely offset over the whole search, and SIGMA_A of some.
 
         Parameters
         ----------
-        directions : ndarray, shape (a, 3)
-            Unit vectors in NED.
-        offset_s : ndarray, shape (T,)
-
-        Returns
-        -------
-        delta_position_m, delta_velocity_m_s : ndarray, shape (a, T, 1 + constants, m - 1)
-            Zero where a stretch begins, and for the scale.
+        count : int
+            About so many of the measurements are used.
+        noises : Noises
+        factors : sequence of float
+            Of SIGMA_A.
+        scaled : bool
+            Whether the scale of the positions is one of the constants.
         """
-        width = 1 + len(CONSTANT_SIGMA)
-        dp, dv = np.zeros((2, len(self.time_s) - 1, len(directions), len(offset_s), width))
-        for at, begin, end, position, velocity in self._moved(directions, offset_s):
-            step = np.diff(self.time_s[begin:end])[:, None, None]
-            leg = np.s_[begin : end - 1, :, at, :-1]
-            np.subtract(velocity[1:], velocity[:-1], out=dv[leg])
-            way = dp[leg]
-            np.subtract(position[1:], position[:-1], out=way)
-            way -= velocity[:-1] * step
-        return np.moveaxis(dp, 0, -1), np.moveaxis(dv, 0, -1)
-
-    def paths(self, directions: Array, offset_s: Array) -> Array:
-        """Where the acceleration leads from rest at the start of each stretch.
-
-        Parameters
-        ----------
-        directions, offset_s : ndarray
-            As :meth:`legs` takes them.
-
-        Returns
-        -------
-        ndarray, shape (m, a, T, constants)
-            What is known where all constants are zero, then what each but the scale adds.
-        """
-        made = np.empty((len(self.time_s), len(directions), len(offset_s), len(CONSTANT_SIGMA)))
-        for at, begin, end, position, velocity in self._moved(directions, offset_s):
-            since = (self.time_s[begin:end] - self.time_s[begin])[:, None, None]
-            way = made[begin:end, :, at]
-            np.subtract(position, position[0], out=way)
-            way -= velocity[0] * since
-        return made
-
-    def _moved(
-        self, directions: Array, offset_s: Array
-    ) -> Iterator[tuple[int, int, int, Array, Array]]:
-        """Which offset, first measurement and end of each stretch, its position and velocity."""
-        # most directions are axes themselves
-        used = np.flatnonzero(np.any(directions, axis=0))
-        axes = slice(int(used[0]), int(used[-1]) + 1)  # a view of the signals
-        own = directions[:, axes]
-        turned = None if np.array_equal(own, np.eye(own.shape[1])) else own
-        for begin, end, signals in self._stretches():
-            for at, offset in enumerate(offset_s.tolist()):
-                position, velocity, _ = signals.at(self.time_s[begin:end] + offset, axes)
-                if turned is not None:
-                    position, velocity = turned @ position, turned @ velocity
-                yield at, begin, end, position, velocity
-
-    def _stretches(self) -> Iterator[tuple[int, int, Signals]]:
-        return zip(self.edges[:-1].tolist(), self.edges[1:].tolist(), self.signals, strict=True)
-
-
-Made = dict[tuple[float, float], Signals]
+        offsets = np.linspace(-SEARCH_S, SEARCH_S, COARSE_POINTS)
+        sigma = noises.sigma_z_m
+        ratios = [factor * noises.sigma_a_m_s2 / sigma for factor in factors]
+        some = self.thinned(count)
+        blocks = some.blocks(offsets, scaled=scaled)
+        fits = of_ratios(blocks, ratios, noises.walk_m / sigma, some.weight, sigma)
+        scores = np.stack([fitted.scaled(sigma).totals()[0] for fitted in fits])
+        level, at = np.unravel_index(np.argmin(scores), scores.shape)
+        sigma_a = noises.sigma_a_m_s2 * factors[int(level)]
+        return float(offsets[at]), replace(noises, sigma_a_m_s2=sigma_a)
 
 
 def motion(
-    imu: pd.DataFrame, attitude: pd.DataFrame, time_s: Array, made: Made | None = None
-) -> PreparedMotion | None:
+    flight: Flight,
+    time_s: Array,
+    measurement_m: Array,
+    *,
+    directions: Array,
+    dt_s: float,
+    weight: Array | None = None,
+    signals: SignalCache | None = None,
+) -> PreparedMotion | Unavailable:
     """Cut measurements into stretches that the IMU covers without a gap.
 
     Parameters
     ----------
-    imu, attitude : DataFrame
-        As in :class:`px4fuse.flight.Flight`.
+    flight : Flight
     time_s : ndarray, shape (m,)
-    made : dict, optional
-        Signals of this flight by their span, which are kept there and used again.
+    measurement_m : ndarray, shape (m, a)
+    directions, dt_s, weight
+        As :class:`PreparedMotion` has them; by default all count the same.
+    signals : dict, optional
+        Signals of this flight, to which new ones are added.
 
     Returns
     -------
-    PreparedMotion, or None where no stretch has enough measurements or the IMU is too slow.
+    PreparedMotion, or Unavailable without IMU or attitude, or with too few measurements with them.
     """
-    made = {} if made is None else made
-    imu_time = imu.index.to_numpy()
-    if len(imu_time) < 2 or np.median(np.diff(imu_time)) > MAX_IMU_INTERVAL_S:
-        return None
-    low = max(imu.index[0], attitude.index[0])
-    high = min(imu.index[-1], attitude.index[-1])
-    gaps = np.flatnonzero(imu_gaps(imu_time))
-    begins = np.maximum(imu_time[np.r_[0, gaps + 1]], low)
-    ends = np.minimum(imu_time[np.r_[gaps, len(imu_time) - 1]], high)
+    imu, attitude = flight.imu, flight.attitude
+    if isinstance(imu, Unavailable):
+        return imu
+    if isinstance(attitude, Unavailable):
+        return attitude
+    signals = {} if signals is None else signals
+    of_stretch: list[Signals] = []
+    imu_time, known = imu.index.to_numpy(), attitude.index.to_numpy()
     rows: list[IntArray] = []
-    signals = []
-    for begin, end in zip(begins, ends, strict=True):
+    for begin, end in _covered(imu_time, known):
         inside = np.flatnonzero((time_s >= begin + SEARCH_S) & (time_s <= end - SEARCH_S))
         if not len(inside):
             continue
@@ -239,20 +256,43 @@ def motion(
         count = max(1, int(np.ceil((within[-1] - within[0]) / STRETCH_S)))
         cuts = np.linspace(within[0], within[-1], count + 1)[1:-1]
         for part in np.split(inside, np.searchsorted(within, cuts)):
-            if len(part) >= MIN_MEASUREMENTS:
+            if len(part) >= MIN_STRETCH_MEASUREMENTS:
                 rows.append(part)
                 around = time_s[part[0]] - SEARCH_S, time_s[part[-1]] + SEARCH_S
-                if around not in made:
-                    made[around] = _signals(imu, attitude, around)
-                signals.append(made[around])
-    if not rows:
-        return None
-    row = np.concatenate(rows)
-    edges = np.cumsum([0, *map(len, rows)])
-    return PreparedMotion(time_s[row], row, edges, tuple(signals))
+                if around not in signals:
+                    signals[around] = signals_of(imu, attitude, around)
+                of_stretch.append(signals[around])
+    row = np.concatenate([np.zeros(0, dtype=np.intp), *rows])
+    if len(row) < MIN_MEASUREMENTS:
+        return Unavailable(
+            "clock offset",
+            f"{len(row)} measurements with IMU and attitude are too few "
+            f"(at least {MIN_MEASUREMENTS})",
+            "Analyse a longer segment.",
+        )
+    return PreparedMotion(
+        time_s[row],
+        measurement_m[row],
+        np.ones(len(row)) if weight is None else weight[row],
+        np.cumsum([0, *map(len, rows)]),
+        tuple(of_stretch),
+        directions,
+        dt_s,
+        float(np.median(np.diff(imu_time))),
+    )
 
 
-def _signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, float]) -> Signals:
+def _covered(imu_time: Array, attitude_time: Array) -> list[tuple[float, float]]:
+    """Start and end of all that IMU and attitude cover; nothing where the IMU is too slow."""
+    if len(imu_time) < 2 or np.median(np.diff(imu_time)) > MAX_IMU_INTERVAL_S:
+        return []
+    gaps = np.flatnonzero(imu_gaps(imu_time))
+    begins = np.maximum(imu_time[np.r_[0, gaps + 1]], attitude_time[0])
+    ends = np.minimum(imu_time[np.r_[gaps, len(imu_time) - 1]], attitude_time[-1])
+    return list(zip(begins.tolist(), ends.tolist(), strict=True))
+
+
+def signals_of(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, float]) -> Signals:
     """Acceleration in NED by the gyros' attitude, and what each constant adds to it."""
     time = imu.index.to_numpy()
     first, last = np.searchsorted(time, [span[0] - 2 * STEP_S, span[1] + 2 * STEP_S], side="left")

@@ -191,15 +191,15 @@ def make_axes(
     """
     samples = within(track.samples, segment)
     acceleration = ned_acceleration(flight)
-    asked = tuple(dict.fromkeys((*AXIS_NAMES, AISLE) if names is None else names))
+    known = (*AXIS_NAMES, AISLE)
+    asked = tuple(dict.fromkeys(known if names is None else names))
     if not asked:
         raise SettingsError("no axis was asked for.")
     if heading_deg is not None and not 0.0 <= heading_deg <= 360.0:
         raise SettingsError(f"`heading_deg` {heading_deg:g} is not between 0 and 360 degrees.")
-    if unknown := [name for name in asked if name not in (*AXIS_NAMES, AISLE)]:
-        raise SettingsError(
-            f"axis {unknown[0]}: not a known axis. Choose from {', '.join((*AXIS_NAMES, AISLE))}."
-        )
+    if unknown := [name for name in asked if name not in known]:
+        raise SettingsError(f"axis {unknown[0]}: not a known axis. Choose from {', '.join(known)}.")
+    where = f"{flight.log.name}: {track.name}"
     axes = []
     for name in asked:
         direction, heading, note = _direction(name, track, segment, heading_deg)
@@ -208,26 +208,16 @@ def make_axes(
         if np.count_nonzero(finite) < MIN_MEASUREMENTS:
             if names is None:
                 continue
-            raise MissingDataError(
-                f"{flight.log.name}: {track.name} has no position along {name} in this segment."
-            )
-        axes.append(
-            Axis(
-                name=name,
-                direction=direction,
-                heading_deg=heading,
-                note=note,
-                measurement_time_s=samples.index.to_numpy()[finite],
-                measurement_m=projected[finite],
-                acceleration=acceleration
-                if isinstance(acceleration, Unavailable)
-                else project_acceleration(acceleration, direction, segment),
-            )
+            raise MissingDataError(f"{where} has no position along {name} in this segment.")
+        pushed = (
+            acceleration
+            if isinstance(acceleration, Unavailable)
+            else project_acceleration(acceleration, direction, segment)
         )
+        time = samples.index.to_numpy()[finite]
+        axes.append(Axis(name, direction, heading, note, time, projected[finite], pushed))
     if not axes:
-        raise MissingDataError(
-            f"{flight.log.name}: {track.name} has no finite position in this segment."
-        )
+        raise MissingDataError(f"{where} has no finite position in this segment.")
     return tuple(axes)
 
 

@@ -89,46 +89,41 @@ def smoothing(
             "Analyse a longer segment, or log the source at a higher rate.",
         )
     first = max(0, (count - MAX_MEASUREMENTS) // 2)
-    cut = [_cut(axis, first, first + MAX_MEASUREMENTS) for axis in axes]
-    bad = np.isin(cut[0].measurement_time_s, outlier_time_s)
+    middle = slice(first, first + MAX_MEASUREMENTS)
+    time = axes[0].measurement_time_s[middle]
+    bad = np.isin(time, outlier_time_s)
     level = sigma_a_m_s2 * SIGMA_A_FACTORS[:, None], sigma_z_m * SIGMA_Z_FACTORS[None, :]
     settings = replace(settings, input="imu")
-    plain, _ = _score(cut, settings, bad, 0.0, level)
-    if clock_offset_s:
+
+    def score(correlation: float, offset_s: float = 0.0) -> tuple[float, float]:
         moved = [
-            replace(axis, measurement_time_s=axis.measurement_time_s + clock_offset_s)
-            for axis in cut
+            replace(
+                axis, measurement_time_s=time + offset_s, measurement_m=axis.measurement_m[middle]
+            )
+            for axis in axes
         ]
-        plain = min(plain, _score(moved, settings, bad, 0.0, level)[0])
+        return _score(moved, settings, bad, correlation, level)
+
+    plain = score(0.0)[0]
+    if clock_offset_s:
+        plain = min(plain, score(0.0, clock_offset_s)[0])
     best, at, noise = plain, 0.0, sigma_z_m
-    # from none on, for as long as more of it makes the positions more likely; then between
-    for correlations in (CORRELATIONS[1:], None):
-        for correlation in (_between(at) if correlations is None else correlations).tolist():
-            score, sigma = _score(cut, settings, bad, correlation, level)
-            if score < best:
-                best, at, noise = score, correlation, sigma
-            elif correlations is not None and (at > 0.0 or correlation > FIRST_CORRELATIONS):
-                break
-    interval = float(np.median(np.diff(cut[0].measurement_time_s)))
-    lag = 0.0 if at == 0.0 else -interval / float(np.log(at))
-    return Smoothing(at, lag, plain - best, noise)
-
-
-def _between(at: float) -> Array:
-    """Correlations between one that was tried and its neighbours."""
-    if at == 0.0:
-        return np.array([])
+    # from none on, for as long as more of it makes the positions more likely
+    for correlation in CORRELATIONS[1:].tolist():
+        here, sigma = score(correlation)
+        if here < best:
+            best, at, noise = here, correlation, sigma
+        elif at > 0.0 or correlation > FIRST_CORRELATIONS:
+            break
+    # then between that and its neighbours
     place = int(np.searchsorted(CORRELATIONS, at))
-    around = CORRELATIONS[place - 1 : place + 2]
-    return np.asarray((around[:-1] + around[1:]) / 2.0)
-
-
-def _cut(axis: Axis, first: int, last: int) -> Axis:
-    return replace(
-        axis,
-        measurement_time_s=axis.measurement_time_s[first:last],
-        measurement_m=axis.measurement_m[first:last],
-    )
+    around = CORRELATIONS[place - 1 : place + 2] if at else np.zeros(0)
+    for correlation in ((around[:-1] + around[1:]) / 2.0).tolist():
+        here, sigma = score(correlation)
+        if here < best:
+            best, at, noise = here, correlation, sigma
+    lag = -float(np.median(np.diff(time)) / np.log(at)) if at else 0.0
+    return Smoothing(at, lag, plain - best, noise)
 
 
 def _score(
@@ -141,7 +136,7 @@ def _score(
     """Least negative log-likelihood with a low pass undone, and the SIGMA_Z at it."""
     time = axes[0].measurement_time_s
     interval = np.diff(time, prepend=time[0])
-    known = (interval < GAP_INTERVALS * np.median(np.diff(time))) & (np.arange(len(time)) > 0)
+    known = (interval < GAP_INTERVALS * np.median(interval[1:])) & (interval > 0.0)
     kept = np.where(known, correlation, 0.0)
     # what was undone with an outlier is one too
     skip = bad | (known & np.concatenate([[False], bad[:-1]]) & (correlation > 0.0))

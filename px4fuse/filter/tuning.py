@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -23,23 +22,19 @@ from px4fuse.filter.consistency import Consistency, assess
 from px4fuse.filter.fitting import (
     SIGMA_A_SEARCH_M_S2,
     SIGMA_Z_SEARCH_M,
-    Likelihood,
     NoiseFit,
     Noises,
-    Part,
     filter_part,
-    fitted,
     most_likely,
 )
 from px4fuse.filter.likelihood import (
     Preintegrated,
     innovations,
     preintegrate,
-    profile_end,
+    profile_ends,
     total_over_grid,
 )
-from px4fuse.filter.marginal import centred
-from px4fuse.filter.motion import SEARCH_S, Made, motion
+from px4fuse.filter.motion import SignalCache, motion
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.flight import Flight, Unavailable
@@ -53,7 +48,6 @@ MAP_SIGMAS = 4.5
 MIN_MEASUREMENTS = 30
 MAX_OUTLIER_SHARE = 0.3
 # The clock offset is a nuisance here: a rough one is enough
-OFFSET_POINTS, OFFSET_BLOCKS = 25, 5
 COARSE_MEASUREMENTS = 2000
 SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 FIRST_WALK_M = 0.02
@@ -210,7 +204,7 @@ def tune(
     progress: Callable[[str], None] = lambda _: None,
     flight: Flight | None = None,
     drifts: bool = False,
-    made: Made | None = None,
+    signals: SignalCache | None = None,
 ) -> dict[str, AxisTuning | Unavailable]:
     """Most likely SIGMA_A and SIGMA_Z of each axis, and of north and east together.
 
@@ -227,7 +221,7 @@ def tune(
         Whose IMU tells biases and tilt from noise.
     drifts : bool
         Whether the source may wander by itself, as odometry does.
-    made : dict, optional
+    signals : dict, optional
         As :func:`px4fuse.filter.motion.motion` has it.
 
     Returns
@@ -240,11 +234,11 @@ def tune(
         if np.array_equal(pair[0].measurement_time_s, pair[1].measurement_time_s):
             groups[HORIZONTAL] = pair
     tuned = {}
-    made = {} if made is None else made
+    signals = {} if signals is None else signals
     for name, group in groups.items():
         if names is None or name in names:
             progress(name)
-            tuned[name] = tune_axes(name, group, settings, flight, drifts, made)
+            tuned[name] = tune_axes(name, group, settings, flight, drifts, signals)
     return tuned
 
 
@@ -254,7 +248,7 @@ def tune_axes(
     settings: Settings,
     flight: Flight | None = None,
     drifts: bool = False,
-    made: Made | None = None,
+    signals: SignalCache | None = None,
 ) -> AxisTuning | Unavailable:
     """Most likely noises that several axes share.
 
@@ -269,7 +263,7 @@ def tune_axes(
         Whose IMU tells biases and tilt from noise.
     drifts : bool
         Whether the source may wander by itself, as odometry does.
-    made : dict, optional
+    signals : dict, optional
         As :func:`px4fuse.filter.motion.motion` has it.
     """
     legs = [preintegrate(axis, settings) for axis in axes]
@@ -283,7 +277,7 @@ def tune_axes(
     parts = [filter_part(leg) for leg in legs]
     chosen = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
     alone = most_likely(parts, chosen, np.ones(count))
-    found = _with_biases(axes, settings, flight, alone, drifts, made)
+    found = _with_biases(axes, settings, flight, alone, drifts, signals)
     best = alone if found is None else found
     skip = alone.outlier > 0.5
     if np.mean(skip) > MAX_OUTLIER_SHARE:
@@ -314,7 +308,7 @@ def tune_axes(
         held_out=_hold_out(name, legs, chosen, alone),
         noises=best.noises,
         biases_fitted=found is not None,
-        make_map=partial(_map, legs, alone.weight, chosen.sigma_z_m, needed, sigma_z, after),
+        make_map=partial(_map, legs, alone.weight, needed, sigma_z, after),
     )
 
 
@@ -324,56 +318,41 @@ def _with_biases(
     flight: Flight | None,
     alone: NoiseFit,
     drifts: bool,
-    made: Made | None = None,
+    signals: SignalCache | None,
 ) -> NoiseFit | None:
     """Noises with the IMU's constants and the clock offset taken out, None without an IMU."""
     if flight is None or settings.input == "zero":
         return None
-    if isinstance(flight.imu, Unavailable) or isinstance(flight.attitude, Unavailable):
-        return None
-    moved = motion(flight.imu, flight.attitude, axes[0].measurement_time_s, made)
-    if moved is None or len(moved.time_s) < MIN_MEASUREMENTS:
-        return None
-    # the filter starts at the first measurement, which it does not weigh
-    weight = np.concatenate([np.ones(len(axes[0].measurement_m) - len(alone.weight)), alone.weight])
-    weight = weight[moved.row]
     measured = np.column_stack([axis.measurement_m for axis in axes])
-    directions = np.array([axis.direction for axis in axes])
+    moved = motion(
+        flight,
+        axes[0].measurement_time_s,
+        measured,
+        directions=np.array([axis.direction for axis in axes]),
+        dt_s=settings.dt_s,
+        # the filter starts at the first measurement, which it does not weigh
+        weight=np.concatenate([np.ones(len(measured) - len(alone.weight)), alone.weight]),
+        signals=signals,
+    )
+    if isinstance(moved, Unavailable):
+        return None
     start = replace(alone.noises, walk_m=FIRST_WALK_M if drifts else 0.0)
-    offsets = np.linspace(-SEARCH_S, SEARCH_S, OFFSET_POINTS)
-    some = moved.thinned(COARSE_MEASUREMENTS) or moved
-    levels = [
-        replace(start, sigma_a_m_s2=start.sigma_a_m_s2 * factor) for factor in SIGMA_A_FACTORS
-    ]
-    of_some = weight[np.isin(moved.row, some.row)]
-    known, scores = some.positions(measured, settings.dt_s), []
-    for few in np.array_split(offsets, OFFSET_BLOCKS):  # their signals are long
-        part = Part(known, *some.legs(directions, few))
-        scores.append([fitted(part, noises, of_some).total() for noises in levels])
-    level, at = np.unravel_index(np.argmin(np.hstack(scores)), (len(levels), len(offsets)))
-    positions = moved.positions(measured, settings.dt_s)
-    legs = moved.legs(directions, offsets[[at]])
-    parts = [Part(*centred(positions, *legs, scaled=True))]
-    return most_likely(parts, levels[level], weight)
+    offset, start = moved.search(COARSE_MEASUREMENTS, start, SIGMA_A_FACTORS, scaled=False)
+    return most_likely([moved.at(offset)], start, moved.weight)
 
 
 def _noise(best: NoiseFit, which: int) -> Noise:
     """Value and 95 % interval of SIGMA_A (0) or SIGMA_Z (1), the other one maximised out."""
     values = best.noises.sigma_a_m_s2, best.noises.sigma_z_m
-    search = (SIGMA_A_SEARCH_M_S2, SIGMA_Z_SEARCH_M)[which]
 
     def score(log_value: float, log_other: float) -> float:
         pair = (log_value, log_other) if which == 0 else (log_other, log_value)
         sigma_a, sigma_z = np.exp(pair).tolist()
         return best.score(Noises(sigma_a, sigma_z, best.noises.walk_m))
 
-    at, other = np.log(values[which]), np.log(values[1 - which])
-    widening = best.widening if which == 1 else 1.0
-    low, high = (
-        profile_end(score, (at, other), side, np.log(bound), widening)
-        for side, bound in zip((-1.0, 1.0), search, strict=True)
-    )
-    return _bounded(values[which], low, high, search)
+    search = (SIGMA_A_SEARCH_M_S2, SIGMA_Z_SEARCH_M)[which]
+    widening = (1.0, best.widening)[which]
+    return _bounded(score, (np.log(values[which]), np.log(values[1 - which])), search, widening)
 
 
 def _needed(found: NoiseFit, sigma_z: float) -> Noise:
@@ -384,18 +363,18 @@ def _needed(found: NoiseFit, sigma_z: float) -> Noise:
 
     low, high = np.log(SIGMA_A_SEARCH_M_S2)
     at = float(minimize_scalar(score, bounds=(low, high), options={"xatol": 1e-3}).x)
-    return _bounded(
-        float(np.exp(at)),
-        profile_end(score, (at, 0.0), -1.0, low),
-        profile_end(score, (at, 0.0), 1.0, high),
-        SIGMA_A_SEARCH_M_S2,
-    )
+    return _bounded(score, (at, 0.0), SIGMA_A_SEARCH_M_S2)
 
 
 def _bounded(
-    value: float, low: float | None, high: float | None, search: tuple[float, float]
+    score: Callable[[float, float], float],
+    best: tuple[float, float],
+    search: tuple[float, float],
+    widening: float = 1.0,
 ) -> Noise:
-    """A noise from its interval in ln; without a value where that has its best at an end."""
+    """A noise with its interval; without a value where that has its best at an end."""
+    value = float(np.exp(best[0]))
+    low, high = profile_ends(score, best, search, widening)
     inside = search[0] * AT_END < value < search[1] / AT_END
     return Noise(
         value if inside and low is not None and high is not None else None,
@@ -405,12 +384,7 @@ def _bounded(
 
 
 def _map(
-    legs: list[Preintegrated],
-    weight: Array,
-    start_z_m: float,
-    sigma_a: Noise,
-    sigma_z: Noise,
-    best: Noises,
+    legs: list[Preintegrated], weight: Array, sigma_a: Noise, sigma_z: Noise, best: Noises
 ) -> LikelihoodMap:
     """Likelihood of the two-state filter all around its optimum."""
     grids = []
@@ -423,11 +397,7 @@ def _map(
         ends = at * (below / at) ** reach, at * (above / at) ** reach
         grids.append(np.geomspace(max(ends[0], low), min(ends[1], high), GRID))
     a, z = grids
-    score = Likelihood([filter_part(leg) for leg in legs], weight, start_z_m)
-    if score.tabulated:
-        total = np.array([[score(Noises(*pair)) for pair in product([x], z)] for x in a])
-    else:
-        total = total_over_grid(legs, a[:, None], z[None, :], weight)
+    total = total_over_grid(legs, a[:, None], z[None, :], weight)
     return LikelihoodMap(a, z, total - total.min())
 
 
@@ -447,24 +417,10 @@ def _hold_out(
             f"half of the segment holds {half} measurements (at least {MIN_MEASUREMENTS})",
             "Analyse a longer segment.",
         )
-    part = [filter_part(_cut(leg, half)) for leg in legs]
-    weight = found.weight[:half]
-    first = most_likely(part, found.noises, weight, outliers=False)
+    part = [filter_part(leg.first(half)) for leg in legs]
+    first = most_likely(part, found.noises, found.weight[:half], outliers=False)
     tuned = first.noises
     # of the second half given the first
     scores = [found.score(noises) - first.score(noises) for noises in (chosen, tuned)]
     count = len(found.weight) - half
     return HeldOut(tuned.sigma_a_m_s2, tuned.sigma_z_m, count, (scores[0] - scores[1]) / count)
-
-
-def _cut(legs: Preintegrated, count: int) -> Preintegrated:
-    """The first measurements only."""
-    return replace(
-        legs,
-        length_s=legs.length_s[:count],
-        delta_position_m=legs.delta_position_m[:count],
-        delta_velocity_m_s=legs.delta_velocity_m_s[:count],
-        noise_unit=legs.noise_unit[:count],
-        noise_fixed=legs.noise_fixed[:count],
-        measurement_m=legs.measurement_m[:count],
-    )

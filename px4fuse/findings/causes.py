@@ -125,13 +125,9 @@ RECORDING = frozenset(
         "source_samples_lost", "too_few_innovations",
     }
 )  # fmt: skip
-NOISES = frozenset(
-    {
-        "kf_variance_overstated", "kf_variance_understated", "ekf2_variance_overstated",
-        "ekf2_variance_understated", "process_noise_forgotten", "sigma_a_large", "sigma_a_small",
-        "sigma_z_large", "sigma_z_small",
-    }
-)  # fmt: skip
+SETTINGS = frozenset({"sigma_a_large", "sigma_a_small", "sigma_z_large", "sigma_z_small"})
+VARIANCES = frozenset({*_OVERSTATED, "kf_variance_understated", "ekf2_variance_understated"})
+NOISES = SETTINGS | VARIANCES | {"process_noise_forgotten"}
 
 
 def by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:

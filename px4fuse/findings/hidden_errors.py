@@ -87,8 +87,7 @@ def larger(analysis: Analysis, hidden: list[Hidden]) -> Finding:
     evidence: dict[str, float | str] = {"axis": worst.axis, "filter": worst.owner}
     said = []
     for owner, name in FILTERS.items():
-        one = next((each for each in hidden if each.owner == owner), None)
-        if one is not None:
+        for one in [each for each in hidden if each.owner == owner][:1]:
             nis = one.statement.nis_mean
             evidence |= {
                 f"{owner}_nis_mean": nis,

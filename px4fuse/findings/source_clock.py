@@ -1,4 +1,4 @@
-"""The source's stamps are late or early against the IMU, or their error changed in flight."""
+"""The source's stamps are late or early against the IMU, and EKF2_EV_DELAY is not that delay."""
 
 from __future__ import annotations
 
@@ -7,24 +7,31 @@ from dataclasses import replace
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
 from px4fuse.comparison.model import Comparison
+from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
-from px4fuse.findings.model import Found, error, finding
+from px4fuse.findings.model import Found, error, finding, warning
 from px4fuse.findings.source_positions import low_pass
 from px4fuse.findings.source_stamps import until_synchronised
 from px4fuse.flight import Unavailable
 
 OFFSET_S = 0.03  # at 1 m/s a third of a good UWB's noise
 OFFSET_ERROR_S = 0.10  # at 1 m/s a good UWB's noise
+EKF2_UPDATE_S = 0.010  # EKF2_PREDICT_US, EKF2's own step
+AT_THE_SENDER = "Correct the stamps at the sender:"
 
 
 def detect(analysis: Analysis) -> Found:
-    """An offset that is known, of stamps that are the source's own."""
-    clock, source = analysis.clock, analysis.source
-    # what was derived from EKF2's own output has EKF2's stamps
-    if not isinstance(clock, ClockOffset) or source.origin.reconstructed:
-        return
-    # a low pass lags behind the motion by itself
-    if not clock.determinable or low_pass(analysis) is not None:
+    """An offset that is known, of stamps that are the source's own and not EKF2's."""
+    clock, made = analysis.clock, analysis.source.origin.reconstructed
+    if isinstance(clock, ClockOffset) and clock.determinable and not made:
+        yield from offset(analysis, clock)
+        yield from delay(analysis, clock)
+
+
+def offset(analysis: Analysis, clock: ClockOffset) -> Found:
+    """The stamps contradict the IMU, or their error changed in flight."""
+    source = analysis.source
+    if low_pass(analysis) is not None:  # which lags behind the motion by itself
         return
     low, high = clock.interval_s
     evidence = {"offset_s": clock.offset_s, "interval_low_s": low, "interval_high_s": high}
@@ -84,3 +91,40 @@ def typed_offset_s(comparison: Comparison, clock: ClockOffset) -> float:
     """
     placed = comparison.source.alignment
     return clock.offset_s if placed is None else placed.clock_offset_s + clock.remaining_s
+
+
+def delay(analysis: Analysis, clock: ClockOffset) -> Found:
+    """EKF2_EV_DELAY lies outside what the clock offset and EKF2's step leave open."""
+    delay_ms = analysis.flight.log.parameters.get("EKF2_EV_DELAY")
+    asked_ms = -1e3 * clock.offset_s
+    known_ms = 1e3 * max(clock.chance_s + EKF2_UPDATE_S, OFFSET_S)
+    if delay_ms is None or abs(delay_ms - asked_ms) < known_ms:
+        return
+    low_ms, high_ms = (-1e3 * end for end in reversed(clock.interval_s))
+    asked, more = f"the data ask for {round(asked_ms)} ms", ""
+    ends = f"{round(low_ms)} to {round(high_ms)}"
+    if asked_ms < 0.0:
+        asked = f"the stamps are early by {round(-asked_ms)} ms"
+        ends, more = f"{round(-high_ms)} to {round(-low_ms)}", ", for which there is no delay"
+    yield warning(
+        "ekf2_ev_delay_wrong",
+        f"EKF2_EV_DELAY is {delay_ms:g} ms, while {asked}",
+        f" (95 % {ends}){more}: EKF2 fuses each position at the wrong time, and its track lags or "
+        "leads by the difference.",
+        delay_remedy(analysis, 0.0 if low_ms <= 0.0 else asked_ms, delay_ms),
+        {"ekf2_ev_delay_ms": delay_ms, "asked_ms": asked_ms},
+    )
+
+
+def delay_remedy(analysis: Analysis, delay_ms: float, flown_ms: float) -> str:
+    """EKF2_EV_DELAY as the data ask for it, as far as PX4's range and a replay allow."""
+    model, most_ms = analysis.ekf2_model, PARAMETERS["EKF2_EV_DELAY"].maximum
+    if delay_ms > most_ms:
+        return f"{AT_THE_SENDER} PX4 allows {most_ms:g} ms (EKF2_EV_DELAY)."
+    if round(delay_ms) <= 0.0 and flown_ms == 0.0:
+        return f"{AT_THE_SENDER} EKF2 has no parameter for stamps that are early."
+    changes = {"EKF2_EV_DELAY": max(float(round(delay_ms)), 0.0)}
+    if not isinstance(model, Unavailable):
+        changes = remedy.delay_change(model, delay_ms) or changes
+    words, _ = remedy.remedy_words(model, changes, remedy.delay_helps, otherwise=AT_THE_SENDER)
+    return words

@@ -16,6 +16,7 @@ from px4fuse.comparison.model import AgainstTruth, AxisComparison, Difference, F
 from px4fuse.comparison.why import the
 from px4fuse.ekf2.walk import Why
 from px4fuse.filter.kalman import state_at
+from px4fuse.findings.causes import SETTINGS, VARIANCES
 from px4fuse.findings.hidden_errors import hidden_errors
 from px4fuse.findings.model import Finding
 from px4fuse.findings.sigma import tuned_for
@@ -25,13 +26,7 @@ from px4fuse.plain import excess_words, length_words
 
 MOST_SENTENCES = 3
 # What the first sentence tells already
-TOLD_FIRST = frozenset(
-    {
-        "kf_variance_overstated", "kf_variance_understated", "ekf2_variance_overstated",
-        "ekf2_variance_understated", "errors_larger_than_claimed", "ekf2_unavailable",
-    }
-)  # fmt: skip
-SETTINGS = frozenset({"sigma_a_large", "sigma_a_small", "sigma_z_large", "sigma_z_small"})
+TOLD_FIRST = VARIANCES | {"errors_larger_than_claimed", "ekf2_unavailable"}
 # What weighs less than why EKF2 differs
 EFFECTS = frozenset({"ekf2_resets", "ekf2_rejecting", "ekf2_fusion_interrupted"})
 

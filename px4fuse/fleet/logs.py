@@ -61,56 +61,43 @@ def find_logs(given: Iterable[str]) -> list[FoundLog]:
     SettingsError
         There is no log in one of them, or a package is missing that its kind of URL requires.
     """
-    found: dict[str, FoundLog] = {}
-    for one in given:
-        if not one:
-            raise SettingsError("the name of a log is empty. Give files, folders or URLs.")
-        logs = _logs_in(one)
-        if not logs:
-            raise SettingsError(
-                f"{one}: no logs in it ({', '.join(SUFFIXES)}). Give a folder that holds some."
-            )
-        for log in logs:
-            found.setdefault(log.address, log)
+    found = {log.address: log for one in given for log in _logs_in(one)}
     if not found:
         raise SettingsError("no logs: give files, folders, globs or URLs.")
     return sorted(found.values())
 
 
 def _logs_in(given: str) -> list[FoundLog]:
+    if not given:
+        raise SettingsError("the name of a log is empty. Give files, folders or URLs.")
+    files, root = _file_system(given)
     try:
-        files, root = _file_system(given)
-        if files.isfile(root):
-            infos = {root: files.info(root)}
-        elif files.isdir(root):
+        if files.isdir(root):
             every = files.find(root, detail=True)
             infos = {path: info for path, info in every.items() if _suffix(path) in SUFFIXES}
-        elif any(sign in given for sign in "*?["):
-            every = files.glob(root, detail=True)
-            infos = {path: info for path, info in every.items() if info["type"] == "file"}
-        elif files.exists(root):  # a device or pipe: its worker says so
-            infos = {root: {}}
+        elif files.exists(root):  # of a device or pipe its worker says that it is none
+            infos = {root: files.info(root) if files.isfile(root) else {}}
         else:
-            raise SettingsError(f"{given}: no such file or folder.")
-    except SettingsError:
-        raise
+            every = files.glob(root, detail=True) if any(sign in given for sign in "*?[") else {}
+            infos = {path: info for path, info in every.items() if info["type"] == "file"}
     # OSError, and what the package of each kind of URL defines: no account, no such bucket
     except Exception as error:
         raise SettingsError(
             f"{given}: cannot be read ({one_line(str(error), 200) or type(error).__name__})."
         ) from error
+    if not infos:
+        raise SettingsError(
+            f"{given}: no logs there ({', '.join(SUFFIXES)}). Give a file, or a folder that holds "
+            "some."
+        )
     return [_found(given, files, path, info) for path, info in infos.items()]
 
 
 def _found(given: str, files: AbstractFileSystem, path: str, info: dict[str, Any]) -> FoundLog:
-    if _is_local(files):
-        address = log = path
-        if not Path(given).is_absolute():
-            log = os.path.relpath(path)
-    else:
-        address = log = files.unstrip_protocol(path)
-    name = PurePosixPath(path.partition("?")[0]).name or "log"
-    return FoundLog(name, log, address, info.get("size"))
+    address = path if _is_local(files) else files.unstrip_protocol(path)
+    is_relative = _is_local(files) and not Path(given).is_absolute()
+    log = os.path.relpath(path) if is_relative else address
+    return FoundLog(_name(path), log, address, info.get("size"))
 
 
 @contextmanager
@@ -141,7 +128,7 @@ def local_file(address: str) -> Iterator[Path]:
             "--max-size MB."
         )
     with TemporaryDirectory(prefix="px4fuse-") as folder:
-        local = Path(folder, PurePosixPath(path.partition("?")[0]).name or "log")
+        local = Path(folder, _name(path))
         files.get_file(path, str(local))
         files.invalidate_cache()
         if _identity(files, path) != before:
@@ -177,3 +164,8 @@ def _is_local(files: AbstractFileSystem) -> bool:
 
 def _suffix(path: str) -> str:
     return PurePosixPath(path).suffix.lower()
+
+
+def _name(path: str) -> str:
+    """Without its folder, and without what a URL asks for."""
+    return PurePosixPath(path.partition("?")[0]).name or "log"

@@ -12,20 +12,9 @@ from px4fuse.fleet.by_log import Log, logs_of, short_names
 from px4fuse.fleet.questions import above, overstated_words
 from px4fuse.fleet.rows import FAILED, PLACES
 from px4fuse.plain import few_words, number_words
+from px4fuse.webpage import frame
 from px4fuse.webpage.charts import Scale
-from px4fuse.webpage.frame import (
-    Cell,
-    Column,
-    Part,
-    Row,
-    figure,
-    links,
-    listed,
-    page,
-    pairs,
-    tabled,
-    words,
-)
+from px4fuse.webpage.frame import Cell, Column, Part, Row
 from px4fuse.webpage.safe import clean, local_link
 
 SIGMA_Z, CLOCK = ("sigma_z_m", "sigma_z_low_m", "sigma_z_high_m"), (
@@ -79,20 +68,20 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
         vehicle = log.get("vehicle", "")
         cells = (
             Cell(log["name"], log["name"], log["log"].rpartition("/")[0]),
-            words(log.get("date", "")[:10]),
-            words(names.get(vehicle, str(vehicle))),
-            words(log.get("firmware", "")),
+            frame.words(log.get("date", "")[:10]),
+            frame.words(names.get(vehicle, str(vehicle))),
+            frame.words(log.get("firmware", "")),
             Cell(log["status"], log["status"], "worse than before" * bool(log["changes"]),
                  LOOKS[log["status"]]),
             *(_factor(log["factors"].get(whose), factor) for whose in ("kf", "ekf2")),
             _interval(log, SIGMA_Z, sigma_z),
             _interval(log, CLOCK, clock),
-            figure(log.get("position_rmse_m")),
+            frame.figure(log.get("position_rmse_m")),
             Cell() if log["status"] == FAILED else
-            figure(float(len(said)), below=few_words(said, 2)),
+            frame.figure(float(len(said)), below=few_words(said, 2)),
         )  # fmt: skip
         rows.append(Row(cells, tuple(log["tags"]), _details(log), _beside(log)))
-    return page(
+    return frame.page(
         title=title,
         subtitle=f"{len(logs)} log{'' if len(logs) == 1 else 's'}, compared with {made_with}",
         above=above(logs, names, factor, sigma_z, clock),
@@ -125,7 +114,7 @@ def _factor(value: float | None, scale: Scale | None) -> Cell:
     if value is None or scale is None:
         return Cell()
     at = scale.share(value)
-    return figure(value, overstated_words(value), (min(at, 0.5), at, max(at, 0.5)))
+    return frame.figure(value, overstated_words(value), (min(at, 0.5), at, max(at, 0.5)))
 
 
 def _interval(log: Log, columns: Sequence[str], scale: Scale | None) -> Cell:
@@ -133,7 +122,7 @@ def _interval(log: Log, columns: Sequence[str], scale: Scale | None) -> Cell:
     if value is None or scale is None:
         return Cell()
     ends = (value if low is None else low, value, value if high is None else high)
-    return figure(value, f"{value:.3g}", tuple(map(scale.share, ends)))
+    return frame.figure(value, f"{value:.3g}", tuple(map(scale.share, ends)))
 
 
 def _details(log: Log) -> tuple[Part, ...]:
@@ -144,19 +133,19 @@ def _details(log: Log) -> tuple[Part, ...]:
     ]
     heads = ["", *(axis["axis"] for axis in log["axes"])]
     return (
-        listed("Not judged", [reason for reason, _ in log["lacking"] if reason], warn=True),
-        listed("What to set", list(dict.fromkeys(r for _, r in log["lacking"] if r))),
-        listed("Worse than in the baseline", log["changes"], warn=True),
-        listed("What happened", list(filter(None, log.get("story", "").splitlines()))),
-        listed("Findings", [f"{named(one)} ({one})" for one in log["findings"]]),
-        tabled("Axes", heads if axes else (), axes, range(1, len(heads))),
+        frame.listed("Not judged", [reason for reason, _ in log["lacking"] if reason], warn=True),
+        frame.listed("What to set", list(dict.fromkeys(r for _, r in log["lacking"] if r))),
+        frame.listed("Worse than in the baseline", log["changes"], warn=True),
+        frame.listed("What happened", list(filter(None, log.get("story", "").splitlines()))),
+        frame.listed("Findings", [f"{named(one)} ({one})" for one in log["findings"]]),
+        frame.tabled("Axes", heads if axes else (), axes, range(1, len(heads))),
     )
 
 
 def _beside(log: Log) -> tuple[Part, ...]:
     return (
-        links("Files", [(said, local_link(log.get(name, ""))) for said, name in FILES]),
-        pairs("Flight", [(name, _said(log.get(name, ""))) for name in OF_LOG]),
+        frame.links("Files", [(said, local_link(log.get(name, ""))) for said, name in FILES]),
+        frame.pairs("Flight", [(name, _said(log.get(name, ""))) for name in OF_LOG]),
     )
 
 

@@ -32,7 +32,8 @@ from px4fuse.writing import write_all
 if TYPE_CHECKING:
     from distributed import Client
 
-RESULTS = "results"
+# Columns of the files of a log, relative to the folder
+FILES = ("results", "report")
 _GOES_ON = "What is done is kept: the same command goes on from there."
 
 Progress = Callable[[str, int, int], None]
@@ -259,20 +260,11 @@ def _todo(found: _Found, job: Job) -> Iterator[Job]:
             continue
         sha256 = found.hash_of.get(log.address, "")
         rows = found.store.rows(sha256)
-        if rows and ("axis" not in rows[0] or all(_files(found, rows[0])[: 1 + job.reports])):
+        files = [rows[0][kind] for kind in FILES[: 1 + job.reports]] if rows else [""]
+        if rows and ("axis" not in rows[0] or all((found.output / f).is_file() for f in files)):
             found.reused.add(sha256)
         else:
             yield replace(job, address=log.address, sha256=sha256)
-
-
-def _files(found: _Found, row: Row) -> tuple[str, str]:
-    """Results and report of a log, relative to the folder; empty where there is none."""
-    stem = f"{RESULTS}/{file_stem(row['name'], row['log_sha256'])}"
-    results, report = f"{stem}.json", f"{stem}.pdf"
-    return (
-        results if (found.output / results).is_file() else "",
-        report if (found.output / report).is_file() else "",
-    )
 
 
 def _keep(found: _Found, address: str, outcome: Outcome) -> None:
@@ -282,12 +274,15 @@ def _keep(found: _Found, address: str, outcome: Outcome) -> None:
         found.lost[address] = row
         return
     sha256 = found.hash_of[address] = row["log_sha256"]
-    stem = found.output / RESULTS / file_stem(row["name"], sha256)
-    files = {".json": outcome.results, ".pdf": outcome.report}
-    write_all(
-        {stem.with_name(stem.name + end): content for end, content in files.items() if content}
-    )
-    found.store.keep(sha256, found.logs[address].size_bytes, outcome.rows)
+    stem = f"results/{file_stem(row['name'], sha256)}"
+    contents = {
+        f"{stem}{end}": content
+        for end, content in ((".json", outcome.results), (".pdf", outcome.report))
+    }
+    write_all({found.output / name: content for name, content in contents.items() if content})
+    files = dict(zip(FILES, (name if contents[name] else "" for name in contents), strict=True))
+    rows = [each | files for each in outcome.rows]
+    found.store.keep(sha256, found.logs[address].size_bytes, rows)
 
 
 def _written(found: _Found, baseline: pd.DataFrame | None) -> Fleet:
@@ -298,8 +293,6 @@ def _written(found: _Found, baseline: pd.DataFrame | None) -> Fleet:
         for log in found.logs.values():
             lost = found.lost.get(log.address)
             kept = [lost] if lost else found.store.rows(found.hash_of.get(log.address, ""))
-            judged = bool(kept) and "axis" in kept[0]
-            results, report = _files(found, kept[0]) if judged else ("", "")
             for row in kept:
                 severities.update(row.get("severities", ()))
                 yield row | {
@@ -307,8 +300,6 @@ def _written(found: _Found, baseline: pd.DataFrame | None) -> Fleet:
                     "name": log.name,
                     "px4fuse": found.store.px4fuse,
                     "settings": found.store.settings,
-                    "results": results,
-                    "report": report,
                 }
 
     table, against = table_of(rows()), ""

@@ -107,27 +107,18 @@ def notes(a: DiffInput, b: DiffInput, *, paired: bool) -> Iterator[str]:
         yield f"{untested}Flights are drawn from their logs. Give {logs}."
     if paired:
         yield (
-            "Both are of one flight, so there is no sampling between them: each difference is "
-            "exact for this flight, and nothing says whether another flight would show it too. "
-            f"Less than {LEAST_RATIO:.0%} counts as the same."
+            "Both are of one flight: each difference is exact for it, and nothing says whether "
+            f"another flight would show it too. Less than {LEAST_RATIO:.0%} counts as the same."
         )
         return
     if any(at(a.results, place) != at(b.results, place) for _, _, place in _SETTINGS):
-        yield (
-            "The filter's settings are not the same, so numbers of ours differ by them too, not "
-            "by the flights alone."
-        )
+        yield "The filter's settings are not the same: numbers of ours differ by them too."
     yield (
         f"Of the changes that are called significant, {FALSE_DISCOVERY_RATE:.0%} are expected to "
-        "be chance (Benjamini and Hochberg 1995); q is the p-value after that correction."
-    )
-    yield (
-        "Intervals (95 %) of noises, clock and heading are from their likelihood; of innovations "
-        "and errors from a bootstrap over blocks of the flight, without the log of innovations "
-        "from chi-square for as many as are independent; of shares from Wilson's formula."
-    )
-    yield (
-        "Two intervals are combined by the distances from each value to its ends (Zou and Donner "
-        "2008), and widened by what flights of one simulated vehicle differ by beyond them. A "
-        "real vehicle may vary more: px4fuse batch --baseline takes that from your own flights."
+        "be chance (Benjamini and Hochberg 1995); q is the p-value after that correction. "
+        "Intervals are from the likelihood, of innovations and errors from a bootstrap over blocks "
+        "(without the log of innovations from chi-square), of shares from Wilson's formula; they "
+        "are combined after Zou and Donner (2008), and widened by what flights of one simulated "
+        "vehicle differ by. A real one may vary more: px4fuse batch --baseline takes that from "
+        "your own flights."
     )

@@ -1,4 +1,4 @@
-"""What an instructor asks of a class, above the table."""
+"""What stands above the table of a class: how many there are, and their points by item."""
 
 from __future__ import annotations
 
@@ -9,17 +9,14 @@ from collections.abc import Sequence
 from px4fuse.grading.anonymous import Veil
 from px4fuse.grading.class_table import number
 from px4fuse.grading.model import Entry, Item
-from px4fuse.plain import few_words
-from px4fuse.webpage.charts import bar, bins, histogram
-from px4fuse.webpage.frame import card, note, opens, picks, ranking, summary
+from px4fuse.webpage.charts import bins, histogram
+from px4fuse.webpage.frame import card, note, summary
 from px4fuse.webpage.safe import escaped
-
-MOST_NAMES = 40
 
 
 def above(entries: Sequence[Entry], veil: Veil) -> str:
     """HTML of all that stands above the table."""
-    shown = _items(entries, veil) + _mistakes(entries)
+    shown = _items(entries, veil)
     return _summary(entries) + (f'<div class="cards">{shown}</div>' if shown else "")
 
 
@@ -76,22 +73,3 @@ def _items(entries: Sequence[Entry], veil: Veil) -> str:
         '<th scope="col" class="n wide-only">All</th></tr></thead>'
         f"<tbody>{''.join(lines)}</tbody></table>",
     )
-
-
-def _mistakes(entries: Sequence[Entry]) -> str:
-    """Who missed which mistake, from the answer key; those that most missed first."""
-    found: dict[str, list[tuple[int, bool]]] = defaultdict(list)
-    for at, entry in enumerate(entries):
-        for mistake, was in (entry.counting.mistakes if entry.counting else {}).items():
-            found[mistake].append((at, was))
-    shares = {name: sum(was for _, was in those) / len(those) for name, those in found.items()}
-    lines = []
-    for mistake in sorted(found, key=lambda name: (shares[name], name)):
-        those = found[mistake]
-        missed = [opens(at, entries[at].called) for at, was in those if not was]
-        by = f"<p>Not named by {few_words(missed, MOST_NAMES)}.</p>" if missed else ""
-        said = picks(f"missed:{mistake}", mistake) if missed else f"<span>{escaped(mistake)}</span>"
-        named = f"{len(those) - len(missed)} of {len(those)} named it"
-        lines.append(f"<li>{bar(shares[mistake])}{said}<span class='right'>{named}</span>{by}</li>")
-    said = "Of the students whose flight has it, by the answer key; hardest first."
-    return ranking("Who missed which mistake", said, lines, len(lines)) if lines else ""

@@ -94,7 +94,7 @@ def grade(
         Flight logs and folders of them; a report names its log by SHA-256.
     output : Path
         Folder for the class table (``class.csv``, ``class.html``), the redrawn ``reports/``,
-        ``feedback/``, ``gradescope/``, ``grades/`` for learning platforms, and the records that
+        ``feedback/``, ``grades/`` for learning platforms, and the records that
         make a second run quick. Its ``overrides.csv`` is read.
     key : AnswerKey, optional
         Which mistakes each student's flight has.

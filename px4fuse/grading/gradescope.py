@@ -1,4 +1,4 @@
-"""Gradescope: results that its autograder takes, and what it says of a submission.
+"""The autograder that Gradescope runs: written here, run there.
 
 After "Autograder Specifications" of gradescope-autograders.readthedocs.io: ``setup.sh`` is run once
 to build the container, ``run_autograder`` for every submission; the zip file's content stands in
@@ -9,30 +9,69 @@ to build the container, ``run_autograder`` for every submission; the zip file's 
 
 from __future__ import annotations
 
+import json
+import platform
+import re
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from datetime import datetime
+from importlib import metadata
+from importlib.resources import files
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from px4fuse.assignment.key import key_text, read_key
 from px4fuse.errors import SettingsError
+from px4fuse.grading.entries import Course, class_entries
+from px4fuse.grading.feedback import returned_text
+from px4fuse.grading.grade import grade_all
+from px4fuse.grading.lateness import LateRule
 from px4fuse.grading.model import Entry
 from px4fuse.grading.platforms import NOBODY, ExportOrigin
-from px4fuse.reading import read_text
+from px4fuse.grading.roster import Register, people_of_key
+from px4fuse.grading.rubric import read_rubric, rubric_text
+from px4fuse.grading.submissions import collect
+from px4fuse.grading.zipping import zipped
+from px4fuse.reading import files_by_sha256, read_log_bytes, read_text
 from px4fuse.results.reading import cleaned, one_line
+from px4fuse.writing import write_all
 
+SETUP = """#!/usr/bin/env bash
+# Run once, when the autograder is uploaded: a Python of its own, with the versions of the machine
+# that wrote this, so that the numbers and pages are the same to the last digit.
+set -euo pipefail
+apt-get update
+apt-get install -y python3-venv
+python3 -m venv /opt/uv
+/opt/uv/bin/pip install uv
+/opt/uv/bin/uv venv --python {python} /opt/px4fuse
+/opt/uv/bin/uv pip install --python /opt/px4fuse/bin/python \\
+    --requirement /autograder/source/requirements.txt
+"""
+RUN = """#!/usr/bin/env bash
+# Run for every submission: its PDF is read within bounds, and nothing in it is executed.
+export PYTHONPATH=/autograder/source
+exec /opt/px4fuse/bin/python -P -m px4fuse grade --gradescope /autograder{options}
+"""
+EXECUTABLE = ("setup.sh", "run_autograder")
 VISIBLE = "after_due_date"
 MAX_METADATA = 5_000_000
 
 
-def results(entry: Entry, text: str, seconds: float | None = None) -> dict[str, Any]:
+def results(entry: Entry, text: str, seconds: float) -> dict[str, Any]:
     """``results.json`` of one student.
 
     Parameters
     ----------
     text : str
         What the student reads about all of it.
-    seconds : float, optional
+    seconds : float
         That grading took.
     """
     graded = entry.counting
@@ -57,7 +96,7 @@ def results(entry: Entry, text: str, seconds: float | None = None) -> dict[str, 
         tests.append(
             _test(last, "For the instructor", output, "hidden", score=0.0, max_score=0.0, tags=tags)
         )
-    made: dict[str, Any] = {
+    return {
         "score": entry.total or 0.0,
         "output": text,
         "output_format": "text",
@@ -66,8 +105,8 @@ def results(entry: Entry, text: str, seconds: float | None = None) -> dict[str, 
         "visibility": VISIBLE,
         "stdout_visibility": "hidden",
         "tests": tests,
+        "execution_time": round(seconds, 2),
     }
-    return made if seconds is None else {**made, "execution_time": round(seconds, 2)}
 
 
 def _test(number: int, name: str, output: str, visibility: str, **more: object) -> dict[str, Any]:
@@ -121,3 +160,104 @@ def submission_metadata(folder: Path) -> tuple[ExportOrigin, datetime | None]:
     name, email = (one_line(one or "", 200) for one in (user.name, user.email))
     origin = ExportOrigin("gradescope", name=name, email=email, time=said.created_at)
     return origin if name else NOBODY, getattr(said.assignment, "due_date", None)
+
+
+def autograder_zip(
+    logs: Sequence[Path], rubric: Path | None, key: Path | None, late: LateRule | None
+) -> bytes:
+    """The zip file to upload under "Configure Autograder", for an assignment of one PDF.
+
+    It holds px4fuse as it is installed here, the versions of what it needs, the logs, the rubric
+    and the answer key, which students never see: nothing of theirs is executed.
+
+    Raises
+    ------
+    SettingsError
+        No log was given, or rubric or key are not what they should be.
+    LogError
+        A log cannot be read.
+    """
+    paths = files_by_sha256(logs).values()
+    if not paths:
+        raise SettingsError("--write-autograder: give the flight logs with --logs.")
+    read_rubric(rubric)
+    text = rubric_text() if rubric is None else rubric.read_text(encoding="utf-8-sig")
+    python = ".".join(platform.python_version_tuple()[:2])
+    options = f' --late "{late.text}"' if late else ""
+    about = metadata.distribution("px4fuse")
+    described = about.read_text("METADATA") or about.read_text("PKG-INFO") or ""
+    contents = {
+        "setup.sh": SETUP.format(python=python).encode(),
+        "run_autograder": RUN.format(options=options).encode(),
+        "requirements.txt": "".join(f"{one}\n" for one in sorted(set(_requirements()))).encode(),
+        f"px4fuse-{about.version}.dist-info/METADATA": described.encode(),
+        **dict(_package("px4fuse", files("px4fuse"))),
+        "rubric.toml": text.encode(),
+        **({} if key is None else {"key.json": key_text(read_key(key)).encode()}),
+    }
+    for number, path in enumerate(paths):
+        contents[f"logs/{number}{path.suffix}"] = read_log_bytes(path)
+    return zipped(contents, EXECUTABLE)
+
+
+def _requirements() -> Iterator[str]:
+    """The versions of what px4fuse needs, as they are here: the last digits depend on them."""
+    for text in metadata.requires("px4fuse") or ():
+        name = re.match(r"[\w.-]+", text)
+        if name is not None and "extra == 'test'" not in text:
+            with suppress(metadata.PackageNotFoundError):  # an extra that is not installed here
+                yield f"{name[0]}=={metadata.version(name[0])}"
+
+
+def _package(name: str, folder: Traversable) -> Iterator[tuple[str, bytes]]:
+    """The files of a package, without what Python compiled."""
+    for one in sorted(folder.iterdir(), key=lambda each: each.name):
+        if one.is_dir() and one.name != "__pycache__":
+            yield from _package(f"{name}/{one.name}", one)
+        elif one.is_file():
+            yield f"{name}/{one.name}", one.read_bytes()
+
+
+def run_autograder(folder: Path, late: LateRule | None) -> None:
+    """Grade the one submission that Gradescope put into its folder, and write its results.
+
+    Parameters
+    ----------
+    folder : Path
+        ``/autograder``, with ``source``, ``submission`` and ``submission_metadata.json``.
+
+    Raises
+    ------
+    SettingsError
+        Rubric, key or metadata are not what they should be: Gradescope shows it to the instructor.
+    """
+    start = time.perf_counter()
+    source = folder / "source"
+    rubric = read_rubric(source / "rubric.toml")
+    key_path = source / "key.json"
+    key = read_key(key_path) if key_path.exists() else None
+    origin, due = submission_metadata(folder)
+    register = Register(people_of_key(key)) if key else None
+    try:
+        found, _ = collect([folder / "submission"])
+    except SettingsError as error:  # an empty folder, or other files than PDFs
+        of = sum(item.points for item in rubric.items)
+        entry = Entry(origin.name, "", None, email=origin.email, of=of)
+        text = str(error)
+    else:
+        found = tuple(replace(one, origin=origin) for one in found)
+        with tempfile.TemporaryDirectory(prefix="px4fuse-") as records:
+            graded, _ = grade_all(found, [source / "logs"], rubric, Path(records), key, register, 1)
+        entries, _ = class_entries(graded, found, register, Course(due=due, late=late), {}, {})
+        entry = max(
+            (one for one in entries if one.counting),
+            key=lambda one: -1.0 if one.total is None else one.total,
+        )
+        text = returned_text(entry)
+        if register and register.by_platform(origin) is None:
+            name = origin.name or "(none)"
+            unknown = f"The answer key has nobody of the name {name}: compare the report's."
+            entry = replace(entry, remarks=(unknown, *entry.remarks))
+    made = results(entry, text, time.perf_counter() - start)
+    content = json.dumps(made, ensure_ascii=False, indent=2)
+    write_all({folder / "results" / "results.json": content.encode()})

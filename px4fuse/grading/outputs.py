@@ -6,7 +6,6 @@ import csv
 import hashlib
 import io
 import itertools
-import json
 import random
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -20,7 +19,6 @@ from px4fuse.grading.class_page import html_text
 from px4fuse.grading.class_table import csv_text
 from px4fuse.grading.entries import Course
 from px4fuse.grading.feedback import returned_text
-from px4fuse.grading.gradescope import results
 from px4fuse.grading.model import Entry, Graded, Submission
 from px4fuse.grading.names import distinct, file_names
 from px4fuse.grading.overrides import NAME, TEMPLATE
@@ -89,11 +87,8 @@ def write_class(
     contents["class.html"] = html_text(shown, title, made_with).encode()
     if not (output / NAME).exists():
         contents[NAME] = TEMPLATE.encode()
-    for entry, name, text in zip(entries, names, texts, strict=True):
+    for name, text in zip(names, texts, strict=True):
         contents[f"{FEEDBACK}/{name}.txt"] = text.encode()
-        if entry.counting:
-            found = json.dumps(results(entry, text), ensure_ascii=False, indent=2)
-            contents[f"gradescope/{name}/results.json"] = found.encode()
     notes: list[str] = []
     stems = distinct((sheet.path.stem for sheet in course.worksheets), "{}-{}")
     for sheet, stem in zip(course.worksheets, stems, strict=True):
@@ -103,7 +98,7 @@ def write_class(
     if moodle := exports.moodle_feedback(entries, files, texts):
         contents[f"{GRADES}/moodle_feedback.zip"] = moodle
     write_all({output / name: content for name, content in contents.items()})
-    folders = [REPORTS, SHEETS] * drawn + [FEEDBACK, "gradescope"]
+    folders = [REPORTS, SHEETS] * drawn + [FEEDBACK]
     folders += [GRADES] * any(name.startswith(GRADES) for name in contents)
     written = tuple(output / name for name in ("class.csv", "class.html", *folders, NAME))
     return written, (*notes, *_left_over(output, names))
@@ -210,6 +205,6 @@ def _left_over(output: Path, names: Sequence[str]) -> tuple[str, ...]:
     if not others:
         return ()
     return (
-        f"feedback and gradescope also hold {len(others)} of an earlier run, which are not among "
+        f"feedback also holds {len(others)} of an earlier run, which are not among "
         f"these submissions: {few_words(others, 4)}. Delete them if they are out of date.",
     )

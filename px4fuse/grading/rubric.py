@@ -1,8 +1,7 @@
 """The rubric: what a report is worth, as an instructor writes it down.
 
-A TOML file of items, each with a title, points, the name of a check and its parameters. A check is
-a kind of :class:`px4fuse.grading.evidence.RubricItem`, its class here, and an item of rubric.toml
-that explains it.
+A TOML file of items, each with a title, points, the name of a check and its parameters: see
+:mod:`px4fuse.grading.checks`.
 """
 
 from __future__ import annotations
@@ -10,24 +9,14 @@ from __future__ import annotations
 import tomllib
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, Union
 
 import msgspec
 from msgspec import Meta
 
 from px4fuse.errors import SettingsError
-from px4fuse.grading.checks_filter import ClockItem, ConsistencyItem, TuningItem
-from px4fuse.grading.checks_loop import ClosureItem, LoopItem
-from px4fuse.grading.checks_report import (
-    AnswersItem,
-    FlightItem,
-    NumberItem,
-    SectionsItem,
-    StudentItem,
-    TextItem,
-    VerifiedItem,
-)
-from px4fuse.grading.evidence import Text
+from px4fuse.grading import checks  # noqa: F401 - the kinds of items
+from px4fuse.grading.evidence import RubricItem, Text
 from px4fuse.reading import read_text
 from px4fuse.results.reading import one_line
 
@@ -35,20 +24,11 @@ DEFAULT = "rubric.toml"
 MAX_RUBRIC_BYTES = 1_000_000
 HELP = "px4fuse grade --write-rubric FILE.toml writes one that explains itself."
 
-AnyItem = (
-    VerifiedItem
-    | StudentItem
-    | SectionsItem
-    | TuningItem
-    | ConsistencyItem
-    | ClockItem
-    | NumberItem
-    | FlightItem
-    | LoopItem
-    | ClosureItem
-    | AnswersItem
-    | TextItem
-)
+if TYPE_CHECKING:
+    AnyItem = RubricItem
+else:
+    # of every check, told apart by their tags
+    AnyItem = Union[tuple(RubricItem.__subclasses__())]  # noqa: UP007
 # What is done with points that nobody can vouch for: left for the instructor, taken, or counted
 Doubtful = Literal["pending", "zero", "count"]
 

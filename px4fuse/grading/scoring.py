@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from px4fuse.answers import Answers
 from px4fuse.assignment.key import AnswerKey
-from px4fuse.grading.checks_loop import contradictions
+from px4fuse.grading.checks import contradictions
 from px4fuse.grading.evidence import Evidence, reason_of, text_of
 from px4fuse.grading.model import Graded, Item
 from px4fuse.grading.rubric import Doubtful, Rubric

@@ -140,7 +140,9 @@ def _table(
     return DescribedTable(name, data.reindex(columns=columns["column"].tolist()), columns)
 
 
-def _series(flight: Flight, name: str, data: pd.DataFrame | Unavailable) -> Iterator[DescribedTable]:
+def _series(
+    flight: Flight, name: str, data: pd.DataFrame | Unavailable
+) -> Iterator[DescribedTable]:
     """A time series that is named as its stream; nothing where it is unavailable."""
     if isinstance(data, pd.DataFrame):
         yield _table(name, _timed(data), _origin(flight, name))

@@ -184,22 +184,19 @@ def _read_ekf2(
             f"EKF2 reset its state {count} times in the recording; ODOMETRY does not say by "
             "how much, so nothing was undone"
         )
-    variance: pd.DataFrame | Unavailable = samples.reindex(columns=VARIANCE_COLUMNS)
-    variance = variance[(variance > 0.0).all(axis=1)]
-    if variance.empty:
-        message = messages.ACCURACY.topic
-        variance = _variance_by_accuracy(recording)
-        notes.append(
-            "EKF2's position variances are from ESTIMATOR_STATUS: its horizontal accuracy squared, "
-            "half to each axis; velocity variances are not sent"
-        )
-    if variance.empty:
-        notes.pop()
-        variance = Unavailable(
-            "EKF2 variances",
-            "no ODOMETRY with covariance and no ESTIMATOR_STATUS of the autopilot",
-            remedies["variance"],
-        )
+    found = samples.reindex(columns=VARIANCE_COLUMNS)
+    found = found[(found > 0.0).all(axis=1)]
+    if found.empty:
+        message, found = messages.ACCURACY.topic, _variance_by_accuracy(recording)
+        if len(found):
+            notes.append(
+                "EKF2's position variances are from ESTIMATOR_STATUS: its horizontal accuracy "
+                "squared, half to each axis; velocity variances are not sent"
+            )
+    lacking = "no ODOMETRY with covariance and no ESTIMATOR_STATUS of the autopilot"
+    variance: pd.DataFrame | Unavailable = found
+    if found.empty:
+        variance = Unavailable("EKF2 variances", lacking, remedies["variance"])
     else:
         recording.came_from("ekf2_variance", BOOT_CLOCK, message)
     inside = "MAVLink does not carry EKF2's"

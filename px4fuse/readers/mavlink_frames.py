@@ -353,7 +353,7 @@ def _between(
     for kind, sizes in found.items():
         known = kind[2] in dialect.mavlink_map
         good = np.logical_and.reduce([part == one for part, one in zip(kinds, kind, strict=True)])
-        if not known or len(sizes) > max(np.count_nonzero(good), 1):
+        if not known or len(sizes) > max(int(np.count_nonzero(good)), 1):
             passed_over[kind[2]] += len(sizes)
             bad -= sum(sizes)
     return dict(passed_over), bad

@@ -10,12 +10,13 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.arrays import Array, IntArray
 from px4fuse.flight import (
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
     QUATERNION_COLUMNS,
     ROTATION_VARIANCE_COLUMNS,
+    STATE_COLUMNS,
     VELOCITY_COLUMNS,
     VELOCITY_VARIANCE_COLUMNS,
 )
@@ -190,37 +191,32 @@ def _in_ned(samples: pd.DataFrame) -> pd.DataFrame:
     (``streams/ODOMETRY.hpp``). Orientations are given up where the frame is not NED or FRD: what
     such a sender calls its body is not known.
     """
-    parts = [POSITION_COLUMNS, POSITION_VARIANCE_COLUMNS, VELOCITY_COLUMNS]
-    parts += [VELOCITY_VARIANCE_COLUMNS, QUATERNION_COLUMNS, ROTATION_VARIANCE_COLUMNS]
-    given = [samples[columns].to_numpy() for columns in parts]
-    position, position_variance, velocity, velocity_variance, *orientation = given
-    made = [np.full_like(values, np.nan) for values in given]
-    turned = np.linalg.norm(orientation[0], axis=1) > MIN_NORM
-    for number, frame in FRAMES_OF_REFERENCE.items():
-        own: BoolArray = (samples["frame_id"] == number).to_numpy() & (not frame.body)
-        made[0][own], made[1][own] = (
-            frame.turn(position[own]),
-            frame.permute(position_variance[own]),
-        )
+    turned = np.linalg.norm(samples[QUATERNION_COLUMNS].to_numpy(), axis=1) > MIN_NORM
+    orientation = QUATERNION_COLUMNS + ROTATION_VARIANCE_COLUMNS
+    made = samples.copy()
+    made[STATE_COLUMNS + POSITION_VARIANCE_COLUMNS] = np.nan
+    made[VELOCITY_VARIANCE_COLUMNS + orientation] = np.nan
+    used = {*samples["frame_id"].unique(), *samples["child_frame_id"].unique()}
+    for number in used & FRAMES_OF_REFERENCE.keys():
+        frame = FRAMES_OF_REFERENCE[number]
+        own = samples[(samples["frame_id"] == number) & (not frame.body)]
+        made.loc[own.index, POSITION_COLUMNS] = frame.turn(own[POSITION_COLUMNS].to_numpy())
+        variance = frame.permute(own[POSITION_VARIANCE_COLUMNS].to_numpy())
+        made.loc[own.index, POSITION_VARIANCE_COLUMNS] = variance
         if frame.as_is:
-            made[4][own], made[5][own] = orientation[0][own], orientation[1][own]
-        moving: BoolArray = (samples["child_frame_id"] == number).to_numpy()
-        rows = np.flatnonzero(moving & turned if frame.body else moving)
-        speed, spread = frame.turn(velocity[rows]), frame.permute(velocity_variance[rows])
-        if frame.body and len(rows):
-            rotation = Rotation.from_quat(orientation[0][rows], scalar_first=True).as_matrix()
+            made.loc[own.index, orientation] = own[orientation]
+        moving = samples[(samples["child_frame_id"] == number) & (turned | (not frame.body))]
+        speed = frame.turn(moving[VELOCITY_COLUMNS].to_numpy())
+        spread = frame.permute(moving[VELOCITY_VARIANCE_COLUMNS].to_numpy())
+        if frame.body and len(moving):
+            quaternion = moving[QUATERNION_COLUMNS].to_numpy(copy=True)
+            rotation = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
             speed = np.einsum("nij,nj->ni", rotation, speed)
             # diagonal of R diag(s) Rᵀ
             spread = np.einsum("nij,nj->ni", rotation**2, spread)
-        made[2][rows], made[3][rows] = speed, spread
-    columns = {name: at for part in parts for name, at in zip(part, (0, 1, 2, 3), strict=False)}
-    return samples.assign(
-        **{
-            name: values[:, columns[name]]
-            for part, values in zip(parts, made, strict=True)
-            for name in part
-        }
-    )
+        made.loc[moving.index, VELOCITY_COLUMNS] = speed
+        made.loc[moving.index, VELOCITY_VARIANCE_COLUMNS] = spread
+    return made
 
 
 def _boot_stamps(frames: Frames, address: Address) -> tuple[IntArray, Array]:
@@ -290,7 +286,14 @@ def settle_clocks(frames: Frames, address: Address) -> Recording:
     else:
         notes.append("no message in the stream carries a time: nothing in it can be placed in time")
     notes += _frame_notes(frames, received)
-    damage = _damage(frames)
+    share = frames.bad_bytes / len(frames.content)
+    lost = f"{frames.bad_bytes:,} bytes ({share:.2%}) belong to no whole MAVLink frame"
+    # a first and a last frame that are cut are no damage
+    inside = frames.bad_bytes - 2 * LONGEST_FRAME
+    is_damaged = inside > DAMAGED_SHARE * len(frames.content)
+    damage = (f"the file is damaged: {lost}",) if is_damaged else ()
+    if frames.bad_bytes and not is_damaged:
+        notes.append(lost)
     # without a boot clock the receipt must do
     span = stamps if len(stamps) else np.array([0.0, received.max()])
     zero_s, end_s = float(span[0]), float(span[-1])
@@ -307,22 +310,8 @@ def _without_strays(stamps: Array, rows: IntArray) -> IntArray:
     return np.concatenate(parts[many[0] : many[-1] + 1])
 
 
-def _damage(frames: Frames) -> tuple[str, ...]:
-    """What could not be read, where it is more than a first and a last frame that are cut."""
-    inside = frames.bad_bytes - 2 * LONGEST_FRAME
-    damaged = inside > DAMAGED_SHARE * len(frames.content)
-    return (f"the file is damaged: {_passed_over(frames)}",) if damaged else ()
-
-
-def _passed_over(frames: Frames) -> str:
-    share = frames.bad_bytes / len(frames.content)
-    return f"{frames.bad_bytes:,} bytes ({share:.2%}) belong to no whole MAVLink frame"
-
-
 def _frame_notes(frames: Frames, received: Array) -> list[str]:
     notes = []
-    if frames.bad_bytes and not _damage(frames):
-        notes.append(_passed_over(frames))
     if frames.passed_over:
         listed = ", ".join(
             f"{count} of {message_name(number)}"

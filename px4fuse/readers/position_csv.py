@@ -138,7 +138,10 @@ class _Table:
         except ValueError as error:
             raise LogError(f"{self.file}: no table of numbers. Export it as CSV again.") from error
         texts = texts.apply(lambda column: column.str.strip())
-        return texts.mask(texts.apply(lambda column: column.str.lower().isin(_MISSING)), None)
+        made: pd.DataFrame = texts.mask(
+            texts.apply(lambda column: column.str.lower().isin(_MISSING)), None
+        )
+        return made
 
 
 @dataclass(frozen=True)
@@ -473,7 +476,9 @@ def _length_units(
         reason = f"as {spread:.0f} m is not an indoor flight; if cm, give --position-unit"
     else:
         unit, reason = "m", "assumed, as no unit gives an indoor flight: else give --position-unit"
-    units = {at: option or choice.unit(at, LENGTH_UNITS) or unit for at in numbers.columns}
+    units = {
+        at: option or choice.unit(at, LENGTH_UNITS) or unit for at in map(int, numbers.columns)
+    }
     scales = {at: LENGTH_UNITS[name] for at, name in units.items()}
     span = max(float(spreads[index]) * scales[index] for index in axes)
     used = ", ".join(dict.fromkeys(units[index] for index in axes))

@@ -59,9 +59,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         )
     local = topics.read(px4.LOCAL_POSITION)
     if local is None:
-        return Unavailable(
-            "EKF2", "no topic vehicle_local_position", "Record with SDLOG_PROFILE bit 0 (default)."
-        )
+        return Unavailable("EKF2", "no topic vehicle_local_position", px4.DEFAULT_PROFILE)
     state = local[STATE_COLUMNS].dropna()
     if state.empty:
         return Unavailable(
@@ -228,7 +226,7 @@ def _read_fusing(topics: Topics) -> pd.DataFrame | Unavailable:
         return Unavailable(
             "EKF2 fusion flags",
             "neither estimator_status_flags nor estimator_status is in the log",
-            "Record with SDLOG_PROFILE bit 0 (default).",
+            px4.DEFAULT_PROFILE,
         )
     frame = topics.of_primary(layout, step=True)
     if "flags" in frame:

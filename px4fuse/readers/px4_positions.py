@@ -45,9 +45,9 @@ def read_positions(
     topics: Topics, ekf2: Ekf2 | Unavailable
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
     """Every external position track, the best first, and what was looked for and not found."""
-    turns = isinstance(ekf2, Ekf2) and isinstance(ekf2.fusing, pd.DataFrame)
+    fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else ekf2
     # of what EKF2 kept, a source that EKF2 took a heading from counts as an odometry
-    turns = turns and bool((ekf2.fusing["yaw"] > 0).any())
+    turns = isinstance(fusing, pd.DataFrame) and bool((fusing["yaw"] > 0).any())
     found = [
         *(_read_logged(topics, source) for source in px4.TRACKS),
         _read_kept(topics, turns),
@@ -144,7 +144,8 @@ def _read_kept(topics: Topics, turns: bool) -> PositionTrack | Unavailable:
     layout = topics.find(px4.AID_OBSERVATION_HORIZONTAL)
     if layout is None:
         return _unavailable(KEPT_OBSERVATION, f"no topic {KEPT_OBSERVATION} in the log")
-    samples, used, notes = topics.of_primary(layout), [layout.topic], ()
+    samples, used = topics.of_primary(layout), [layout.topic]
+    notes: tuple[str, ...] = ()
     vertical = topics.find(px4.AID_OBSERVATION_VERTICAL)
     if vertical is not None:
         samples, notes = _with_height(samples, topics.of_primary(vertical))
@@ -213,7 +214,8 @@ def _rebuild(topics: Topics, ekf2: Ekf2 | Unavailable, turns: bool) -> PositionT
             )
     if not {"north_m", "east_m"} <= tracks.keys():
         return _unavailable(RECONSTRUCTION, "EKF2 fused no horizontal external vision position")
-    samples, notes = pd.DataFrame({name: tracks[name] for name in POSITION_COLUMNS[:2]}), ()
+    samples = pd.DataFrame({name: tracks[name] for name in POSITION_COLUMNS[:2]})
+    notes: tuple[str, ...] = ()
     if "down_m" in tracks:
         samples, notes = _with_height(samples, tracks["down_m"].to_frame("down_m"))
     return _track(

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from px4fuse.ekf2_parameters import EV_HGT, EV_POS
+from px4fuse.ekf2_parameters import AID_MASK, EV_POS
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
     AXIS_NAMES,
@@ -55,6 +55,9 @@ LOCAL_POSITION = (
         | elements(["delta_north_m_s", "delta_east_m_s"], "delta_vxy"),
     ),
 )
+
+# What records all that EKF2 and the loggers publish by default
+DEFAULT_PROFILE = "Record with SDLOG_PROFILE bit 0 (default)."
 
 # Topics with EKF2's state vector and its variances, best first
 ESTIMATOR_STATES = ("estimator_states", "estimator_status")  # since v1.12, v1.8 to v1.11
@@ -283,8 +286,9 @@ TRACK_REMEDIES: Mapping[str, str] = {
 # What has EKF2 fuse external vision; it starts on samples less than 0.2 s apart (ev_control.cpp)
 HOW_TO_FUSE: Mapping[str, str] = {
     "horizontal": "Send the position at 10 Hz (EKF2 starts on samples less than 0.2 s apart) and "
-    f"set {EV_POS.switched_on}.",
-    "vertical": f"Set {EV_HGT.switched_on} if EKF2 is to fuse the source's height.",
+    f"set bit 0 of {EV_POS.switch} (bit 3 of {AID_MASK} before v1.14).",
+    "vertical": f"Set bit 1 of {EV_POS.switch} (EKF2_HGT_MODE 3 before v1.14) if EKF2 is to fuse "
+    "the source's height.",
 }
 
 AID_OBSERVATION_HORIZONTAL = (

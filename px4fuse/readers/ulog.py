@@ -57,8 +57,15 @@ def read_ulog(path: Path) -> Flight:
 
 def to_flight(topics: Topics) -> Flight:
     """Make a flight of the topics of a log."""
-    imu = _read_imu(topics)
-    attitude = _read_attitude(topics)
+    running = "Check that the logger ran while the sensors did."
+    imu = _enough(_read_imu(topics), "IMU", px4.IMU[0].topic, running)
+    logged = topics.read(px4.ATTITUDE)
+    attitude = _enough(
+        None if logged is None else with_attitude(logged),
+        "attitude",
+        px4.ATTITUDE[0].topic,
+        "Check that the estimator ran while the logger did.",
+    )
     ekf2 = read_ekf2(topics)
     positions, missing_positions = read_positions(topics, ekf2)
     truth = read_truth(topics, positions)
@@ -141,12 +148,21 @@ def _start_unix(topics: Topics) -> float | None:
     return float((utc_s - gps.index)[known].median()) if known.any() else None
 
 
-def _read_imu(topics: Topics) -> pd.DataFrame | Unavailable:
+def _enough(
+    samples: pd.DataFrame | None, what: str, topic: str, remedy: str
+) -> pd.DataFrame | Unavailable:
+    """The usable samples of a topic, or why there are none."""
+    if samples is None:
+        return Unavailable(what, f"no topic {topic}", px4.DEFAULT_PROFILE)
+    if len(samples) < 2:
+        return Unavailable(what, f"{topic} holds {len(samples)} usable samples", remedy)
+    return samples
+
+
+def _read_imu(topics: Topics) -> pd.DataFrame | None:
     imu = topics.read(px4.IMU)
     if imu is None:
-        return Unavailable(
-            "IMU", "no topic sensor_combined", "Record with SDLOG_PROFILE bit 0 (default)."
-        )
+        return None
     if "accelerometer_offset_us" in imu:
         offset_us = imu.pop("accelerometer_offset_us")
         imu = imu[offset_us != ACCELEROMETER_OFFSET_INVALID_US]
@@ -154,30 +170,7 @@ def _read_imu(topics: Topics) -> pd.DataFrame | Unavailable:
         keep = increasing(time_us.astype(np.int64) + topics.zero_us)
         imu = imu.iloc[keep].set_axis(pd.Index(time_us[keep] * 1e-6, name="time_s"))
     columns = SPECIFIC_FORCE_COLUMNS + ANGULAR_RATE_COLUMNS
-    imu = finite_rows(imu[columns], columns)
-    if len(imu) < 2:
-        return Unavailable(
-            "IMU",
-            f"sensor_combined holds {len(imu)} usable samples",
-            "Check that the logger ran while the sensors did.",
-        )
-    return imu
-
-
-def _read_attitude(topics: Topics) -> pd.DataFrame | Unavailable:
-    attitude = topics.read(px4.ATTITUDE)
-    if attitude is None:
-        return Unavailable(
-            "attitude", "no topic vehicle_attitude", "Record with SDLOG_PROFILE bit 0 (default)."
-        )
-    attitude = with_attitude(attitude)
-    if len(attitude) < 2:
-        return Unavailable(
-            "attitude",
-            f"vehicle_attitude holds {len(attitude)} usable samples",
-            "Check that the estimator ran while the logger did.",
-        )
-    return attitude
+    return finite_rows(imu[columns], columns)
 
 
 def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavailable:

@@ -39,13 +39,9 @@ _MICROSECOND = 1e-6
 MAX_PUBLICATION_LAG_S = 10.0
 # Samples outside the data window by more than this are stale leftovers of an earlier boot phase.
 WINDOW_MARGIN_S = 2.0
-# ULog file format, docs.px4.io: header, then definitions up to the first of these messages
-HEADER_BYTES = 16
-DATA_MESSAGES = "ALC"
 # What a time stamp of a topic says, see measurement_time_us
 AT_MEASUREMENT = "autopilot boot clock, at measurement"
 AT_PUBLICATION = "autopilot boot clock, at publication"
-MAX_READS = 2_000_000
 RELEASE = 255
 # An info message in which a log says of itself what whoever reads it must know
 NOTE_KEY = "px4fuse_note"
@@ -242,17 +238,12 @@ def increasing(time_us: NDArray[np.int64]) -> IntArray:
         return indices
     tails: list[int] = []  # smallest last stamp of an increasing run of each length
     tail_at: list[int] = []  # where that stamp stands
-    previous = np.full(len(stamps), -1, dtype=np.intp)
+    previous = np.empty(len(stamps), dtype=np.intp)
     for at, stamp in enumerate(stamps.tolist()):
         length = bisect_left(tails, stamp)
-        if length:
-            previous[at] = tail_at[length - 1]
-        if length == len(tails):
-            tails.append(stamp)
-            tail_at.append(at)
-        else:
-            tails[length] = stamp
-            tail_at[length] = at
+        previous[at] = tail_at[length - 1] if length else -1
+        tails[length : length + 1] = [stamp]
+        tail_at[length : length + 1] = [at]
     run = []
     at = tail_at[-1]
     while at >= 0:
@@ -287,10 +278,10 @@ def read_topics(path: Path) -> Topics:
     whole = framing.content
     try:
         with contextlib.redirect_stdout(chatter):  # pyulog prints its warnings
-            ulog = ULog(_handle(whole), message_name_filter_list=topics())
+            ulog = ULog(io.BytesIO(whole), message_name_filter_list=topics())
             tables = _tables(ulog)
             # a log of other topics can still be placed in time, by all that it holds
-            placed = tables or _tables(ULog(_handle(whole)))
+            placed = tables or _tables(ULog(io.BytesIO(whole)))
     except _PARSE_ERRORS as error:
         raise LogError(
             f"{name}: not a readable ULog ({str(error) or type(error).__name__}). "
@@ -308,6 +299,11 @@ def read_topics(path: Path) -> Topics:
     if NOTE_KEY in ulog.msg_info_dict:
         notes += (_text(ulog.msg_info_dict, NOTE_KEY, ""),)
     zero_us, end_us = _data_span(placed, name)
+    given = {
+        name: float(value)
+        for name, value in ulog.initial_parameters.items()
+        if isinstance(value, int | float) and np.isfinite(value)
+    }
     log = LogInfo(
         name=name,
         sha256=hashlib.sha256(content).hexdigest(),
@@ -322,24 +318,14 @@ def read_topics(path: Path) -> Topics:
             Dropout((d.timestamp - zero_us) * _MICROSECOND, d.duration * 1e-3)
             for d in ulog.dropouts
         ),
-        parameters=MappingProxyType(
-            {
-                name: float(ulog.initial_parameters[name])
-                for name in REPORTED
-                if _is_finite(ulog.initial_parameters.get(name))
-            }
-        ),
+        parameters=MappingProxyType({name: given[name] for name in REPORTED if name in given}),
         notes=notes,
         damage=_corruption(ulog, chatter.getvalue()),
         bytes_read=len(content) - framing.lost_bytes,
         autopilot=_text(ulog.msg_info_dict, "sys_name", "PX4"),
         vehicle=_text(ulog.msg_info_dict, "sys_uuid", ""),
     )
-    parameters = {
-        name: float(value)
-        for name, value in ulog.initial_parameters.items()
-        if name.startswith("EKF2_") and _is_finite(value)
-    }
+    parameters = {name: value for name, value in given.items() if name.startswith("EKF2_")}
     return Topics(log, tables, zero_us, {}, MappingProxyType(parameters), framing)
 
 
@@ -394,10 +380,6 @@ def _text(info: dict[str, Any], key: str, otherwise: str) -> str:
     return "".join(c for c in text if c.isprintable()) or otherwise
 
 
-def _is_finite(value: object) -> bool:
-    return isinstance(value, int | float) and bool(np.isfinite(value))
-
-
 def _corruption(ulog: ULog, chatter: str) -> tuple[str, ...]:
     """What pyulog says of whole messages that make no sense."""
     if not ulog.file_corruption:
@@ -417,34 +399,3 @@ def _firmware(info: dict[str, Any]) -> str:
     # last byte: 0 development, 64 alpha, 128 beta, 192 release candidate, 255 release
     suffix = "" if kind == RELEASE else ("-dev", "-alpha", "-beta", "-rc")[kind // 64]
     return f"{_text(info, 'sys_name', 'PX4')} v{major}.{minor}.{patch}{suffix}"
-
-
-class _PatientBytes(io.BytesIO):
-    """A file that ends a reader that no longer gets anywhere.
-
-    pyulog steps back by more than it read when the definitions are cut off, and would do so for
-    ever.
-    """
-
-    def __init__(self, content: bytes) -> None:
-        super().__init__(content)
-        self._left = min(1000 + 4 * len(content), MAX_READS)
-
-    def read(self, size: int | None = -1) -> bytes:
-        self._left -= 1
-        if self._left < 0:
-            raise EOFError("its definitions are damaged")
-        return super().read(size)
-
-
-def _handle(content: bytes) -> io.BytesIO:
-    """The file for pyulog; a patient one, which costs time, only for damaged definitions."""
-    at = HEADER_BYTES
-    while at + 3 <= len(content):
-        size, kind = struct.unpack_from("<HB", content, at)
-        if chr(kind) in DATA_MESSAGES:
-            return io.BytesIO(content)
-        at += 3 + size
-        if kind == 0 or size == 0 or at > len(content):
-            break
-    return _PatientBytes(content)

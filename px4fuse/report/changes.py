@@ -8,21 +8,9 @@ import pandas as pd
 
 from px4fuse.comparison.model import AxisComparison
 from px4fuse.comparison.why import the
+from px4fuse.report import flight, innovations
 from px4fuse.report.changes_words import cells, folded_words, other_lines, printed
 from px4fuse.report.document import ChangesDocument
-from px4fuse.report.flight import (
-    draw_error,
-    draw_position,
-    error_reference,
-    error_words,
-    position_words,
-)
-from px4fuse.report.innovations import (
-    draw_innovations,
-    draw_sigma,
-    innovation_words,
-    sigma_numbers,
-)
 from px4fuse.report.page import Cell, Page, halves
 from px4fuse.report.style import MAX_POINTS_NARROW, MUTED, SEVERITY_COLOURS, TIME_LABEL
 from px4fuse.results.contract import ChangeResults
@@ -36,10 +24,10 @@ HEIGHT = 105.0
 
 # Title of each panel, the sentence below it, and what draws it
 PANELS: tuple[tuple[str, Callable[[AxisComparison], str], Callable[..., None]], ...] = (
-    ("position (m)", position_words, draw_position),
-    ("error (m)", error_words, draw_error),
-    ("innovations with ±2√S (m)", innovation_words, draw_innovations),
-    ("σ of position (m), log scale", sigma_numbers, draw_sigma),
+    ("position (m)", flight.position_words, flight.draw_position),
+    ("error (m)", flight.error_words, flight.draw_error),
+    ("innovations with ±2√S (m)", innovations.innovation_words, innovations.draw_innovations),
+    ("σ of position (m), log scale", innovations.sigma_numbers, innovations.draw_sigma),
 )
 
 
@@ -87,8 +75,8 @@ def _flights(a: AxisComparison, b: AxisComparison) -> Page:
         "dotted. An error is the distance from the truth, and without one that of ours from EKF2.",
     )
     for title, words, draw_panel in PANELS:
-        if draw_panel is draw_error and not all(
-            isinstance(error_reference(result), pd.DataFrame) for result in (a, b)
+        if draw_panel is flight.draw_error and not all(
+            isinstance(flight.error_reference(result), pd.DataFrame) for result in (a, b)
         ):
             continue
         columns, drawn = halves(), []

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from px4fuse.plain import number_words
-from px4fuse.webpage.safe import escaped
+from px4fuse.webpage.safe import PICTURE, escaped
 
 BINS = 10
 # In light and in dark pages alike
@@ -73,25 +73,22 @@ def histogram(values: Sequence[float], most: float, caption: str) -> str:
     return f'<figure><div class="bins">{columns}</div><figcaption>{told}</figcaption></figure>'
 
 
-def sketch(parts: Iterable[float], mark: float | None = None) -> str:
-    """An interval (low, value, high) on a scale from 0 to 1, which the page's script draws."""
-    told = " ".join(f"{part:.3f}" for part in parts)
-    return f'<span data-parts="{told}" data-mark="{"" if mark is None else f"{mark:.3f}"}"></span>'
+def sketched(parts: Iterable[float], scale: Scale) -> str:
+    """An interval (low, value, high) on a scale, for the page's script, which draws it."""
+    return " ".join(f"{scale.share(part):.3f}" for part in parts)
 
 
-def over_time(table: pd.DataFrame, span: tuple[pd.Timestamp, ...], scale: Scale, told: str) -> str:
-    """A picture of values over time, each with its interval.
+def over_time(table: pd.DataFrame, span: tuple[pd.Timestamp, ...], scale: Scale) -> str:
+    """Address of a picture of values over time, each with its interval.
 
     Parameters
     ----------
     table : DataFrame
-        Columns date, value, low, high; the last two may be absent numbers.
+        Columns value, low, high, of which the last two may be absent numbers, by date.
     span : (Timestamp, Timestamp)
         Ends of the axis of time.
     scale : Scale
         Of the values.
-    told : str
-        What a screen reader says.
     """
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415 - takes its time
@@ -101,7 +98,7 @@ def over_time(table: pd.DataFrame, span: tuple[pd.Timestamp, ...], scale: Scale,
     reach = table[["low", "high"]].sub(table["value"], axis=0).abs()
     reach[reach.isna().any(axis=1)] = 0.0
     axes.errorbar(
-        table["date"], table["value"], yerr=reach.to_numpy().T, fmt="o", ms=2.5, lw=0.7, color=INK
+        table.index, table["value"], yerr=reach.to_numpy().T, fmt="o", ms=2.5, lw=0.7, color=INK
     )
     margin = max((span[1] - span[0]) / 50, pd.Timedelta(hours=1))
     locator = AutoDateLocator(maxticks=8)  # type: ignore[no-untyped-call]
@@ -114,5 +111,4 @@ def over_time(table: pd.DataFrame, span: tuple[pd.Timestamp, ...], scale: Scale,
     axes.spines[["top", "right"]].set_visible(False)
     drawn = io.BytesIO()
     figure.savefig(drawn, format="png", dpi=150, transparent=True, metadata={"Software": None})
-    source = base64.b64encode(drawn.getvalue()).decode()
-    return f'<img class="plot" alt="{escaped(told)}" src="data:image/png;base64,{source}">'
+    return PICTURE + base64.b64encode(drawn.getvalue()).decode()

@@ -7,12 +7,11 @@ Without scripts the page shows its first rows as a plain table.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from string import Template
 from typing import Any, Literal
 
-from px4fuse.webpage.safe import cleaned, escaped, inert_json, part, policy_hash
+from px4fuse.webpage.safe import cleaned, inert_json, part, policy_hash, template
 
 # Rows that the script draws at once, and that are there without it
 PAGE_ROWS = 100
@@ -164,49 +163,26 @@ def boxes(
 # ------------------------------------------------------------------ above the table
 
 
-def card(title: str, *content: str) -> str:
-    """A box with a heading; the content is HTML."""
-    return f'<section class="card"><h2>{escaped(title)}</h2>{"".join(content)}</section>'
+def _macro(name: str) -> Callable[..., str]:
+    """A macro of ``parts.html``, which gives HTML."""
+    parts: Any = template("webpage/parts.html").module
+    macro = getattr(parts, name)
+    # as a plain text: what is put together of these is not escaped once more
+    return lambda *given: str(macro(*given))
 
 
-def ranking(title: str, said: str, lines: Sequence[str], most: int, rest: str = "") -> str:
-    """A box with a list, its first lines; ``said`` and ``rest`` stand before and behind it."""
-    more = len(lines) - most
-    return card(
-        title,
-        note(said) if said else "",
-        f'<ol class="ranks">{"".join(lines[:most])}</ol>',
-        note(f"And {more} more{rest}.") if more > 0 else "",
-    )
-
-
-def summary(entries: Sequence[tuple[str, str]], *content: str) -> str:
-    """The box on top: names with their values, which are HTML, and what else stands in it."""
-    listed = "".join(f"<div><dt>{name}</dt><dd>{value}</dd></div>" for name, value in entries)
-    inside = f"<dl>{listed}</dl>{''.join(content)}"
-    return f'<section class="card summary" aria-label="Summary">{inside}</section>'
-
-
-def note(text: str) -> str:
-    """A small grey paragraph."""
-    return f'<p class="note">{escaped(text)}</p>'
-
-
-def picks(tag: str, text: str) -> str:
-    """A button that chooses a filter's tag."""
-    return _button("tag", tag, text)
-
-
-def opens(index: int, text: str) -> str:
-    """A button that shows and unfolds a row, counted from 0."""
-    return _button("open", str(index), text)
-
-
-def _button(does: str, value: str, text: str) -> str:
-    return (
-        f'<button type="button" class="link" data-{does}="{escaped(value)}" dir="auto">'
-        f"{escaped(text)}</button>"
-    )
+#: A box: ``card(title, *content)``, where content is HTML
+card = _macro("card")
+#: A box with a list, its first lines: ``ranking(title, said, lines, most, rest)``
+ranking = _macro("ranking")
+#: The box on top: ``summary(entries, *content)``, names with their values, which are HTML
+summary = _macro("summary")
+#: A small grey paragraph: ``note(text)``
+note = _macro("note")
+#: A button that chooses a filter's tag: ``picks(tag, text)``
+picks = _macro("picks")
+#: A button that shows and unfolds a row, counted from 0: ``opens(index, text)``
+opens = _macro("opens")
 
 
 # ------------------------------------------------------------------ the page
@@ -262,34 +238,24 @@ def page(
         "size": PAGE_ROWS,
         "nouns": noun,
     }
-    return Template(part("frame.html")).substitute(
+    return template("webpage/frame.html").render(
         style_hash=policy_hash(style),
         script_hash=policy_hash(script),
         style=style,
         script=script,
-        title=escaped(title),
-        subtitle=escaped(subtitle),
+        title=title,
+        subtitle=subtitle,
         above=above,
-        placeholder=escaped(placeholder),
-        filters="".join(_select(number, *each) for number, each in enumerate(filters)),
-        groups="".join(
-            f'<label><input type="checkbox" data-group="{escaped(group)}" autocomplete="off"> '
-            f"{escaped(label)}</label>"
-            for group, label in groups
-        ),
-        label=escaped(noun[1].capitalize()),
-        one=escaped(noun[0]),
-        plain=_plain(columns, rows, noun, otherwise),
+        placeholder=placeholder,
+        filters=filters,
+        groups=groups,
+        noun=noun,
+        columns=columns,
+        rows=rows,
+        plain_rows=PLAIN_ROWS,
+        otherwise=otherwise,
         content=inert_json(cleaned(content)),
     )
-
-
-def _select(number: int, label: str, options: Sequence[tuple[str, str]]) -> str:
-    made = "".join(
-        f'<option value="{escaped(tag)}">{escaped(said)}</option>' for tag, said in options
-    )
-    select = f'<select id="filter-{number}" autocomplete="off">{made}</select>'
-    return f"<label>{escaped(label)} {select}</label>"
 
 
 def _compact(cell: Cell) -> list[Any]:
@@ -299,22 +265,3 @@ def _compact(cell: Cell) -> list[Any]:
     while fields and fields[-1] in ("", []):
         fields.pop()
     return fields
-
-
-def _plain(
-    columns: Sequence[Column], rows: Sequence[Row], noun: tuple[str, str], otherwise: str
-) -> str:
-    """The first rows as a plain table, for browsers that run no scripts."""
-    heads = "".join(f'<th scope="col">{escaped(column.title)}</th>' for column in columns)
-    lines = [
-        "".join(f'<td dir="auto">{escaped(f"{c.text} {c.below}".strip())}</td>' for c in row.cells)
-        for row in rows[:PLAIN_ROWS]
-    ]
-    said = f"The first {PLAIN_ROWS} of {len(rows)} {noun[1]}. " if len(rows) > PLAIN_ROWS else ""
-    return note(
-        f"{said}Sorting, searching and unfolding need scripts, which are part of this page. "
-        f"{otherwise}"
-    ) + (
-        f'<table class="list"><thead><tr>{heads}</tr></thead>'
-        f"<tbody>{''.join(f'<tr>{line}</tr>' for line in lines)}</tbody></table>"
-    )

@@ -6,11 +6,14 @@ import base64
 import hashlib
 import json
 import re
+from functools import cache
 from html import escape
 from importlib.resources import files
 from pathlib import PurePosixPath
 from typing import Any
 from urllib.parse import quote
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 MAX_CHARACTERS = 20_000
 PICTURE = "data:image/png;base64,"
@@ -64,6 +67,17 @@ def local_link(path: str) -> str:
     if PurePosixPath(path).is_absolute():
         return ""
     return quote(path.encode("utf-8", "replace"))
+
+
+@cache
+def template(name: str) -> Template:
+    """A template of the package: text from data is clean and escaped in it, whatever it is."""
+    environment = Environment(
+        loader=PackageLoader("px4fuse", ""), autoescape=True, trim_blocks=True,
+        finalize=lambda value: clean(value) if type(value) is str else value,
+        undefined=StrictUndefined,
+    )  # fmt: skip
+    return environment.get_template(name)
 
 
 def part(name: str) -> str:

@@ -33,7 +33,7 @@ def seconds(work: Callable[[], object]) -> float:
 
 def main() -> None:
     import numpy as np
-    import test_evaluation
+    from trajectory_tools import flight
 
     from px4fuse.readers.trajectory import read_trajectory, tum_text
     from px4fuse.trajectory.association import associate
@@ -41,8 +41,8 @@ def main() -> None:
     from px4fuse.trajectory.offset import estimate_time_offset
     from px4fuse.trajectory.scores import rmse_interval
 
-    reference = test_evaluation.flight(600.0, 200.0)
-    estimate = test_evaluation.flight(600.0, 30.0, "vio")
+    reference = flight(600.0, 200.0)
+    estimate = flight(600.0, 30.0, "vio")
     noise = np.random.default_rng(1).normal(0.0, 0.05, estimate.position_m.shape)
     estimate = replace(estimate, position_m=estimate.position_m + noise)
     with tempfile.TemporaryDirectory() as folder:

@@ -49,7 +49,7 @@ def chain(poses: int):
 
 def main() -> None:
     import gtsam
-    from test_pose_graph import gtsam_optimiser
+    from trajectory_tools import gtsam_optimiser
 
     from px4fuse.readers.g2o import read_g2o
     from px4fuse.trajectory.graph.model import cost

@@ -34,9 +34,10 @@ def seconds(work: Callable[[], object], runs: int = RUNS) -> float:
 
 
 def main() -> None:
-    import test_clock
+    import filter_tools
 
     from px4fuse.comparison.comparison import compare
+    from px4fuse.comparison.estimates import noises_and_clock
     from px4fuse.filter.kalman import replay
     from px4fuse.filter.likelihood import preintegrate, total_over_grid
     from px4fuse.filter.settings import Settings
@@ -53,14 +54,14 @@ def main() -> None:
         f"64 x 64 settings, {len(weight)} measurements: {grid:.2f} s, {4096 / grid:.0f} a second; "
         f"filterpy {single:.2f} s for one; {4096 * single / grid:.0f} times as fast"
     )
-    test_clock.IMU_HZ = 250.0
-    flight, _ = test_clock.made_flight(1, duration_s=600.0, offset_s=-0.1)
-    axes = tuple(each.axis for each in compare(flight, test_clock.SETTINGS).axes.values())
+    filter_tools.IMU_HZ, settings = 250.0, filter_tools.SETTINGS
+    flight, _ = filter_tools.made_flight(1, duration_s=600.0, offset_s=-0.1)
+    compared = compare(flight, settings)
     for names in (None, (HORIZONTAL,)):
-        took = seconds(lambda names=names: tune(axes, test_clock.SETTINGS, names, flight=flight), 1)
+        took = seconds(lambda names=names: tune(compared.lines, settings, names, flight=flight), 1)
         print(f"tune, {names[0] if names else 'all axes'}, 600 s: {took:.1f} s (aim 5 s)")
-    took = seconds(lambda: test_clock.estimate(flight), 1)
-    print(f"clock offset, 600 s: {took:.1f} s (aim 10 s)")
+    took = seconds(lambda: noises_and_clock(compared), 1)
+    print(f"horizontal and clock offset, 600 s: {took:.1f} s (aim 2.5 s)")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,29 @@
+"""The commands as a user types them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from px4fuse.cli import cli, main
+
+
+def run(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(cli, [str(argument) for argument in arguments])
+
+
+def run_main(monkeypatch, capsys, *arguments: str | Path) -> tuple[int, str, str]:
+    """The real entry point: exit code, standard output, standard error."""
+    monkeypatch.setattr(sys, "argv", ["px4fuse", *map(str, arguments)])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    out, err = capsys.readouterr()
+    return int(stopped.value.code or 0), out, err
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file in a folder by its name."""
+    return {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
