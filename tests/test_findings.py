@@ -157,10 +157,10 @@ FAULTS = [
           change=without_every(10)),
     Fault("innovations_need_ulog", "info", change=as_recording),
     Fault("not_px4", "info", {"autopilot": "ArduPilot"}, change=with_log(autopilot="ArduPilot")),
-    Fault("autopilot_restarted", "warning", says="boot clock went back 1 time",
-          change=with_log(notes=("the autopilot's boot clock went back 1 time (restart): x",))),
+    Fault("autopilot_restarted", "warning", says="boot clock went back once (restart)",
+          change=with_log(restarts=1)),
     Fault("receipt_out_of_order", "info", says="went back 3 times",
-          change=with_log(notes=("the time of receipt went back 3 times",))),
+          change=with_log(receipt_went_back=3)),
     Fault("position_file_placement", "warning", says="Yaw is known to 5° only.",
           change=with_source(alignment=placed("yaw is known to 5° only"))),
     # the filter's own settings
@@ -227,8 +227,8 @@ FAULTS = [
     Fault("input_unavailable", "warning", flight={"imu": None}, says="constant velocity"),
     Fault("input_unavailable", "warning", flight={"attitude_hz": None}, says="constant velocity"),
     Fault("log_damaged", "warning", {"ends_in_flight": 0.0}, {"damage": ("it is damaged",)}),
-    Fault("samples_dropped", "info", {"notes": 1},
-          {"notes": ("2 samples of x were dropped: their time stamps are zero or go back",)}),
+    Fault("samples_dropped", "info", {"notes": 2}, change=with_log(dropped={"x": 2, "y": 1}),
+          says="2 samples of x were dropped: their time stamps are zero or go back (as are some"),
     Fault("too_few_innovations", "warning", {"count": 7}, {"duration_s": 1.5}),
 ]  # fmt: skip
 # Tested where their estimates are

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from px4fuse.flight import Unavailable
 from px4fuse.lesson import ODOMETRY_M, loop_lines
 from px4fuse.loop.analysis import analyse, loop_in
 from px4fuse.loop.corrections import BY_DISTANCE, PLAIN, SINGLE_LOOP
-from px4fuse.loop.loop import Loop, close_loop
+from px4fuse.loop.loop import Loop
 from px4fuse.loop.model import CorrectedPath, OdometryNoise
 from px4fuse.loop.odometry import odometry_variances
 from px4fuse.loop.sources import LoopSource, read_source, split_part
@@ -42,6 +43,10 @@ def sample() -> LoopSource:
 @pytest.fixture(scope="module")
 def sample_loop(sample: LoopSource) -> Loop:
     return analyse(sample, reference=read_source(str(SLAM)).trajectory)
+
+
+def close_loop(trajectory: Trajectory, **how: Any) -> Loop:
+    return analyse(LoopSource(trajectory, None), **how)
 
 
 def path(loop: Loop, way: str) -> CorrectedPath:
@@ -247,8 +252,8 @@ FALSE = GivenClosure(12.0, 2 * LAP_S + 35.0, 0.05)
 def test_one_false_closure_among_true_ones(seed: int) -> None:
     noise = OdometryNoise()
     truth, odometry = laps(3, seed, noise)
-    clean = close_loop(odometry, closures=TRUE, noise=noise, references=(truth,))
-    fooled = close_loop(odometry, closures=(*TRUE, FALSE), noise=noise, references=(truth,))
+    clean = close_loop(odometry, closures=TRUE, noise=noise, reference=truth)
+    fooled = close_loop(odometry, closures=(*TRUE, FALSE), noise=noise, reference=truth)
     assert all(judged.accepted for judged in clean.closures)
     *true, false = fooled.closures
     assert false.p < 0.001
