@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cli_tools import run_main
 from click.testing import CliRunner
-from test_cli import run_main
 from ulog_tools import ev_error, ev_stamps, make_log, position
 
 import px4fuse.report.pdf

@@ -11,11 +11,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from cli_tools import run_main
 from click.testing import CliRunner, Result
 from conftest import page_of
 from exchange import replace
 from rich.console import Console
-from test_cli import run_main
 
 from px4fuse.analysis import run as analyse
 from px4fuse.analysis import run_loop, run_preparation, run_what_if
