@@ -65,6 +65,10 @@ class TestDraw:
     def test_pinned_so_that_next_term_gives_the_same(self):
         drawn = draw(SECRET, "s1", "aisle", 2)
         scenario = drawn.scenario
+        # a loop does not tell where it landed
+        assert scenario.truth
+        assert not draw(SECRET, "s1", "loop").scenario.truth
+        assert not draw(SECRET, "s1", "aisle", truth=False).scenario.truth
         assert (scenario.seed, scenario.sigma_uwb_m, scenario.heading_deg) == PINNED[0]
         assert drawn.typed == PINNED[1]
 
@@ -153,16 +157,9 @@ class TestDraw:
             hardest = max([EASIEST, *ratios]) if drawn.chosen else HARDEST
             assert drawn.difficulty == pytest.approx(hardest, abs=0.011)
             assert EASIEST <= drawn.difficulty <= HARDEST
-
-    def test_sizes_fill_the_band_evenly(self):
         each = [draw(SECRET, f"s{n}", "loop", 1).difficulty for n in range(500)]
         counts, _ = np.histogram(each, bins=4, range=(EASIEST, HARDEST))
         assert counts.min() > 90
-
-    def test_a_loop_does_not_tell_where_it_landed(self):
-        assert not draw(SECRET, "s1", "loop").scenario.truth
-        assert draw(SECRET, "s1", "aisle").scenario.truth
-        assert not draw(SECRET, "s1", "aisle", truth=False).scenario.truth
 
 
 @pytest.mark.parametrize(
@@ -195,6 +192,8 @@ ROSTERS = {
     "tabs": "Student-ID\tFull name\n1001\tAnn Lee\n1002\tBob Ray\n",
     "old mac": "id,name\r1001,Ann Lee\r1002,Bob Ray\r",
     "empty rows": "\n\nid,name\n\n1001,Ann Lee\n,\n 1002 , Bob Ray \n\n",
+    "UTF-16": "id,name\n1001,Ann Lee\n1002,Bob Ray\n".encode("utf-16"),
+    "Windows-1252": "id,naïve,name\n1001,ä,Ann Lee\n1002,ö,Bob Ray\n".encode("cp1252"),
     "short rows": "name,x,id\nAnn Lee,,1001\nBob Ray,,1002,more,cells\n",
 }
 
@@ -222,20 +221,8 @@ class TestRoster:
         students = read_roster(roster(tmp_path, content))
         assert [one.student_id for one in students] == ["1001", "1002"]
         assert [one.file for one in students] == ["1001.ulg", "1002.ulg"]
-        if "whole" not in content:
+        if "whole" not in str(content):
             assert [one.name for one in students] == ["Ann Lee", "Bob Ray"]
-
-    @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
-    def test_encodings(self, tmp_path, encoding):
-        (one,) = read_roster(roster(tmp_path, "id,name\nä1,Jürgen\n".encode(encoding)))
-        assert (one.student_id, one.name) == ("ä1", "Jürgen")
-
-    def test_formulas_and_markup_stay_data(self, tmp_path):
-        text = 'id,name\n=1+1|cmd,"<b onclick=\'x\'>&"\n@x,"=HYPERLINK(""http://x"")"\n'
-        first, second = read_roster(roster(tmp_path, text))
-        assert first == Person("=1+1|cmd", "<b onclick='x'>&")
-        assert first.file == "_1+1_cmd.ulg"
-        assert second.name == '=HYPERLINK("http://x")'
 
     @pytest.mark.parametrize(("content", "said"), BAD_ROSTERS.values(), ids=BAD_ROSTERS.keys())
     def test_bad_ones(self, tmp_path, content, said):
@@ -248,6 +235,7 @@ class TestRoster:
         ("student_id", "stem"),
         [
             ("a@b.de", "a@b.de"),
+            ("=1+1|cmd", "_1+1_cmd"),
             ("../../etc/passwd", "_.._etc_passwd"),
             ("C:\\x", "C__x"),
             ("NUL", "_NUL"),
@@ -349,11 +337,6 @@ class TestAssign:
         assert not any(path.is_file() for path in folder.rglob("*"))
         assert not (tmp_path / "k.json").exists()
 
-    def test_number_of_mistakes(self, tmp_path):
-        for kind, count in (("aisle", 3), ("aisle", -1), ("loop", 2), ("mixed", 2)):
-            with pytest.raises(SettingsError, match="--mistakes"):
-                assign(CLASS, tmp_path / "f", tmp_path / "k.json", SECRET, kind, count)
-
     def test_place_of_the_key(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         flights = tmp_path / "flights"
@@ -426,7 +409,9 @@ BAD_COMMANDS = {
     "no secret file": ("--assignment roster.csv -o f --secret-file none", "cannot be read"),
     "seed": ("--assignment roster.csv -o f --seed 3", "--seed is for a single flight"),
     "mistake": ("--assignment roster.csv -o f --mistake nlos", "--mistake is for a single"),
-    "too many": ("--assignment roster.csv -o f --mistakes 9", "0 to 2"),
+    "too many": ("--assignment roster.csv -o f --mistakes 3", "0 to 2"),
+    "too many for a loop": ("--assignment roster.csv -o f --kind mixed --mistakes 2", "0 to 1"),
+    "fewer than none": ("--assignment roster.csv -o f --mistakes -1", "--mistakes"),
     "mistakes alone": ("-o f.ulg --mistakes 1", "requires --assignment"),
     "secret alone": ("-o f.ulg --secret abcdefghij", "requires --assignment"),
     "preview alone": ("-o f.ulg --preview", "requires --assignment"),
@@ -446,20 +431,11 @@ class TestCommand:
     def at(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         roster(tmp_path, "id,name\ns01,=cmd|x\ns02,<b>\n")
+        (tmp_path / "secret.txt").write_text("\ufeffour secret 2026\r\n", encoding="utf-8")
         return tmp_path
 
     def run(self, *words):
         return CliRunner().invoke(cli, ["simulate", *words])
-
-    def test_journey(self, at):
-        result = self.run("--assignment", "roster.csv", "-o", "flights")
-        assert result.exit_code == 0, result.output
-        assert {path.name for path in (at / "flights").glob("*.ulg")} == {"s01.ulg", "s02.ulg"}
-        key = read_key(at / "flights_answers.json")
-        assert [one.name for one in key.answers] == ["=cmd|x", "<b>"]
-        assert key.secret
-        assert key.secret not in result.output
-        assert "kept in the answers" in result.output
 
     def test_preview_prints_what_is_then_drawn_and_writes_nothing(self, at):
         given = ("--assignment", "roster.csv", "-o", "f", "--kind", "mixed", "--mistakes", "1",
@@ -470,6 +446,9 @@ class TestCommand:
         assert files(at) == before
         assert "Nothing was written" in shown.output
         assert self.run(*given).exit_code == 0
+        by_file = self.run(*given[:-2], "--secret-file", "secret.txt")
+        assert "0 written, 2 were there already" in by_file.output
+        assert "our secret" not in (at / "f_answers.json").read_text(encoding="utf-8")
         key = read_key(at / "f_answers.json")
         lines = shown.output.splitlines()
         for answer in key.answers:
@@ -480,19 +459,11 @@ class TestCommand:
         # the key's secret serves where none is given
         kept = self.run("--assignment", "roster.csv", "-o", "g", "--kind", "loop")
         assert kept.exit_code == 0
+        assert "kept in the answers" in kept.output
+        assert read_key(at / "g_answers.json").secret not in kept.output
         again = self.run("--assignment", "roster.csv", "-o", "g", "--kind", "loop", "--preview")
         for answer in read_key(at / "g_answers.json").answers:
             assert " ".join(answer.mistakes) in again.output
-
-    def test_secret_by_file_or_option_is_the_same(self, at):
-        (at / "secret.txt").write_text("\ufeffour secret 2026\r\n", encoding="utf-8")
-        for folder, secret in (("a", ("--secret-file", "secret.txt")),
-                               ("b", ("--secret", "our secret 2026"))):  # fmt: skip
-            given = ("--assignment", "roster.csv", "-o", folder, "--kind", "loop", *secret)
-            assert self.run(*given, "--answer", f"{folder}.json").exit_code == 0
-        assert files(at / "a") == files(at / "b")
-        assert (at / "a.json").read_bytes() == (at / "b.json").read_bytes()
-        assert "our secret" not in (at / "a.json").read_text(encoding="utf-8")
 
     @pytest.mark.parametrize(("words", "said"), BAD_COMMANDS.values(), ids=BAD_COMMANDS.keys())
     def test_bad_ones_write_nothing(self, at, words, said, capsys, monkeypatch):

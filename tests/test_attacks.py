@@ -17,7 +17,7 @@ import pytest
 from click.testing import CliRunner
 from conftest import page_of
 from exchange import replace
-from forgery import Base, base, forged, on_page, read_again, report_of, with_results
+from forgery import Base, base, forged, on_page, read_again, report_of
 from results_tools import LOOP, SHA256, changed, decoded
 
 from px4fuse.answers import form_text
@@ -262,15 +262,6 @@ def test_pages_that_were_painted_over(flight: Flight, honest: Graded, rubric: Ru
     for rule, counted in (("pending", None), ("zero", 0.0)):
         strict = flight.graded(report_of(pdf), verdict, replace(rubric, pages=rule))
         assert strict.counted == counted
-
-
-@pytest.mark.parametrize("results", [b"{}", b"", b"[1]", b"not JSON"])
-def test_no_results_are_no_report(flight: Flight, rubric: Rubric, results: bytes) -> None:
-    pdf = sealed(forged(flight.honest.pdf, with_results(results.decode())))
-    report = read_report(pdf, "a.pdf")
-    assert isinstance(report, Refused)
-    graded = flight.graded(report, Verdict("cannot verify", (report.reason,), False), rubric)
-    assert graded.counted == 0.0
 
 
 @pytest.mark.parametrize("student_id", ["s02", "S02", "ѕ02", "s99", "", " "])

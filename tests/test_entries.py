@@ -68,17 +68,18 @@ def test_late_is_what_comes_after_the_due_time_in_its_zone() -> None:
     assert (ada.late_s, ada.deduction, ada.total) == (0.0, 0.0, 6.0)
 
 
-def test_an_hour_that_the_clock_goes_back_is_an_hour() -> None:
-    """In the night to 25 October 2026 Berlin has the hour from 2 to 3 twice."""
-    term = Course(due=due_time("2026-10-24 23:00:00 Europe/Berlin"))
-    (ada, _), _ = laid_out({"Lab_ada_attempt_2026-10-25-05-00-00_r.pdf": graded("", 4.0)}, term)
-    assert ada.late_s == 7 * 3600.0
-
-
-def test_nobody_has_less_than_nothing() -> None:
-    term = Course(due=DUE, late=late_rule("100%/day"))
-    (ada, _), _ = laid_out(THREE, term)
-    assert (ada.deduction, ada.total) == (10.0, 0.0)
+@pytest.mark.parametrize(
+    ("due", "rule", "late_s", "off"),
+    [
+        (DUE, "100%/day", 46 * 3600.0, 10.0),  # nobody has less than nothing
+        # in the night to 25 October Berlin has the hour from 2 to 3 twice
+        (due_time("2026-10-24 23:00:00 Europe/Berlin"), "1%/hour", 683 * 3600.0 + 3600.0, 10.0),
+    ],
+)
+def test_what_is_taken_off(due, rule, late_s, off) -> None:
+    (ada, _), _ = laid_out(THREE, Course(due=due, late=late_rule(rule)))
+    assert (ada.late_s, ada.deduction) == (late_s, off)
+    assert ada.total == 0.0
 
 
 def test_a_late_mark_without_a_time_takes_nothing_off_and_is_said() -> None:

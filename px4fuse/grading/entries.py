@@ -52,33 +52,9 @@ class Course:
     anonymous: bool = False
 
 
-@dataclass(frozen=True)
-class _Attempt:
-    """One attempt: the file, when it came, and what that costs."""
-
-    graded: Graded
-    name: str
-    time: datetime | None
-    packed: datetime | None
-    late_s: float | None
-    deduction: float
-    remarks: tuple[str, ...]
-
-    @property
-    def worth(self) -> float:
-        """For the best of several: what counts, pending ones last."""
-        points = self.graded.counted
-        return -1.0 if points is None else max(points - self.deduction, 0.0)
-
-    @property
-    def times(self) -> tuple[float, ...]:
-        """By which attempts are ordered, and by which one submission's files are the same."""
-        return tuple(one.timestamp() if one else 0.0 for one in (self.time, self.packed))
-
-    @property
-    def order(self) -> tuple[object, ...]:
-        """By time, of one submission the better file later."""
-        return (*self.times, self.worth, self.graded.submission)
+# When it came and when it was packed, by which attempts are ordered; the file; and the row that it
+# would make alone
+Attempt = tuple[tuple[float, float], Graded, Entry]
 
 
 def class_entries(
@@ -109,7 +85,7 @@ def class_entries(
         On overrides that fit nobody.
     """
     everyone = register or Register(_named(graded, submissions))
-    attempts: dict[int, list[_Attempt]] = defaultdict(list)
+    attempts: dict[int, list[Attempt]] = defaultdict(list)
     strangers = []
     note = "Not in the roster." if register else "Neither the report nor the platform names anyone."
     for one, submission in zip(graded, submissions, strict=True):
@@ -120,11 +96,13 @@ def class_entries(
         attempt = _attempt(one, submission, said, course, place, everyone)
         if place is not None:
             attempts[place].append(attempt)
-            continue
-        person = Person(one.student_id, one_line(one.student or submission.origin.name, 200))
-        attempt = replace(attempt, remarks=(note, *attempt.remarks))
-        strangers.append(_entry(person, [attempt], course))
-    made = [_entry(one, attempts[at], course) for at, one in enumerate(everyone.people)]
+        else:
+            strangers.append(replace(attempt[2], remarks=(note, *attempt[2].remarks)))
+    made = [
+        _chosen(attempts[at], course) if attempts[at]
+        else Entry(person.name, person.student_id, None, email=person.email)
+        for at, person in enumerate(everyone.people)
+    ]  # fmt: skip
     made += strangers
     told, notes = matched(overrides, made)
     most = max((one.of for one in graded), default=0.0)
@@ -167,7 +145,8 @@ def _attempt(
     course: Course,
     place: int | None,
     register: Register,
-) -> _Attempt:
+) -> Attempt:
+    """One file as if it were the only one of its student, ``said`` when it came."""
     origin, due = submission.origin, course.due
     time, packed = (
         None if one is None else in_zone_of(one, due) for one in (said, submission.time)
@@ -194,42 +173,55 @@ def _attempt(
             f"The report gives the id of {other.student_id} ({other.name or 'no name'}), but "
             f"{origin.platform.capitalize()} says who handed it in."
         )
-    off = course.late.deduction(late_s, graded.of) if course.late and late_s else 0.0
-    return _Attempt(graded, origin.name, time, packed, late_s, off, tuple(remarks))
-
-
-def _entry(person: Person, attempts: Sequence[_Attempt], course: Course) -> Entry:
-    if not attempts:
-        return Entry(person.name, person.student_id, None, email=person.email)
-    ordered = sorted(attempts, key=lambda one: one.order)
-    # what is not a report counts only where there is nothing else
-    able = [one for one in ordered if one.graded.version] or ordered
-    chosen = {
-        "latest": able[-1],
-        # several files of one submission: the best
-        "first": [one for one in able if one.times == able[0].times][-1],
-        "best": max(able, key=lambda one: (one.worth, one.order)),
-    }[course.attempt]
-    remarks = list(chosen.remarks)
-    beside = sum(one.times == chosen.times for one in able) if any(chosen.times) else 1
-    if beside > 1:
-        remarks.append(f"{beside} reports came at the same time; the best of them counts.")
-    if not ordered[-1].graded.version and ordered[-1] is not chosen:
-        remarks.append(
-            f"{one_line(ordered[-1].graded.submission, 80)} cannot be read as a report, so that "
-            "another file counts."
-        )
-    return Entry(
-        person.name or one_line(chosen.graded.student or chosen.name, 200),
+    person = Person(graded.student_id) if place is None else register.people[place]
+    entry = Entry(
+        person.name or one_line(graded.student or origin.name, 200),
         person.student_id,
-        chosen.graded,
-        tuple(one.graded for one in ordered if one is not chosen),
-        "" if chosen.time is None else chosen.time.strftime(SHOWN),
-        chosen.late_s,
-        chosen.deduction,
+        graded,
+        (),
+        "" if time is None else time.strftime(SHOWN),
+        late_s,
+        course.late.deduction(late_s, graded.of) if course.late and late_s else 0.0,
         email=person.email,
         remarks=tuple(remarks),
     )
+    times = (time.timestamp() if time else 0.0, packed.timestamp() if packed else 0.0)
+    return times, graded, entry
+
+
+def _worth(attempt: Attempt) -> float:
+    """For the best of several: what counts, pending ones last."""
+    _, one, entry = attempt
+    return -1.0 if one.counted is None else max(one.counted - entry.deduction, 0.0)
+
+
+def _order(attempt: Attempt) -> tuple[object, ...]:
+    """By time, of one submission the better file later."""
+    return attempt[0], _worth(attempt), attempt[1].submission
+
+
+def _chosen(attempts: Sequence[Attempt], course: Course) -> Entry:
+    """The attempt that counts, with the others and what that needs said."""
+    ordered = sorted(attempts, key=_order)
+    # what is not a report counts only where there is nothing else
+    able = [one for one in ordered if one[1].version] or ordered
+    found = {
+        "latest": able[-1],
+        # several files of one submission: the best
+        "first": [one for one in able if one[0] == able[0][0]][-1],
+        "best": max(able, key=lambda one: (_worth(one), _order(one))),
+    }[course.attempt]
+    times, graded, entry = found
+    remarks = list(entry.remarks)
+    beside = sum(one[0] == times for one in able) if any(times) else 1
+    if beside > 1:
+        remarks.append(f"{beside} reports came at the same time; the best of them counts.")
+    last = ordered[-1][1]
+    if not last.version and last is not graded:
+        name = one_line(last.submission, 80)
+        remarks.append(f"{name} cannot be read as a report, so that another file counts.")
+    others = tuple(one for _, one, _ in ordered if one is not graded)
+    return replace(entry, others=others, remarks=tuple(remarks))
 
 
 def _settled(

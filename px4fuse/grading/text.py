@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 
-from px4fuse.errors import SettingsError
 from px4fuse.results.contract import Reported, to_plain
 
 # Words in a row by which two texts are compared: of two written apart a few per cent are the same,
@@ -24,7 +23,6 @@ TEMPLATE_SHARE, TEMPLATE_CLASS = 0.5, 5
 # From this share on a text is the report's own words, or has too few of the course's language
 QUOTED, OF_THE_LANGUAGE = 0.5, 0.10
 JUDGED_FROM = 40
-MANY_MIXED = 3
 # What a text says to who, or what, grades it
 TO_A_GRADER = re.compile(
     r"full points|ignore (the|all|any|previous)|rubric|language model|system prompt|grader",
@@ -68,24 +66,8 @@ def text_flags(results: Reported, min_words: int, common_words: Sequence[str]) -
         share = len(own & printed) / len(own)
         if share >= QUOTED:
             yield f"The text is px4fuse's own: {share:.0%} of it is in the report."
-    mixed = [word for word in set(text[: 12 * MAX_WORDS].split()) if _mixes_alphabets(word)]
-    if len(mixed) >= MANY_MIXED:
-        yield (
-            f"The text has {len(mixed)} words with letters of two alphabets that look alike: such "
-            "words hide from a search."
-        )
     if said := TO_A_GRADER.search(text):
         yield f"The text speaks to who grades it (\u201c{said[0]}\u201d): it is not followed."
-
-
-def _mixes_alphabets(word: str) -> bool:
-    if word.isascii():
-        return False
-    try:
-        from confusable_homoglyphs.confusables import is_dangerous  # noqa: PLC0415 - a megabyte
-    except ImportError as error:
-        raise SettingsError('grading needs more packages: pip install "px4fuse[grade]".') from error
-    return bool(is_dangerous(word))
 
 
 def runs_of_all(value: object) -> frozenset[tuple[str, ...]]:

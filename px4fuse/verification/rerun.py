@@ -7,8 +7,6 @@ nothing in it names an output.
 
 from __future__ import annotations
 
-import os
-import re
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
@@ -31,8 +29,6 @@ MAX_NAME_BYTES = 240
 ASK = "Ask how the report was made, and for the log and all files that it was made from."
 NOT_OURS = "the recorded request is not one that px4fuse can have made"
 _Place = Callable[[str, str | None, str], Path]
-# What Windows does not take in a name, or takes for something else than a file
-_WINDOWS = re.compile(r'[<>:"|?*]|^(?:con|prn|aux|nul|com\d|lpt\d)(?:\.|$)|[. ]$', re.IGNORECASE)
 
 
 class FileMissingError(ResultsError):
@@ -122,11 +118,6 @@ def _place(
     plain = name == Path(name).name and "\\" not in name and name.isprintable()
     if not plain or len(name.encode(errors="replace")) > MAX_NAME_BYTES:
         raise ResultsError(f"{NOT_OURS}: a file name in it is not a plain name", ASK)
-    if os.name == "nt" and _WINDOWS.search(name):
-        raise ResultsError(
-            "a recorded file name is not valid on Windows",
-            "Verify it on Linux or macOS.",
-        )
     # each in a folder of its own: two may have one name
     folder = Path(tempfile.mkdtemp(dir=within))
     target = folder / name
@@ -135,11 +126,6 @@ def _place(
     except OSError:  # on Windows for administrators only
         shutil.copyfile(path, target)
     return target
-
-
-def _joined(results: ComparisonResults, role: str) -> str | None:
-    """SHA-256 of the recording that was joined to the log in a role."""
-    return next((file.sha256 for file in results.log.joined if file.role == role), None)
 
 
 def split_part(source: str) -> tuple[str, str]:
@@ -155,18 +141,15 @@ def _compared(handed_in: ComparisonResults, place: _Place, versions: Provenance)
     from px4fuse.findings import find  # noqa: PLC0415
     from px4fuse.results.build import results  # noqa: PLC0415
 
-    recorded = request = handed_in.request
-    person = handed_in.student
-    log = place(request.log, handed_in.log.sha256, "the log")
-    request = replace(request, log=str(log))
-    if request.mavlink is not None:
-        sha256 = _joined(handed_in, "mavlink")
-        placed = place(request.mavlink, sha256, "--mavlink")
+    recorded, person = handed_in.request, handed_in.student
+    joined = {file.role: file.sha256 for file in handed_in.log.joined}
+    request = replace(recorded, log=str(place(recorded.log, handed_in.log.sha256, "the log")))
+    if (mavlink := recorded.mavlink) is not None:
+        placed = place(mavlink, joined.get("mavlink"), "--mavlink")
         request = replace(request, mavlink=str(placed))
-    if request.position is not None:
-        sha256 = _joined(handed_in, "position")
-        placed = place(request.position.path, sha256, "--position")
-        request = replace(request, position=replace(request.position, path=str(placed)))
+    if (position := recorded.position) is not None:
+        placed = place(position.path, joined.get("position"), "--position")
+        request = replace(request, position=replace(position, path=str(placed)))
     analysis = run(request)
     document = Document(analysis, find(analysis), person, command_line(recorded))
     found = results(recorded, analysis, document.findings, person, document.command)
@@ -178,13 +161,12 @@ def _looped(handed_in: LoopResults, place: _Place, versions: Provenance) -> Reco
     from px4fuse.findings import find_loop  # noqa: PLC0415
     from px4fuse.results.build_trajectories import loop_results  # noqa: PLC0415
 
-    recorded = request = handed_in.request
-    person = handed_in.student
-    path, part = split_part(request.source)
-    source = place(path, handed_in.track.sha256, "the log")
-    request = replace(request, source=f"{source}{part}")
-    if request.reference is not None:
-        path, part = split_part(request.reference)
+    recorded, person = handed_in.request, handed_in.student
+    path, part = split_part(recorded.source)
+    placed = place(path, handed_in.track.sha256, "the log")
+    request = replace(recorded, source=f"{placed}{part}")
+    if recorded.reference is not None:
+        path, part = split_part(recorded.reference)
         sha256 = handed_in.references[-1].sha256 if handed_in.references else None
         placed = place(path, sha256, "--reference")
         request = replace(request, reference=f"{placed}{part}")

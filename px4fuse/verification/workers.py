@@ -114,7 +114,10 @@ def run_bounded(
             while waiting and len(workers) < max(1, processes):
                 # given now, sent when the process is ready: a start that fails costs one job
                 workers.append(_Worker(function, memory_bytes, waiting.pop()))
-            answered = _wait_for_any(workers)
+            # the latest when somebody's time is up
+            soonest = min(worker.deadline for worker in workers)
+            pipes = [worker.pipe for worker in workers]
+            answered = wait(pipes, max(0.0, soonest - time.monotonic()))
             for worker in list(workers):
                 if worker.pipe in answered:
                     sound, result = _received(worker)
@@ -146,12 +149,6 @@ def bounded(
     work = run_bounded(function, [job], processes=1, timeout_s=timeout_s, memory_bytes=memory_bytes)
     with closing(work):
         return next(work)[1]
-
-
-def _wait_for_any(workers: list[_Worker]) -> list[Any]:
-    """Pipes that have something to read, at the latest when somebody's time is up."""
-    soonest = min(worker.deadline for worker in workers)
-    return wait([worker.pipe for worker in workers], max(0.0, soonest - time.monotonic()))
 
 
 def _send(worker: _Worker, jobs: Sequence[Any]) -> None:
@@ -201,27 +198,20 @@ def _serve(pipe: Connection, function: Callable[[Any], Any], memory_bytes: int |
             job = pipe.recv()
         except (EOFError, OSError):
             return
-        answer: tuple[bool, Any]
         try:
-            answer = (True, function(job))
-            message = pickle.dumps(answer, pickle.HIGHEST_PROTOCOL)
+            message = pickle.dumps((True, function(job)), pickle.HIGHEST_PROTOCOL)
         except MemoryError:
             # the next job would not find enough memory either
-            answer = (False, Failed("it needed more memory than one file may take."))
-            message = pickle.dumps(answer)
-        except Px4FuseError as error:
-            message = pickle.dumps((True, _failed(str(error))))
+            why = Failed("it needed more memory than one file may take.")
+            message = pickle.dumps((False, why))
         except Exception as error:  # noqa: BLE001 - a job's failure is its result
-            message = pickle.dumps((True, _failed(f"{type(error).__name__}: {error}")))
+            # two seconds to import, in every process, for what mostly does not happen
+            from px4fuse.results.reading import one_line  # noqa: PLC0415
+
+            kind = "" if isinstance(error, Px4FuseError) else f"{type(error).__name__}: "
+            message = pickle.dumps((True, Failed(one_line(f"{kind}{error}", 300))))
         del job
         pipe.send_bytes(message)
-
-
-def _failed(text: str) -> Failed:
-    # two seconds to import, in every process, for what mostly does not happen
-    from px4fuse.results.reading import one_line  # noqa: PLC0415
-
-    return Failed(one_line(text, 300))
 
 
 def _limit_memory(memory_bytes: int | None) -> None:
