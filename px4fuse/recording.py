@@ -150,6 +150,12 @@ class LogInfo(Record, frozen=True, omit_defaults=False):
         Of ``bytes``, those of whole messages.
     ends_in_flight : bool
         Whether the land detector still says "flying" at the end of the data.
+    restarts : int or None
+        How often the boot clock began again: then one part of the recording was read.
+    receipt_went_back : int or None
+        How often the recording computer's clock was set back.
+    dropped : mapping
+        Samples whose time stamps cannot be, by topic or file.
     autopilot : str
         "PX4", "ArduPilot", or what the log says.
     start_unix_s : float or None
@@ -179,6 +185,9 @@ class LogInfo(Record, frozen=True, omit_defaults=False):
     damage: tuple[str, ...] = ()
     bytes_read: Count = 0
     ends_in_flight: bool = False
+    restarts: Count | None = None
+    receipt_went_back: Count | None = None
+    dropped: Mapping[str, Count] = {}
 
     __repr__ = brief
 

@@ -72,7 +72,7 @@ def log(**parts: Any) -> Any:
     usual = {
         "parameters": {}, "notes": (), "format": "ULog", "has_ulog": True, "autopilot": "PX4",
         "dropouts": (), "damage": (), "ends_in_flight": False, "duration_s": 60.0, "bytes": 0,
-        "bytes_read": 0,
+        "bytes_read": 0, "restarts": None, "receipt_went_back": None, "dropped": {},
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **parts})
 

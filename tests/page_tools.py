@@ -22,10 +22,11 @@ def texts(*pages: Page) -> list[str]:
     found = []
     for page in pages:
         for block in every(page.blocks):
-            parts = (*block.get("left", ()), *block.get("right", ()))
-            cells = [cell["text"] for row in block.get("rows", ()) for cell in row]
+            label = block["label"]["text"].split("\n") if "label" in block else ()
+            cells = [cell for row in block.get("rows", ()) for cell in row]
             found += [block[key] for key in ("title", "text", "lead", "say") if block.get(key)]
-            found += [*(part["text"] for part in parts), *block.get("head", ()), *cells]
+            found += [*label, *(part["text"] for part in block.get("texts", ()))]
+            found += [*block.get("head", ()), *(c if isinstance(c, str) else c[0] for c in cells)]
     return found
 
 

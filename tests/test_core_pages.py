@@ -18,7 +18,7 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.findings import Finding, find
 from px4fuse.flight import Flight, FlightMode, Reset, Unavailable
 from px4fuse.recording import Dropout
-from px4fuse.report import cover, flight, innovations, marks, other_axes
+from px4fuse.report import cover, flight, innovations, marks, panels
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page
 from px4fuse.report.pdf import render
@@ -51,26 +51,11 @@ def eventful() -> Document:
     return replace(document(comparison), analysis=with_noises(comparison))
 
 
-def test_the_order_of_a_report(sample_flight: Flight) -> None:
-    pdf = render(document(compare(sample_flight)), "{}")
-    titles = [page.extract_text().splitlines() for page in PdfReader(io.BytesIO(pdf)).pages]
-    told = [" ".join(lines) for lines in titles]
-    for page, title in enumerate(
-        (
-            "Two-state Kalman filter against EKF2",
-            "The flight along the aisle",
-            "Innovations and variances along the aisle",
-            "Appendix: other axes",
-        )
-    ):
-        assert title in told[page], page
-
-
 def test_every_kind_of_mark_is_drawn_once_with_its_name(eventful: Document) -> None:
     said = [artist.get_label() for artist in marks.handles(eventful)]
     assert said == [
-        "source silent", "on the ground", "log dropout", "flight modes, in turn", "EKF2 reset",
-        "EKF2 rejected", "outlier", "take-off", "landing",
+        "flight modes, in turn", "on the ground", "source silent", "log dropout", "EKF2 rejected",
+        "outlier", "EKF2 reset", "take-off", "landing",
     ]  # fmt: skip
     axes = Figure().add_axes((0.1, 0.1, 0.8, 0.8))
     axes.plot([6.0, 94.0], [2.0, 3.0])
@@ -81,10 +66,9 @@ def test_every_kind_of_mark_is_drawn_once_with_its_name(eventful: Document) -> N
     axes.lines[0].remove()
     bands = [c for c in axes.collections if isinstance(c, PolyCollection)]
     spans = [[tuple(path.vertices[[0, 2], 0]) for path in band.get_paths()] for band in bands]
-    assert spans[0] == [(40.0, 95.0)]
-    assert spans[1] == [(5.0, 20.0), (90.0, 95.0)]
-    assert spans[2] == list(eventful.events.gaps)
-    assert spans[3] == [(50.0, 50.5)]
+    assert spans == [
+        [(40.0, 95.0)], [(5.0, 20.0), (90.0, 95.0)], list(eventful.events.gaps), [(50.0, 50.5)],
+    ]  # fmt: skip
     assert {text.get_text() for text in axes.texts} == {"Offboard", "Land"}
     # rejected, outliers, resets, take-off, landing
     assert [len(line.get_xdata()) for line in axes.lines[2:]] == [1, 1, 1]
@@ -118,7 +102,7 @@ def test_all_time_axes_of_the_core_are_one(eventful: Document) -> None:
 def test_rejected_innovations_are_hollow_and_fused_ones_filled(eventful: Document) -> None:
     result = eventful.analysis.main
     axes = Figure().add_axes((0.1, 0.1, 0.8, 0.8))
-    innovations.draw_innovations(axes, result, 10_000)
+    panels.draw_innovations(axes, result)
     hollow = [
         line
         for line in axes.lines
@@ -126,7 +110,7 @@ def test_rejected_innovations_are_hollow_and_fused_ones_filled(eventful: Documen
     ]
     count = int((result.ekf2_innovations["rejected"] > 0).sum())
     assert sum(len(line.get_xdata()) for line in hollow) == count
-    assert f"rejected {count} of them (hollow)" in innovations.innovation_words(result)
+    assert f"rejected {count} of them (hollow)" in panels.innovation_words(eventful, result)
 
 
 def test_the_zoom_is_where_the_filter_is_updated() -> None:
@@ -136,20 +120,34 @@ def test_the_zoom_is_where_the_filter_is_updated() -> None:
     updates = comparison.main.replay.updates.index
     assert ((updates >= start) & (updates <= end)).sum() >= 12
     assert abs((start + end) / 2.0 - 60.0) < 17.0
-    assert "In the 20." in innovations.sigma_words(document(comparison))
+    assert "In the 20." in panels.sigma_words(document(comparison), comparison.main)
 
 
 def test_sentences_are_made_of_the_numbers(eventful: Document) -> None:
     result = eventful.analysis.main
     (page,) = drawn(flight.draw, eventful)
-    assert f"{flight.inside_share(result):.0%} of our error lies in our own ±2σ" in words(page)
+    assert f"{panels.inside_share(result):.0%} of our error lies in our own ±2σ" in words(page)
     steps = result.replay.steps
     truth = np.interp(steps.index, result.truth.index, result.truth["position_m"])
     inside = abs(steps["position_m"] - truth) <= 2.0 * np.sqrt(steps["position_variance_m2"])
-    assert flight.inside_share(result) == pytest.approx(inside.mean(), abs=1e-3)
-    assert flight._nearer(1.0, 1.05) == "Ours and EKF2 are equally near to the truth"
-    assert flight._nearer(3.0, 1.0) == "EKF2 is 3 times nearer to the truth than ours"
-    assert flight._nearer(1.0, 2.5) == "Ours is 2.5 times nearer to the truth than EKF2"
+    assert panels.inside_share(result) == pytest.approx(inside.mean(), abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("ours", "ekf2", "said"),
+    [
+        (1.0, 1.05, "Ours and EKF2 are equally near to the truth."),
+        (3.0, 1.0, "EKF2 is 3 times nearer to the truth than ours."),
+        (1.0, 2.5, "Ours is 2.5 times nearer to the truth than EKF2."),
+    ],
+)
+def test_who_is_nearer_is_said(eventful: Document, ours: float, ekf2: float, said: str) -> None:
+    result = eventful.analysis.main
+    made = {
+        name: replace(one, truth=replace(one.truth, position_rmse_m=error))
+        for (name, one), error in zip(result.filters.items(), (ours, ekf2), strict=True)
+    }
+    assert panels.nearer(replace(result, filters=made), panels.POSITIONS) == said
 
 
 @pytest.mark.parametrize("count", [0, 3, 40])
@@ -196,7 +194,7 @@ def test_what_is_absent_leaves_a_line_and_no_empty_panel(changes, says: str) -> 
     of = document(compare(aisle_flight(**changes)))
     pages = [
         page
-        for draw in (cover.draw, flight.draw, innovations.draw, other_axes.draw)
+        for draw in (cover.draw, flight.draw, innovations.draw, flight.draw_other_axes)
         for page in drawn(draw, of)
     ]
     assert says in words(*pages)
@@ -208,7 +206,7 @@ def test_what_is_absent_leaves_a_line_and_no_empty_panel(changes, says: str) -> 
 
 def test_one_axis_is_the_core_alone() -> None:
     of = document(compare(aisle_flight(), axes=("north",)))
-    assert drawn(other_axes.draw, of) == []
+    assert drawn(flight.draw_other_axes, of) == []
     (page,) = drawn(flight.draw, of)
     assert "The flight along north" in words(page)
     (first,) = drawn(cover.draw, of)
@@ -217,17 +215,22 @@ def test_one_axis_is_the_core_alone() -> None:
 
 
 def test_other_axes_stand_in_columns() -> None:
-    (page,) = drawn(other_axes.draw, document(compare(aisle_flight())))
+    (page,) = drawn(flight.draw_other_axes, document(compare(aisle_flight())))
     assert len(axes_of(page)) == 15
     for name in ("north", "east", "down"):
         assert name in texts(page)
 
 
-def test_the_sample_tells_its_story(sample_flight: Flight) -> None:
-    comparison = compare(sample_flight)
-    analysis = with_noises(comparison)
+def test_the_sample_tells_its_story_and_its_pages_have_their_order(sample_flight: Flight) -> None:
+    analysis = with_noises(compare(sample_flight))
     of = Document(analysis, find(analysis), Student("Ada", "7"), "px4fuse compare aisle_uwb.ulg")
-    said = " ".join(words(drawn(cover.draw, of)[0]).split())
+    sheets = PdfReader(io.BytesIO(render(of, "{}"))).pages
+    told = [" ".join(sheet.extract_text().split()) for sheet in sheets]
     for sentence in of.story:
-        assert " ".join(sentence.split()[:8]) in said
-    assert "Ada, 7" in said
+        assert " ".join(sentence.split()[:8]) in told[0]
+    assert "Ada, 7" in told[0]
+    titles = (
+        "Two-state Kalman filter against EKF2", "The flight along the aisle",
+        "Innovations and variances along the aisle", "Appendix: other axes",
+    )  # fmt: skip
+    assert all(title in text for title, text in zip(titles, told, strict=False))

@@ -46,7 +46,7 @@ from px4fuse.simulation.scenario import Scenario
 
 
 def number(value: float, interval=None, *, aim="low", scale="ratio", kind="x") -> Number:
-    return Number(Measure(kind, "it", "m", aim, scale), "it", value, interval)
+    return Number(Measure(kind, "it", "m", aim, scale), value, interval)
 
 
 def around(value: float, factor: float, **kinds) -> Number:
@@ -125,6 +125,9 @@ def test_means_of_nis_are_compared_as_the_f_test_would(n, m, ratio):
         number(value, interval_of(white(value, count), "nis_mean", value))
         for value, count in ((1.0, n), (ratio, m))
     ]
+    assert interval_of(white(1.0, n), "innovation_std_m", 3.0) == pytest.approx(
+        tuple(3.0 * np.sqrt(both[0].interval))
+    )
     exact = 2.0 * min(fisher.cdf(ratio, m, n), fisher.sf(ratio, m, n))
     assert contrast(*both).p == pytest.approx(exact, rel=0.25, abs=0.02)
 

@@ -1,4 +1,4 @@
-"""What the model of EKF2 takes from a log: parameters, rules, the IMU and vision.
+"""What the model of EKF2 takes from a log: parameters, rules, vision, and stretches of steps.
 
 The limits are written out here, so that one that is changed must be changed here as well.
 """
@@ -6,6 +6,7 @@ The limits are written out here, so that one that is changed must be changed her
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,14 +17,28 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.ekf2 import inputs as inputs_module
 from px4fuse.ekf2.inputs import Inputs, Rules, Vision, _decisions, _source, prepare, read_vision
-from px4fuse.ekf2.stretches import Stretch
+from px4fuse.ekf2.stretches import (
+    Stretch,
+    _stretch,
+    down_sampled,
+    find_stretches,
+    predict_s,
+    step_ends,
+)
 from px4fuse.ekf2.whatif import sweep_values
 from px4fuse.ekf2_parameters import PARAMETERS, check, fuses_by_mask, settings_in_force
 from px4fuse.errors import SettingsError
 from px4fuse.flight import (
+    ACCELEROMETER_BIAS_COLUMNS,
+    ANGULAR_RATE_COLUMNS,
+    DELAYED_VARIANCE_COLUMNS,
+    GYRO_BIAS_COLUMNS,
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
     QUATERNION_COLUMNS,
+    SPECIFIC_FORCE_COLUMNS,
+    STATE_COLUMNS,
+    VELOCITY_COLUMNS,
     Ekf2,
     Flight,
     FusionRecord,
@@ -32,6 +47,7 @@ from px4fuse.flight import (
     Unavailable,
 )
 from px4fuse.origin import ALIGNED, GIVEN_FILE, GNSS, KEPT, MOTION_CAPTURE, RECEIVED, Origin
+from px4fuse.trajectory.rotation import matrix
 
 ALIGNED_TOPIC = "estimator_visual_odometry_aligned"
 AID = ("estimator_aid_src_ev_pos",)
@@ -87,57 +103,49 @@ def test_a_sweep_has_2_to_200_values() -> None:
 # ---------------------------------------------------------------- inputs and vision
 
 
-def flown(
-    monkeypatch: pytest.MonkeyPatch, *, interval_s: float = 0.008, **record: Any
-) -> Inputs | Unavailable:
+@pytest.fixture
+def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     """What is prepared of a flight of which only the parameters matter."""
     monkeypatch.setattr(inputs_module, "read_vision", lambda *_: made(Vision, stamp_s=None))
     monkeypatch.setattr(inputs_module, "find_stretches", lambda *_: (made(Stretch),))
-    parts = {"parameters": {}, "other_aiding": (), "per_step_biases": False, **record}
-    fusing = parts.pop("fusing", pd.DataFrame({"vertical": [1.0, 0.0]}))
-    horizon = parts.pop("horizon_s", 0.1)
-    firmware = parts.pop("firmware", "PX4 v1.16.1")
-    ekf2 = made(
-        Ekf2, record=made(FusionRecord, **parts), innovations={"north": pd.DataFrame()},
-        horizon_s=horizon, step_s=0.01, fusing=fusing,
-    )  # fmt: skip
-    imu = pd.DataFrame(index=interval_s * np.arange(2))
-    return prepare(made(Flight, imu=imu, attitude=imu, ekf2=ekf2, log=log(firmware=firmware)))
+
+    def prepared(
+        interval_s: float = 0.008, horizon_s: Any = 0.1, firmware: str = "PX4 v1.16.1",
+        fusing: Any = NONE, per_step_biases: bool = False, **parameters: float,
+    ) -> Any:  # fmt: skip
+        record = made(
+            FusionRecord, parameters=parameters, other_aiding=(), per_step_biases=per_step_biases
+        )
+        ekf2 = made(
+            Ekf2, record=record, innovations={"north": pd.DataFrame()}, horizon_s=horizon_s,
+            step_s=0.01, fusing=fusing,
+        )  # fmt: skip
+        imu = pd.DataFrame(index=interval_s * np.arange(2))
+        return prepare(made(Flight, imu=imu, attitude=imu, ekf2=ekf2, log=log(firmware=firmware)))
+
+    return prepared
 
 
-def test_rules_of_the_releases(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rules_of_the_releases(flown: Callable[..., Any]) -> None:
     """EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h."""
-    new = flown(monkeypatch, parameters={"EKF2_DELAY_MAX": 200.0, "EKF2_IMU_POS_Y": 0.25})
-    assert isinstance(new, Inputs)
+    new = flown(EKF2_DELAY_MAX=200.0, EKF2_IMU_POS_Y=0.25)
     assert new.rules == Rules(0.2, 0.4, 1.0, 5, None, False)
     assert new.imu_offset_m.tolist() == [0.0, 0.25, 0.0]
     assert (new.step_s, new.horizon_s, new.predict_s, new.max_interval_s) == (0.01, 0.1, 0.01, 0.25)
-    old = flown(monkeypatch, parameters={"EKF2_AID_MASK": 8.0}, per_step_biases=True)
-    assert isinstance(old, Inputs)
+    old = flown(EKF2_AID_MASK=8.0, per_step_biases=True)
     assert old.rules == Rules(math.inf, 7.0, 7.0, 1_000_000, pytest.approx(5e-4), True)
     assert old.settings["EKF2_EV_DELAY"] == 175.0
-    predict = flown(monkeypatch, parameters={"EKF2_PREDICT_US": 8000.0})
-    assert isinstance(predict, Inputs)
-    assert predict.predict_s == pytest.approx(0.008)
+    assert flown(EKF2_PREDICT_US=8000.0).predict_s == pytest.approx(0.008)
 
 
-def test_what_a_log_must_hold(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert isinstance(flown(monkeypatch, interval_s=0.012), Inputs)
-    slow = flown(monkeypatch, interval_s=0.0125)
-    assert isinstance(slow, Unavailable)
-    assert "logged at 80 Hz" in slow.reason
-    assert isinstance(flown(monkeypatch, horizon_s=NONE), Unavailable)
-    oldest = flown(monkeypatch, horizon_s=NONE, firmware="PX4 v1.13.3")
-    assert isinstance(oldest, Inputs)
-    assert oldest.horizon_s == 0.0
+def test_what_a_log_must_hold(flown: Callable[..., Any]) -> None:
+    assert isinstance(flown(0.012), Inputs)
+    assert "logged at 80 Hz" in flown(0.0125).reason
+    assert isinstance(flown(horizon_s=NONE), Unavailable)
+    assert flown(horizon_s=NONE, firmware="PX4 v1.13.3").horizon_s == 0.0
     for vertical, there in (([1.0, 0.0], False), ([1.0, 1.0, 0.0], True)):
-        fusing = pd.DataFrame({"vertical": vertical})
-        one = flown(monkeypatch, fusing=fusing)
-        assert isinstance(one, Inputs)
-        assert one.vision_height is there
-    none = flown(monkeypatch, fusing=NONE)
-    assert isinstance(none, Inputs)
-    assert none.vision_height is False
+        assert flown(fusing=pd.DataFrame({"vertical": vertical})).vision_height is there
+    assert flown(fusing=NONE).vision_height is False
 
 
 def track(name: str, origin: Origin, interval_s: float = 0.1, **parts: Any) -> PositionTrack:
@@ -229,3 +237,150 @@ def test_what_ekf2_did_with_a_sample_is_found_by_its_time() -> None:
         rejected, reset = _decisions(made(Ekf2, **{**parts, **other}), record, stamp)
         assert np.isnan(rejected).all()
         assert not reset.any()
+
+
+# ---------------------------------------------------------------- stretches
+
+
+@pytest.mark.parametrize(
+    ("interval_ms", "known", "ends"),
+    [
+        ([4] * 5, [], [2, 4]),
+        ([4, 9, 4, 4], [], [2, 4]),  # longer than the target before its samples are there
+        ([9, 4, 4], [], [1, 3]),
+        ([4, 4, 9, 4, 4], [], [2, 3, 5]),
+        ([4, 4, 1, 1.5, 4, 4, 4], [], [2, 5, 7]),  # by count when half of the target has passed
+        ([4] * 9, [3], [2, 3, 5, 7, 9]),  # a known end sets the count again
+        ([10] * 3, [], [1, 2, 3]),
+        ([2.75] * 7, [0, 6], [3, 6]),
+    ],
+)
+def test_a_step_ends_after_its_samples_or_when_it_is_long(
+    interval_ms: list[float], known: list[int], ends: list[int]
+) -> None:
+    found = step_ends(np.array(interval_ms) * 1e-3, np.array(known, int), 0.008)
+    assert found.tolist() == ends
+
+
+def test_a_gain_is_seen_from_the_end_of_its_step() -> None:
+    """A turn of 1 mrad each sample: what was gained before lies turned by what came after."""
+    turn = np.tile([0.0, 0.0, 0.001], (3, 1))
+    gain = np.tile([1.0, 0.0, 0.0], (3, 1))
+    total, gained = down_sampled(turn, gain, np.array([2, 3]))
+    np.testing.assert_allclose(total[:, 2], [0.002, 0.001])
+    np.testing.assert_allclose(gained[:, 0], [2.0, 1.0])
+    np.testing.assert_allclose(gained[:, 1], [-0.002, -0.0005], atol=1e-12)
+
+
+def facing(at: Any, error: Any = 0.0) -> np.ndarray:
+    angle = 0.5 * (np.asarray(at) - 10.5) + error
+    return np.column_stack([np.cos(angle / 2), 0 * angle, 0 * angle, np.sin(angle / 2)])
+
+
+def turning(states: np.ndarray) -> tuple[pd.DataFrame, pd.DataFrame, Ekf2, FusionRecord]:
+    """0.5 rad/s about the vertical; the gyro reads 0.01 rad/s too much, EKF2 knows."""
+    time = 10.0 + 0.005 * np.arange(401)
+    imu = pd.DataFrame(0.0, index=time, columns=ANGULAR_RATE_COLUMNS + SPECIFIC_FORCE_COLUMNS)
+    imu[ANGULAR_RATE_COLUMNS[2]] = 0.51
+    imu[SPECIFIC_FORCE_COLUMNS] = [1.0, 0.2, -9.8]
+    attitude = pd.DataFrame(facing(time[::4]), index=time[::4], columns=QUATERNION_COLUMNS)
+    delayed = pd.DataFrame(
+        facing(states, 0.1 * (states - 10.0)), index=states, columns=QUATERNION_COLUMNS
+    )
+    delayed = delayed.assign(**dict.fromkeys(VELOCITY_COLUMNS, 2.0), **{
+        **dict.fromkeys(POSITION_COLUMNS, np.nan), **dict.fromkeys(GYRO_BIAS_COLUMNS, 0.0),
+        **dict.fromkeys(ACCELEROMETER_BIAS_COLUMNS, 0.2), GYRO_BIAS_COLUMNS[2]: 0.01,
+        **{name: 1.0 + n for n, name in enumerate(DELAYED_VARIANCE_COLUMNS)},
+    })  # fmt: skip
+    delayed["attitude_down_rad2"] = states
+    state = pd.DataFrame(7.0, index=time, columns=STATE_COLUMNS).assign(down_m=time)
+    record = made(FusionRecord, delayed=delayed, parameters={})
+    return imu, attitude, made(Ekf2, state=state), record
+
+
+def test_a_stretch_of_a_vehicle_that_turns() -> None:
+    flown = turning(10.0 + 0.1 * np.arange(21))
+    found = _stretch(*flown, 5, 11.5)
+    steps = 10.5 + 0.01 * np.arange(101)
+    np.testing.assert_allclose(found.time_s, steps, atol=1e-9)
+    np.testing.assert_allclose(found.step_s, 0.01, atol=1e-9)
+    turned = matrix(facing(steps))
+    np.testing.assert_allclose(found.rotation, turned, atol=1e-6)
+    np.testing.assert_allclose(found.correction_rad, 0.0, atol=1e-6)
+    # in the frame at the end of the step, without its bias
+    np.testing.assert_allclose(found.force_m_s2, [[0.8, 0.0, -10.0]] * 100, atol=5e-3)
+    np.testing.assert_allclose(found.state[:3], [0.0, 0.0, 0.05], atol=1e-6)
+    np.testing.assert_allclose(found.state[3:9], [2.0, 2.0, 2.0, 7.0, 7.0, 10.5])
+    np.testing.assert_allclose(found.state[9:], 0.0)
+    expected = np.arange(1.0, 16.0)
+    expected[DELAYED_VARIANCE_COLUMNS.index("attitude_down_rad2")] = 10.5
+    np.testing.assert_allclose(found.variance, expected)
+    np.testing.assert_allclose(found.heading_variance_rad2, steps)
+    np.testing.assert_allclose(found.down_m, steps)
+    np.testing.assert_allclose(
+        found.attitude_error_rad[:, 2], 0.05 + 0.1 * (steps - 10.5), atol=1e-6
+    )
+    assert found.fusing
+    flown[3].delayed[POSITION_COLUMNS] = 3.0
+    np.testing.assert_allclose(_stretch(*flown, 5, 11.5).state[6:9], [3.0, 3.0, 10.5])
+
+
+def test_an_end_that_the_log_shows_sets_the_count_of_samples_again() -> None:
+    """States of 10.605 and 10.61 s, to half a microsecond; that of 10.705002 s is on no sample."""
+    shown = [10.5, 10.6050004, 10.6099996, 10.705002, 11.5]
+    found = _stretch(*turning(np.array(shown)), 0, 11.5)
+    steps = np.sort(np.append(10.5 + 0.01 * np.arange(101), 10.605))
+    np.testing.assert_allclose(found.time_s, steps, atol=1e-9)
+
+
+def stretches(monkeypatch: pytest.MonkeyPatch, **parts: Any) -> list[tuple[float, float]]:
+    """Start and end of each, of a flight of 60 s with everything every 0.01 or 0.1 s."""
+    found: list[tuple[float, float]] = []
+    usual = {
+        "imu": np.arange(0.0, 60.0, 0.01), "vision": np.arange(0.0, 60.0, 0.1),
+        "fused": np.arange(0.0, 60.0, 0.1), "airborne": NONE, "delayed": np.arange(0.0, 60.0, 0.5),
+    }  # fmt: skip
+    given = {**usual, **parts}
+
+    def keep(_imu: Any, _attitude: Any, _ekf2: Any, record: Any, at: int, high: float) -> None:
+        found.append((float(record.delayed.index[at]), round(float(high), 2)))
+
+    monkeypatch.setattr("px4fuse.ekf2.stretches._stretch", keep)
+    find_stretches(
+        made(Flight, airborne=given["airborne"]),
+        pd.DataFrame(index=given["imu"]),
+        pd.DataFrame(index=given["imu"]),
+        made(Ekf2, innovations={"north": pd.DataFrame(index=given["fused"])}),
+        made(FusionRecord, delayed=pd.DataFrame(index=given["delayed"])),
+        given["vision"],
+    )
+    return found
+
+
+def without(times: np.ndarray, low: float, high: float) -> np.ndarray:
+    return times[(times < low + 1e-6) | (times > high - 1e-6)]
+
+
+def test_where_a_stretch_begins_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    imu, vision = np.arange(0.0, 60.0, 0.01), np.arange(0.0, 60.0, 0.1)
+    assert stretches(monkeypatch) == [(1.0, 59.99)]
+    # a second of fusion, four in the air
+    late = np.arange(20.0, 60.0, 0.1)
+    assert stretches(monkeypatch, fused=late) == [(21.0, 59.99)]
+    assert stretches(monkeypatch, airborne=((10.0, 50.0), (52.0, 60.0))) == [(14.0, 59.99)]
+    assert stretches(monkeypatch, airborne=((70.0, 90.0),)) == [(1.0, 59.99)]
+    # gaps of vision beyond 2 s, and of the IMU beyond 0.05 s, part the flight
+    assert len(stretches(monkeypatch, vision=without(vision, 30.0, 31.9))) == 1
+    exactly = without(np.arange(0.0, 60.0, 0.125), 30.0, 32.0)
+    assert len(stretches(monkeypatch, vision=exactly)) == 1
+    parted = stretches(monkeypatch, vision=without(vision, 30.0, 32.2))
+    assert parted == [(1.0, 30.0), (33.5, 59.99)]
+    assert len(stretches(monkeypatch, imu=without(imu, 30.0, 30.04))) == 1
+    parted = stretches(monkeypatch, imu=without(imu, 30.0, 30.07))
+    assert [start for start, _ in parted] == [1.0, 31.5]
+    # ten seconds at least, and a second after the last sample of vision
+    assert stretches(monkeypatch, fused=np.arange(48.0, 60.0, 0.1))[0][0] == 49.0
+    assert stretches(monkeypatch, fused=np.arange(49.3, 60.0, 0.1)) == []
+    assert stretches(monkeypatch, fused=np.array([])) == []
+    assert stretches(monkeypatch, vision=np.arange(5.0, 40.0, 0.1)) == [(6.0, 40.9)]
+    assert predict_s(made(FusionRecord, parameters={})) == 0.01

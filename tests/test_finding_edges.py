@@ -30,6 +30,7 @@ from findings_tools import (
     statement,
 )
 
+from px4fuse.comparison import remedy as remedies
 from px4fuse.comparison.remedy import Effect
 from px4fuse.ekf2.model import Model
 from px4fuse.filter.heading import HeadingError, HeadingPart
@@ -44,10 +45,10 @@ from px4fuse.findings import (
     hidden_errors,
     imu,
     missing,
-    no_motion,
     recording,
     source_frame,
     source_intervals,
+    source_positions,
 )
 from px4fuse.findings.causes import by_cause
 from px4fuse.findings.model import moments, share_on, spans_at
@@ -260,11 +261,11 @@ def test_what_ends_rejections_is_tried_in_order(
         return [Effect(each, SimpleNamespace(position_rmse_to_truth_m=list(each)),
                        SimpleNamespace(position_rmse_to_truth_m=0.1)) for each in candidates]  # type: ignore[arg-type]  # fmt: skip
 
-    monkeypatch.setattr(ekf2_rejecting, "asked_of_ekf2", lambda *_: wanted)
-    monkeypatch.setattr(ekf2_rejecting, "replayed", replayed)
+    monkeypatch.setattr(remedies, "asked_of_ekf2", lambda *_: wanted)
+    monkeypatch.setattr(remedies, "replayed", replayed)
     monkeypatch.setattr(Effect, "words", lambda _: "effect")
     monkeypatch.setattr(
-        ekf2_rejecting, "rejects_less", lambda before, _: before.position_rmse_to_truth_m == [ends]
+        remedies, "rejects_less", lambda before, _: before.position_rmse_to_truth_m == [ends]
     )
     flown = {"EKF2_EVP_NOISE": 0.1, "EKF2_EV_DELAY": 0.0, "EKF2_EVP_GATE": 5.0}
     model = made(Model, inputs=SimpleNamespace(settings=flown))
@@ -380,12 +381,6 @@ def test_topics_that_were_logged_too_slowly(
         assert all(says.format(hz) in f.remedy for f, hz in zip(found, expected, strict=True))
 
 
-def test_a_rate_that_is_just_enough_is_enough() -> None:
-    assert 0.98 * (32.0 / 0.98) == 32.0
-    assert not imu.too_slow(at_rate(32.0), 32.0 / 0.98)
-    assert imu.too_slow(at_rate(32.0), 1.001 * 32.0 / 0.98)
-
-
 @pytest.mark.parametrize(
     ("damage", "flying", "severity", "said"),
     [
@@ -473,13 +468,13 @@ def test_the_range_of_the_motion_leaves_out_a_twentieth_at_either_end() -> None:
     moving["east_m"] = np.repeat([-9.0, -1.0, -0.5, 0.0, 0.5, 1.0, 9.0], [3, 4, 3, 80, 3, 4, 3])
     outside = positions([5.0, 111.0], 99.0)
     comparison = analysis(source=source(samples=pd.concat([moving, outside])))
-    assert no_motion.motion_range_m(comparison) == 2.0
+    assert source_positions.motion_range_m(comparison) == 2.0
 
 
 @pytest.mark.parametrize(("extent_m", "expected"), [(0.5, None), (0.499, "warning")])
 def test_a_vehicle_that_hardly_moved(extent_m: float, expected: str | None) -> None:
     samples = positions(10.0 + np.arange(100), np.repeat([0.0, extent_m], 50))
-    assert severity(no_motion.detect, analysis(source=source(samples=samples))) == expected
+    assert severity(source_positions.motion, analysis(source=source(samples=samples))) == expected
 
 
 # ---------------------------------------------------------------- frames

@@ -12,7 +12,7 @@ from ulog_tools import load
 
 from px4fuse.alignment.joining import join
 from px4fuse.errors import MissingDataError
-from px4fuse.flight import AXIS_NAMES, POSITION_COLUMNS, Ekf2, Flight, Unavailable
+from px4fuse.flight import AXIS_NAMES, POSITION_COLUMNS, Flight, Unavailable
 from px4fuse.readers import read_log
 
 POSITION_TOPICS = ("vehicle_visual_odometry", "estimator_aid_src_ev_pos")
@@ -55,7 +55,7 @@ def track(flight: Flight, name: str):
 # ---- the sample -------------------------------------------------------------------------------
 
 
-def test_a_ulog_without_positions_gets_them_back_from_the_tlog(
+def test_a_ulog_without_positions_gets_them_back_and_keeps_what_it_has(
     stripped, tlog_flight, sample_flight
 ):
     assert "vehicle_visual_odometry" not in [t.name for t in stripped.positions]
@@ -63,57 +63,37 @@ def test_a_ulog_without_positions_gets_them_back_from_the_tlog(
     assert joined.positions[0].name == "VISION_POSITION_ESTIMATE"
     mine = joined.positions[0].samples
     truth = track(sample_flight, "vehicle_visual_odometry").samples
+    ours, theirs = (
+        samples[POSITION_COLUMNS].set_axis(pd.Index(boot(flight, samples), name="t"))
+        for flight, samples in ((joined, mine), (sample_flight, truth))
+    )
     nearest = pd.merge_asof(
-        pd.DataFrame(index=pd.Index(boot(sample_flight, truth), name="t")).assign(
-            **truth[POSITION_COLUMNS].reset_index(drop=True).set_axis(boot(sample_flight, truth))
-        ),
-        mine[POSITION_COLUMNS].set_axis(pd.Index(boot(joined, mine), name="t")),
-        left_index=True, right_index=True, direction="nearest", tolerance=1e-3,
-    )  # fmt: skip
-    assert len(nearest) == len(truth)
-    left = nearest[[f"{c}_x" for c in POSITION_COLUMNS]].to_numpy()
-    right = nearest[[f"{c}_y" for c in POSITION_COLUMNS]].to_numpy()
+        theirs, ours, left_index=True, right_index=True, direction="nearest", tolerance=1e-3
+    )
+    left, right = (nearest[[c + end for c in POSITION_COLUMNS]] for end in ("_x", "_y"))
     np.testing.assert_allclose(left, right, atol=1e-6)
-
-
-def test_the_first_recording_keeps_what_it_has(stripped, tlog_flight):
-    joined = join(stripped, tlog_flight)
     assert joined.log.boot_time_s == stripped.log.boot_time_s
-    assert joined.imu is stripped.imu
-    assert joined.attitude is stripped.attitude
-    assert joined.truth is stripped.truth
-    assert joined.airborne == stripped.airborne
-    assert isinstance(stripped.ekf2, Ekf2)
+    for part in ("imu", "attitude", "truth", "airborne"):
+        assert getattr(joined, part) is getattr(stripped, part)
     assert joined.ekf2.state is stripped.ekf2.state
     assert joined.streams["imu"].log == "stripped.ulg"
     assert joined.log.senders == tlog_flight.log.senders
     [given] = joined.inputs
-    assert given.name == "aisle_uwb.tlog"
+    assert (given.name, given.role) == ("aisle_uwb.tlog", "mavlink")
     assert given.sha256 == tlog_flight.log.sha256
-    assert given.role == "mavlink"
-
-
-def test_the_join_is_noted_with_how_well_both_agree(sample_flight, tlog_flight):
-    note = join(sample_flight, tlog_flight).log.notes[-1]
-    assert "joined with aisle_uwb.tlog" in note
-    assert "129.7 s in common" in note
-    assert "EKF2 positions differ by 0.001 m (median)" in note
-
-
-def test_tracks_stand_in_the_order_of_the_ladder(sample_flight, tlog_flight):
-    for joined in (join(sample_flight, tlog_flight), join(tlog_flight, sample_flight)):
-        places = [t.origin.preference for t in joined.positions]
-        assert places == sorted(places)
-        names = {t.name for t in joined.positions}
-        assert {"vehicle_visual_odometry", "VISION_POSITION_ESTIMATE"} <= names
 
 
 def test_either_way_round_says_the_same_on_the_boot_clock(sample_flight, tlog_flight):
     one, other = join(sample_flight, tlog_flight), join(tlog_flight, sample_flight)
+    note = one.log.notes[-1]
+    for said in ("joined with aisle_uwb.tlog", "129.7 s in common", "differ by 0.001 m (median)"):
+        assert said in note
+    for joined in (one, other):
+        places = [t.origin.preference for t in joined.positions]
+        assert places == sorted(places)
     for name in ("vehicle_visual_odometry", "VISION_POSITION_ESTIMATE"):
         first, second = track(one, name).samples, track(other, name).samples
         np.testing.assert_allclose(boot(one, first), boot(other, second), atol=1e-6)
-    assert isinstance(other.ekf2, Ekf2)
     # MAVLink does not carry innovations, and only a lacking estimator is replaced
     assert isinstance(other.ekf2.innovations["north"], Unavailable)
 
@@ -134,13 +114,12 @@ def test_every_part_that_lacks_is_taken_and_moved(record):
     for part in ("imu", "attitude", "airborne", "ekf2"):
         assert isinstance(getattr(bare, part), Unavailable)
         assert not isinstance(getattr(joined, part), Unavailable)
-    np.testing.assert_allclose(boot(joined, joined.imu), boot(full, full.imu), atol=1e-9)
-    np.testing.assert_allclose(
-        boot(joined, joined.ekf2.state), boot(full, full.ekf2.state), atol=1e-9
-    )
-    np.testing.assert_allclose(
-        boot(joined, joined.ekf2.variance), boot(full, full.ekf2.variance), atol=1e-9
-    )
+    for ours, theirs in (
+        (joined.imu, full.imu),
+        (joined.ekf2.state, full.ekf2.state),
+        (joined.ekf2.variance, full.ekf2.variance),
+    ):
+        np.testing.assert_allclose(boot(joined, ours), boot(full, theirs), atol=1e-9)
     np.testing.assert_allclose(joined.airborne, np.array(full.airborne) + 5.0, atol=1e-9)
     assert joined.streams["imu"] == full.streams["imu"]
     assert joined.streams["ekf2_variance"] == full.streams["ekf2_variance"]
@@ -174,22 +153,15 @@ def test_variances_alone_are_taken_too(record):
     assert "EKF2 variances" not in [part.what for part in joined.missing]
 
 
-def test_senders_and_unix_time_are_taken(record):
-    ulog = aisle_flight(duration_s=40.0, ekf2=None, attitude_hz=None)
-    ulog = replace(ulog, log=replace(ulog.log, boot_time_s=BOOT_S))
+@pytest.mark.parametrize("earlier_s", [0.0, 10.0])
+def test_senders_and_unix_time_are_taken_at_the_first_recordings_zero(record, earlier_s):
+    ulog = aisle_flight(duration_s=60.0, ekf2=None, attitude_hz=None)
+    ulog = replace(ulog, log=replace(ulog.log, boot_time_s=BOOT_S - earlier_s))
     flight = record(Aisle(system_time=True))
     joined = join(ulog, flight)
-    assert joined.log.start_unix_s == pytest.approx(unix(BOOT_S), abs=1e-2)
+    assert joined.log.start_unix_s == pytest.approx(unix(BOOT_S - earlier_s), abs=1e-2)
     assert joined.log.senders == flight.log.senders
     assert flight.clocks[0] in joined.clocks
-
-
-def test_unix_time_is_moved_to_the_first_recordings_zero(record):
-    """Time zero of the joined flight is the first one's."""
-    ulog = aisle_flight(duration_s=60.0, ekf2=None, attitude_hz=None)
-    ulog = replace(ulog, log=replace(ulog.log, boot_time_s=BOOT_S - 10.0))
-    joined = join(ulog, record(Aisle(system_time=True)))
-    assert joined.log.start_unix_s == pytest.approx(unix(BOOT_S - 10.0), abs=1e-2)
 
 
 # ---- refusals -----------------------------------------------------------------------------------
@@ -198,24 +170,17 @@ def test_unix_time_is_moved_to_the_first_recordings_zero(record):
 def test_recordings_that_do_not_overlap_are_refused_with_both_spans(record):
     first = record(Aisle(seconds=20.0), "first.tlog")
     second = record(Aisle(seconds=20.0, start_s=BOOT_S + 30.0), "second.tlog")
-    with pytest.raises(MissingDataError) as caught:
+    said = r"first.tlog and second.tlog do not overlap.*50.0 s to 70.0 s.*80.0 s to 100.0 s"
+    with pytest.raises(MissingDataError, match=said):
         join(first, second)
-    text = str(caught.value)
-    assert "first.tlog and second.tlog do not overlap" in text
-    assert "50.0 s to 70.0 s" in text
-    assert "80.0 s to 100.0 s" in text
 
 
-def test_another_flight_is_refused_by_its_positions(sample_flight, tlog_flight):
-    elsewhere = replace(
-        tlog_flight,
-        ekf2=replace(tlog_flight.ekf2, state=tlog_flight.ekf2.state + 3.0),
-    )
+def test_another_flight_is_refused_by_its_positions_and_by_its_attitude(
+    sample_flight, tlog_flight, record
+):
+    moved = replace(tlog_flight.ekf2, state=tlog_flight.ekf2.state + 3.0)
     with pytest.raises(MissingDataError, match="not of the same flight: EKF2's positions differ"):
-        join(sample_flight, elsewhere)
-
-
-def test_another_flight_is_refused_by_its_attitude(record):
+        join(sample_flight, replace(tlog_flight, ekf2=moved))
     ulog = aisle_flight(duration_s=40.0, ekf2=None)
     ulog = replace(ulog, log=replace(ulog.log, boot_time_s=BOOT_S))
     with pytest.raises(MissingDataError, match=r"attitudes differ by 4[0-9]°"):

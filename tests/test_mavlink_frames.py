@@ -176,20 +176,6 @@ def test_real_recordings_are_read_as_pymavlink_reads_them(path, tmp_path):
     agrees(path)
 
 
-def test_reading_with_pymavlink_leaves_its_globals_alone(sample_log, tmp_path):
-    """Or every later test would depend on this one."""
-    import os
-
-    from pymavlink import mavutil
-
-    before = (mavutil.mavlink, mavutil.current_dialect, os.environ.get("MAVLINK20"))
-    path = tmp_path / "one.tlog"
-    path.write_bytes(stamped(frame(ATTITUDE)))
-    heard, _ = heard_by_pymavlink(path, stamped=True)
-    assert list(heard) == ["ATTITUDE"]
-    assert (mavutil.mavlink, mavutil.current_dialect, os.environ.get("MAVLINK20")) == before
-
-
 def example(kind) -> object:
     """A message with another value in every field and array element."""
     fields = {}
@@ -266,14 +252,6 @@ def test_unknown_ids_are_counted_and_cost_nothing_else(read):
         assert frames.bad_bytes == 0
 
 
-def test_a_bad_checksum_costs_its_own_frame(read):
-    parts = beats(10)
-    parts[4] = parts[4][:-1] + bytes([parts[4][-1] ^ 1])
-    frames = read(stamped(*parts))
-    assert frames.sequence.tolist() == [0, 1, 2, 3, 5, 6, 7, 8, 9]
-    assert frames.bad_bytes == len(parts[4]) + 8
-
-
 @pytest.mark.parametrize("with_stamps", [True, False])
 def test_frames_of_another_dialect_are_counted_and_are_no_damage(read, with_stamps):
     """Another definition of a message has another checksum seed (CRC_EXTRA)."""
@@ -292,6 +270,11 @@ def test_frames_of_another_dialect_are_counted_and_are_no_damage(read, with_stam
 
 
 def test_frames_of_a_known_message_that_were_changed_on_the_way_are_damage(read):
+    beat = beats(10)
+    beat[4] = beat[4][:-1] + bytes([beat[4][-1] ^ 1])
+    frames = read(stamped(*beat))
+    assert frames.sequence.tolist() == [0, 1, 2, 3, 5, 6, 7, 8, 9]
+    assert frames.bad_bytes == len(beat[4]) + 8
     parts = [frame(ATTITUDE, sequence=i) for i in range(20)]
     for i in (3, 9):
         parts[i] = parts[i][:-1] + bytes([parts[i][-1] ^ 1])
@@ -312,8 +295,21 @@ def test_junk_in_a_tlog_costs_itself(read):
     parts = [stamp(START_US + i) + part for i, part in enumerate(beats(6))]
     frames = read(b"".join(parts[:3]) + b"\xfd junk \xfe" + b"".join(parts[3:]))
     assert frames.sequence.tolist() == list(range(6))
-    assert frames.received_us is not None
     assert frames.received_us.tolist() == [START_US + i for i in range(6)]
+
+
+def test_a_stamp_that_looks_like_the_beginning_of_a_frame_hides_none(read):
+    """Its last bytes and the true frame behind it are by chance a STATUSTEXT of MAVLink 1."""
+    head = raw_frame(30, b"\x01\x02\x03", seed=0, sequence=3)[:-2]
+    body = bytes([12, 1, 1, 1]) + bytes([0xFD, 28]) + head[2:]
+    checksum = mcrf4xx(body + bytes([MESSAGES["STATUSTEXT"].crc_extra]))
+    payload = b"\x01\x02\x03" + checksum.to_bytes(2, "little") + bytes([7] * 23)
+    true = raw_frame(30, payload, seed=ATTITUDE.crc_extra, sequence=3)
+    parts = [stamp(START_US + i) + part for i, part in enumerate(beats(6))]
+    parts[3] = stamp(START_US)[:3] + b"\xfe" + body[:4] + true
+    frames = read(b"".join(parts))
+    assert names(frames) == ["HEARTBEAT"] * 3 + ["ATTITUDE"] + ["HEARTBEAT"] * 2
+    assert frames.bad_bytes == 0
 
 
 @pytest.mark.parametrize("with_stamps", [True, False])
@@ -421,7 +417,7 @@ def test_any_mixture_gives_back_its_good_frames(tmp_path_factory, kinds):
     path.write_bytes(b"".join(parts))
     frames = read_frames(path)
     assert len(frames) == good
-    assert sum(frames.passed_over.values()) <= kinds.count("unknown")
+    assert frames.passed_over.get(40_001, 0) <= kinds.count("unknown")
 
 
 # ---- what is no MAVLink, and what it costs ------------------------------------------------------

@@ -26,7 +26,6 @@ from px4fuse.trajectory.graph.model import (
     chi_square,
     composed,
     cost,
-    residuals,
 )
 from px4fuse.trajectory.graph.solver import solve
 
@@ -115,7 +114,6 @@ def test_chordal_initialisation_is_two_dense_least_squares(dimension: int, seed:
         right.append(weight @ rotation[i] @ pose[:d] - row[:, :d] @ graph.poses[0, :d])
     position = np.linalg.lstsq(np.vstack(rows), np.concatenate(right))[0].reshape(n - 1, d)
     made = _chordal(graph)
-    assert made is not None
     assert made.initialised == FROM_CHORDAL
     np.testing.assert_array_equal(made.poses[0], graph.poses[0])
     np.testing.assert_allclose(lie.rotation_matrix(made.poses), rotation, atol=1e-7)
@@ -240,16 +238,15 @@ def test_cost_does_not_know_the_frame(values: list[float], dimension: int) -> No
 def test_order_of_edges_and_their_direction() -> None:
     graph = noisy_graph(3, 4)
     shuffled = without(graph, np.random.default_rng(0).permutation(len(graph.first)))
-    assert solve(shuffled).cost == pytest.approx(solve(graph).cost, rel=1e-9)
     # Z^-1 exp(-Ad(Z) r): the other way round, the same information
-    turn = lie.adjoint(graph.measurements)
-    back = np.linalg.inv(turn)
+    back = np.linalg.inv(lie.adjoint(graph.measurements))
     turned = replace(
         graph, first=graph.second, second=graph.first,
         measurements=lie.inverse(graph.measurements),
         information=back.transpose(0, 2, 1) @ graph.information @ back,
     )  # fmt: skip
-    assert solve(turned).cost == pytest.approx(solve(graph).cost, rel=1e-8)
+    for same in (shuffled, turned):
+        assert solve(same).cost == pytest.approx(solve(graph).cost, rel=1e-8)
 
 
 def test_information_of_low_rank() -> None:
@@ -266,33 +263,24 @@ def test_information_of_low_rank() -> None:
 # --- refusals ------------------------------------------------------------------------------------
 
 
-def test_parts_are_refused() -> None:
-    graph = noisy_graph(2, 0)
-    apart = without(graph, (graph.second < 10) | (graph.first >= 10))
-    with pytest.raises(TrajectoryError, match=r"falls into 2 parts: vertex 10 is not joined to"):
-        solve(replace(apart, ids=apart.ids))
-    silent = replace(graph, information=graph.information * 0.0)
-    with pytest.raises(TrajectoryError, match=r"falls into 30 parts"):
-        solve(silent)
-    with pytest.raises(TrajectoryError, match=r"has no edges"):
-        solve(without(graph, np.zeros(len(graph.first), dtype=bool)))
-
-
-def test_numbers_that_are_none_are_refused() -> None:
+def test_graphs_that_cannot_be_solved_are_refused() -> None:
     graph = noisy_graph(2, 0)
     poses = graph.poses.copy()
     poses[4, 1] = np.nan
-    with pytest.raises(TrajectoryError, match="not a finite number"):
-        solve(replace(graph, poses=poses))
-
-
-@pytest.mark.parametrize("change", [{"dimension": 4}, {"poses": np.zeros((30, 7))}, {
-    "first": np.full(44, 30)}])  # fmt: skip
-def test_graphs_of_wrong_shape(change: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=r"dimension is|has shape|edges must"):
-        replace(noisy_graph(2, 0), **change)
+    for bad, said in (
+        (without(graph, (graph.second < 10) | (graph.first >= 10)),
+         "falls into 2 parts: vertex 10 is not joined to"),
+        (replace(graph, information=graph.information * 0.0), "falls into 30 parts"),
+        (without(graph, np.zeros(len(graph.first), dtype=bool)), "has no edges"),
+        (replace(graph, poses=poses), "not a finite number"),
+    ):  # fmt: skip
+        with pytest.raises(TrajectoryError, match=said):
+            solve(bad)
+    for change in ({"dimension": 4}, {"poses": np.zeros((30, 7))}, {"first": np.full(44, 30)}):
+        with pytest.raises(ValueError, match=r"dimension is|has shape|edges must"):
+            replace(graph, **change)
     with pytest.raises(ValueError, match="loops has shape"):
-        solve(noisy_graph(2, 0), loops=np.ones(3, dtype=bool))
+        solve(graph, loops=np.ones(3, dtype=bool))
 
 
 # --- starts --------------------------------------------------------------------------------------
@@ -305,7 +293,6 @@ def test_both_starts_are_exact_without_noise(dimension: int) -> None:
     made = initialise(replace(graph, poses=held))
     np.testing.assert_allclose(lie.log(lie.between(held, made.poses)), 0.0, atol=1e-6)
     by_chordal = _chordal(graph)
-    assert by_chordal is not None
     np.testing.assert_allclose(lie.log(lie.between(graph.poses, by_chordal.poses)), 0.0, atol=1e-6)
 
 
@@ -374,9 +361,8 @@ def test_false_closure_is_set_aside() -> None:
         graph, truth, true = laps(seed)
         known = ate(solve(without(graph, true)).poses, truth)
         for method in ("none", "dcs", "gnc") if seed < 3 else ("dcs", "gnc"):
-            # Least squares has no good minimum here to converge to
-            few = 20 if method == "none" else 100
-            solution = solve(graph, robust=method, max_iterations=few)
+            solution = solve(graph, robust=method)
+            # least squares has no good minimum here to converge to
             assert solution.converged or method == "none"
             off[method].append(ate(solution.poses, truth) / known - 1.0)
             assert np.all((solution.weights >= 0.0) & (solution.weights <= 1.0))
@@ -390,18 +376,18 @@ def test_false_closure_is_set_aside() -> None:
 
 
 def test_true_closures_keep_their_weight() -> None:
-    for seed in range(3):
+    for seed in range(2):
         graph, _, _ = laps(seed, false=0)
-        plain = solve(graph)
-        assert solve(graph, robust="gnc").weights.min() == 1.0
-        assert solve(graph, robust="gnc").cost == pytest.approx(plain.cost, rel=1e-8)
+        robust = solve(graph, robust="gnc")
+        assert robust.weights.min() == 1.0
+        assert robust.cost == pytest.approx(solve(graph).cost, rel=1e-8)
 
 
 def test_lowest_minimum_of_dcs_drops_true_closures() -> None:
     """Why dcs starts from the solution of gnc, and does not choose among minima by their cost."""
 
     def dcs_cost(graph: PoseGraph, poses: np.ndarray) -> float:
-        squared = chi_square(graph, residuals(graph, poses))
+        squared = chi_square(graph, poses)
         beyond = ~graph.successive & (squared > 1.0)
         lost = 2.0 * squared / (1.0 + squared) - 0.5
         return float(np.sum(np.where(beyond, lost, 0.5 * squared)))
@@ -430,8 +416,8 @@ def test_edges_that_are_not_doubted_keep_their_weight() -> None:
 def test_costs_of_a_solution() -> None:
     graph, _, _ = laps(1)
     for method in ("none", "dcs"):
-        solution = solve(graph, robust=method, max_iterations=20)
-        squared = chi_square(graph, residuals(graph, solution.poses))
+        solution = solve(graph, robust=method)
+        squared = chi_square(graph, solution.poses)
         assert solution.cost == pytest.approx(0.5 * np.sum(solution.weights * squared))
         assert solution.cost_initial == pytest.approx(cost(graph))
 
@@ -540,12 +526,12 @@ def test_gate_needs_odometry() -> None:
     gap = without(graph, np.arange(len(graph.first)) != 10)
     with pytest.raises(TrajectoryError, match="No odometry edge joins vertices 10 and 11"):
         gate(gap, [edge - 1])
-    flat = replace(graph, information=graph.information.copy())
-    flat.information[12, 2, :] = flat.information[12, :, 2] = 0.0
-    with pytest.raises(TrajectoryError, match="has a direction without information"):
-        gate(flat, [edge])
-    silent = replace(graph, information=graph.information.copy())
-    silent.information[edge] = 0.0
-    with pytest.raises(TrajectoryError, match="has no information"):
-        gate(silent, [edge])
+    for at, direction, said in (
+        (12, 2, "has a direction without information"),
+        (edge, slice(None), "has no information"),
+    ):
+        information = graph.information.copy()
+        information[at, direction, :] = information[at, :, direction] = 0.0
+        with pytest.raises(TrajectoryError, match=said):
+            gate(replace(graph, information=information), [edge])
     assert gate(graph, []) == []

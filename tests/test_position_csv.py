@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import REPOSITORY
-from hypothesis import HealthCheck, Phase, example, given, settings
+from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from patience import patience
 
@@ -60,7 +60,8 @@ def exact(ticks: np.ndarray, decimals: int) -> list[str]:
 
 UNIX_S = exact(UNIX_US + TIME_US, 6)
 X, Y, Z = (fixed(axis, 4) for axis in TRACK_M.T)
-PLAIN = {"time": UNIX_S, "x": X, "y": Y, "z": Z}
+PLAIN_XYZ = {"x": X, "y": Y, "z": Z}
+PLAIN = {"time": UNIX_S, **PLAIN_XYZ}
 
 
 def table(
@@ -247,8 +248,7 @@ def test_units_and_clocks_of_time(read, case):
     ],
 )
 def test_says_why_the_unit_of_time(read, case, words):
-    name, texts, _, _ = TIMES[case]
-    said(read(table({name: texts, "x": X, "y": Y, "z": Z})), "time: ", *words)
+    said(read(table({TIMES[case][0]: TIMES[case][1], **PLAIN_XYZ})), "time: ", *words)
 
 
 def test_nineteen_digits_keep_their_microseconds(read):
@@ -388,19 +388,18 @@ def test_length_unit_option_wins(read, unit):
     assert samples["sigma_z_m"].to_numpy() == pytest.approx(SIGMA_M * LENGTH_UNITS[unit])
 
 
-def test_an_outlier_does_not_decide_the_unit(read):
-    x = [*X]
-    x[7] = "4000.0"
+@pytest.mark.parametrize(
+    ("x", "words"),
+    [
+        ([*X[:7], "4000.0", *X[8:]], "in m (no unit in the names)"),
+        (fixed(np.linspace(0.0, 5e6, ROWS), 1), "assumed, as no unit gives an indoor flight"),
+    ],
+)
+def test_an_outlier_does_not_decide_the_unit_and_no_spread_is_believed(read, x, words):
     file = read(table({**PLAIN, "x": x}))
-    assert file.samples["x_m"].iloc[7] == 4000.0
+    assert file.samples["x_m"].tolist() == list(map(float, x))
     assert file.samples["y_m"].to_numpy() == pytest.approx(TRACK_M[:, 1])
-
-
-def test_a_spread_that_no_unit_explains_is_doubted(read):
-    x = fixed(np.linspace(0.0, 5e6, ROWS), 1)
-    file = read(table({**PLAIN, "x": x}))
-    assert file.samples["x_m"].iloc[-1] == 5e6
-    said(file, "position: ", "assumed, as no unit gives an indoor flight")
+    said(file, "position: ", words)
 
 
 @pytest.mark.parametrize("extra", [{}, {"z": [""] * ROWS}, {"z": ["nan"] * ROWS}])
@@ -439,12 +438,10 @@ def test_sigma(read, columns, factors):
     said(file, "sigma: ", repr(next(iter(columns))) if "sigma_z" not in columns else "'sigma_x'")
 
 
-def test_sigma_has_the_unit_of_position(read):
-    file = read(table({"t": UNIX_S, "x": MM[0], "y": MM[1], "sigma": fixed(1000 * SIGMA_M, 0)}))
+def test_sigma_has_the_unit_and_the_frame_of_position(read):
+    mm = fixed(1000 * SIGMA_M, 0)
+    file = read(table({"t": UNIX_S, "x": MM[0], "y": MM[1], "sigma": mm}))
     assert file.samples["sigma_y_m"].to_numpy() == pytest.approx(SIGMA_M)
-
-
-def test_sigma_of_a_named_frame(read):
     columns = {"n": X, "e": Y, "d": Z, "sd": SIGMA, "sigma_e": fixed(2 * SIGMA_M, 3)}
     samples = read(table({"t": UNIX_S, **columns})).samples
     assert samples["sigma_x_m"].to_numpy() == pytest.approx(SIGMA_M)
@@ -727,25 +724,6 @@ def check_any(read, content: bytes, given_options: dict) -> None:
     assert all(len(line.splitlines()) == 1 for line in (*file.detected, *file.notes))
 
 
-@fuzzed
-@given(st.binary(max_size=400), options)
-@example(b"\xff\xfe" + bytes(range(255)), {})
-def test_any_bytes(read, content, given_options):
-    check_any(read, content, given_options)
-
-
-@fuzzed
-@given(st.text(max_size=300), options)
-def test_any_text(read, content, given_options):
-    check_any(read, content.encode(errors="replace"), given_options)
-
-
-@fuzzed
-@given(st.lists(words_of_tables, max_size=80).map("".join), options)
-def test_any_table(read, content, given_options):
-    check_any(read, content.encode(), given_options)
-
-
 @st.composite
 def rows_of_values(draw: st.DrawFn) -> bytes:
     values = st.one_of(
@@ -760,21 +738,30 @@ def rows_of_values(draw: st.DrawFn) -> bytes:
     return "\n".join([header, *map(",".join, rows), ""]).encode()
 
 
-@fuzzed
-@given(rows_of_values(), options)
-def test_any_values(read, content, given_options):
-    check_any(read, content, given_options)
+@st.composite
+def damaged_files(draw: st.DrawFn) -> bytes:
+    content = bytearray(draw(st.sampled_from(SEEDS)))
+    for _ in range(draw(st.integers(1, 4))):
+        at = draw(st.integers(0, len(content)))
+        end = min(len(content), at + draw(st.integers(0, 60)))
+        content[at:end] = draw(st.binary(max_size=20))
+    return bytes(content)
 
 
+CONTENTS = {
+    "bytes": st.binary(max_size=400) | st.just(b"\xff\xfe" + bytes(range(255))),
+    "text": st.text(max_size=300).map(lambda text: text.encode(errors="replace")),
+    "table": st.lists(words_of_tables, max_size=80).map("".join).map(str.encode),
+    "values": rows_of_values(),
+    "damaged": damaged_files(),
+}
+
+
+@pytest.mark.parametrize("kind", CONTENTS)
 @fuzzed
-@given(st.sampled_from(SEEDS), st.data(), options)
-def test_damaged_files(read, seed, data, given_options):
-    content = bytearray(seed)
-    for _ in range(data.draw(st.integers(1, 4))):
-        at = data.draw(st.integers(0, len(content)))
-        end = min(len(content), at + data.draw(st.integers(0, 60)))
-        content[at:end] = data.draw(st.binary(max_size=20))
-    check_any(read, bytes(content), given_options)
+@given(data=st.data(), given_options=options)
+def test_any_content_is_read_or_refused(read, kind, data, given_options):
+    check_any(read, data.draw(CONTENTS[kind]), given_options)
 
 
 @pytest.mark.parametrize(

@@ -119,26 +119,32 @@ def test_only_the_segment_is_taken() -> None:
     part = Segment(1.3, 1.7, "")
     for axis in ("north", "aisle"):
         assert innovations(made, axis, part).index.tolist() == pytest.approx([1.4, 1.6])
-    nothing = project_innovations(
-        made, made.ekf2, made.positions[0], axes_of(made)["north"], Segment(20.0, 30.0, "")
-    )
-    assert isinstance(nothing, Unavailable)
-    assert "no sample in the segment" in str(nothing)
 
 
-@pytest.mark.parametrize("lacking", ["north", "east"])
-def test_the_aisle_needs_both_horizontal_axes(lacking: str) -> None:
-    gone = Unavailable("innovations", f"no {lacking}", "Log them.")
-    made = with_innovations(flight(), **{lacking: gone})
-    got = project_innovations(made, made.ekf2, made.positions[0], axes_of(made)["aisle"], WHOLE)
-    assert got is gone
+GONE = Unavailable("innovations", "none logged", "Log them.")
 
 
-def test_innovations_are_of_external_vision_alone() -> None:
-    made = flight(uwb=Uwb(name="vehicle_mocap_odometry", origin=MOTION_CAPTURE))
-    got = project_innovations(made, made.ekf2, made.positions[0], axes_of(made)["north"], WHOLE)
+@pytest.mark.parametrize(
+    ("made", "axis", "segment", "says"),
+    [
+        (with_innovations(flight(), north=NORTH), "north", Segment(20.0, 30.0, ""),
+         "no sample in the segment"),
+        # the aisle needs both horizontal axes
+        (with_innovations(flight(), north=GONE), "aisle", WHOLE, "none logged"),
+        (with_innovations(flight(), east=GONE), "aisle", WHOLE, "none logged"),
+        # innovations are of external vision alone
+        (flight(uwb=Uwb(name="vehicle_mocap_odometry", origin=MOTION_CAPTURE)), "north", WHOLE,
+         "not to vehicle_mocap_odometry"),
+    ],
+    ids=["segment", "north", "east", "mocap"],
+)  # fmt: skip
+def test_where_there_are_none_it_says_why(
+    made: Flight, axis: str, segment: Segment, says: str
+) -> None:
+    (track,) = made.positions
+    got = project_innovations(made, made.ekf2, track, axes_of(made)[axis], segment)
     assert isinstance(got, Unavailable)
-    assert "not to vehicle_mocap_odometry" in str(got)
+    assert says in str(got)
 
 
 def test_where_no_observation_noise_is_logged_the_parameters_stand_in() -> None:
@@ -194,32 +200,23 @@ def test_state_truth_and_variance_are_projected() -> None:
     second = np.arange(0.0, 40.5, 1.0)
     variance = table(second, rng.uniform(0.1, 2.0, (len(second), 6)), variances)
     ekf2 = replace(made.ekf2, variance=variance)
-    part = Segment(10.0, 20.0, "")
-    aisle = axes_of(made)["aisle"]
-    for got, samples in (
-        (project_state(ekf2.state, aisle, part), ekf2.state),
-        (project_truth(made.truth, aisle, part), made.truth.samples),
+    part, aisle = Segment(10.0, 20.0, ""), axes_of(made)["aisle"]
+    states = {"position_m": POSITION_COLUMNS, "velocity_m_s": VELOCITY_COLUMNS}
+    spreads = {
+        "position_variance_m2": POSITION_VARIANCE_COLUMNS,
+        "velocity_variance_m2_s2": VELOCITY_VARIANCE_COLUMNS,
+    }
+    for got, samples, columns, power in (
+        (project_state(ekf2.state, aisle, part), ekf2.state, states, 1),
+        (project_truth(made.truth, aisle, part), made.truth.samples, states, 1),
+        (project_variance(ekf2, aisle, part), variance, spreads, 2),
     ):
         assert isinstance(got, pd.DataFrame)
         cut = samples[(samples.index >= 10.0) & (samples.index <= 20.0)]
         assert got.index.tolist() == cut.index.tolist()
-        for column, (north, east, _) in (
-            ("position_m", POSITION_COLUMNS), ("velocity_m_s", VELOCITY_COLUMNS),
-        ):  # fmt: skip
-            np.testing.assert_allclose(
-                got[column], COSINE * cut[north] + SINE * cut[east], rtol=1e-12
-            )
-    projected = project_variance(ekf2, aisle, part)
-    assert isinstance(projected, pd.DataFrame)
-    cut = variance[10:21]
-    assert projected.index.tolist() == cut.index.tolist()
-    for column, (north, east, _) in (
-        ("position_variance_m2", POSITION_VARIANCE_COLUMNS),
-        ("velocity_variance_m2_s2", VELOCITY_VARIANCE_COLUMNS),
-    ):
-        np.testing.assert_allclose(
-            projected[column], COSINE**2 * cut[north] + SINE**2 * cut[east], rtol=1e-12
-        )
+        for column, (north, east, _) in columns.items():
+            expected = COSINE**power * cut[north] + SINE**power * cut[east]
+            np.testing.assert_allclose(got[column], expected, rtol=1e-12)
     late = Segment(100.0, 110.0, "")
     assert isinstance(project_variance(ekf2, aisle, late), Unavailable)
     assert isinstance(project_truth(made.truth, aisle, late), Unavailable)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from conftest import REPOSITORY
-from test_bad_logs import patience
+from patience import patience
 from test_cli import run_main
 
 from px4fuse.errors import LogError, Px4FuseError

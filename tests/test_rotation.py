@@ -27,7 +27,7 @@ def test_a_rotation_that_hardly_turns_keeps_its_size() -> None:
     np.testing.assert_allclose(to_vector(from_vector(vectors)), vectors, atol=1e-12)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 8, 9, 10])
+@pytest.mark.parametrize("count", [1, 2, 3, 8, 9, 10, 50])
 def test_a_running_product_is_the_product(count: int) -> None:
     turns = from_vector(np.random.default_rng(count).normal(0.0, 1.0, (count, 3)))
     product, one = running_product(turns), np.array([1.0, 0.0, 0.0, 0.0])
@@ -57,12 +57,6 @@ def test_rotations_are_scipys() -> None:
     assert matrix(both) == pytest.approx((theirs[:25] * theirs[25:]).as_matrix(), abs=1e-12)
     v, u = rng.normal(size=(2, 3))
     assert skew(v) @ u == pytest.approx(np.cross(v, u))
-    product = running_product(q)
-    known = q[0]
-    for at in range(1, 50):
-        known = multiply(known, q[at])
-    assert product[-1] == pytest.approx(known, abs=1e-12)
-    assert len(running_product(q[:1])) == 1
 
 
 def test_interpolation_does_not_mind_the_sign() -> None:

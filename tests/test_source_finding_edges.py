@@ -46,8 +46,9 @@ from px4fuse.findings import (
 from px4fuse.flight import SPECIFIC_FORCE_COLUMNS
 from px4fuse.origin import ALIGNED, KEPT, MOTION_CAPTURE
 
-ODOMETRY = {"source": source(orientation=object())}
-MADE_OF_EKF2 = {"source": source(origin=KEPT)}
+MOVING = positions(np.arange(0.0, 120.0), np.arange(120.0))
+ODOMETRY = {"source": source(orientation=object(), samples=MOVING)}
+MADE_OF_EKF2 = {"source": source(origin=KEPT, samples=MOVING)}
 
 
 def bias_of_ekf2(*bias: float) -> dict[str, Any]:
@@ -148,7 +149,7 @@ EDGES = [
           (96, {"clock_map": clock_map()}, "info"), (97, {"clock_map": clock_map()}, None),
           (47, {"clock_map": None}, None), (47, {"clock_map": clock_map("arrival time")}, None),
           (47, {"clock_map": clock_map(distinct=2)}, None))),
-    *((source_positions.detect, low_pass(gain, lag_s), expected) for gain, lag_s, expected in (
+    *((source_positions.smoothing, low_pass(gain, lag_s), expected) for gain, lag_s, expected in (
         (12.0, 0.05, "warning"), (11.9, 0.05, None), (12.0, 0.049, None),
         (12.0, 0.0999, "warning"), (12.0, 0.1, "error"))),
     (source_positions.detect, low_pass(99.0, 1.0, **ODOMETRY), None),
@@ -357,7 +358,7 @@ def test_what_a_clock_offset_asks_of_ekf2(monkeypatch: pytest.MonkeyPatch) -> No
     """The delay is what the stamps are late by, with what was applied: 150 ms."""
     effect = SimpleNamespace(before=1.0, after=2.0, words=lambda: "it helps")
     monkeypatch.setattr(
-        source_clock, "delay_change", lambda _, late_ms: {"EKF2_EV_DELAY": round(late_ms)}
+        remedies, "delay_change", lambda _, late_ms: {"EKF2_EV_DELAY": round(late_ms)}
     )
     monkeypatch.setattr(remedies, "replayed", lambda *_: [effect])
     for fed, helps, there in (("uwb", True, True), ("another", True, False), ("uwb", False, False)):

@@ -11,13 +11,11 @@ import pytest
 from exchange import replace
 from filter_tools import COUNT, SETTINGS, TRUE, made_flight, modelled
 from flights import line
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.stats import binom, norm
 
-from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import compare
-from px4fuse.filter.consistency import Consistency
+from px4fuse.comparison.model import Comparison
 from px4fuse.filter.likelihood import PROFILE_DROP, innovations, preintegrate
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
@@ -93,11 +91,16 @@ def test_bad_settings_lose_on_unseen_data() -> None:
     assert found.held_out.gain_nats > 0.1
     assert found.held_out.count == COUNT // 2
     assert found.gain_nats > 0.1
-    assert isinstance(found.before, Consistency)
-    assert isinstance(found.after, Consistency)
     assert found.before.verdict != "consistent"
     assert found.after.verdict == "consistent"
     assert abs(found.after.lag1_autocorrelation) < abs(found.before.lag1_autocorrelation)
+    # nor do noises depend on what was chosen
+    other = tuned(modelled(1), chosen=Settings(sigma_a_m_s2=0.01, sigma_z_m=5.0, input="zero"))
+    for name in ("sigma_a", "sigma_z"):
+        one, two = (getattr(each, name) for each in (found, other))
+        assert [one.value, one.low, one.high] == pytest.approx(
+            [two.value, two.low, two.high], rel=1e-4
+        )
 
 
 def test_irregular_intervals_do_not_disturb() -> None:
@@ -126,17 +129,6 @@ def test_horizontal_axes_together_know_more_than_each_alone() -> None:
                 # twice the data: 1/√2 of the width
                 assert width[1] / width[0] == pytest.approx(np.sqrt(0.5), rel=0.25)
                 assert pooled.value is not None
-
-
-def test_sigma_z_does_not_depend_on_what_was_chosen() -> None:
-    axis = modelled(3)
-    settings = [Settings(sigma_a_m_s2=a, sigma_z_m=z, input="zero")
-                for a, z in ((0.01, 5.0), (20.0, 0.01))]  # fmt: skip
-    first, second = (tuned(axis, chosen=each) for each in settings)
-    for one, other in ((first.sigma_z, second.sigma_z), (first.sigma_a, second.sigma_a)):
-        assert [one.value, one.low, one.high] == pytest.approx(
-            [other.value, other.low, other.high], rel=1e-4
-        )
 
 
 # --- the map ---
@@ -175,26 +167,19 @@ def test_the_map_is_the_likelihood_on_its_grid_and_the_interval_its_profile() ->
 @pytest.mark.parametrize("sigma_a", [0.05, 0.5])
 def test_noise_free_positions_bound_the_noise_and_give_no_value(sigma_a: float) -> None:
     found = tuned(modelled(3, 500, sigma_a=sigma_a, sigma_z=0.0))
-    assert found.sigma_z.value is None
-    assert found.sigma_z.low is None
+    assert found.sigma_z.value is found.sigma_z.low is None
     assert SIGMA_Z_SEARCH_M[0] <= found.sigma_z.high < 0.003
     assert found.sigma_a.low <= sigma_a <= found.sigma_a.high or sigma_a < 0.1
 
 
-def test_a_flight_without_process_noise_bounds_sigma_a() -> None:
-    found = tuned(line(0.2 * np.arange(300), np.random.default_rng(0).normal(0.0, 0.1, 300)))
-    assert found.sigma_a.value is None
-    assert found.sigma_a.low is None
-    assert 0.001 < found.sigma_a.high < 0.02
-    assert found.sigma_z.low < 0.1 < found.sigma_z.high
-
-
-def test_noise_beyond_the_search_has_a_lower_end_only() -> None:
-    rng = np.random.default_rng(0)
-    found = tuned(line(0.2 * np.arange(300), rng.normal(0.0, 30.0, 300)))
-    assert found.sigma_z.value is None
-    assert found.sigma_z.high is None
-    assert found.sigma_z.low > 9.0
+def test_noises_at_an_end_of_the_search_have_the_other_end_only() -> None:
+    noise = np.random.default_rng(0).normal(0.0, 1.0, 300)
+    still, wild = (tuned(line(0.2 * np.arange(300), sigma * noise)) for sigma in (0.1, 30.0))
+    assert still.sigma_a.value is still.sigma_a.low is None
+    assert 0.001 < still.sigma_a.high < 0.02
+    assert still.sigma_z.low < 0.1 < still.sigma_z.high
+    assert wild.sigma_z.value is wild.sigma_z.high is None
+    assert wild.sigma_z.low > 9.0
 
 
 def test_too_few_measurements_are_said_to_be() -> None:
@@ -222,9 +207,7 @@ def test_axes_are_named_and_pooled_only_where_they_share_their_times() -> None:
 
 
 def horizontal(flight: Flight, *, imu: bool = True, drifts: bool = False) -> AxisTuning:
-    compared = compare(flight, SETTINGS)
-    axes = tuple(result.axis for result in compared.axes.values())
-    given = compared.flight if imu else None
+    axes, given = compare(flight, SETTINGS).lines, flight if imu else None
     found = tune(axes, SETTINGS, (HORIZONTAL,), flight=given, drifts=drifts)[HORIZONTAL]
     assert isinstance(found, AxisTuning)
     assert found.biases_fitted == imu
@@ -270,35 +253,29 @@ def test_a_source_that_wanders_has_a_walk_of_its_own() -> None:
 
 # --- real and simulated logs ---
 
-WITH_VISION = (
-    "main202603_aisle_hwlogvision",
-    "v1.13.3_aisle_hwlogvision",
-    "v1.16.1_aisle_hwlogvision",
-    "v1.14.4_aisle_nominal",
-    "v1.16.1_aisle_nominal",
-    "v1.16.1_aisle_10hz",
-    "v1.16.1_aisle_clock_nosync",
-    "v1.16.1_aisle_nlos",
-    "v1.16.1_aisle_overconfident",
-    "v1.13.3_aisle_evdelay175",
-)
 
-
-def truth_of(log: Path) -> tuple[Array, NDArray[np.bool_]]:
-    """Boot times (s from the first data) of the positions sent, and which are outliers."""
-    made = json.loads(log.with_suffix(".json").read_text(encoding="utf-8"))
-    sent = [each for each in made["uwb"] if not each.get("dropped")]
-    start = read_log(log).log.boot_time_s
-    time = np.array([each["t_px4_us"] for each in sent]) * 1e-6 - start
-    return time, np.array([bool(each.get("outlier")) for each in sent])
+def tuned_log(log: Path) -> tuple[Comparison, AxisTuning]:
+    compared = compare(read_log(log))
+    found = tune(compared.lines, compared.settings, (HORIZONTAL,), flight=compared.flight)
+    return compared, found[HORIZONTAL]
 
 
 @pytest.mark.reallogs
-@pytest.mark.parametrize("name", WITH_VISION)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "main202603_aisle_hwlogvision",
+        "v1.13.3_aisle_hwlogvision",
+        "v1.14.4_aisle_nominal",
+        "v1.16.1_aisle_nominal",
+        "v1.16.1_aisle_10hz",
+        "v1.16.1_aisle_clock_nosync",
+        "v1.16.1_aisle_nlos",
+        "v1.13.3_aisle_evdelay175",
+    ],
+)
 def test_the_noise_injected_is_found_in_simulated_flights(shared_logs, name: str) -> None:
-    compared = compare(read_log(shared_logs / "simulated" / f"{name}.ulg"))
-    axes = tuple(result.axis for result in compared.axes.values())
-    found = tune(axes, compared.settings, (HORIZONTAL,), flight=compared.flight)[HORIZONTAL]
+    _, found = tuned_log(shared_logs / "simulated" / f"{name}.ulg")
     assert found.sigma_z.value == pytest.approx(0.10, rel=0.10)
     assert found.sigma_z.low <= 0.10 <= found.sigma_z.high
 
@@ -306,12 +283,12 @@ def test_the_noise_injected_is_found_in_simulated_flights(shared_logs, name: str
 @pytest.mark.reallogs
 def test_nlos_is_found(shared_logs) -> None:
     log = shared_logs / "simulated" / "v1.16.1_aisle_nlos.ulg"
-    compared = compare(read_log(log))
-    axes = tuple(result.axis for result in compared.axes.values())
-    found = tune(axes, compared.settings, (HORIZONTAL,), flight=compared.flight)[HORIZONTAL]
-    time, outlier = truth_of(log)
-    segment = compared.segment
-    truly = time[outlier & (time > segment.start_s) & (time < segment.end_s)]
+    compared, found = tuned_log(log)
+    made = json.loads(log.with_suffix(".json").read_text(encoding="utf-8"))
+    wrong = [each for each in made["uwb"] if each.get("outlier") and not each.get("dropped")]
+    # from the first data
+    time = np.array([each["t_px4_us"] for each in wrong]) * 1e-6 - compared.flight.log.boot_time_s
+    truly = time[(time > compared.segment.start_s) & (time < compared.segment.end_s)]
     assert len(truly) > 15
     distance = np.abs(found.outlier_time_s[:, None] - truly).min(axis=1)
     right = np.count_nonzero(distance < 0.02)
@@ -325,8 +302,6 @@ def test_motion_capture_bounds_the_noise(shared_logs) -> None:
     logs = sorted((shared_logs / "real").glob("vladimireganov*.ulg"))
     assert len(logs) >= 3
     for log in logs:
-        compared = compare(read_log(log))
-        axes = tuple(result.axis for result in compared.axes.values())
-        found = tune(axes, compared.settings, (HORIZONTAL,), flight=compared.flight)[HORIZONTAL]
+        _, found = tuned_log(log)
         assert found.sigma_z.value is None, log.name
         assert found.sigma_z.high < 0.03, log.name

@@ -168,7 +168,7 @@ def test_the_page_shows_words_bars_and_agreement(sample: Analysis) -> None:
         end = steps[-1].get_x() + steps[-1].get_width()
         assert end == pytest.approx(left.get_width(), abs=1e-9)
         assert getattr(of(sample), total) > 0.0
-    ours, left = over_time.lines[:2]
+    ours, left = over_time.lines[-2:]
     assert abs(ours.get_ydata()).max() == abs(of(sample).apart_m).max()
     assert abs(left.get_ydata()).max() == abs(of(sample).left_m).max()
 

@@ -50,6 +50,27 @@ TURNED_RATIO, TURNED_RMS_M = 2.0, 0.3
 
 
 @dataclass(frozen=True)
+class Question:
+    """A position file, and what is known of how it lies in the flight; what is None is sought.
+
+    Attributes
+    ----------
+    samples : DataFrame
+        Of the file, by its own clock.
+    frame : str or None
+    yaw_rad : float or None
+        Of the file's frame against EKF2's.
+    lag_s : float or None
+        Time of the flight at the file's first sample.
+    """
+
+    samples: pd.DataFrame
+    frame: str | None
+    yaw_rad: float | None
+    lag_s: float | None
+
+
+@dataclass(frozen=True)
 class Match:
     """The file in one frame, matched with one reference.
 
@@ -88,13 +109,7 @@ class Match:
         return ", ".join(f"{name} {misfit:.2f} m" for name, misfit in self.misfits_m.items())
 
 
-def find_match(
-    flight: Flight,
-    samples: pd.DataFrame,
-    frame: str | None,
-    yaw_rad: float | None,
-    lag_s: float | None,
-) -> Match | None:
+def find_match(flight: Flight, asked: Question) -> Match | None:
     """Match with the first reference that serves; None where none does and nothing is sought.
 
     Raises
@@ -102,17 +117,15 @@ def find_match(
     NoMatchError
         With its remedy.
     """
-    asked = {"`clock_offset_s`": lag_s, "`frame`": frame, "`yaw_deg`": yaw_rad}
-    sought = [name for name, known in asked.items() if known is None]
+    known = {"clock_offset_s": asked.lag_s, "frame": asked.frame, "yaw_deg": asked.yaw_rad}
+    sought = [f"`{name}`" for name, value in known.items() if value is None]
     reasons = []
     # what is all given is at most compared, for which the IMU's band says too little
     for references in (ekf2_references, imu_references) if sought else (ekf2_references,):
         try:
-            match = _match(references(flight), samples, frame, yaw_rad, lag_s)
+            match = _match(references(flight), asked)
             _check_match(match)
-            if match.reference.name == IMU:
-                return match
-            return _fitted_across_resets(flight, samples, match, yaw_rad, lag_s)
+            return _fitted_across_resets(flight, match, asked)
         except NoMatchError as error:
             if error.remedy and sought:
                 raise
@@ -122,14 +135,9 @@ def find_match(
     return None
 
 
-def _match(
-    references: list[OwnTrack],
-    samples: pd.DataFrame,
-    frame: str | None,
-    yaw_rad: float | None,
-    lag_s: float | None,
-) -> Match:
+def _match(references: list[OwnTrack], asked: Question) -> Match:
     """Match with the best of the references, in the best of the frames."""
+    samples, frame, yaw_rad = asked.samples, asked.frame, asked.yaw_rad
     if samples.index[-1] - samples.index[0] > MAX_SPAN_S:
         raise NoMatchError("the file spans more than a day: cut it to the day of the flight")
     if horizontal_range_m(file_track(samples, "ned")) < MIN_MOTION_M:
@@ -138,7 +146,7 @@ def _match(
     matches = []
     for reference in references:
         name = reference.name
-        fitted = partial(_best_fit, samples, reference, lag_s)
+        fitted = partial(_best_fit, asked, reference)
         fits = {tried: fitted(tried, yaw_rad) for tried in frames}
         misfits = {tried: fits[tried].rms_m for tried in sorted(fits, key=lambda f: fits[f].rms_m)}
         best = next(iter(misfits))
@@ -200,31 +208,22 @@ def _check_match(match: Match) -> None:
             )
 
 
-def _fitted_across_resets(
-    flight: Flight, samples: pd.DataFrame, match: Match, yaw_rad: float | None, lag_s: float | None
-) -> Match:
+def _fitted_across_resets(flight: Flight, match: Match, asked: Question) -> Match:
     """Fit again to EKF2 with its resets treated as everything else in px4fuse treats them."""
-    if isinstance(flight.ekf2, Unavailable) or not flight.ekf2.resets:
+    ekf2, clock = flight.ekf2, match.clock
+    if match.reference.name == IMU or isinstance(ekf2, Unavailable) or not ekf2.resets:
         return match
-    clock = match.clock
-    placed = placed_samples(samples, match.frame, clock.yaw_rad, clock.origin_m, clock.lag_s)
-    track = continuous_track(flight.ekf2, placed)
-    file = file_track(samples, match.frame)
-    again = partial(least_squares_fit, file, track, clock_free=lag_s is None)
+    placed = placed_samples(asked.samples, match.frame, clock.yaw_rad, clock.origin_m, clock.lag_s)
+    track, file = continuous_track(ekf2, placed), file_track(asked.samples, match.frame)
+    again = partial(least_squares_fit, file, track, clock_free=asked.lag_s is None)
     free = again(match.free, None)
-    fit = free if yaw_rad is None else again(match.fit, yaw_rad)
+    fit = free if asked.yaw_rad is None else again(match.fit, asked.yaw_rad)
     return replace(match, reference=track, fit=fit, free=free)
 
 
-def _best_fit(
-    samples: pd.DataFrame,
-    reference: OwnTrack,
-    lag_s: float | None,
-    frame: str,
-    yaw_rad: float | None,
-) -> Fit:
+def _best_fit(asked: Question, reference: OwnTrack, frame: str, yaw_rad: float | None) -> Fit:
     """Find the lag, unless it is given, then fit."""
-    file = file_track(samples, frame)
+    file, lag_s = file_track(asked.samples, frame), asked.lag_s
     coarse = on_grid(despiked(file))
     if reference.name == IMU:
         if len(coarse.time_s) * STEP_S < MIN_OVERLAP_S:

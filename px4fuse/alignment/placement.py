@@ -19,7 +19,7 @@ import numpy as np
 from msgspec import structs
 
 from px4fuse.alignment.description import describe
-from px4fuse.alignment.matching import find_match
+from px4fuse.alignment.matching import Question, find_match
 from px4fuse.alignment.tracks import EKF2_POSITION, FRAMES, IMU, MIN_SAMPLES, NoMatchError
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import Flight, PositionTrack
@@ -88,16 +88,16 @@ def place(
         )
     yaw_rad = None if yaw_deg == "auto" else float(np.radians(yaw_deg or 0.0))
     try:
-        match = find_match(flight, samples, frame or file.frame, yaw_rad, lag_s)
+        match = find_match(flight, Question(samples, frame or file.frame, yaw_rad, lag_s))
     except NoMatchError as error:
         raise MissingDataError(f"{file.name}: {error}; {spans}. {error.remedy}.") from None
     alignment, placed = describe(flight, file, samples, match, frame, yaw_deg, clock_offset_s)
     how = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
+    turned = f" turned by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
     track = PositionTrack(
         name=file.name,
         origin=GIVEN_FILE,
-        description=f"external position file, {len(placed)} samples, {alignment.frame}"
-        + (f" turned by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""),
+        description=f"external position file, {len(placed)} samples, {alignment.frame}{turned}",
         samples=placed,
         frame="NED",
         clock=f"the file's own {file.clock} clock, {alignment.clock_offset_s:+.3f} s to the boot "
@@ -107,14 +107,16 @@ def place(
         alignment=alignment,
     )
     said = tuple(f"{file.name}: {text}" for text in (*file.detected, *file.notes))
+    dropped = {file.name: file.dropped} if file.dropped else {}
     return replace(
         flight,
-        log=structs.replace(flight.log, notes=(*flight.log.notes, *said)),
-        positions=(track, *flight.positions),
-        inputs=(
-            *flight.inputs,
-            InputFile(file.name, file.sha256, file.size_bytes, role="position"),
+        log=structs.replace(
+            flight.log,
+            notes=(*flight.log.notes, *said),
+            dropped={**flight.log.dropped, **dropped},
         ),
+        positions=(track, *flight.positions),
+        inputs=(*flight.inputs, InputFile(file.name, file.sha256, file.size_bytes, "position")),
     )
 
 
@@ -123,10 +125,8 @@ def _check_options(
 ) -> None:
     if frame is not None and frame not in FRAMES:
         raise SettingsError(f"`frame` {frame}: not a known frame. Choose from {', '.join(FRAMES)}.")
-    if isinstance(yaw_deg, str):
-        if yaw_deg != "auto":
-            raise SettingsError(f"`yaw_deg` {yaw_deg}: give degrees, or auto.")
-    elif yaw_deg is not None and not np.isfinite(yaw_deg):
-        raise SettingsError(f"`yaw_deg` {yaw_deg:g} is not a finite number.")
-    if clock_offset_s is not None and not np.isfinite(clock_offset_s):
-        raise SettingsError(f"`clock_offset_s` {clock_offset_s:g} is not a finite number.")
+    if isinstance(yaw_deg, str) and yaw_deg != "auto":
+        raise SettingsError(f"`yaw_deg` {yaw_deg}: give degrees, or auto.")
+    for name, value in (("yaw_deg", yaw_deg), ("clock_offset_s", clock_offset_s)):
+        if isinstance(value, float) and not np.isfinite(value):
+            raise SettingsError(f"`{name}` {value:g} is not a finite number.")

@@ -23,6 +23,7 @@ from px4fuse.flight import (
 )
 from px4fuse.origin import GIVEN_FILE
 from px4fuse.readers.parts import finite_rows
+from px4fuse.trajectory.association import bracketed
 from px4fuse.trajectory.offset import STEP_S
 
 # Which of x, y, z is north, east, down, and with which sign
@@ -99,12 +100,9 @@ def file_track(samples: pd.DataFrame, frame: str) -> OwnTrack:
 
 def on_grid(track: OwnTrack) -> OwnTrack:
     """Resample to the grid that begins with the track, gaps marked."""
-    interval = np.diff(track.time_s)
     grid = np.arange(track.time_s[0], track.time_s[-1], STEP_S)
-    before = np.searchsorted(track.time_s, grid, side="right") - 1
-    longest = max(GAP_S, GAP_INTERVALS * float(np.median(interval)))
-    within = interval[np.clip(before, 0, len(interval) - 1)] <= longest
-    return OwnTrack(grid, track.at(grid)[0], within)
+    longest = max(GAP_S, GAP_INTERVALS * float(np.median(np.diff(track.time_s))))
+    return OwnTrack(grid, track.at(grid)[0], bracketed(grid, track.time_s, longest))
 
 
 def despiked(track: OwnTrack, window: int = 3) -> OwnTrack:

@@ -106,7 +106,7 @@ def evaluate(
     the PDF.
     """
     from px4fuse.loop.sources import read_source
-    from px4fuse.report.loop_terminal import print_evaluation
+    from px4fuse.report.evaluation import print_evaluation
     from px4fuse.results.build_trajectories import evaluation_results
     from px4fuse.results.contract import to_json
     from px4fuse.trajectory.evaluation import evaluate as score

@@ -102,7 +102,7 @@ def loop(
     from px4fuse.findings import find_loop
     from px4fuse.loop.sources import is_g2o, split_part
     from px4fuse.report.document import LoopDocument
-    from px4fuse.report.loop_terminal import print_loop
+    from px4fuse.report.loop import print_loop
     from px4fuse.results.build_trajectories import loop_results
     from px4fuse.results.contract import to_json
 
@@ -183,7 +183,7 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
     """Solve a pose graph from a file."""
     from px4fuse.loop.sources import split_part
     from px4fuse.readers.g2o import g2o_text, read_g2o
-    from px4fuse.report.loop_terminal import print_graph
+    from px4fuse.report.loop import print_graph
     from px4fuse.results.build_trajectories import graph_results
     from px4fuse.results.contract import to_json
     from px4fuse.trajectory.graph.analysis import analyse_graph
@@ -203,10 +203,10 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
     alone = json_path == STANDARD_OUTPUT
     with progress(alone) as step:
         step(f"reading {shown(source)}")
-        solved = analyse_graph(read_g2o(path), step, robust=robust)
+        solved = analyse_graph(shown(source), read_g2o(path), step, robust=robust)
     command = command_line(LoopRequest(source=str(source))) + (" --robust" if robust else "")
-    results = graph_results(shown(source), solved, command)
+    results = graph_results(solved, command)
     contents = {} if g2o is None else {g2o: g2o_text(solved.graph).encode()}
     if json_path is not None:
         contents[json_path] = to_json(results).encode()
-    finish(contents, lambda to: print_graph(to, shown(source), solved), alone=alone)
+    finish(contents, lambda to: print_graph(to, solved), alone=alone)

@@ -85,7 +85,7 @@ def whatif(
     if json_path == STANDARD_OUTPUT:
         return
     from px4fuse.report.screen import print_file
-    from px4fuse.report.whatif_terminal import print_what_if
+    from px4fuse.report.whatif import print_what_if
 
     console = terminal()
     print_what_if(console, found)

@@ -106,7 +106,7 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, run: Replay) -
         prior_variance_m2=run.updates["prior_position_variance_m2"],
         posterior_variance_m2=run.steps["position_variance_m2"].reindex(run.updates.index),
     )
-    north, east, down = axis.direction.tolist()
+    (north, east, down), rejected = axis.direction.tolist(), _known(innovations, "rejected")
     return AxisComparison(
         heading_deg=axis.heading_deg,
         direction=(north, east, down),
@@ -123,7 +123,7 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, run: Replay) -
             "ekf2": _summary(innovations, variance, against_truth(state, variance, truth), gate),
         },
         difference=difference,
-        rejected_share=_rejected_share(innovations),
+        rejected_share=float(rejected.mean()) if len(rejected) else None,
         axis=axis,
         replay=run,
         ekf2_state=state,
@@ -138,12 +138,12 @@ def _summary(
 ) -> FilterSummary | UnjudgedFilter:
     """What a filter did, from its innovations, its variances, and those around each update."""
     sigmas: dict[str, Any] = {
-        name: _median_sigma(frame, column)
-        for name, frame, column in (
-            ("sigma_p_median_m", variance, "position_variance_m2"),
-            ("sigma_v_median_m_s", variance, "velocity_variance_m2_s2"),
-            ("sigma_p_before_update_m", innovations, "prior_variance_m2"),
-            ("sigma_p_after_update_m", innovations, "posterior_variance_m2"),
+        name: float(np.sqrt(known.median())) if len(known) else None
+        for name, known in (
+            ("sigma_p_median_m", _known(variance, "position_variance_m2")),
+            ("sigma_v_median_m_s", _known(variance, "velocity_variance_m2_s2")),
+            ("sigma_p_before_update_m", _known(innovations, "prior_variance_m2")),
+            ("sigma_p_after_update_m", _known(innovations, "posterior_variance_m2")),
         )
     }
     if not isinstance(innovations, Unavailable):
@@ -155,17 +155,9 @@ def _summary(
     return UnjudgedFilter(**structs.asdict(innovations), **sigmas, truth=truth)
 
 
-def _rejected_share(innovations: Frame) -> float | None:
-    if isinstance(innovations, Unavailable):
-        return None
-    known = innovations["rejected"].dropna()
-    return float(known.mean()) if len(known) else None
-
-
-def _median_sigma(frame: Frame, column: str) -> float | None:
-    if isinstance(frame, Unavailable) or (known := frame[column].dropna()).empty:
-        return None
-    return float(np.sqrt(known.median()))
+def _known(frame: Frame, column: str) -> pd.Series:
+    """What is known of a column; nothing of one that is not there."""
+    return pd.Series(dtype=float) if isinstance(frame, Unavailable) else frame[column].dropna()
 
 
 def _difference(run: Replay, ekf2_state: pd.DataFrame) -> Difference | Unavailable:

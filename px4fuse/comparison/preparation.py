@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TypedDict, Unpack
 
-import pandas as pd
-
 from px4fuse.comparison.model import Comparison
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.settings import Settings
@@ -166,15 +164,12 @@ def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
     """The same track with ``clock_offset_s`` added to its time stamps."""
     if clock_offset_s == 0.0:
         return track
-
-    def later(frame: pd.DataFrame) -> pd.DataFrame:
-        return frame.set_axis(pd.Index(frame.index.to_numpy() + clock_offset_s, name="time_s"))
-
-    return replace(
-        track,
-        samples=later(track.samples),
-        orientation=None if track.orientation is None else later(track.orientation),
+    samples, orientation = (
+        None if frame is None else frame.set_axis(frame.index + clock_offset_s)
+        for frame in (track.samples, track.orientation)
     )
+    assert samples is not None
+    return replace(track, samples=samples, orientation=orientation)
 
 
 def choose_segment(

@@ -7,7 +7,7 @@ The sentences are made of them last: what each filter does, with numbers, and wh
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -91,11 +91,10 @@ def why_ekf2_differs(
     if isinstance(walked, Unavailable):
         return dict.fromkeys(results, walked)
     certain = clock if isinstance(clock, ClockOffset) and clock.determinable else None
-    facts = Facts(comparison, model, asked_m, certain)
     found: dict[str, Why | Unavailable] = {}
     for name, why in walked.items():
-        outside = _outside(results[name], why.spans_s)
-        found[name] = with_words(name, structs.replace(why, outside=outside), facts)
+        outside = structs.replace(why, outside=_outside(results[name], why.spans_s))
+        found[name] = with_words(name, outside, comparison, model, asked_m, certain)
     return found
 
 
@@ -111,45 +110,32 @@ def _outside(result: AxisComparison, spans: Spans) -> Outside | None:
     return Outside(float(apart[most]), float(times[most]))
 
 
-@dataclass(frozen=True)
-class Facts:
-    """What the words are made of, beside the steps.
+def with_words(
+    name: str,
+    why: Why,
+    comparison: Comparison,
+    model: Model,
+    asked_m: float | None,
+    clock: ClockOffset | None,
+) -> Why:
+    """The same with sentences: what makes EKF2 differ along an axis, the weightiest first.
 
-    Attributes
+    Parameters
     ----------
-    comparison : Comparison
-    model : Model
-    noise_asked_m : float or None
+    asked_m : float or None
         Measurement noise that the data ask for, of the source that EKF2 fused.
     clock : ClockOffset or None
         None where it is not determinable.
     """
-
-    comparison: Comparison
-    model: Model
-    noise_asked_m: float | None
-    clock: ClockOffset | None
-
-    @property
-    def rejected(self) -> float:
-        """Share of the samples that EKF2's gate rejected, by the log."""
-        return self.model.agreement.rejected_share_logged
-
-    @property
-    def too_sure(self) -> bool:
-        """Whether EKF2 rejects samples because its measurement noise is too small."""
-        asked, used = self.noise_asked_m, noise_used_m(self.model)
-        return asked is not None and used * TOO_SMALL < asked and self.rejected >= REJECTED_SHARE
-
-
-def with_words(name: str, why: Why, facts: Facts) -> Why:
-    """The same with sentences: what makes EKF2 differ along an axis, the weightiest first."""
-    first, *others = _parts(why, too_sure=facts.too_sure)
-    if facts.too_sure:
+    used_m, rejected = noise_used_m(model), model.agreement.rejected_share_logged
+    too_sure = asked_m is not None and used_m * TOO_SMALL < asked_m and rejected >= REJECTED_SHARE
+    first, *others = _parts(why, too_sure=too_sure)
+    because = _reasons(why, comparison, model, clock)
+    if too_sure:
         cause = (
-            "EKF2_EVP_NOISE is too small: EKF2 takes the source's noise to be "
-            f"{noise_used_m(facts.model):.2g} m, the data ask for {facts.noise_asked_m:.2g} m, so "
-            f"its gate rejects {facts.rejected:.0%} of the samples{_coasted(why)}"
+            f"EKF2_EVP_NOISE is too small: EKF2 takes the source's noise to be {used_m:.2g} m, the "
+            f"data ask for {asked_m:.2g} m, so its gate rejects {rejected:.0%} of the samples"
+            f"{_coasted(why)}"
         )
         more = (
             f". This noise and the rejections that follow from it are {_share(first, why)} of "
@@ -158,17 +144,15 @@ def with_words(name: str, why: Why, facts: Facts) -> Why:
     else:
         cause = (
             f"Most of what ours and EKF2 are apart along {the(name)} is the {first.name} "
-            f"({_share(first, why)}): {_because(first, why, facts)}"
+            f"({_share(first, why)}): {because[first.name]}"
         )
         more = _moment(first)
-    sentences = [*_clock(facts), f"{cause}{more}."]
-    if others and others[0].position_mean_square_m2 >= NOTABLE * why.position_mean_square_m2:
-        second = others[0]
-        sentences.append(
-            f"Then the {second.name} ({_share(second, why)}): {_because(second, why, facts)}"
-            f"{_moment(second)}."
-        )
-    sentences += [_velocity(why, [first, *others]), *_truth(why, too_sure=facts.too_sure)]
+    sentences = [*_wrong_stamps(comparison, model, clock), f"{cause}{more}."]
+    second = others[0]
+    if second.position_mean_square_m2 >= NOTABLE * why.position_mean_square_m2:
+        share, reason = _share(second, why), because[second.name]
+        sentences.append(f"Then the {second.name} ({share}): {reason}{_moment(second)}.")
+    sentences += [_velocity(why, [first, *others]), *_truth(why, too_sure=too_sure)]
     far_m = max(FAR_M, FAR_TIMES * float(np.max(np.abs(why.apart_m))))
     if why.outside is not None and why.outside.maximum_m > far_m:
         sentences.append(
@@ -221,10 +205,13 @@ def _coasted(why: Why) -> str:
     )
 
 
-def _because(part: Step, why: Why, facts: Facts) -> str:
-    """What EKF2 does there, and what ours does."""
-    settings, inputs = facts.comparison.settings, facts.model.inputs
-    flown, source, fused = inputs.settings, facts.comparison.source.name, inputs.vision.source
+def _reasons(
+    why: Why, comparison: Comparison, model: Model, clock: ClockOffset | None
+) -> dict[str, str]:
+    """What EKF2 does at each step, and what ours does."""
+    settings, inputs = comparison.settings, model.inputs
+    rejected = model.agreement.rejected_share_logged
+    flown, source, fused = inputs.settings, comparison.source.name, inputs.vision.source
     samples = (
         f"ours predicts every {settings.dt_s:g} s and starts by itself, EKF2 predicts every "
         f"{inputs.step_s * 1e3:.0f} ms"
@@ -234,10 +221,8 @@ def _because(part: Step, why: Why, facts: Facts) -> str:
     elif source != fused:
         samples = f"ours was given {source}, EKF2 {fused}"
     data = ""
-    if facts.clock is not None:
-        asked, low, high = (
-            -1e3 * at for at in (facts.clock.offset_s, *facts.clock.interval_s[::-1])
-        )
+    if clock is not None:
+        asked, low, high = (-1e3 * at for at in (clock.offset_s, *clock.interval_s[::-1]))
         data = f", and the data ask for {asked:.0f} ms (95 % {low:.0f} to {high:.0f})"
     same = flown["EKF2_ACC_NOISE"] * np.sqrt(inputs.step_s / settings.dt_s)
     surer = same < settings.sigma_a_m_s2
@@ -249,7 +234,7 @@ def _because(part: Step, why: Why, facts: Facts) -> str:
             f"(EKF2_EV_DELAY), ours {0.0 - settings.clock_offset_s * 1e3:.0f} ms{data}"
         ),
         NOISE: (
-            f"EKF2 takes the source's noise to be {noise_used_m(facts.model):.2g} m "
+            f"EKF2 takes the source's noise to be {noise_used_m(model):.2g} m "
             f"(EKF2_EVP_NOISE), ours {settings.sigma_z_m:.2g} m"
         ),
         BIASES: "EKF2 estimates the accelerometer's bias in flight, ours knows none",
@@ -258,15 +243,12 @@ def _because(part: Step, why: Why, facts: Facts) -> str:
             f"{settings.sigma_a_m_s2:.2g}, so EKF2 trusts {trusted}"
         ),
         ATTITUDE: "EKF2 lets the positions correct its attitude, ours takes it as it is",
-        GATE: (
-            f"EKF2's gate rejects {facts.rejected:.1%} of the samples, ours takes all"
-            f"{_coasted(why)}"
-        ),
+        GATE: (f"EKF2's gate rejects {rejected:.1%} of the samples, ours takes all{_coasted(why)}"),
         OUTPUT: (
             f"EKF2 filters {inputs.horizon_s * 1e3:.0f} ms behind the present, carries that to now "
             f"by the IMU and smooths it (EKF2_TAU_POS {flown['EKF2_TAU_POS']:g} s)"
         ),
-    }[part.name]
+    }
 
 
 def _velocity(why: Why, parts: list[Step]) -> str:
@@ -304,17 +286,14 @@ def _truth(why: Why, *, too_sure: bool) -> list[str]:
     ]
 
 
-def _clock(facts: Facts) -> list[str]:
+def _wrong_stamps(comparison: Comparison, model: Model, clock: ClockOffset | None) -> list[str]:
     """That the source's stamps are wrong for both filters alike, where they are."""
-    clock, own_s = facts.clock, facts.comparison.settings.clock_offset_s
     if clock is None:
         return []
-    delay_s = facts.model.inputs.settings["EKF2_EV_DELAY"] * 1e-3
-    known_s, late_s = max(CLOCK_S, clock.chance_s), clock.offset_s
-    if (
-        min(abs(clock.remaining_s), abs(late_s + delay_s)) < known_s
-        or abs(own_s + delay_s) > CLOCK_S
-    ):
+    delay_s, late_s = model.inputs.settings["EKF2_EV_DELAY"] * 1e-3, clock.offset_s
+    wrong_s = min(abs(clock.remaining_s), abs(late_s + delay_s))
+    apart_s = abs(comparison.settings.clock_offset_s + delay_s)
+    if wrong_s < max(CLOCK_S, clock.chance_s) or apart_s > CLOCK_S:
         return []
     return [
         f"The source's stamps are {'late' if late_s < 0 else 'early'} by {abs(late_s):.2f} s for "

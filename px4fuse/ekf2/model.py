@@ -162,12 +162,9 @@ def run_variants(
     timings = [variant.timing(inputs) for variant in variants]
     runs = []
     for at, stretch in enumerate(inputs.stretches):
-        intervals = {
-            timing: known[timing][at]
-            if timing in known
-            else make_intervals(inputs, stretch, timing)
-            for timing in set(timings)
-        }
+        intervals = {timing: parts[at] for timing, parts in known.items()}
+        for timing in set(timings) - known.keys():
+            intervals[timing] = make_intervals(inputs, stretch, timing)
         runs.append(run(inputs, stretch, variants, [intervals[timing] for timing in timings]))
     return runs
 

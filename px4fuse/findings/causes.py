@@ -118,13 +118,11 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
     "logger_dropouts": ("imu_gap",),
 }  # fmt: skip
 # What the recording lacks: put right first, since noises are judged by what was recorded
-RECORDING = frozenset(
-    {
-        "autopilot_restarted", "imu_gap", "input_unavailable", "log_damaged", "logger_dropouts",
-        "logging_rate_low", "source_decimated", "source_gap", "source_not_logged",
-        "source_samples_lost", "too_few_innovations",
-    }
-)  # fmt: skip
+RECORDING = frozenset({
+    "autopilot_restarted", "imu_gap", "input_unavailable", "log_damaged", "logger_dropouts",
+    "logging_rate_low", "source_decimated", "source_gap", "source_not_logged",
+    "source_samples_lost", "too_few_innovations",
+})  # fmt: skip
 SETTINGS = frozenset({"sigma_a_large", "sigma_a_small", "sigma_z_large", "sigma_z_small"})
 VARIANCES = frozenset({*_OVERSTATED, "kf_variance_understated", "ekf2_variance_understated"})
 NOISES = SETTINGS | VARIANCES | {"process_noise_forgotten"}

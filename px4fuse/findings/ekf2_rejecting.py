@@ -3,13 +3,7 @@
 from __future__ import annotations
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.remedy import (
-    asked_of_ekf2,
-    not_replayed,
-    rejects_less,
-    replayed,
-    settings_words,
-)
+from px4fuse.comparison import remedy
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.findings.model import Found, finding, moments
 from px4fuse.flight import Ekf2, Unavailable
@@ -50,8 +44,8 @@ def _remedy(analysis: Analysis) -> str:
     """The noise or the delay that the data ask for, where that ends the rejections."""
     model = analysis.ekf2_model
     if isinstance(model, Unavailable):
-        return f"{IN_ORDER} {not_replayed(model)}"
-    wanted = asked_of_ekf2(analysis, model, analysis.tuning, analysis.clock)
+        return f"{IN_ORDER} {remedy.not_replayed(model)}"
+    wanted = remedy.asked_of_ekf2(analysis, model, analysis.tuning, analysis.clock)
     flown = model.inputs.settings
     asked = {name: value for name, value in wanted.items() if value != flown[name]}
     delay = {name: value for name, value in asked.items() if "DELAY" in name}
@@ -59,23 +53,23 @@ def _remedy(analysis: Analysis) -> str:
     both = asked if noise and delay else {}
     candidates = [changes for changes in (noise, delay, both) if changes]
     gate = min(2.0 * flown["EKF2_EVP_GATE"], PARAMETERS["EKF2_EVP_GATE"].maximum)
-    found = replayed(model, *candidates, {"EKF2_EVP_GATE": gate})
+    found = remedy.replayed(model, *candidates, {"EKF2_EVP_GATE": gate})
     if isinstance(found, Unavailable):
-        return f"{IN_ORDER} {not_replayed(found)}"
+        return f"{IN_ORDER} {remedy.not_replayed(found)}"
     *effects, wider = found
     for effect in effects:
-        if rejects_less(effect.before, effect.after):
-            return f"Set {settings_words(effect.changes)}: {effect.words()}."
+        if remedy.rejects_less(effect.before, effect.after):
+            return f"Set {remedy.settings_words(effect.changes)}: {effect.words()}."
     said = f"{OUTLIERS} What EKF2 fused does not tell its noise here."
     if effects:
+        asked_for, remain = remedy.settings_words(effects[-1].changes), effects[-1].words()
         said = (
-            f"With what the data ask for ({settings_words(effects[-1].changes)}) the rejections "
-            f"remain: {effects[-1].words()}. {OUTLIERS}"
+            f"With what the data ask for ({asked_for}) the rejections remain: {remain}. {OUTLIERS}"
         )
     elif wanted:
         said = f"{OUTLIERS} EKF2's parameters are what the data ask for."
     if isinstance(wider.after.position_rmse_to_truth_m, Unavailable):
         return said
-    helps = rejects_less(wider.before, wider.after)
+    helps = remedy.rejects_less(wider.before, wider.after)
     verdict = "Widen EKF2_EVP_GATE" if helps else "A wider EKF2_EVP_GATE is no remedy"
     return f"{said} {verdict}; at {gate:g}: {wider.words()}."

@@ -9,6 +9,7 @@ from px4fuse.loop.model import LANDING, Closure
 from px4fuse.trajectory.graph.analysis import GATE_ALPHA
 
 MOST = 0.5  # of several closures more are true than false
+EVIDENCE = ("time_1_s", "time_2_s", "distance_m", "d2", "degrees_of_freedom", "p")
 DOUBTFUL_WEIGHT = 0.5  # GNC ends at 0 or 1 (Yang et al. 2020)
 
 
@@ -26,27 +27,27 @@ def find_in(loop: Loop) -> Found:
 
 def closures(loop: Loop) -> Found:
     """Closures that the drift cannot explain, or that the others contradict."""
-    weighed = [(c, c.weight_gnc) for c in loop.closures if c.weight_gnc is not None]
-    dropped = {closure: weight for closure, weight in weighed if weight < DOUBTFUL_WEIGHT}
-    most = len(dropped) > MOST * len(loop.closures)
+    weights = [1.0 if c.weight_gnc is None else c.weight_gnc for c in loop.closures]
+    dropped = sum(weight < DOUBTFUL_WEIGHT for weight in weights)
+    most = dropped > MOST * len(weights)
     if most:
         yield warning(
             "loop_drift_understated",
-            f"Robust solving drops {len(dropped)} of {len(loop.closures)} closures",
+            f"Robust solving drops {dropped} of {len(weights)} closures",
             ": more likely the odometry drifts more than stated than that most closures are false.",
             "Give a larger --drift or --heading-drift.",
-            {"dropped": len(dropped), "closures": len(loop.closures)},
+            {"dropped": dropped, "closures": len(weights)},
         )
-    for closure in loop.closures:
+    for closure, weight in zip(loop.closures, weights, strict=True):
         if not closure.accepted:
             yield _false(closure, loop.end_assumed)
-        elif closure in dropped and not most:
+        elif weight < DOUBTFUL_WEIGHT and not most:
             yield warning(
                 "loop_closure_doubtful",
                 f"The other closures contradict {closure}",
                 ": robust solving drops it, although the drift alone could explain it.",
                 "Leave it out, or take the robust solution (GNC).",
-                _evidence(closure) | {"gnc_weight": dropped[closure]},
+                _evidence(closure) | {"gnc_weight": weight},
             )
 
 
@@ -96,12 +97,4 @@ def _false(closure: Closure, assumed: bool) -> Finding:
 
 
 def _evidence(closure: Closure) -> dict[str, float]:
-    return {
-        "time_1_s": closure.time_1_s,
-        "time_2_s": closure.time_2_s,
-        "distance_m": closure.distance_m,
-        "d2": closure.d2,
-        "degrees_of_freedom": closure.degrees_of_freedom,
-        "p": closure.p,
-        "alpha": GATE_ALPHA,
-    }
+    return {**{name: getattr(closure, name) for name in EVIDENCE}, "alpha": GATE_ALPHA}

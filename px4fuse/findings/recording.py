@@ -58,37 +58,39 @@ def loss(analysis: Analysis) -> Found:
             else "Copy the log again; if that does not help, replace the SD card.",
             {"lost_bytes": log.bytes - log.bytes_read, "ends_in_flight": float(log.ends_in_flight)},
         )
-    dropped = [note for note in log.notes if " dropped: " in note]
-    if dropped:
-        more = len(dropped) - 1
+    for name, count in list(log.dropped.items())[:1]:
+        topics = len(log.dropped) - 1
         yield info(
             "samples_dropped",
-            _sentence(dropped[0]),
-            f" (and {more} more such note{'s' if more > 1 else ''})." if more else ".",
+            f"{count} samples of {name} were dropped",
+            ": their time stamps are zero or go back"
+            f"{f' (as are some of {topics} more)' if topics else ''}.",
             "The file is whole: a clock was set back, or messages overtook each other. If it is "
             "the position source, synchronise its clock before take-off (TIMESYNC).",
-            {"notes": len(dropped)},
+            {"notes": len(log.dropped)},
         )
 
 
 def clocks_set_back(analysis: Analysis) -> Found:
     """The boot clock began again, or the recording computer's clock was set back."""
-    for note in analysis.flight.log.notes:
-        if "boot clock went back" in note:
-            yield warning(
-                "autopilot_restarted",
-                _sentence(note),
-                ".",
-                "Record each flight into a file of its own.",
-            )
-        if "time of receipt went back" in note:
-            yield info(
-                "receipt_out_of_order",
-                _sentence(note),
-                ": the recording computer's clock was set, or recordings were put together; the "
-                "sender's own stamps are not affected.",
-                "Switch the recording computer's time service off while recording.",
-            )
+    log = analysis.flight.log
+    if log.restarts:
+        yield warning(
+            "autopilot_restarted",
+            f"The autopilot's boot clock went back {times(log.restarts)} (restart)",
+            ": only the longest part was read.",
+            "Record each flight into a file of its own.",
+            {"count": log.restarts},
+        )
+    if log.receipt_went_back:
+        yield info(
+            "receipt_out_of_order",
+            f"The time of receipt went back {times(log.receipt_went_back)}",
+            ": the recording computer's clock was set, or recordings were put together; the "
+            "sender's own stamps are not affected.",
+            "Switch the recording computer's time service off while recording.",
+            {"count": log.receipt_went_back},
+        )
 
 
 def estimators(analysis: Analysis) -> Found:

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
@@ -21,13 +22,14 @@ from px4fuse.comparison.remedy import filter_words
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings.hidden_errors import hidden_errors
-from px4fuse.findings.model import Found, Severity, finding, lowered
-from px4fuse.findings.no_motion import MOTION_RANGE_M, motion_range_m
-from px4fuse.flight import Unavailable
+from px4fuse.findings.model import Found, Severity, error, finding, lowered
+from px4fuse.findings.source_positions import MOTION_RANGE_M, motion_range_m
+from px4fuse.flight import Unavailable, sample_rate
 from px4fuse.plain import factor_words
 
 NOISE_OFF = 1.5  # times, in standard deviation; below, the tracks hardly change
 NOISE_OFF_ERROR = 4.0  # times: the gain is a different one
+RESPONSE_TIME_S = 2.5  # five times the lesson's; a vehicle turns around in less
 BEYOND = 1.5  # times the 95 % interval's reach; 0.3 % of clean flights lie beyond
 LAG1_SLOW = 0.3  # correlation; white innovations stay below 2/√n, 0.2 at n = 100
 # What a filter is run with where the source is better than its rate can show (m): what motion
@@ -89,6 +91,12 @@ class Off:
 
 
 def detect(analysis: Analysis) -> Found:
+    """Both."""
+    yield from settings_off(analysis)
+    yield from forgotten(analysis)
+
+
+def settings_off(analysis: Analysis) -> Found:
     """What is off beyond its interval, the worse one first."""
     tunings = map(analysis.tuning.get, (HORIZONTAL, "aisle", "down"))
     tuned = next((tuned for tuned in tunings if isinstance(tuned, AxisTuning)), None)
@@ -154,3 +162,36 @@ def off_by(option: str, chosen: float, asked: Noise) -> Off | None:
         severity = lowered(severity)
     name = f"{option[2:].replace('-', '_')}_{'small' if chosen < value else 'large'}"
     return Off(name, option, chosen, asked, value, size, severity)
+
+
+def forgotten(analysis: Analysis) -> Found:
+    """SIGMA_A so small that σ hardly grows between updates and new measurements are ignored.
+
+    A slow filter is no mistake where nothing happens: its innovations must say that it lags. Told
+    of the first axis on which it needs too long to follow.
+    """
+    for name, result in analysis.axes.items():
+        updates, statement = result.replay.updates, result.filters["kf"]
+        if isinstance(statement, Unavailable) or statement.verdict != "variance understated":
+            continue
+        if statement.lag1_autocorrelation < LAG1_SLOW:
+            continue
+        gain = float(updates["gain_position"].iloc[len(updates) // 2 :].median())
+        response_s = 1.0 / (sample_rate(updates) * gain)
+        if response_s < RESPONSE_TIME_S:
+            continue
+        after = result.replay.steps["position_variance_m2"].reindex(updates.index).to_numpy()
+        before = updates["prior_position_variance_m2"].to_numpy()
+        growth = float(np.median((before[1:] / after[:-1] - 1.0)[len(after) // 2 :]))
+        tuned = tuned_for(analysis, name)
+        needed = None if tuned is None else tuned.filter_sigma_a.value
+        more = "" if needed is None else f" {try_out(analysis, {'--sigma-a': needed})}"
+        yield error(
+            "process_noise_forgotten",
+            f"With SIGMA_A {analysis.settings.sigma_a_m_s2:g} m/s² Q is forgotten",
+            f": σ_p hardly grows between updates ({growth:.1%} in variance), the gain is "
+            f"{gain:.3f}, and the filter needs {response_s:.0f} s to follow (along {name}).",
+            f"Raise SIGMA_A.{more}",
+            {"relative_growth": growth, "gain": gain, "response_s": response_s, "axis": name},
+        )
+        return

@@ -66,29 +66,24 @@ def turned(analysis: Analysis, heading: HeadingError) -> Found:
     if abs(turn) < max(HEADING_SIGMAS * sigma, HEADING_ERROR_DEG):
         return
     severity: Severity = "error" if abs(turn) >= HEADING_ERROR_LARGE_DEG else "warning"
-    stated = f"{turn:+.0f}° ± {1.96 * sigma:.0f}° (clockwise seen from above)"
-    evidence = {"turn_deg": turn, "sigma_deg": sigma}
-    if name == IN_EKF2_FRAME:
-        yield finding(
-            severity,
-            "ekf2_heading_wrong",
-            f"The positions that EKF2 fused ({name}) lie turned by {stated} against EKF2's "
-            "heading, the same throughout",
-            ": what the IMU measures as north, they show in another direction.",
-            f"Align the positioning system's frame with north, or {remedy}",
-            evidence,
-        )
-        return
-    yield finding(
-        severity,
+    stated = f"turned by {turn:+.0f}° ± {1.96 * sigma:.0f}° (clockwise seen from above) against"
+    found = (
         "source_frame_turned",
-        f"The frame of {name} is turned by {stated} against the vehicle's heading",
+        f"The frame of {name} is {stated} the vehicle's heading",
         ": what the IMU measures as north, the positions show in another direction. Either the "
         "positioning frame is not aligned with north, or the heading is wrong (magnetometer).",
         f"Turn the positions by {-turn:+.0f}° before they are sent (a file: --position-yaw), or "
         "calibrate the magnetometer.",
-        evidence,
     )
+    if name == IN_EKF2_FRAME:
+        found = (
+            "ekf2_heading_wrong",
+            f"The positions that EKF2 fused ({name}) lie {stated} EKF2's heading, the same "
+            "throughout",
+            ": what the IMU measures as north, they show in another direction.",
+            f"Align the positioning system's frame with north, or {remedy}",
+        )
+    yield finding(severity, *found, {"turn_deg": turn, "sigma_deg": sigma})
 
 
 def _drifting(source: str, heading: HeadingError, remedy: str) -> Finding:

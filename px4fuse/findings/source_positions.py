@@ -1,4 +1,4 @@
-"""What is wrong with the positions themselves: smoothed, stepping, scattered, out of scale.
+"""What is wrong with the positions themselves: still, smoothed, stepping, scattered, scaled.
 
 How well a log can show a scale: six passes at 5 Hz and 0.10 m give it to 3.5 % (one σ), so that
 5 % is invisible, whatever is computed; 15 % is seen at 10 Hz and 0.05 m. Small errors need a tape
@@ -13,16 +13,18 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.model import Comparison
 from px4fuse.filter.causes import AFTER_STEP_S, Explained
 from px4fuse.filter.signals import within
 from px4fuse.filter.smoothing import Smoothing
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.imu import MIN_IMU_RATE_HZ, too_slow
-from px4fuse.findings.model import Found, finding, moments, times
+from px4fuse.findings.model import Found, finding, moments, times, warning
 from px4fuse.findings.source_stamps import arrivals
-from px4fuse.flight import POSITION_VARIANCE_COLUMNS, Unavailable
+from px4fuse.flight import POSITION_COLUMNS, POSITION_VARIANCE_COLUMNS, Unavailable
 from px4fuse.plain import factor_words
 
+MOTION_RANGE_M = 0.5  # 5 to 95 %; a hovering drone with 0.1 m UWB stays below
 GAIN_NATS = 12.0  # a likelihood ratio of 160,000; clean flights have 0 to 2
 LAG_S = 0.05  # at 1 m/s half of a good UWB's noise
 LAG_ERROR_S = 0.10  # at 1 m/s a good UWB's noise
@@ -40,6 +42,7 @@ REPORTED_ERROR = 3.0  # times in variance: beyond what EKF2's NIS bears
 
 def detect(analysis: Analysis) -> Found:
     """All of them; odometry, and what was made of EKF2's output, only where that says something."""
+    yield from motion(analysis)
     yield from jumps(analysis)
     yield from outliers(analysis)
     if analysis.source.orientation is None and not analysis.source.origin.reconstructed:
@@ -181,4 +184,24 @@ def stated_variance(analysis: Analysis) -> Found:
             f"Correct it at the sender: a variance of {noise**2:.2g} m², or set EKF2_EV_NOISE_MD "
             f"to 1 and EKF2_EVP_NOISE to {noise:.2g}.",
             {"reported_sigma_m": sigma, "sigma_z_m": noise, "variance_factor": factor},
+        )
+
+
+def motion_range_m(comparison: Comparison) -> float:
+    """Larger horizontal extent of the source in the segment, 5 to 95 %."""
+    inside = within(comparison.source.samples, comparison.segment)
+    low, high = inside[POSITION_COLUMNS[:2]].quantile([0.05, 0.95]).to_numpy()
+    return float(np.max(high - low))
+
+
+def motion(analysis: Analysis) -> Found:
+    """The vehicle hardly moved: nothing about dynamics can be identified."""
+    extent = motion_range_m(analysis)
+    if extent < MOTION_RANGE_M:
+        yield warning(
+            "no_motion",
+            f"The vehicle moved only {extent:.2f} m horizontally",
+            " (5 to 95 %): velocity, heading and clock offset cannot be judged from this flight.",
+            "Fly several passes of 5 m or more, with clear starts and stops.",
+            {"range_m": extent},
         )

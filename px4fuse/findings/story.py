@@ -69,8 +69,7 @@ def _verdict(analysis: Analysis, since: str) -> str:
     )
     our_filter = f"our filter was {ours_off}{ours}{since}"
     if isinstance(result.ekf2_state, Unavailable):
-        missing = result.ekf2_state.reason
-        return f"{along} {our_filter}; there is no EKF2 beside it: {missing}."
+        return f"{along} {our_filter}; there is no EKF2 beside it: {result.ekf2_state.reason}."
     if ours_off and ekf2_off:
         return f"{along} EKF2 was {ekf2_off}{ekf2}; {our_filter}."
     apart = "both were flown"

@@ -182,7 +182,7 @@ def _change(
     within = None if found is None or q is None else found.interval
     return NumberChange(
         path=path,
-        label=number.label,
+        label=measure.label,
         unit=measure.unit,
         a=None if a is None else a.value,
         b=None if b is None else b.value,

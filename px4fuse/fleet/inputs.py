@@ -76,31 +76,22 @@ def read_inputs(
 def _read(path: Path) -> DiffInput | None:
     """The results in a file; None of a log."""
     name, head = shown(path), read_head(path, 64, LogError)
-    kind: Kind
-    found: Results
-    if head.startswith(b"%PDF-"):
-        kind = "report"
-        content = read_whole(path, ResultsError, MAX_REPORT_BYTES, smaller="Reports are below 2 MB")
-        report = read_report(content, name)
-        if isinstance(report, Refused):
-            raise ResultsError(report.reason)
-        found = report.results
-    elif head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
-        kind = "results"
-        found = read_results(
-            read_whole(
-                path, ResultsError, MAX_RESULTS_BYTES, smaller="Give results of px4fuse compare"
-            ),
-            name,
-        )
-    else:
+    is_report = head.startswith(b"%PDF-")
+    if not is_report and not head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
         return None
+    limit = MAX_REPORT_BYTES if is_report else MAX_RESULTS_BYTES
+    advice = "Reports are below 2 MB" if is_report else "Give results of px4fuse compare"
+    content = read_whole(path, ResultsError, limit, smaller=advice)
+    report = read_report(content, name) if is_report else None
+    if isinstance(report, Refused):
+        raise ResultsError(report.reason)
+    found: Results = report.results if report else read_results(content, name)
     if not isinstance(found, ComparisonResults):
         raise ResultsError(
             f"{name}: holds {found.schema.name}; px4fuse diff takes what px4fuse compare writes, "
             "or a log."
         )
-    return DiffInput(name, kind, found)
+    return DiffInput(name, "report" if is_report else "results", found)
 
 
 def _analysed(path: Path, other: DiffInput | None, progress: Progress) -> DiffInput:

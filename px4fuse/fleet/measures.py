@@ -131,7 +131,6 @@ class Number:
     """One number of a comparison, with its 95 % interval; None where there is none."""
 
     measure: Measure
-    label: str
     value: float
     interval: Bounds | None = None
 
@@ -178,11 +177,11 @@ def numbers(results: ComparisonResults, analysis: Analysis | None = None) -> dic
                 continue
             if kind == REJECTED and name not in (level, "down"):
                 continue
+            label = f"{measure.label}, {name}" if name else measure.label
             # where a truth judges both, their distance from each other is neither good nor bad
-            apart = has_truth and kind.startswith(APART)
+            aim = "" if has_truth and kind.startswith(APART) else measure.aim
             found[path] = Number(
-                replace(measure, aim="") if apart else measure,
-                f"{measure.label}, {name}" if name else measure.label,
+                replace(measure, label=label, aim=aim),
                 float(value),
                 bootstrapped(errors[path], field)
                 if path in errors
@@ -218,8 +217,8 @@ def _of_innovations(judged: FilterSummary, field: str, value: float) -> Bounds |
     if field not in ("nis_mean", "innovation_std_m") or not _is_normal(judged, count):
         return None
     ends = count / chi2.ppf((0.5 + LEVEL / 2, 0.5 - LEVEL / 2), count)
-    interval = value * (ends if field == "nis_mean" else np.sqrt(ends))
-    return float(interval[0]), float(interval[1])
+    low, high = (ends if field == "nis_mean" else np.sqrt(ends)).tolist()
+    return value * low, value * high
 
 
 def bootstrapped(errors: Array, field: str) -> Bounds | None:

@@ -118,19 +118,19 @@ def _drift(
         yield {
             "vehicle": vehicle,
             "said": names.get(vehicle, vehicle) or "no vehicle named",
-            "told": _told(table["value"]),
+            "medians": _medians(table["value"]),
             "drawn": partial(over_time, table, (dates.min(), dates.max()), scale),
         }
 
 
-def _told(values: pd.Series) -> str:
+def _medians(values: pd.Series) -> str:
     """Number and medians: all that the picture says, in words."""
     quarter = len(values) // 4
-    told = f"{len(values)} logs, median {values.median():.3g}"
+    words = f"{len(values)} logs, median {values.median():.3g}"
     if quarter:
         first, last = values.iloc[:quarter].median(), values.iloc[-quarter:].median()
-        told += f"; first quarter {first:.3g}, last quarter {last:.3g}"
-    return told
+        words += f"; first quarter {first:.3g}, last quarter {last:.3g}"
+    return words
 
 
 def _worst(logs: Sequence[Log]) -> Iterator[tuple[int, str, str]]:

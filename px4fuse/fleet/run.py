@@ -145,24 +145,6 @@ def batch(
     return fleet.table if output is not None else fleet.table.assign(results="", report="")
 
 
-def fleet_request(settings: dict[str, Any]) -> ComparisonRequest:
-    """The request of every log, without its log.
-
-    Raises
-    ------
-    SettingsError
-        A setting is unknown or out of range.
-    """
-    try:
-        request = ComparisonRequest(log="LOG", **settings)
-    except TypeError as error:
-        raise SettingsError(f"no such setting ({error}).") from error
-    if request.mavlink is not None or request.position is not None:
-        raise SettingsError("`mavlink` and `position` belong to one flight, not to many.")
-    Settings(request.sigma_a_m_s2, request.sigma_z_m, request.dt_s)
-    return request
-
-
 def run(
     paths: Iterable[str],
     output: Path,
@@ -190,7 +172,14 @@ def run(
     Px4FuseError
         The cluster is gone.
     """
-    logs, request = {log.address: log for log in find_logs(paths)}, fleet_request(settings)
+    logs = {log.address: log for log in find_logs(paths)}
+    try:
+        request = ComparisonRequest(log="LOG", **settings)
+    except TypeError as error:
+        raise SettingsError(f"no such setting ({error}).") from error
+    if request.mavlink is not None or request.position is not None:
+        raise SettingsError("`mavlink` and `position` belong to one flight, not to many.")
+    Settings(request.sigma_a_m_s2, request.sigma_z_m, request.dt_s)  # refuses what is out of range
     version, used = metadata.version("px4fuse"), command_line(request)
     job = Job("", request, reports, max_log_bytes.get(), version)
     with connected(scheduler, workers, memory) as client, opened(output, version, used) as store:

@@ -24,7 +24,7 @@ def print_fleet(console: Console, fleet: Fleet) -> None:
     for cause in most.head(SHOWN).to_dict("records"):
         one = "" if cause["count"] == 1 else f"{cause['count']} logs, one is "
         style = "red" if cause["status"] == FAILED else "yellow"
-        text = "{first}: {status}: {reason}. {remedy}".format(**cause).rstrip()
+        text = "{first}: {status}: {reason}. {remedy}".format_map(cause).rstrip()
         say(console, Text(one + text, style))
     if len(most) > SHOWN:
         say(console, f"{len(most) - SHOWN} more reasons are in fleet.html.")

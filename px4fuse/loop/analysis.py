@@ -6,19 +6,34 @@ from collections.abc import Callable
 
 import numpy as np
 
-from px4fuse.errors import MissingDataError, SettingsError
+from px4fuse.arrays import Array, IntArray
+from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Flight, Truth, Unavailable
-from px4fuse.loop.loop import Loop, close_loop
-from px4fuse.loop.model import KnownEnd, OdometryNoise
-from px4fuse.loop.part import chosen_part, measured_end, part_of_flight, true_end
+from px4fuse.loop.closure import key_frame_spacing_m, key_frames, upright
+from px4fuse.loop.corrections import by_distance, judge, score_all, solve_all
+from px4fuse.loop.loop import Loop
+from px4fuse.loop.model import LANDING, KnownEnd, OdometryNoise
+from px4fuse.loop.odometry import Claim, pose_graph
+from px4fuse.loop.part import (
+    assumed_end,
+    chosen_part,
+    heading_change_deg,
+    measured_end,
+    part_of,
+    part_of_flight,
+    true_end,
+)
 from px4fuse.loop.sources import LoopSource
 from px4fuse.loop.tracks import odometry_of, trajectory_of
 from px4fuse.request import GivenClosure
-from px4fuse.trajectory.model import Trajectory
+from px4fuse.trajectory.graph import lie
+from px4fuse.trajectory.model import Trajectory, by_axis, cumulative_distance
 
 # Where stamps are UNIX time, a smaller time counts from the first pose
 SMALLEST_STAMP_S = 1e6
+# A path that is shorter is no loop, whatever its ends
+MIN_PATH_M = 2.0
 # What `compare` takes for a loop: this long, and ending within this share of its length
 LOOP_MIN_PATH_M = 10.0
 LOOP_MAX_GAP_SHARE = 0.10
@@ -60,8 +75,10 @@ def analyse(
     Raises
     ------
     TrajectoryError, SettingsError
-        As :func:`px4fuse.loop.loop.close_loop`.
+        The part is too short, a closure lies outside it, or a number is out of range.
     """
+    noise = noise or OdometryNoise()
+    _check_drift(noise)
     trajectory, flight = source.trajectory, source.flight
     zero_s = float(trajectory.time_s[0]) if trajectory.unix_offset_s == 0.0 else 0.0
 
@@ -70,45 +87,147 @@ def analyse(
 
     start = None if start_s is None else stamp(start_s)
     end = None if end_s is None else stamp(end_s)
-    truth, absolute, at_rest = None, False, False
+    truth, at_rest = None, False
     if flight is None:
         span = float(trajectory.time_s[0]), float(trajectory.time_s[-1])
         segment = chosen_part(Segment(*span, "the whole trajectory"), start, end, span)
     else:
         segment, at_rest = part_of_flight(flight, trajectory, start, end)
         truth = None if trajectory.kind == "truth" else truth_of(flight)
-        # it was told its position, and no odometry
-        told = any(track.origin.is_vision for track in flight.positions)
-        no_odometry = isinstance(odometry_of(flight), Unavailable)
-        absolute = trajectory.kind in ("ekf2", "kf") and told and no_odometry
-    known: KnownEnd | None = None
-    notes: tuple[str, ...] = ()
-    if landed_at is not None:
-        if not came_back:
+    whole = upright(trajectory)
+    path = part_of(whole, segment, at_rest)
+    notes = list(whole.notes)
+    known: KnownEnd | Unavailable
+    if not came_back:
+        if landed_at is not None:
             raise SettingsError("`landed_at` and `came_back` exclude each other. Leave one out.")
-        known = measured_end(trajectory, segment, at_rest, *landed_at)
-    elif truth is not None and came_back:
-        found = true_end(trajectory, truth, segment, at_rest)
+        known = Unavailable(
+            "misclosure", "the vehicle is not said to have come back", "Leave out --open."
+        )
+    elif landed_at is not None:
+        known = measured_end(path, *landed_at)
+    else:
+        known = assumed_end(path)
+        found = None if truth is None else true_end(path, truth, segment, at_rest)
         if isinstance(found, KnownEnd):
             known = found
-        else:
-            notes = (f"the truth does not tell where it ended: {found}",)
-    return close_loop(
-        trajectory,
-        segment,
+        elif found is not None:
+            notes.append(f"the truth does not tell where it ended: {found}")
+    claims: list[Claim] = [
+        (GivenClosure(stamp(one.time_1_s), stamp(one.time_2_s), one.sigma_m), None)
+        for one in closures
+    ]
+    if not isinstance(known, Unavailable):
+        claims.insert(0, (GivenClosure(segment.start_s, segment.end_s, known.sigma_m), known))
+    for closure, known_end in claims:
+        _check(closure, path, is_landing=known_end is not None)
+    spacing = key_frame_spacing_m(path.position_m) if spacing_m is None else spacing_m
+    frames, distance = _key_frames(path, spacing)
+    graph, nodes, statement = pose_graph(path, frames, claims, noise)
+    notes.insert(len(whole.notes), statement)
+    judged = judge(graph, claims)
+    solved, judged = solve_all(path, nodes, graph, judged, progress)
+    end_m, heading = path.position_m[-1] - path.position_m[0], heading_change_deg(path)
+    missed = known if isinstance(known, Unavailable) else end_m - known.displacement
+    heading_error = _heading_error(known, heading)
+    landing = judged[0] if judged and judged[0].source == LANDING else None
+    spread = by_distance(path, distance, missed, heading_error, landing)
+    references = tuple(part for part in (truth, reference) if part is not None)
+    raw, corrections = score_all(path, spread | solved, references)
+    error = None if isinstance(missed, Unavailable) else float(np.linalg.norm(missed))
+    return Loop(
+        track=path.name,
+        kind=path.kind,
+        frame=path.frame,
+        start_s=segment.start_s,
+        end_s=segment.end_s,
+        part_reason=segment.reason,
+        poses=len(path),
+        key_frames=len(frames),
+        key_frame_spacing_m=spacing,
+        path_length_m=float(distance[-1]),
+        end_from_start_m=by_axis(path.frame, end_m),
+        heading_change_deg=heading,
         known_end=known,
-        came_back=came_back,
-        closures=tuple(
-            GivenClosure(stamp(c.time_1_s), stamp(c.time_2_s), c.sigma_m) for c in closures
-        ),
-        noise=noise,
-        references=tuple(part for part in (truth, reference) if part is not None),
-        spacing_m=spacing_m,
-        at_rest=at_rest,
-        absolute=absolute,
-        notes=notes,
-        progress=progress,
+        closure_error_m=error,
+        closure_percent=None if error is None else 100.0 * error / float(distance[-1]),
+        closure_error_axes_m=None
+        if isinstance(missed, Unavailable)
+        else by_axis(path.frame, missed),
+        heading_error_deg=heading_error,
+        absolute=flight is not None and _is_absolute(trajectory, flight),
+        odometry_noise=noise,
+        closures=judged,
+        corrections=corrections,
+        notes=tuple(note for note in notes if note),
+        odometry=raw,
+        nodes=frames,
+        distance_m=distance,
+        graph=graph,
+        references=references,
+        given_frame=trajectory.frame,
     )
+
+
+def _is_absolute(trajectory: Trajectory, flight: Flight) -> bool:
+    """Whether it follows a position that the flight was told, and no odometry."""
+    told = any(track.origin.is_vision for track in flight.positions)
+    no_odometry = isinstance(odometry_of(flight), Unavailable)
+    return trajectory.kind in ("ekf2", "kf") and told and no_odometry
+
+
+def _key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
+    """Indices of poses that are key frames, and the distance along them at each pose."""
+    if not 1e-3 <= spacing_m <= 100.0:
+        raise SettingsError(f"`key_frames_m` {spacing_m:g} is outside 0.001 to 100 m.")
+    frames = key_frames(path.position_m, spacing_m)
+    along = cumulative_distance(path.position_m[frames])
+    if not along[-1] >= max(MIN_PATH_M * min(1.0, spacing_m / 0.5), 1e-6):
+        raise TrajectoryError(
+            f"{path.name}: the path is {along[-1]:.2f} m long on key frames {spacing_m:g} m apart, "
+            "too short for a loop. Give the part with `start_s` and `end_s`, or `key_frames_m`."
+        )
+    return frames, np.interp(path.time_s, path.time_s[frames], along)
+
+
+def _check_drift(noise: OdometryNoise) -> None:
+    drifts = {"position_drift_m": noise.position_m, "heading_drift_deg": noise.heading_deg}
+    for name, drift in drifts.items():
+        if not 1e-4 <= drift <= 100.0:
+            raise SettingsError(f"`{name}` {drift:g} is outside 0.0001 to 100.")
+
+
+def _check(closure: GivenClosure, path: Trajectory, *, is_landing: bool) -> None:
+    """Refuse a closure outside the path, one that leads back in time, and one without width."""
+    (low, high), times = path.time_s[[0, -1]], (closure.time_1_s, closure.time_2_s)
+    label = f"{path.name}: closure {times[0]:.12g},{times[1]:.12g}"
+    outside = [] if is_landing else [time for time in times if not low <= time <= high]
+    if outside:
+        raise TrajectoryError(
+            f"{label}: {outside[0]:.12g} s is outside the path, which runs from {low:.2f} s to "
+            f"{high:.2f} s."
+        )
+    if not (is_landing or times[0] < times[1]):
+        raise TrajectoryError(f"{label}: the first time must be before the second.")
+    if not 1e-4 <= closure.sigma_m <= 100.0:
+        raise TrajectoryError(f"{label}: SIGMA {closure.sigma_m:g} is outside 0.0001 to 100 m.")
+
+
+def _heading_error(end: KnownEnd | Unavailable, heading_deg: float | None) -> float | Unavailable:
+    """How far the heading is off at the end (°)."""
+    what = "heading misclosure"
+    if isinstance(end, Unavailable):
+        return end
+    if heading_deg is None:
+        return Unavailable(what, "the trajectory has no orientations", "None needed.")
+    if end.heading_change_deg is None:
+        return Unavailable(
+            what,
+            f"the vehicle ends turned by {heading_deg:+.0f}°, and how far it was really turned is "
+            "not known",
+            "Give it as the third number of --landed-at FORWARD,RIGHT,DEG.",
+        )
+    return float(np.degrees(lie.wrap(np.radians(heading_deg - end.heading_change_deg))))
 
 
 def truth_of(flight: Flight) -> Trajectory | None:

@@ -15,20 +15,18 @@ from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Frame, Trajectory, cumulative_distance
 
 DOWN = np.array([0.0, 0.0, 1.0])
-# Rows turn a frame into one with z down: x forward or north, y right or east
-_TO_Z_DOWN: dict[Frame, tuple[tuple[tuple[float, ...], ...], Frame, str]] = {
-    "ENU": (
-        ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
-        "NED",
-        "east, north, up turned into north, east, down",
-    ),
+# Which of x, y, z of a frame is forward or north, right or east, and down, and with which sign
+_TO_Z_DOWN: dict[Frame, tuple[list[int], list[float], Frame, str]] = {
+    "ENU": ([1, 0, 2], [1.0, 1.0, -1.0], "NED", "east, north, up turned into north, east, down"),
     "camera": (
-        ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+        [2, 0, 1],
+        [1.0, 1.0, 1.0],
         "FRD",
         "the camera's right, down, forward turned into forward, right, down",
     ),
     "unknown": (
-        ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)),
+        [0, 1, 2],
+        [1.0, -1.0, -1.0],
         "FRD",
         "the frame is not stated: z is taken to be up",
     ),
@@ -46,15 +44,14 @@ def upright(trajectory: Trajectory) -> Trajectory:
     """
     if trajectory.frame in ("NED", "FRD"):
         return trajectory
-    rows, frame, note = _TO_Z_DOWN[trajectory.frame]
-    turn = np.array(rows)
+    order, sign, frame, note = _TO_Z_DOWN[trajectory.frame]
     variance = trajectory.position_variance_m2
     return replace(
         trajectory,
-        position_m=trajectory.position_m @ turn.T,
-        rotation=_turned(trajectory, Rotation.from_matrix(turn), trajectory.frame),
+        position_m=trajectory.position_m[:, order] * sign,
+        rotation=_turned(trajectory, _turn(trajectory.frame), trajectory.frame),
         frame=frame,
-        position_variance_m2=None if variance is None else variance @ np.abs(turn).T,
+        position_variance_m2=None if variance is None else variance[:, order],
         notes=(*trajectory.notes, note),
     )
 
@@ -63,14 +60,15 @@ def in_frame(trajectory: Trajectory, frame: Frame) -> Trajectory:
     """What :func:`upright` made of a trajectory in ``frame``, turned back into that frame."""
     if frame not in _TO_Z_DOWN or trajectory.frame not in ("NED", "FRD"):
         return trajectory
-    back = Rotation.from_matrix(np.array(_TO_Z_DOWN[frame][0])).inv()
-    return replace(
-        trajectory,
-        position_m=back.apply(trajectory.position_m),
-        rotation=_turned(trajectory, back, frame),
-        frame=frame,
-        position_variance_m2=None,
-    )
+    back = _turn(frame).inv()
+    turned = _turned(trajectory, back, frame)
+    return replace(trajectory.moved(back.apply(trajectory.position_m), turned), frame=frame)
+
+
+def _turn(frame: Frame) -> Rotation:
+    """From a frame into its one with z down."""
+    order, sign, _, _ = _TO_Z_DOWN[frame]
+    return Rotation.from_matrix(np.eye(3)[order] * np.array(sign)[:, None])
 
 
 def _turned(trajectory: Trajectory, turn: Rotation, frame: Frame) -> Rotation | None:

@@ -15,7 +15,7 @@ from px4fuse.errors import Px4FuseError
 from px4fuse.flight import Unavailable
 from px4fuse.loop.closure import correct_by_distance, distribute_by_distance
 from px4fuse.loop.model import LANDING, Closure, CorrectedPath, Way
-from px4fuse.loop.odometry import Told
+from px4fuse.loop.odometry import Claim
 from px4fuse.record import written
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
 from px4fuse.trajectory.graph.analysis import GATE_ALPHA, SOLUTIONS
@@ -39,7 +39,7 @@ SINGLE_LOOP = (
     "solving can reject nothing and only the gate can."
 )
 # A corrected path, and the solution of the pose graph where it is of one; or why there is none
-Made = tuple[Trajectory, Solution | None] | Unavailable
+Corrected = tuple[Trajectory, Solution | None] | Unavailable
 
 
 def by_distance(
@@ -48,7 +48,7 @@ def by_distance(
     misclosure_m: Array | Unavailable,
     heading: float | Unavailable,
     landing: Closure | None,
-) -> dict[Way, Made]:
+) -> dict[Way, Corrected]:
     """Positions alone (the lesson's Example 2), and headings too."""
     if isinstance(misclosure_m, Unavailable):
         return {"by_distance_plain": misclosure_m, "by_distance": misclosure_m}
@@ -73,13 +73,13 @@ def _refused(what: str, closure: Closure) -> Unavailable:
     )
 
 
-def judge(graph: PoseGraph | Unavailable, told: Sequence[Told]) -> tuple[Closure, ...]:
+def judge(graph: PoseGraph | Unavailable, claims: Sequence[Claim]) -> tuple[Closure, ...]:
     """What odometry says of each closure: the last edges of the graph; none without a graph."""
     if isinstance(graph, Unavailable):
         return ()
-    edges = np.arange(len(graph.first) - len(told), len(graph.first))
+    edges = np.arange(len(graph.first) - len(claims), len(graph.first))
     judged = []
-    for result, (given, end) in zip(gate(graph, edges, alpha=GATE_ALPHA), told, strict=True):
+    for result, (given, end) in zip(gate(graph, edges, alpha=GATE_ALPHA), claims, strict=True):
         missed = graph.poses[result.second, :3] - graph.poses[result.first, :3]
         facts = structs.asdict(given) | structs.asdict(result)
         del facts["first"], facts["second"]
@@ -95,9 +95,9 @@ def solve_all(
     graph: PoseGraph | Unavailable,
     closures: tuple[Closure, ...],
     progress: Callable[[str], None],
-) -> tuple[dict[Way, Made], tuple[Closure, ...]]:
+) -> tuple[dict[Way, Corrected], tuple[Closure, ...]]:
     """Solve the graph with all closures, with the good ones, and robustly, which weighs them."""
-    found: dict[Any, Made] = {}
+    found: dict[Any, Corrected] = {}
     if isinstance(graph, Unavailable) or not closures:
         none = Unavailable("pose graph", "there is no closure", "Give one with --closure.")
         why = graph if isinstance(graph, Unavailable) else none
@@ -157,7 +157,7 @@ def _carried(path: Trajectory, nodes: IntArray, before: Array, after: Array) -> 
 
 
 def score_all(
-    odometry: Trajectory, made: Mapping[Way, Made], references: tuple[Trajectory, ...]
+    odometry: Trajectory, made: Mapping[Way, Corrected], references: tuple[Trajectory, ...]
 ) -> tuple[CorrectedPath, dict[Way, CorrectedPath | Unavailable]]:
     """The odometry, and every path, scored; the clocks are matched once, on the odometry."""
     raw = _scored("uncorrected", odometry, odometry, None, references, {})

@@ -22,7 +22,7 @@ GROWTH = 2.0
 FLOOR_SHARE = 1e-2
 TENTH = 0.1
 # A closure that was given, or that of the landing and where that was
-Told = tuple[GivenClosure, KnownEnd | None]
+Claim = tuple[GivenClosure, KnownEnd | None]
 
 
 def odometry_variances(
@@ -84,7 +84,7 @@ def _growth(variance: Array | None, nodes: IntArray) -> Array | None:
 
 
 def pose_graph(
-    path: Trajectory, frames: IntArray, told: Sequence[Told], noise: OdometryNoise
+    path: Trajectory, frames: IntArray, claims: Sequence[Claim], noise: OdometryNoise
 ) -> tuple[PoseGraph | Unavailable, IntArray, str]:
     """Pose graph of a path: an edge from node to node by odometry, and one per closure.
 
@@ -94,7 +94,7 @@ def pose_graph(
         In a frame with z down; there is no graph of one without orientations.
     frames : ndarray of int, shape (f,)
         Key frames, as indices of poses.
-    told : sequence of closure and, where it is that of the landing, where that was
+    claims : sequence of closure and, where it is that of the landing, where that was
 
     Returns
     -------
@@ -108,7 +108,7 @@ def pose_graph(
     if path.rotation is None:
         what = "the trajectory has no orientations"
         return Unavailable("pose graph", what, "Give one that has."), frames, ""
-    times = np.array([(closure.time_1_s, closure.time_2_s) for closure, _ in told]).reshape(-1, 2)
+    times = np.array([(closure.time_1_s, closure.time_2_s) for closure, _ in claims]).reshape(-1, 2)
     at = np.abs(path.time_s - times[..., None]).argmin(axis=-1)
     nodes = np.union1d(frames, at).astype(np.intp)
     ends = np.searchsorted(nodes, at)
@@ -121,7 +121,7 @@ def pose_graph(
     information[steps[:, None], range(6), range(6)] = diagonal
     back, there = rotation[first].inv(), rotation[second]
     moved = back.apply(position[second] - position[first])
-    for row, (closure, end) in enumerate(told, start=len(steps)):
+    for row, (closure, end) in enumerate(claims, start=len(steps)):
         moved[row] = 0.0 if end is None else back[row].apply(end.displacement)
         information[row, range(3), range(3)] = closure.sigma_m**-2
         if end is not None and end.heading_change_deg is not None:

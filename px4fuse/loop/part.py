@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Flight, Unavailable
-from px4fuse.loop.closure import DOWN, heading_change_rad, upright
+from px4fuse.loop.closure import DOWN, heading_change_rad
 from px4fuse.loop.model import KnownEnd
-from px4fuse.trajectory.model import MIN_POSES, Frame, Trajectory, by_axis
+from px4fuse.trajectory.model import MIN_POSES, Trajectory, by_axis
 
 # Poses on the ground are averaged over this long, if they stay within this far of each other
 REST_S = 1.0
@@ -107,12 +107,20 @@ def chosen_part(
     return Segment(low, high, reason)
 
 
-def assumed_end(frame: Frame, heading_change_deg: float | None) -> KnownEnd:
+def heading_change_deg(path: Trajectory) -> float | None:
+    """Last heading minus first, clockwise; None without orientations."""
+    if path.rotation is None:
+        return None
+    return float(np.degrees(heading_change_rad(path.rotation[-1] * path.rotation[0].inv())))
+
+
+def assumed_end(path: Trajectory) -> KnownEnd:
     """The vehicle ends where it began; with the same heading if the odometry nearly says so."""
-    same = heading_change_deg is not None and abs(heading_change_deg) <= SAME_HEADING_DEG
+    change = heading_change_deg(path)
+    same = change is not None and abs(change) <= SAME_HEADING_DEG
     heading = "with the same heading" if same else "its heading there is not known"
     return KnownEnd(
-        displacement_m=by_axis(frame, np.zeros(3)),
+        displacement_m=by_axis(path.frame, np.zeros(3)),
         heading_change_deg=0.0 if same else None,
         sigma_m=0.10,
         sigma_heading_deg=5.0 if same else None,
@@ -122,12 +130,7 @@ def assumed_end(frame: Frame, heading_change_deg: float | None) -> KnownEnd:
 
 
 def measured_end(
-    trajectory: Trajectory,
-    segment: Segment,
-    at_rest: bool,
-    forward_m: float,
-    right_m: float,
-    heading_change_deg: float | None,
+    path: Trajectory, forward_m: float, right_m: float, turned_deg: float | None
 ) -> KnownEnd:
     """Where the vehicle landed, measured with a tape from the place where it took off.
 
@@ -135,10 +138,9 @@ def measured_end(
     ----------
     forward_m, right_m : float
         Along its nose at take-off, and to the right of it.
-    heading_change_deg : float or None
+    turned_deg : float or None
         How far it was turned, clockwise.
     """
-    path = part_of(upright(trajectory), segment, at_rest)
     heading = 0.0
     if path.rotation is not None:
         nose = path.rotation[0].apply([1.0, 0.0, 0.0])
@@ -146,9 +148,9 @@ def measured_end(
     moved = Rotation.from_rotvec(heading * DOWN).apply([forward_m, right_m, 0.0])
     return KnownEnd(
         displacement_m=by_axis(path.frame, moved),
-        heading_change_deg=heading_change_deg,
+        heading_change_deg=turned_deg,
         sigma_m=0.05,
-        sigma_heading_deg=None if heading_change_deg is None else 2.0,
+        sigma_heading_deg=None if turned_deg is None else 2.0,
         source=f"measured: it landed {forward_m:g} m ahead and {right_m:g} m to the right of where "
         "it took off (--landed-at)",
         assumed=False,
@@ -156,13 +158,12 @@ def measured_end(
 
 
 def true_end(
-    trajectory: Trajectory, truth: Trajectory, segment: Segment, at_rest: bool
+    path: Trajectory, truth: Trajectory, segment: Segment, at_rest: bool
 ) -> KnownEnd | str:
     """Where the vehicle really ended, by the ground truth in the same log, or why not.
 
     The truth is turned into the odometry's frame by their headings at the start.
     """
-    path = part_of(upright(trajectory), segment, at_rest)
     try:
         real = part_of(truth, segment, at_rest)
     except TrajectoryError as error:
@@ -172,8 +173,7 @@ def true_end(
     if path.rotation is not None and real.rotation is not None:
         turn = heading_change_rad(path.rotation[0] * real.rotation[0].inv())
         moved = Rotation.from_rotvec(turn * DOWN).apply(moved)
-        heading = heading_change_rad(real.rotation[-1] * real.rotation[0].inv())
-        change = float(np.degrees(heading))
+        change = heading_change_deg(real)
     elif path.frame != real.frame:
         return "the truth has no orientation by which to turn it into the odometry's frame"
     return KnownEnd(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
 
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.flight import Flight, Unavailable
@@ -40,7 +39,7 @@ def split_part(argument: str) -> tuple[Path, Part | None]:
     if whole.exists() or not colon:
         return whole, None
     if part in PARTS:
-        return Path(path), cast(Part, part)
+        return Path(path), part
     if Path(path).is_file():
         raise TrajectoryError(
             f"{shown(Path(path))}:{part}: {part!r} is not a part of a flight. Choose from "

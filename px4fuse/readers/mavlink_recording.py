@@ -68,6 +68,8 @@ class Recording:
     damage : tuple of str
         What could not be read: sentences.
     notes : list of str
+    restarts, receipt_went_back : int or None
+        As :class:`~px4fuse.recording.LogInfo` has them.
     dropped : dict
         Samples dropped for an impossible time stamp, by message; :meth:`frame` fills it.
     streams : dict
@@ -84,6 +86,8 @@ class Recording:
     duration_s: float
     notes: list[str]
     damage: tuple[str, ...] = ()
+    restarts: int | None = None
+    receipt_went_back: int | None = None
     dropped: dict[str, int] = field(default_factory=dict)
     streams: dict[str, Stream] = field(default_factory=dict)
 
@@ -285,7 +289,8 @@ def settle_clocks(frames: Frames, address: Address) -> Recording:
         received = stamps[at]
     else:
         notes.append("no message in the stream carries a time: nothing in it can be placed in time")
-    notes += _frame_notes(frames, received)
+    back = int(np.count_nonzero(np.diff(received) < 0.0)) if frames.received_us is not None else 0
+    notes += _frame_notes(frames, back)
     share = frames.bad_bytes / len(frames.content)
     lost = f"{frames.bad_bytes:,} bytes ({share:.2%}) belong to no whole MAVLink frame"
     # a first and a last frame that are cut are no damage
@@ -298,8 +303,9 @@ def settle_clocks(frames: Frames, address: Address) -> Recording:
     span = stamps if len(stamps) else np.array([0.0, received.max()])
     zero_s, end_s = float(span[0]), float(span[-1])
     return Recording(
-        frames, *address, session, received, line, zero_s, end_s - zero_s, notes, damage
-    )
+        frames, *address, session, received, line, zero_s, end_s - zero_s, notes, damage,
+        len(restarts) or None, back or None,
+    )  # fmt: skip
 
 
 def _without_strays(stamps: Array, rows: IntArray) -> IntArray:
@@ -310,7 +316,7 @@ def _without_strays(stamps: Array, rows: IntArray) -> IntArray:
     return np.concatenate(parts[many[0] : many[-1] + 1])
 
 
-def _frame_notes(frames: Frames, received: Array) -> list[str]:
+def _frame_notes(frames: Frames, back: int) -> list[str]:
     notes = []
     if frames.passed_over:
         listed = ", ".join(
@@ -323,8 +329,7 @@ def _frame_notes(frames: Frames, received: Array) -> list[str]:
         )
     if frames.bad_stamps:
         notes.append(f"{frames.bad_stamps} times of receipt are damaged and were interpolated")
-    back = int(np.count_nonzero(np.diff(received) < 0.0))
-    if back and frames.received_us is not None:
+    if back:
         notes.append(f"the time of receipt went back {back} {'times' if back > 1 else 'time'}")
     return notes
 

@@ -87,6 +87,8 @@ class PositionRecording:
         One sentence per decision.
     notes : tuple of str
         What was dropped and why, and what looks doubtful.
+    dropped : int
+        Rows without a time that can be.
     """
 
     name: str
@@ -97,6 +99,7 @@ class PositionRecording:
     frame: str | None
     detected: tuple[str, ...]
     notes: tuple[str, ...]
+    dropped: int = 0
 
 
 @dataclass(frozen=True)
@@ -245,6 +248,7 @@ def read_position_csv(
         samples=samples.where(np.isfinite(samples)),  # 1e999 reads as infinity
         clock=clock,
         frame=choice.frame,
+        dropped=dropped,
         detected=(
             f"table: {_SEPARATORS[table.separator]} between columns, header in line "
             f"{table.first_line - 1}",

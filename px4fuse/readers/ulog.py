@@ -86,6 +86,7 @@ def to_flight(topics: Topics) -> Flight:
         log=structs.replace(
             topics.log,
             notes=topics.log.notes + dropped,
+            dropped={topic: count for (topic, _), count in sorted(topics.dropped.items())},
             start_unix_s=_start_unix(topics),
             damage=(*_lost(topics, imu, in_flight), *topics.log.damage),
             ends_in_flight=in_flight,

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import pandas as pd
 
 from px4fuse.comparison.model import AxisComparison
 from px4fuse.comparison.why import the
-from px4fuse.report import flight, innovations
+from px4fuse.report import panels
 from px4fuse.report.changes_words import cells, folded_words, other_lines, printed
 from px4fuse.report.document import ChangesDocument
 from px4fuse.report.page import Cell, Page, halves
-from px4fuse.report.style import MAX_POINTS_NARROW, MUTED, SEVERITY_COLOURS, TIME_LABEL
+from px4fuse.report.style import MUTED, SEVERITY_COLOURS, TIME_LABEL
 from px4fuse.results.contract import ChangeResults
 
 COLOURS = {"worse": SEVERITY_COLOURS["error"], "better": "#1f6b3a"}
@@ -22,13 +22,7 @@ HEADS = ("", "number", "A", "B", "change, with its 95 % interval", "by chance?")
 HEIGHT = 105.0
 
 
-# Title of each panel, the sentence below it, and what draws it
-PANELS: tuple[tuple[str, Callable[[AxisComparison], str], Callable[..., None]], ...] = (
-    ("position (m)", flight.position_words, flight.draw_position),
-    ("error (m)", flight.error_words, flight.draw_error),
-    ("innovations with ±2√S (m)", innovations.innovation_words, innovations.draw_innovations),
-    ("σ of position (m), log scale", innovations.sigma_numbers, innovations.draw_sigma),
-)
+PANELS = (panels.POSITION, panels.ERROR, panels.INNOVATIONS, panels.SIGMA_P)
 
 
 def draw(document: ChangesDocument) -> Iterator[Page]:
@@ -74,15 +68,14 @@ def _flights(a: AxisComparison, b: AxisComparison) -> Page:
         "A at the left, B at the right. Ours is dark and solid, EKF2 lighter and dashed, the truth "
         "dotted. An error is the distance from the truth, and without one that of ours from EKF2.",
     )
-    for title, words, draw_panel in PANELS:
-        if draw_panel is flight.draw_error and not all(
-            isinstance(flight.error_reference(result), pd.DataFrame) for result in (a, b)
-        ):
+    known = [isinstance(panels.error_reference(result), pd.DataFrame) for result in (a, b)]
+    for panel in PANELS:
+        if panel is panels.ERROR and not all(known):
             continue
         columns, drawn = halves(), []
         for side, result, column in zip("AB", (a, b), columns, strict=True):
-            axes = column.panel(f"{side}: {title}", words(result), HEIGHT)
-            draw_panel(axes, result, MAX_POINTS_NARROW)
+            axes = column.panel(f"{side}: {panel.named(result)}", panel.numbers(result), HEIGHT)
+            panel.draw(axes, result)
             axes.set_xlabel(TIME_LABEL)
             drawn.append(axes)
         low, high = zip(*(axes.get_ylim() for axes in drawn), strict=True)

@@ -6,8 +6,8 @@ from rich.console import Console
 from rich.text import Text
 
 from px4fuse.report.changes_words import cells, folded_words, other_lines, printed
-from px4fuse.report.screen import plain_table, print_file, print_line, say
-from px4fuse.report.terminal import STYLES
+from px4fuse.report.screen import STYLES, plain_table, print_file, print_line, say
+from px4fuse.report.style import SEVERITY_COLOURS
 from px4fuse.results.contract import ChangeResults
 
 MOST = 15
@@ -44,7 +44,8 @@ def print_changes(console: Console, results: ChangeResults, report: object = Non
     if folded := folded_words(results):
         say(console, Text(folded, "dim"))
     for head, text, severity in other_lines(results):
-        print_line(console, head, Text(text, STYLES[severity] if severity else ""))
+        style = STYLES[SEVERITY_COLOURS[severity]] if severity else ""
+        print_line(console, head, Text(text, style))
     for note in results.notes[:2]:
         say(console, Text(note, "dim"))
     if report is not None:

@@ -12,7 +12,7 @@ from px4fuse.plain import p_words
 from px4fuse.report import marks
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page, legend_above
-from px4fuse.report.style import OURS, OURS_BAND, OURS_LINE, TIME_LABEL
+from px4fuse.report.style import OURS, OURS_BAND, OURS_LINE
 from px4fuse.report.words import clock_advice, delay_wrong, stamps_wrong
 
 # Heights of the axes in points
@@ -42,16 +42,11 @@ def line(document: Document) -> str:
 
 def has_page(document: Document) -> bool:
     """Whether the flight says more about the clock than that it is right."""
-    clock, comparison = document.analysis.clock, document.comparison
+    clock, analysis = document.analysis.clock, document.analysis
     if isinstance(clock, Unavailable):
         return False
-    return (
-        not clock.determinable
-        or stamps_wrong(comparison, clock)
-        or delay_wrong(comparison, clock)
-        or _changes(clock)
-        or _drifts(clock)
-    )
+    wrong = stamps_wrong(analysis, clock) or delay_wrong(analysis, clock)
+    return not clock.determinable or wrong or _changes(clock) or _drifts(clock)
 
 
 def _changes(clock: ClockOffset) -> bool:
@@ -59,9 +54,8 @@ def _changes(clock: ClockOffset) -> bool:
 
 
 def _drifts(clock: ClockOffset) -> bool:
-    if clock.drift_ppm is None or clock.drift_sigma_ppm is None:
-        return False
-    return abs(clock.drift_ppm) > DRIFT_SIGMAS * clock.drift_sigma_ppm
+    drift, sigma = clock.drift_ppm, clock.drift_sigma_ppm
+    return drift is not None and sigma is not None and abs(drift) > DRIFT_SIGMAS * sigma
 
 
 def draw(document: Document) -> Iterator[Page]:
@@ -76,8 +70,8 @@ def draw(document: Document) -> Iterator[Page]:
         "maximised over the offset, jointly with sensor biases, attitude errors and noises; the "
         "attitude is from the gyros alone, because EKF2's was corrected by these very positions.",
     )
-    for text in clock_advice(document.comparison, clock):
-        page.labelled(text[:9].strip(), text[9:], size=8.5)
+    for label, text in clock_advice(document.analysis, clock).items():
+        page.labelled(label, text, size=8.5)
     _curve(page, clock)
     if len(clock.parts) > 1:
         _parts(page, clock, document)
@@ -87,13 +81,12 @@ def draw(document: Document) -> Iterator[Page]:
 def _curve(page: Page, clock: ClockOffset) -> None:
     """Likelihood over the offset."""
     (low, high), best, applied = clock.interval_s, clock.offset_s, clock.applied_s
-    axes = page.panel(
-        "ln of how much less likely each offset is than the best",
+    say = (
         f"Best at {best:+.3f} s; 95 % from {low:+.3f} to {high:+.3f} s, wider than the curve alone "
-        f"would say because the IMU's noise moves it too. From {clock.count} measurements.",
-        CURVE,
-        above=14.0,
+        f"would say because the IMU's noise moves it too. From {clock.count} measurements."
     )
+    title = "ln of how much less likely each offset is than the best"
+    axes = page.panel(title, say, CURVE, above=14.0)
     axes.axvspan(low, high, color=OURS_BAND, lw=0, label="95 % interval")
     axes.plot(clock.curve_s, clock.curve_drop, **OURS_LINE)
     axes.axvline(applied, color="black", lw=0.8, ls="--", label="as analysed")
@@ -120,7 +113,8 @@ def _parts(page: Page, clock: ClockOffset, document: Document) -> None:
             f"Drift {clock.drift_ppm:+,.0f} ± {1.96 * clock.drift_sigma_ppm:,.0f} ppm{sure}."
         )
     said.append("Band: 95 % interval of the whole flight.")
-    axes = page.panel("Offset of each part of the flight by itself (s)", " ".join(said), PARTS)
+    title = "Offset of each part of the flight by itself (s)"
+    axes = marks.panel(page, document, title, " ".join(said), PARTS)
     axes.axhspan(*clock.interval_s, color=OURS_BAND, lw=0)
     ends = np.array([(part.start_s, part.end_s) for part in clock.parts])
     axes.errorbar(
@@ -128,5 +122,3 @@ def _parts(page: Page, clock: ClockOffset, document: Document) -> None:
         xerr=np.diff(ends, axis=1)[:, 0] / 2.0, yerr=[1.96 * part.sigma_s for part in clock.parts],
         fmt="o", color=OURS, ms=4, lw=1.0, capsize=2,
     )  # fmt: skip
-    marks.draw(axes, document)
-    axes.set_xlabel(TIME_LABEL)

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from px4fuse.analysis import Analysis, Counterfactual
 from px4fuse.comparison.events import Events, happened
-from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.model import AxisComparison
 from px4fuse.findings import Finding
 from px4fuse.findings.story import story
 from px4fuse.flight import Unavailable
@@ -50,9 +50,9 @@ class Document:
     made: Provenance | None = None
 
     @property
-    def comparison(self) -> Comparison:
-        """The comparison itself, without what explains it."""
-        return self.analysis
+    def other_axes(self) -> list[AxisComparison]:
+        """The axes beside the main one."""
+        return [axis for axis in self.analysis.axes.values() if axis is not self.analysis.main]
 
     @cached_property
     def story(self) -> tuple[str, ...]:
@@ -62,22 +62,12 @@ class Document:
     @property
     def truth_known(self) -> bool:
         """Whether the log has a truth to compare with."""
-        return not isinstance(self.comparison.flight.truth, Unavailable)
+        return not isinstance(self.analysis.flight.truth, Unavailable)
 
     @cached_property
     def events(self) -> Events:
         """What is marked on every time axis."""
-        return happened(self.comparison)
-
-    @property
-    def log(self) -> tuple[str, str]:
-        """Name and SHA-256 of the log."""
-        return self.comparison.flight.log.name, self.comparison.flight.log.sha256
-
-    @property
-    def title(self) -> str:
-        """Of the PDF."""
-        return f"px4fuse compare {self.log[0]}"
+        return happened(self.analysis)
 
 
 @dataclass(frozen=True)
@@ -95,16 +85,6 @@ class WhatIfDocument:
     command: str
     student: ClassVar[Student] = NOBODY
 
-    @property
-    def log(self) -> tuple[str, str]:
-        """Name and SHA-256 of the log."""
-        return self.made_of.flight.log.name, self.made_of.flight.log.sha256
-
-    @property
-    def title(self) -> str:
-        """Of the PDF."""
-        return f"px4fuse whatif {self.log[0]}"
-
 
 @dataclass(frozen=True)
 class EvaluationDocument:
@@ -118,16 +98,6 @@ class EvaluationDocument:
     score: Evaluation
     command: ClassVar[str] = ""
     student: ClassVar[Student] = NOBODY
-
-    @property
-    def log(self) -> tuple[str, str]:
-        """Name and SHA-256 of what the estimate was read from."""
-        return self.score.estimate.name, self.score.estimate.sha256
-
-    @property
-    def title(self) -> str:
-        """Of the PDF."""
-        return f"px4fuse evaluate {self.log[0]} {self.score.reference.name}"
 
 
 @dataclass(frozen=True)
@@ -151,17 +121,6 @@ class ChangesDocument:
         """The command line that makes it again, without folders."""
         return self.results.provenance.command
 
-    @property
-    def log(self) -> tuple[str, str]:
-        """Names of both logs with the SHA-256 of A, and the SHA-256 of B."""
-        a, b = self.results.a, self.results.b
-        return f"A {a.log}, SHA-256 {a.log_sha256[:12]} · B {b.log}", b.log_sha256
-
-    @property
-    def title(self) -> str:
-        """Of the PDF."""
-        return f"px4fuse diff {self.results.a.given} {self.results.b.given}"
-
 
 @dataclass(frozen=True)
 class LoopDocument:
@@ -183,20 +142,3 @@ class LoopDocument:
     student: Student
     command: str
     made: Provenance | None = None
-
-    @property
-    def log(self) -> tuple[str, str]:
-        """Name and SHA-256 of what the trajectory was read from."""
-        track = self.loop.odometry.trajectory
-        return track.name, track.sha256
-
-    @property
-    def title(self) -> str:
-        """Of the PDF."""
-        return f"px4fuse loop {self.log[0]}"
-
-    @property
-    def facts(self) -> tuple[tuple[str, str], ...]:
-        """Whose report it is, and which file it is about."""
-        student = who(self.student, ", ")
-        return (*((("Student", student),) if student else ()), ("SHA-256", self.log[1]))

@@ -6,7 +6,6 @@ needs is a font that has the characters.
 
 from __future__ import annotations
 
-import sys
 import unicodedata
 from functools import cache
 from pathlib import Path
@@ -29,14 +28,6 @@ NO_GLYPH = "\N{WHITE SQUARE}"
 MOST_SHOWN = 12
 # First word of Unicode's name of a character, for scripts that people call otherwise
 SCRIPTS = {"CJK": "Chinese", "HIRAGANA": "Japanese", "KATAKANA": "Japanese", "HANGUL": "Korean"}
-# Where it is not "Noto Sans" and the script; and Debian's package where that is not fonts-noto-core
-NOTO = {
-    "Chinese": "Noto Sans SC", "Japanese": "Noto Sans JP", "Korean": "Noto Sans KR",
-    "symbol": "Noto Emoji",
-}  # fmt: skip
-PACKAGES = dict.fromkeys(("Chinese", "Japanese", "Korean"), "fonts-wqy-zenhei") | {
-    "symbol": "fonts-symbola"
-}
 
 
 @cache
@@ -67,17 +58,12 @@ def missing(text: str) -> str:
 
 def advice(characters: str) -> str:
     """What to install for :func:`missing` characters, as one sentence or two."""
-    scripts = list(dict.fromkeys(map(_script, characters)))
+    scripts = " and ".join(dict.fromkeys(map(_script, characters)))
     shown = characters[:MOST_SHOWN] + ("…" if len(characters) > MOST_SHOWN else "")
-    noto = " and ".join(dict.fromkeys(NOTO.get(s, f"Noto Sans {s}") for s in scripts))
-    if sys.platform.startswith("linux"):
-        packages = dict.fromkeys(PACKAGES.get(s, "fonts-noto-core") for s in scripts)
-        install = f"Install a font that has them: sudo apt install {' '.join(packages)}."
-    else:
-        install = f"Install a font that has them: {noto}, from fonts.google.com/noto."
     return (
-        f"No font of this machine has the {' and '.join(scripts)} characters {shown}: the report "
-        f"shows {NO_GLYPH} for each. {install}"
+        f"No font of this machine has the {scripts} characters {shown}: the report shows "
+        f"{NO_GLYPH} for each. Install a font that has them: Noto Sans for {scripts}, from "
+        "fonts.google.com/noto."
     )
 
 

@@ -3,85 +3,85 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
+import pandas as pd
+from rich.console import Console
 
+from px4fuse.arrays import Array
 from px4fuse.findings import Finding, by_root
 from px4fuse.flight import Unavailable
-from px4fuse.loop.corrections import BY_DISTANCE, PLAIN, UNCORRECTED
+from px4fuse.loop import corrections
+from px4fuse.loop.analysis import SMALLEST_STAMP_S
+from px4fuse.loop.corrections import SINGLE_LOOP
 from px4fuse.loop.loop import Loop
-from px4fuse.loop.model import CorrectedPath
+from px4fuse.loop.model import LANDING, Closure, CorrectedPath
 from px4fuse.plain import capital, p_words
+from px4fuse.report import style
 from px4fuse.report.cover import write_finding
-from px4fuse.report.document import Document, LoopDocument
-from px4fuse.report.evaluation import way
-from px4fuse.report.loop_words import (
-    ate_words,
-    by_distance_words,
-    closure_name,
-    loop_lines,
-    moved_words,
-    redundancy_words,
-    refusals,
-    score_words,
-    statistics_words,
-)
+from px4fuse.report.document import Document, LoopDocument, who
+from px4fuse.report.evaluation import interval_words, score_words, way
 from px4fuse.report.page import AXIS_LABEL, TICKS, Cell, Page, appendix, legend_above
-from px4fuse.report.style import EKF2, MUTED, OURS, SEVERITY_COLOURS, TRUTH_LINE, bare_x, thin
-from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
-from px4fuse.trajectory.graph.analysis import SOLUTIONS
+from px4fuse.report.screen import show
+from px4fuse.report.style import EKF2, LINES, MUTED, OURS, as_map, bare_x, curve
+from px4fuse.request import LoopRequest
+from px4fuse.trajectory.evaluation import Evaluation
+from px4fuse.trajectory.graph.analysis import GATE_ALPHA, MANY_CLOSURES, SOLUTIONS, SolvedGraph
 from px4fuse.trajectory.model import AXES_OF_FRAME
-from px4fuse.trajectory.scores import RelativeError
+from px4fuse.trajectory.scores import Interval, Statistics
 
-GREEN = "#3a7d5c"
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+MOST_ROWS = 10  # of rejected closures
+GREEN, RED = "#3a7d5c", style.SEVERITY_COLOURS["error"]
 STYLES: Mapping[str, dict[str, Any]] = {
-    UNCORRECTED: {"color": EKF2, "lw": 1.1, "ls": (0, (4, 1.6))},
-    PLAIN: {"color": "#79b294", "lw": 1.3, "ls": (0, (1.2, 1.2))},
-    BY_DISTANCE: {"color": GREEN, "lw": 1.0, "ls": (0, (6, 1.2, 1, 1.2))},
+    corrections.UNCORRECTED: {"color": EKF2, "lw": 1.1, "ls": (0, (4, 1.6))},
+    corrections.PLAIN: {"color": "#79b294", "lw": 1.3, "ls": (0, (1.2, 1.2))},
+    corrections.BY_DISTANCE: {"color": GREEN, "lw": 1.0, "ls": (0, (6, 1.2, 1, 1.2))},
     SOLUTIONS["gated"]: {"color": OURS, "lw": 1.2, "ls": "-"},
     SOLUTIONS["all"]: {"color": "#8d6a9f", "lw": 0.9, "ls": (0, (2, 1))},
 }
+KINDS = {
+    "vio": "odometry (external vision)", "ekf2": "EKF2's track", "kf": "our filter's track",
+    "truth": "ground truth", "slam": "a SLAM system's trajectory", "unknown": "a trajectory",
+}  # fmt: skip
+CLOSURE_HEAD = (
+    "same place at", "missed\nby (m)", "d²", "dof", "p", "gate", "DCS\nweight", "GNC\nweight",
+)  # fmt: skip
+TITLE, LEAD = (
+    "Loop closure",
+    "A path that truly returns must close; the gap is what the odometry drifted. Each correction "
+    "spreads it over the path: by distance (positions only as in the lesson's Example 2, or "
+    "headings too), or as a pose graph weighs it. A closure that is not true would warp the whole "
+    "path, so that each one is tested before its use.",
+)
+WARPED = SOLUTIONS["all"]  # by closures that are not true
 MAP_POINTS = 2000
 MAP, HEIGHT, LEGEND = 290.0, 105.0, 30.0  # of the axes, and of a legend, in points
 
 
 def draw(document: Document) -> Iterator[Page]:
     """Draw the loop's pages; none where the flight holds no loop."""
-    loop = document.analysis.loop
-    if isinstance(loop, Loop):
-        yield from draw_loop(loop, name=appendix)
+    if isinstance(document.analysis.loop, Loop):
+        yield from _draw(document.analysis.loop, Page(appendix(TITLE), LEAD), appendix)
 
 
 def draw_report(document: LoopDocument) -> Iterator[Page]:
     """Draw the pages of a report on a loop alone, its findings on the first."""
-    yield from draw_loop(document.loop, document.findings, document.facts)
+    page = Page(TITLE, LEAD)
+    if student := who(document.student, ", "):
+        page.labelled("Student", student)
+    page.labelled("SHA-256", document.loop.odometry.trajectory.sha256)
+    yield from _draw(document.loop, page, str, document.findings)
 
 
-def draw_loop(
-    loop: Loop,
-    findings: tuple[Finding, ...] = (),
-    facts: tuple[tuple[str, str], ...] = (),
-    name: Callable[[str], str] = str,
+def _draw(
+    loop: Loop, page: Page, name: Callable[[str], str], findings: tuple[Finding, ...] = ()
 ) -> Iterator[Page]:
-    """Draw the pages about one loop, their titles made by ``name``."""
-    page = Page(
-        name("Loop closure"),
-        "A path that truly returns must close; the gap is what the odometry drifted. Each "
-        "correction spreads it over the path: by distance (positions only as in the lesson's "
-        "Example 2, or headings too), or as a pose graph weighs it. A closure "
-        "that is not true would warp the whole path, so that each one is tested before its use.",
-    )
-    for label, text in (*facts, *loop_lines(loop)):
-        page.labelled(label, text)
-    for text in (by_distance_words(loop), redundancy_words(loop), *refusals(loop)):
-        page.write(text, colour=MUTED, above=2.0)
-    for group in by_root(findings):
-        write_finding(page, group)
-    page.skip(6.0)
-    _table(page, loop)
+    """Draw the first page to its end and those after it, their titles made by ``name``."""
+    write_loop(page, loop, findings)
     _map(page, loop)
     yield page
     page = Page(
@@ -92,26 +92,15 @@ def draw_loop(
     )
     _along(page, loop)
     yield page
-    yield _scores(loop, name)
-
-
-def _table(page: Page, loop: Loop) -> None:
-    """Every path with how far it moved and its ATE against each reference."""
-    references = [reference.name for reference in loop.references]
-    page.table(
-        ["path", "moved RMS / max (m)", *(f"ATE to {name} (m)" for name in references)],
-        [
-            [part.name, moved_words(part), *(ate_words(part.scores[name]) for name in references)]
-            for part in loop.reported
-        ],
+    page = Page(
+        name("Closures and scores"),
+        "d² is the squared misclosure against what drift and closure explain together; p is the "
+        "chance of a larger one if the closure is true. Robust solving (dynamic covariance "
+        "scaling, DCS; graduated non-convexity, GNC) weighs each closure by how well the others "
+        "agree with it: 1 keeps it, 0 drops it.",
     )
-    page.numbers(
-        "ATE is the RMSE of position after alignment, in brackets its 95 % interval by block "
-        "bootstrap where the flight is long enough for one."
-        if references
-        else "Neither ground truth nor a SLAM trajectory is given, so that no error of the path "
-        "can be stated; --reference FILE scores it."
-    )
+    write_scores(page, loop)
+    yield page
 
 
 def shown(loop: Loop) -> list[CorrectedPath]:
@@ -120,36 +109,25 @@ def shown(loop: Loop) -> list[CorrectedPath]:
 
 
 def _map(page: Page, loop: Loop) -> None:
-    title = "From above, in the odometry's frame"
-    axes = page.panel(title, "", MAP, left=36.0, below=LEGEND)
+    axes = page.panel("From above, in the odometry's frame", "", MAP, left=36.0, below=LEGEND)
     path = loop.odometry.trajectory
     names = AXES_OF_FRAME[path.frame]
     _reference(axes, loop)
     for part in shown(loop):
         position = part.trajectory.position_m[:: max(1, len(part.trajectory) // MAP_POINTS)]
         axes.plot(position[:, 1], position[:, 0], label=part.name, **STYLES[part.name])
-    start, end = path.position_m[0], path.position_m[-1]
-    axes.plot(start[1], start[0], "o", color="black", ms=5, label="start", zorder=5)
-    axes.plot(end[1], end[0], "s", color=EKF2, mec="black", mew=0.6, ms=5,
-              label="end by odometry", zorder=5)  # fmt: skip
+    start, end = path.position_m[[0, -1]][:, (1, 0)]
+    axes.plot(*start, "o", color="black", ms=5, label="start", zorder=5)
+    axes.plot(*end, "s", color=EKF2, mec="black", mew=0.6, ms=5, label="end by odometry", zorder=5)
     if loop.closure_error_axes_m is not None:
-        true = end - np.array(list(loop.closure_error_axes_m.values()))
-        axes.annotate(
-            "", xy=(true[1], true[0]), xytext=(end[1], end[0]), zorder=6,
-            arrowprops={"arrowstyle": "->", "color": "#a61b1b", "lw": 1.2, "shrinkA": 3,
-                        "shrinkB": 0},
-        )  # fmt: skip
-        axes.plot([], [], color="#a61b1b", lw=1.2, label=f"gap {loop.closure_error_m:.2f} m")
-        axes.plot(true[1], true[0], "x", color="#a61b1b", ms=5, mew=1.2, zorder=6,
-                  label="where it really ended")  # fmt: skip
-    axes.set_aspect("equal", adjustable="datalim", anchor="W")
-    axes.grid(True, axis="both")
-    axes.set_xlabel(f"{names[1]} (m)")
-    axes.set_ylabel(f"{names[0]} (m)")
-    axes.legend(
-        loc="upper left", ncols=4, borderaxespad=0.0,
-        bbox_to_anchor=(0.0, -(TICKS + AXIS_LABEL + 2.0) / MAP),
-    )  # fmt: skip
+        true = end - np.array(list(loop.closure_error_axes_m.values()))[[1, 0]]
+        arrow = {"arrowstyle": "->", "color": RED, "lw": 1.2, "shrinkA": 3, "shrinkB": 0}
+        axes.annotate("", xy=true, xytext=end, zorder=6, arrowprops=arrow)
+        axes.plot([], [], color=RED, lw=1.2, label=f"gap {loop.closure_error_m:.2f} m")
+        axes.plot(*true, "x", color=RED, ms=5, mew=1.2, zorder=6, label="where it really ended")
+    as_map(axes, names[1], names[0])
+    below = -(TICKS + AXIS_LABEL + 2.0) / MAP
+    axes.legend(loc="upper left", ncols=4, borderaxespad=0.0, bbox_to_anchor=(0.0, below))
 
 
 def _reference(axes: Axes, loop: Loop) -> None:
@@ -160,116 +138,262 @@ def _reference(axes: Axes, loop: Loop) -> None:
             if not isinstance(score, Evaluation):
                 continue
             position = score.transform.undo(score.reference_m)
-            way(axes, position[:, (1, 0)], score.time_s, label=name, **TRUTH_LINE, zorder=4)
+            way(axes, position[:, (1, 0)], score.time_s, label=name, **LINES["truth"], zorder=4)
             return
 
 
 def _along(page: Page, loop: Loop) -> None:
-    scored = [name for name in (reference.name for reference in loop.references)
-              if isinstance(loop.odometry.scores[name], Evaluation)]  # fmt: skip
-    corrected = [part for part in shown(loop) if part is not loop.odometry]
-    every: list[Axes] = []
-
-    def panel(title: str) -> Axes:
-        axes = page.panel(title, "", HEIGHT, above=4.0 if every else 14.0)
-        axes.xaxis.set_major_locator(MaxNLocator(6))
+    """Height of each path, how far it moved, and its error: a panel for each, over distance."""
+    height = f"{capital(AXES_OF_FRAME[loop.odometry.trajectory.frame][2])} (m)"
+    along, paths = loop.distance_m, shown(loop)
+    panels: dict[str, dict[str, tuple[Array, Array, str]]] = {
+        height: {part.name: (along, part.trajectory.position_m[:, 2], "") for part in paths},
+        "How far each pose moved (m)": {
+            part.name: (along, part.moved_m, f"at most {part.moved_m.max():.2f} m")
+            for part in paths
+            if part is not loop.odometry
+        },
+    }
+    for reference in loop.references:
+        scores = [(part, part.scores[reference.name]) for part in paths]
+        panels[f"Distance to {reference.name} after alignment (m)"] = {
+            part.name: (
+                np.interp(score.time_s, part.trajectory.time_s, along),
+                score.position_error_m,
+                f"RMSE {score.ate.translation_m.rmse:.3f} m, max "
+                f"{score.ate.translation_m.max:.3f} m",
+            )
+            for part, score in scores
+            if isinstance(score, Evaluation)
+        }
+    drawn = {title: curves for title, curves in panels.items() if curves}
+    for place, (title, curves) in enumerate(drawn.items(), start=1):
+        axes = page.panel(title, "", HEIGHT, above=14.0 if title == height else 4.0)
+        for name, (x, y, _) in curves.items():
+            curve(axes, pd.Series(y, x), label=name, **STYLES[name])
         axes.set_xlim(0.0, loop.path_length_m)
-        every.append(axes)
-        return axes
-
-    axes = panel(f"{capital(AXES_OF_FRAME[loop.odometry.trajectory.frame][2])} (m)")
-    for part in shown(loop):
-        axes.plot(*thin(loop.distance_m, part.trajectory.position_m[:, 2]), label=part.name,
-                  **STYLES[part.name])  # fmt: skip
-    legend_above(axes)
-    if corrected:
-        axes = panel("How far each pose moved (m)")
-        for part in corrected:
-            axes.plot(*thin(loop.distance_m, part.moved_m), **STYLES[part.name])
-        _fit(axes, corrected)
-        page.numbers("; ".join(f"{p.name}: at most {p.moved_m.max():.2f} m" for p in corrected))
-    for name in scored:
-        axes = panel(f"Distance to {name} after alignment (m)")
-        said, drawn = [], []
-        for part in shown(loop):
-            score = part.scores[name]
-            if not isinstance(score, Evaluation):
-                said.append(f"{part.name}: {score.reason}")
-                continue
-            along = np.interp(score.time_s, part.trajectory.time_s, loop.distance_m)
-            axes.plot(*thin(along, score.position_error_m), **STYLES[part.name])
-            drawn.append(part)
-            said.append(f"{part.name}: RMSE {score.ate.translation_m.rmse:.3f} m, max "
-                        f"{score.ate.translation_m.max:.3f} m")  # fmt: skip
-        _fit(axes, drawn)
-        page.numbers("; ".join(said))
-    for axes in every[:-1]:
-        bare_x(axes)
-    every[-1].set_xlabel("distance along the path (m)")
+        if place == len(drawn):
+            axes.set_xlabel("distance along the path (m)")
+        else:
+            bare_x(axes)
+        if title == height:
+            legend_above(axes)
+            continue
+        # a path that a false closure warps runs out of sight
+        used = [float(np.nanmax(y)) for name, (_, y, _) in curves.items() if name != WARPED]
+        if used:
+            axes.set_ylim(0.0, 1.15 * max(*used, 1e-3))
+        page.numbers("; ".join(f"{name}: {said}" for name, (*_, said) in curves.items()))
 
 
-def _fit(axes: Axes, drawn: list[CorrectedPath]) -> None:
-    """Scale to the paths that might be used: one that a false closure warps runs out of sight."""
-    highest = [
-        float(np.nanmax(line.get_ydata()))
-        for line, part in zip(axes.get_lines(), drawn, strict=True)
-        if part.name != SOLUTIONS["all"]
-    ]
-    if highest:
-        axes.set_ylim(0.0, 1.15 * max(*highest, 1e-3))
+# ---------------------------------------------------------------------------------------- words
 
 
-def _scores(loop: Loop, name: Callable[[str], str]) -> Page:
-    """Tables: every closure with its gate and weights, RPE, and how scores were made."""
-    page = Page(
-        name("Closures and scores"),
-        "d² is the squared misclosure against what drift and closure explain together; p is the "
-        "chance of a larger one if the closure is true. Robust solving (dynamic covariance "
-        "scaling, DCS; graduated non-convexity, GNC) weighs each closure by how well the others "
-        "agree with it: 1 keeps it, 0 drops it.",
+def print_loop(
+    console: Console, loop: Loop, findings: tuple[Finding, ...], request: LoopRequest
+) -> None:
+    """Print what was found about a loop."""
+    page = Page()
+    write_loop(page, loop)
+    write_scores(page, loop)
+    for group in by_root(findings):
+        write_finding(page, group)
+    show(console, page.blocks, request)
+
+
+def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
+    """Write what was found, with every path, how far it moved, and its ATE to each reference."""
+    path = loop.odometry.trajectory
+    page.labelled(
+        "Track",
+        f"{path.name}: {KINDS[path.kind]}, {len(path)} poses, {loop.key_frames} key frames "
+        f"{loop.key_frame_spacing_m:.2g} m apart",
     )
-    page.heading("Closures", 10.5)
+    page.labelled("Part", f"{_span(loop)}, {loop.part_reason}")
+    page.labelled("Closure", closure_words(loop))
+    end = loop.known_end
+    page.labelled("End", "not used" if isinstance(end, Unavailable) else end.source)
+    for closure in loop.closures[:1]:
+        page.labelled("Gate", gate_words(closure))
+    for text in (by_distance_words(loop), *redundancy_words(loop), *refusals(loop)):
+        page.write(text, colour=MUTED, above=2.0)
+    for group in by_root(findings):
+        write_finding(page, group)
+    names = [reference.name for reference in loop.references]
+    page.table(
+        ["path", "moved RMS\n/ max (m)", *(f"ATE to\n{name} (m)" for name in names)],
+        [
+            [part.name, moved_words(part), *(_ate(part.scores[name]) for name in names)]
+            for part in loop.reported
+        ],
+    )
+    page.numbers(
+        "ATE is the RMSE of position after alignment, in brackets its 95 % interval by block "
+        "bootstrap where the flight is long enough for one."
+        if names
+        else "Neither ground truth nor a SLAM trajectory is given, so that no error of the path "
+        "can be stated; --reference FILE scores it."
+    )
+
+
+def write_scores(page: Page, loop: Loop) -> None:
+    """Write every closure with its gate and weights, RPE, and how scores were made."""
     rows: list[list[Cell]] = []
     for closure in loop.closures:
-        weights = [
-            "–" if weight is None else f"{weight:.2f}"
-            for weight in (closure.weight_dcs, closure.weight_gnc)
-        ]
         cells = [
             closure_name(closure, loop), f"{closure.distance_m:.2f}", f"{closure.d2:.1f}",
             f"{closure.degrees_of_freedom}", p_words(closure.p).removeprefix("p "),
-            "accepted" if closure.accepted else "REJECTED", *weights,
+            "accepted" if closure.accepted else "REJECTED",
         ]  # fmt: skip
-        colour = "black" if closure.accepted else SEVERITY_COLOURS["error"]
+        weights = closure.weight_dcs, closure.weight_gnc
+        cells += ["–" if weight is None else f"{weight:.2f}" for weight in weights]
+        colour = "black" if closure.accepted else style.SEVERITY_COLOURS["error"]
         rows.append([(cell, colour) for cell in cells])
     if rows:
-        heads = ["same place at", "missed by (m)", "d²", "dof", "p", "gate", "DCS weight",
-                 "GNC weight"]  # fmt: skip
-        page.table(heads, rows)
-    else:
-        page.write("None.")
+        page.table(CLOSURE_HEAD, rows, right=(1, 2, 3, 4, 6, 7))
     for reference in loop.references:
-        _relative(page, loop, reference.name)
-    return page
+        scores = {part.name: part.scores[reference.name] for part in loop.reported}
+        known = {name: score for name, score in scores.items() if isinstance(score, Evaluation)}
+        page.heading(f"RPE against {reference.name}", 10.5, above=14.0)
+        missing = (score.reason for score in scores.values() if isinstance(score, Unavailable))
+        for reason in dict.fromkeys(missing):
+            page.write(reason, size=7.5)
+        if not known:
+            continue
+        first = next(iter(known.values()))
+        head = ["path", *(f"{e.delta_words} (m)" for e in first.rpe), "rotation (°)"]
+        page.table(head, [
+            [name, *(_error(e.translation_m, e.interval_m) for e in score.rpe),
+             _rmse(score.ate.rotation_deg, 2)]
+            for name, score in known.items()
+        ])  # fmt: skip
+        for text in (score_words(first), *first.notes, *first.warnings):
+            page.numbers(capital(text))
 
 
-def _relative(page: Page, loop: Loop, name: str) -> None:
-    page.heading(f"Against {name}", 10.5, above=14.0)
-    scores = [(part, part.scores[name]) for part in loop.reported]
-    good = [(part, s) for part, s in scores if isinstance(s, Evaluation)]
-    for reason in dict.fromkeys(s.reason for _, s in scores if isinstance(s, Unavailable)):
-        page.write(reason, size=7.5)
-    if not good:
-        return
-    rows: list[list[str]] = []
-    for part, score in good:
-        errors: list[tuple[str, AbsoluteError | RelativeError]]
-        errors = [("ATE", score.ate), *((f"RPE {e.delta_words}", e) for e in score.rpe)]
-        for index, (label, e) in enumerate(errors):
-            numbers = statistics_words(e.translation_m, e.interval_m, e.rotation_deg)
-            rows.append([part.name if index == 0 else "", label, *numbers])
-    heads = ["path", "error over", "RMSE (m)", "95 % interval (m)", "rotation RMSE (°)", "n"]
-    page.table(heads, rows)
-    first = good[0][1]
-    for text in (score_words(first), *first.notes, *first.warnings):
-        page.numbers(capital(text))
+def _span(part: Loop) -> str:
+    if part.start_s > SMALLEST_STAMP_S:
+        return f"{part.end_s - part.start_s:.1f} s from stamp {part.start_s:.2f} s"
+    return f"{part.start_s:.1f} s to {part.end_s:.1f} s"
+
+
+def closure_words(loop: Loop) -> str:
+    """The closure error in m, in percent, per axis and in heading."""
+    error, misclosure = loop.closure_error_m, loop.closure_error_axes_m
+    if error is None or misclosure is None:
+        return f"path {loop.path_length_m:.1f} m; no closure error is stated: it did not come back"
+    text = (
+        f"{error:.2f} m after {loop.path_length_m:.1f} m = {error / loop.path_length_m:.2%} "
+        f"({', '.join(f'{name} {part:+.2f} m' for name, part in misclosure.items())})"
+    )
+    turned = loop.heading_error_deg
+    if isinstance(turned, Unavailable):
+        return f"{text}; heading: not known, {turned.reason}"
+    return f"{text}; heading {turned:+.1f}°"
+
+
+def gate_words(closure: Closure) -> str:
+    """What the gate says about one closure."""
+    verdict = "as the stated drift allows"
+    if not closure.accepted:
+        verdict = "REJECTED: the drift cannot explain it"
+    return (
+        f"d² {closure.d2:.1f} with {closure.degrees_of_freedom} degrees of freedom, p "
+        f"{closure.p:.2g} (rejected below {GATE_ALPHA:g}): {verdict}"
+    )
+
+
+def closure_name(closure: Closure, loop: Loop) -> str:
+    """Which closure; long stamps count from the first pose."""
+    if closure.source == LANDING:
+        return "take-off and landing"
+    zero = loop.start_s if loop.start_s > SMALLEST_STAMP_S else 0.0
+    return f"{closure.time_1_s - zero:.2f} s and {closure.time_2_s - zero:.2f} s"
+
+
+def by_distance_words(loop: Loop) -> str:
+    """What the corrections by distance are; nothing where there is none."""
+    if "by_distance_plain" not in loop.paths:
+        return ""
+    example = (
+        "By distance, positions only, is the lesson's Example 2: each position moves by its share "
+        "of the gap, and the path keeps the bend of its headings."
+    )
+    turned = loop.heading_error_deg
+    if isinstance(turned, Unavailable):
+        return f"{example} Headings are not turned: {turned.reason}."
+    return (
+        f"{example} Headings too: each step is first turned back by its share of the {turned:+.1f}°"
+        " that the heading is off at the end, and what is left of the gap is spread as before."
+    )
+
+
+def redundancy_words(loop: Loop) -> list[str]:
+    """That one loop has no redundancy, or nothing."""
+    return [SINGLE_LOOP] if len(loop.closures) == 1 else []
+
+
+def refusals(loop: Loop) -> list[str]:
+    """Why a correction is missing, each reason once."""
+    parts = [p for p in loop.corrections.values() if isinstance(p, Unavailable)]
+    reasons = [f"{p.what}: {p.reason}" for p in parts]
+    return [r for r in dict.fromkeys(reasons) if SINGLE_LOOP not in r]
+
+
+def _ate(score: Evaluation | Unavailable) -> str:
+    if isinstance(score, Unavailable):
+        return "–"
+    return _error(score.ate.translation_m, score.ate.interval_m)
+
+
+def _error(moved: Statistics | Unavailable, interval: Interval | Unavailable) -> str:
+    """RMSE of an error, in brackets its interval where there is one."""
+    within = interval_words(interval)
+    return _rmse(moved) + (f" ({within})" if within else "")
+
+
+def _rmse(found: Statistics | Unavailable, digits: int = 3) -> str:
+    return f"{found.rmse:.{digits}f}" if isinstance(found, Statistics) else "–"
+
+
+def moved_words(correction: CorrectedPath) -> str:
+    """How far the poses moved."""
+    if not correction.moved_max_m:
+        return "–"
+    return f"{correction.moved_rms_m:.2f} / {correction.moved_max_m:.2f}"
+
+
+def print_graph(console: Console, solved: SolvedGraph) -> None:
+    """Print how a pose graph was solved, and the closures that the gate rejects."""
+    page = Page()
+    page.labelled(
+        "Graph",
+        f"{solved.name}: {solved.dimension}-D, {solved.poses} poses, {solved.edges} edges; poses "
+        f"from {solved.initialised}",
+    )
+    gates = solved.gates
+    if isinstance(gates, Unavailable):
+        page.labelled("Gate", f"none: {gates.reason}")
+    elif not gates:
+        page.labelled("Gate", "no closures to judge: every edge is odometry")
+    else:
+        rejected = [gate for gate in gates if not gate.accepted]
+        said = [
+            f"{gate.first} – {gate.second}: d² {gate.d2:.1f}, p {gate.p:.2g}"
+            for gate in rejected[:MOST_ROWS]
+        ]
+        said += [f"and {len(rejected) - MOST_ROWS} more"] if len(rejected) > MOST_ROWS else []
+        page.labelled("Gate", f"rejects {len(rejected)} of {len(gates)} closures", *said)
+    if len(solved.solutions) == 1 and (~solved.graph.successive).sum() > MANY_CLOSURES:
+        page.labelled("Robust", "left out for so many closures: --robust takes minutes")
+    rows = [
+        [
+            SOLUTIONS[key], f"{solution.cost_initial:.6g}", f"{solution.cost:.6g}",
+            f"{solution.iterations}" + ("" if solution.converged else " (not converged)"),
+            "" if key == "all" else f"{solution.dropped}",
+        ]
+        for key, solution in solved.solutions.items()
+    ]  # fmt: skip
+    head = ("path", "cost before", "cost", "iterations", "closures dropped")
+    page.table(head, rows, right=(1, 2, 3, 4))
+    show(console, page.blocks)

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from matplotlib.artist import Artist
-from matplotlib.axes import Axes
-from matplotlib.collections import PolyCollection
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 from px4fuse.arrays import Array
-from px4fuse.comparison.events import Span
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.report.document import Document
-from px4fuse.report.style import EKF2_REJECTED, MUTED
+from px4fuse.report.page import Page
+from px4fuse.report.style import EKF2_REJECTED, MUTED, TIME_LABEL, bare_x
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
 
 # Bands differ in grey by hatch and depth; marks stand on lines at the foot of the axes, resets
 # hang from their top
@@ -29,9 +28,36 @@ OUTLIER: dict[str, Any] = {"color": "black", "marker": "x", "ms": 3.0, "mew": 0.
 TAKE_OFF: dict[str, Any] = {"color": "black", "marker": "^", "ms": 4.5, "mew": 0, "ls": "none"}
 LANDING: dict[str, Any] = {"color": "black", "marker": "v", "ms": 4.5, "mew": 0, "ls": "none"}
 REJECTED_LINE, OUTLIER_LINE, RESET_LINE = 0.025, 0.075, 0.92
+STRIP = 12.0  # points for the names of flight modes
 # Marks closer than this share of the segment fall on one another
 CLOSEST = 1.0 / 300.0
 STRIP_SIZE, STRIP_WIDTH = 6.5, 4.0  # of the letters, and of one of them, in points
+
+
+class Mark(NamedTuple):
+    """What happened: bands of the whole height, or signs at a height of the axes."""
+
+    label: str
+    where: Sequence[Any] | Array
+    style: dict[str, Any]
+    height: float | None = None
+
+
+def _marks(document: Document, rejected_s: Sequence[float] | Array) -> tuple[Mark, ...]:
+    """Each kind of mark; bands lie on those before them."""
+    events = document.events
+    modes = [(mode.start_s, mode.end_s) for mode in events.modes]
+    return (
+        Mark("flight modes, in turn", modes[1::2], MODE),
+        Mark("on the ground", events.ground, GROUND),
+        Mark("source silent", events.gaps, GAP),
+        Mark("log dropout", events.dropouts, DROPOUT),
+        Mark("EKF2 rejected", rejected_s, EKF2_REJECTED, REJECTED_LINE),
+        Mark("outlier", outliers(document), OUTLIER, OUTLIER_LINE),
+        Mark("EKF2 reset", events.resets_s, RESET, RESET_LINE),
+        Mark("take-off", events.take_off_s, TAKE_OFF, 0.0),
+        Mark("landing", events.landing_s, LANDING, 0.0),
+    )
 
 
 def draw(axes: Axes, document: Document, *, axis: str | None = None, strip: bool = False) -> None:
@@ -48,40 +74,53 @@ def draw(axes: Axes, document: Document, *, axis: str | None = None, strip: bool
     strip : bool
         Name the flight modes above the axes.
     """
-    events, segment = document.events, document.comparison.segment
+    from matplotlib.collections import PolyCollection  # noqa: PLC0415
+    from matplotlib.lines import Line2D  # noqa: PLC0415
+
+    segment, across = document.analysis.segment, axes.get_xaxis_transform()
     axes.set_xlim(segment.start_s, segment.end_s)
-    modes = [(mode.start_s, mode.end_s) for mode in events.modes]
-    for spans, style, order in (
-        (modes[1::2], MODE, 0.1),
-        (events.ground, GROUND, 0.2),
-        (events.gaps, GAP, 0.3),
-        (events.dropouts, DROPOUT, 0.4),
-    ):
-        _bands(axes, spans, {**style, "zorder": order})
-    name = document.comparison.main.axis.name if axis is None else axis
-    span = segment.end_s - segment.start_s
-    for times, height, style in (
-        (events.rejected_s.get(name, ()), REJECTED_LINE, EKF2_REJECTED),
-        (outliers(document), OUTLIER_LINE, OUTLIER),
-        (events.resets_s, RESET_LINE, RESET),
-        (events.take_off_s, 0.0, TAKE_OFF),
-        (events.landing_s, 0.0, LANDING),
-    ):
-        shown = _apart(times, CLOSEST * span)
-        if len(shown):
-            axes.add_artist(  # which leaves the limits alone
-                Line2D(
-                    shown, np.full(len(shown), height), transform=axes.get_xaxis_transform(),
-                    zorder=2.6, clip_on=height > 0.0, **style,
-                )
-            )  # fmt: skip
+    name = document.analysis.main.axis.name if axis is None else axis
+    marks = _marks(document, document.events.rejected_s.get(name, ()))
+    for order, (_, where, style, height) in enumerate(marks, start=1):
+        if not len(where):
+            continue
+        if height is None:
+            corners = [[(s, 0.0), (s, 1.0), (e, 1.0), (e, 0.0)] for s, e in where]
+            bands = PolyCollection(corners, transform=across, zorder=0.1 * order, **style)
+            axes.add_collection(bands, autolim=False)
+        else:
+            shown = _apart(where, CLOSEST * (segment.end_s - segment.start_s))
+            look = {**style, "transform": across, "zorder": 2.6, "clip_on": height > 0.0}
+            signs = Line2D(shown, np.full(len(shown), height), **look)
+            axes.add_artist(signs)  # which leaves the limits alone
     if strip:
         _strip(axes, document)
 
 
+def panel(
+    page: Page, document: Document, title: str, say: str, height: float, *, above: float = 4.0,
+    axis: str | None = None, strip: bool = False, last: bool = True,
+) -> Axes:  # fmt: skip
+    """A panel over the time of the flight, marked as by :func:`draw`.
+
+    Parameters
+    ----------
+    last : bool
+        Whether it says what its x axis is; else another one below it does.
+    """
+    strip = strip and bool(document.events.modes)
+    axes = page.panel(title, say, height, above=max(above, STRIP if strip else 0.0))
+    draw(axes, document, axis=axis, strip=strip)
+    if last:
+        axes.set_xlabel(TIME_LABEL)
+    else:
+        bare_x(axes)
+    return axes
+
+
 def outliers(document: Document) -> Array:
     """Times of the measurements that tuning takes for outliers, of all its axes together."""
-    names = HORIZONTAL, document.comparison.main.axis.name
+    names = HORIZONTAL, document.analysis.main.axis.name
     found = [
         tuned.outlier_time_s
         for name, tuned in document.analysis.tuning.items()
@@ -93,36 +132,20 @@ def outliers(document: Document) -> Array:
 
 def handles(document: Document) -> list[Artist]:
     """Legend entries of the kinds of marks that this flight has."""
-    events = document.events
-    entries: list[tuple[object, Artist]] = [
-        (events.gaps, Patch(**GAP, label="source silent")),
-        (events.ground, Patch(**GROUND, label="on the ground")),
-        (events.dropouts, Patch(**DROPOUT, label="log dropout")),
-        (events.modes[1:], Patch(**MODE, label="flight modes, in turn")),
-        (events.resets_s, Line2D([], [], **RESET, label="EKF2 reset")),
-        (
-            any(len(times) for times in events.rejected_s.values()),
-            Line2D([], [], **EKF2_REJECTED, label="EKF2 rejected"),
-        ),
-        (outliers(document).size, Line2D([], [], **OUTLIER, label="outlier")),
-        (events.take_off_s, Line2D([], [], **TAKE_OFF, label="take-off")),
-        (events.landing_s, Line2D([], [], **LANDING, label="landing")),
+    from matplotlib.lines import Line2D  # noqa: PLC0415
+    from matplotlib.patches import Patch  # noqa: PLC0415
+
+    rejected = [time for times in document.events.rejected_s.values() for time in times]
+    return [
+        Patch(**style, label=label) if height is None else Line2D([], [], **style, label=label)
+        for label, where, style, height in _marks(document, rejected)
+        if len(where)
     ]
-    return [artist for there, artist in entries if there]
 
 
-def _bands(axes: Axes, spans: Iterable[Span], style: dict[str, Any]) -> None:
-    corners = [[(s, 0.0), (s, 1.0), (e, 1.0), (e, 0.0)] for s, e in spans]
-    if corners:
-        bands = PolyCollection(corners, transform=axes.get_xaxis_transform(), **style)
-        axes.add_collection(bands, autolim=False)
-
-
-def _apart(times: Sequence[float] | Array, least_s: float) -> Array:
+def _apart(times: Any, least_s: float) -> Array:
     """Times without those that would be drawn on one another."""
     values = np.asarray(times, dtype=np.float64)
-    if not len(values):
-        return values
     kept: Array = values[np.unique(np.floor(values / least_s), return_index=True)[1]]
     return kept
 

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import html
 import re
-import unicodedata
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from px4fuse.answers import Answers, form_rows
@@ -39,7 +37,12 @@ SILENT = re.compile(r"<!--.*?-->|<(script|style)\b.*?(</\1\s*>|$)", re.DOTALL | 
 IMAGE = re.compile(r"""<img\b(?:[^>]*?\balt\s*=\s*(["'])(.*?)\1)?[^>]*>""", re.IGNORECASE)
 BREAK = re.compile(r"<(br|/p|/div|/tr|/li|/h\d)\b[^>]*>", re.IGNORECASE)
 TAG = re.compile(r"<[^>]*>")
-SYMBOLS = {
+SUPERSCRIPTS = str.maketrans("0123456789+-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁺⁻")
+GREEK = (
+    "alpha beta gamma delta epsilon zeta eta theta iota kappa lambda mu nu xi omicron pi rho sigma "
+    "tau upsilon phi chi psi omega"
+)
+SYMBOLS = dict(zip(GREEK.split(), "αβγδεζηθικλμνξοπρστυφχψω", strict=True)) | {
     "cdot": "·", "times": "×", "pm": "±", "le": "≤", "leq": "≤", "ge": "≥", "geq": "≥",
     "approx": "≈", "neq": "≠", "sim": "~", "infty": "∞", "sum": "Σ", "int": "∫", "partial": "∂",
     "to": "→", "rightarrow": "→", "degree": "°", "circ": "°", "sqrt": "√", "ldots": "…",
@@ -48,59 +51,25 @@ SYMBOLS = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Paragraph:
-    """A paragraph, or a line of code: its words, how they look, and the mark of a list before."""
-
-    text: str
-    size: float = BODY_SIZE
-    weight: str = "normal"
-    colour: str = "black"
-    indents: int = 0
-    mark: str = ""
-    above: float = 4.0
-
-
-@dataclass(frozen=True)
-class NotesTable:
-    """Rows of cells, the first one the head."""
-
-    rows: tuple[tuple[str, ...], ...]
-    indents: int = 0
-
-
 def draw(document: Document | LoopDocument) -> Iterator[Page]:
     """Draw as many pages as the form and the notes need; none without both."""
-    title = "What the student found"
-    if isinstance(document, Document):
-        title = appendix(title)
-    blocks, answers = list(read(document.student.notes)), document.student.answers
-    if not blocks and not isinstance(answers, Answers):
-        return
-    page = Page(title)
+    title, answers = "What the student found", document.student.answers
+    page = Page(appendix(title) if isinstance(document, Document) else title)
     if isinstance(answers, Answers):
         page.heading("The form, as it was filled in")
-        page.table(("Asked", "Answer"), [list(row) for row in form_rows(answers)],
-                   shares=[3.0, 4.0], size=TABLE_SIZE)  # fmt: skip
-        page.skip(8.0)
-    for block in blocks:
-        if isinstance(block, Paragraph):
-            page.note(
-                block.text, block.size, block.weight == "bold", block.colour,
-                indent=INDENT * min(block.indents, MOST_INDENTS), mark=block.mark,
-                above=block.above,
-            )  # fmt: skip
-        else:
-            columns = max(map(len, block.rows))
-            head, *rows = ([*row, *[""] * (columns - len(row))] for row in block.rows)
-            page.table(head, rows, shares=[1.0] * columns, size=TABLE_SIZE)
-    yield page
+        rows = [list(row) for row in form_rows(answers)]
+        page.table(("Asked", "Answer"), rows, shares=[3.0, 4.0], size=TABLE_SIZE)
+    write(page, document.student.notes)
+    if len(page.blocks) > 1:
+        yield page
 
 
-def read(notes: str) -> Iterator[Paragraph | NotesTable]:
-    r"""Markdown as lines and tables, in their order.
+def write(page: Page, notes: str) -> None:
+    r"""Write Markdown on a page, without its marks.
 
-    >>> [line.text for line in read("# A *b*\n\n- $\\sigma_z^2$ is `R`\n\n![a map](m.png)")]
+    >>> page = Page()
+    >>> write(page, "# A *b*\n\n- $\\sigma_z^2$ is `R`\n\n![a map](m.png)")
+    >>> [block["text"] for block in page.blocks]
     ['A b', 'σ_z² is R', '[picture: a map]']
     """
     # the parser costs a fiftieth of a second: not where there are no notes
@@ -109,76 +78,63 @@ def read(notes: str) -> Iterator[Paragraph | NotesTable]:
 
     markdown = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
     markdown.inline.ruler.before("escape", "maths", _maths)
-    yield from _blocks(SyntaxTreeNode(markdown.parse(notes)), 0)
+    _blocks(page, SyntaxTreeNode(markdown.parse(notes)), 0)
 
 
-def _blocks(node: SyntaxTreeNode, indents: int) -> Iterator[Paragraph | NotesTable]:
-    for child in node.children:
+def _blocks(page: Page, node: SyntaxTreeNode, indents: int, mark: str = "") -> None:
+    """Write what a node holds, the mark of a list before the first line of it."""
+    indent = INDENT * min(indents, MOST_INDENTS)
+    children = node.children
+    if mark and (not children or children[0].type.endswith("_list")):
+        page.write("", size=BODY_SIZE, indent=indent, mark=mark)
+        mark = ""
+    for child in children:
         match child.type:
             case "heading":
                 size = HEADING_SIZES.get(child.tag, BODY_SIZE)
-                yield Paragraph(_inline(child), size, "bold", indents=indents, above=8.0)
+                page.write(_inline(child), size=size, bold=True, indent=indent, above=6.0)
             case "bullet_list" | "ordered_list":
-                yield from _items(child, indents)
+                first = int(child.attrs.get("start", 1))
+                for number, item in enumerate(child.children, first):
+                    numbered = child.type == "ordered_list"
+                    _blocks(page, item, indents + 1, f"{number}." if numbered else "•")
             case "blockquote":
-                yield from _blocks(child, indents + 1)
+                _blocks(page, child, indents + 1)
             case "fence" | "code_block":
-                for number, text in enumerate(child.content.rstrip("\n").split("\n")):
-                    code = text.expandtabs(4).replace(" ", "\N{NO-BREAK SPACE}")
-                    yield Paragraph(code or " ", 7.5, colour=MUTED, indents=indents + 1,
-                               above=0.0 if number else 4.0)  # fmt: skip
+                code = child.content.rstrip("\n").expandtabs(4).replace(" ", "\N{NO-BREAK SPACE}")
+                page.write(code, size=7.5, colour=MUTED, indent=indent + INDENT)
             case "table":
-                rows = [row for part in child.children for row in part.children]
-                yield NotesTable(
-                    tuple(tuple(_inline(c) for c in row.children) for row in rows), indents
-                )
+                rows = [row.children for part in child.children for row in part.children]
+                head, *body = ([_inline(cell) for cell in row] for row in rows)
+                page.table(head, body, shares=[1.0] * len(head), size=TABLE_SIZE)
             case "html_block":
-                for text in _said(child.content).split("\n"):
-                    if text.strip():
-                        yield Paragraph(text.strip(), indents=indents)
-            case "hr":
-                yield Paragraph("")
-            case _:
-                yield Paragraph(_inline(child), indents=indents)
-
-
-def _items(node: SyntaxTreeNode, indents: int) -> Iterator[Paragraph | NotesTable]:
-    """Items of a list, the first line of each with its mark."""
-    first = int(node.attrs.get("start", 1))
-    for number, item in enumerate(node.children, start=first):
-        mark = "•" if node.type == "bullet_list" else f"{number}."
-        blocks = list(_blocks(item, indents + 1))
-        if not blocks or not isinstance(blocks[0], Paragraph) or blocks[0].mark:
-            blocks.insert(0, Paragraph("", indents=indents + 1))
-        head = blocks[0]
-        assert isinstance(head, Paragraph)
-        yield Paragraph(head.text, head.size, head.weight, head.colour, head.indents, mark, 2.0)
-        yield from blocks[1:]
+                said = "\n".join(filter(None, map(str.strip, _said(child.content).split("\n"))))
+                page.write(said, size=BODY_SIZE, indent=indent, above=2.0)
+            case _:  # also a rule across, which says nothing
+                above = 0.0 if mark else 2.0
+                page.write(_inline(child), size=BODY_SIZE, indent=indent, mark=mark, above=above)
+        mark = ""
 
 
 def _inline(node: SyntaxTreeNode) -> str:
     """Words of a block without their marks."""
-    said = []
-    for child in node.children:
-        match child.type:
-            case "text" | "code_inline":
-                said.append(child.content)
-            case "maths":
-                said.append(_letters(child.content))
-            case "softbreak":
-                said.append(" ")
-            case "hardbreak":
-                said.append("\n")
-            case "image":
-                said.append(_picture(child.content))
-            case "html_inline":
-                said.append(_said(child.content))
-            case "link":
-                words, address = _inline(child), str(child.attrs.get("href", ""))
-                said.append(words if words in (address, "") else f"{words} ({address})")
-            case _:
-                said.append(_inline(child))
-    return "".join(said)
+    return "".join(map(_words, node.children))
+
+
+def _words(node: SyntaxTreeNode) -> str:
+    match node.type:
+        case "text" | "code_inline":
+            return node.content
+        case "softbreak" | "hardbreak":
+            return " " if node.type == "softbreak" else "\n"
+        case "maths" | "image" | "html_inline":
+            of = {"maths": _letters, "image": _picture, "html_inline": _said}
+            return of[node.type](node.content)
+        case "link":
+            words, address = _inline(node), str(node.attrs.get("href", ""))
+            return words if words in (address, "") else f"{words} ({address})"
+        case _:
+            return _inline(node)
 
 
 def _picture(description: str) -> str:
@@ -206,7 +162,7 @@ def _maths(state: StateInline, silent: bool) -> bool:
 def _letters(maths: str) -> str:
     """TeX as letters, as far as letters go."""
     text = INDEX.sub(r"_(\1)", FRACTION.sub(_fraction, ROOT.sub(r"√(\1)", maths)))
-    text = POWER.sub(lambda m: "".join(map(_superscript, m[1] or m[2])), text)
+    text = POWER.sub(lambda found: (found[1] or found[2]).translate(SUPERSCRIPTS), text)
     return COMMAND.sub(_symbol, text).replace("{", "").replace("}", "").replace("~", " ")
 
 
@@ -214,21 +170,8 @@ def _fraction(found: re.Match[str]) -> str:
     return "/".join(part if part.isalnum() else f"({part})" for part in found.groups())
 
 
-def _superscript(character: str) -> str:
-    if character in "+-":
-        return "⁺" if character == "+" else "⁻"
-    return unicodedata.lookup(f"SUPERSCRIPT {unicodedata.name(character).split()[-1]}")
-
-
 def _symbol(found: re.Match[str]) -> str:
     name = found[1]
     if name in SYMBOLS:
         return SYMBOLS[name]
-    if not name.isalpha():
-        return name
-    size = "CAPITAL" if name[0].isupper() else "SMALL"
-    greek = "LAMDA" if name.lower() == "lambda" else name.upper()
-    try:
-        return unicodedata.lookup(f"GREEK {size} LETTER {greek}")
-    except KeyError:
-        return name
+    return SYMBOLS[name.lower()].upper() if name.lower() in SYMBOLS else name

@@ -1,27 +1,28 @@
-"""A report as data: titles, sentences, tables and panels in order, which ``report.typ`` sets.
+"""What is shown, as data: titles, sentences, tables and panels in order.
 
-What is written here is words and numbers; Typst breaks lines and pages. Text from outside (names,
-notes) is data too, and is never read as markup.
+``report.typ`` sets a page as PDF, :mod:`px4fuse.report.screen` prints its words and tables on the
+terminal. Text from outside (names, notes) is data too, and is never read as markup.
 """
 
 from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from typing import Any
-
-from matplotlib.artist import Artist
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from typing import TYPE_CHECKING, Any
 
 from px4fuse.report import fonts
 from px4fuse.report.style import MUTED
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # Points: width of the text, of the numbers beside an axes, of the labels before sentences
 WIDTH, AXIS_LEFT, LABEL = 512.0, 26.0, 52.0
 # Points below an axes for its numbers, and for its label
 TICKS, AXIS_LABEL, BARE = 12.0, 11.0, 3.0
+KEPT = "\n\N{NO-BREAK SPACE}"  # though not printable by themselves
 Block = dict[str, Any]
 Cell = str | tuple[str, str]
 
@@ -32,37 +33,45 @@ class Page:
     Attributes
     ----------
     blocks : list of Block
-        What was written, in order; panels hold their figures until :meth:`data`.
+        What was written, in order; panels hold their figures until :func:`data`.
     """
 
     def __init__(self, title: str = "", lead: str = "", *, width: float = WIDTH) -> None:
         self.blocks: list[Block] = []
         self.width = width
         if title:
-            self.blocks.append({"kind": "title", "text": title, "lead": printable(lead)})
+            self.add("title", text=title, lead=lead)
+
+    def add(self, kind: str, **parts: Any) -> Block:
+        """Add a block of a kind that ``report.typ`` knows."""
+        self.blocks.append({"kind": kind, **parts})
+        return self.blocks[-1]
 
     def write(
         self, text: str, *, size: float = 8.0, bold: bool = False, colour: str = "black",
-        above: float = 0.0,
+        above: float = 0.0, indent: float = 0.0, mark: str = "",
     ) -> None:  # fmt: skip
-        """Write a paragraph, so many points below what stands above."""
-        if text:
-            self.blocks.append({"kind": "text", "above": above, **_words(text, size, bold, colour)})
+        """Write a paragraph, so many points below and to the right, with the mark of a list."""
+        if text or mark:
+            looks = words(text, size, colour, bold)
+            self.add("text", above=above, indent=indent, mark=mark, **looks)
 
     def heading(self, text: str, size: float = 9.0, above: float = 6.0) -> None:
         """Write a heading within the page."""
-        self.blocks.append({"kind": "heading", "above": above, **_words(text, size, True, "black")})
+        self.add("heading", above=above, **words(text, size, bold=True))
+
+    def numbers(self, text: str) -> None:
+        """Write the numbers of the panel above in small letters."""
+        self.write(text, size=7.0, colour=MUTED, above=-1.0)
 
     def labelled(
-        self, label: str, *texts: str, size: float = 8.0, beside: Sequence[Block] = (),
-        width: float = LABEL, above: float = 0.0, colour: str = "black", bold: bool = True,
+        self, label: str, *texts: str | Block, size: float = 8.0, width: float = LABEL,
+        above: float = 0.0, colour: str = "black", bold: bool = True,
     ) -> None:  # fmt: skip
-        """Write a label, and sentences beside it; ``beside`` in their place has its own looks."""
-        words = list(beside) or [_words(text, size) for text in texts]
-        left = [_words(part, size, bold, colour) for part in label.split("\n") if part]
-        self.blocks.append(
-            {"kind": "labelled", "left": left, "right": words, "width": width, "above": above}
-        )
+        """Write a label, and beside it sentences, of which :func:`words` have their own looks."""
+        beside = [words(text, size) if isinstance(text, str) else text for text in texts]
+        looks = words(label, size, colour, bold)
+        self.add("labelled", label=looks, texts=beside, width=width, above=above)
 
     def table(
         self, head: Sequence[str], rows: Sequence[Sequence[Cell]], *,
@@ -79,15 +88,7 @@ class Page:
         right : sequence of int
             Columns of numbers, which stand at the right.
         """
-        cells = [
-            [{"text": printable(text), "colour": colour} for text, colour in map(_coloured, row)]
-            for row in rows
-        ]
-        align = ["right" if at in right else "left" for at in range(len(head))]
-        self.blocks.append(
-            {"kind": "table", "head": [printable(cell) for cell in head], "rows": cells,
-             "align": align, "shares": shares, "size": size}
-        )  # fmt: skip
+        self.add("table", head=head, rows=rows, shares=shares, right=right, size=size)
 
     def panel(
         self, title: str, say: str, height: float, *, above: float = 4.0, left: float = AXIS_LEFT,
@@ -102,23 +103,27 @@ class Page:
         above, left, right, below : float
             Points around the axes; below them those for ticks and label are added.
         """
-        figure = Figure(figsize=(self.width / 72.0, (above + height + below + 24.0) / 72.0))
-        axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-        self.blocks.append(
-            {"kind": "panel", "title": title, "say": printable(say), "figure": figure,
-             "axes": axes, "around": (left, right, below, above), "height": height}
-        )  # fmt: skip
-        axes.xaxis.set_major_locator(MaxNLocator(8))
-        axes.yaxis.set_major_locator(MaxNLocator(4))
-        _place(self.blocks[-1], self.width)
+        # matplotlib costs a third of a second: not where words alone are shown
+        from matplotlib.figure import Figure  # noqa: PLC0415
+
+        axes = Figure().add_axes((0.0, 0.0, 1.0, 1.0))
+        axes.locator_params(axis="x", nbins=8)
+        axes.locator_params(axis="y", nbins=4)
+        around = left, right, below, above
+        alt = ": ".join(filter(None, (title, say)))
+        block = self.add("panel", title=title, say=say, alt=alt, axes=axes, around=around,
+                         height=height, width=self.width, figure=axes.figure)  # fmt: skip
+        _place(block)
         return axes
 
     def drawing(self, figure: Figure, alt: str) -> None:
         """A figure as it is, with the sentence that a screen reader gets."""
-        self.blocks.append({"kind": "drawing", "figure": figure, "alt": alt})
+        self.add("panel", title="", say="", alt=alt, width=self.width, figure=figure)
 
     def legend(self, *rows: Sequence[Artist]) -> None:
         """Legend of several panels, a line for each row of entries."""
+        from matplotlib.figure import Figure  # noqa: PLC0415
+
         kept = [row for row in rows if row]
         figure = Figure(figsize=(self.width / 72.0, 13.0 * len(kept) / 72.0))
         for place, entries in enumerate(kept):
@@ -130,38 +135,14 @@ class Page:
         named = ", ".join(str(artist.get_label()) for row in kept for artist in row)
         self.drawing(figure, f"Legend: {named}")
 
-    def numbers(self, text: str) -> None:
-        """Write the numbers of the panel above in small letters."""
-        self.write(text, size=7.0, colour=MUTED, above=-1.0)
-
-    def beside(self, *columns: Page, gap: float = 14.0) -> None:
-        """Put columns beside one another."""
-        self.blocks.append(
-            {"kind": "beside", "columns": [column.blocks for column in columns], "gap": gap,
-             "widths": [column.width for column in columns]}
-        )  # fmt: skip
-
-    def note(
-        self, text: str, size: float, bold: bool, colour: str, *, indent: float, mark: str,
-        above: float,
-    ) -> None:  # fmt: skip
-        """Write a paragraph of somebody's own words, so many points to the right, with its mark."""
-        self.blocks.append(
-            {"kind": "note", "indent": indent, "mark": mark, "above": above,
-             **_words(text, size, bold, colour)}
-        )  # fmt: skip
+    def beside(self, *columns: Page, gap: float = 14.0, above: float = 6.0) -> None:
+        """Put columns beside one another, so many points below what stands above."""
+        blocks, widths = [c.blocks for c in columns], [c.width for c in columns]
+        self.add("beside", columns=blocks, widths=widths, gap=gap, above=above)
 
     def foot(self, part: Page) -> None:
         """Put a part at the foot of this page; what does not fit above goes to the next one."""
-        self.blocks.append({"kind": "foot", "blocks": part.blocks})
-
-    def skip(self, points: float) -> None:
-        """Leave a gap."""
-        self.blocks.append({"kind": "skip", "points": points})
-
-    def rule(self) -> None:
-        """Draw a thin line across."""
-        self.blocks.append({"kind": "rule"})
+        self.add("foot", blocks=part.blocks)
 
 
 def halves(first: float = 0.5, gap: float = 14.0) -> tuple[Page, Page]:
@@ -170,9 +151,9 @@ def halves(first: float = 0.5, gap: float = 14.0) -> tuple[Page, Page]:
     return Page(width=left), Page(width=WIDTH - gap - left)
 
 
-def words(text: str, size: float, colour: str = "black") -> Block:
-    """A sentence with its looks, for :meth:`Page.labelled`."""
-    return _words(text, size, colour=colour)
+def words(text: str, size: float, colour: str = "black", bold: bool = False) -> Block:
+    """A sentence with its looks."""
+    return {"text": text, "size": size, "colour": colour, "weight": "bold" if bold else "regular"}
 
 
 def appendix(title: str) -> str:
@@ -195,62 +176,41 @@ def legend_above(axes: Axes, **options: Any) -> None:
 def printable(text: str) -> str:
     """Text without control characters, and a white square for what no font here can draw."""
     return "".join(
-        character if character == "\n" or fonts.font_of(character) else fonts.NO_GLYPH
+        character if character in KEPT or fonts.font_of(character) else fonts.NO_GLYPH
         for character in text.expandtabs(4)
-        if character == "\n" or character.isprintable()
+        if character in KEPT or character.isprintable()
     )
 
 
-def data(blocks: Sequence[Block]) -> list[Block]:
-    """Blocks as Typst takes them: figures as SVG."""
-    return [_serialised(block) for block in blocks]
+def data(part: Any) -> Any:
+    """Blocks as Typst takes them: text that can be printed, and figures as SVG."""
+    if isinstance(part, str):
+        return printable(part)
+    if isinstance(part, Mapping):
+        kept = {name: data(value) for name, value in part.items() if name not in ("figure", "axes")}
+        return kept | ({"svg": _svg(part)} if "figure" in part else {})
+    if isinstance(part, Sequence):
+        return [data(each) for each in part]
+    return part
 
 
-def _serialised(block: Block) -> Block:
-    made = dict(block)
-    if block["kind"] == "beside":
-        made["columns"] = [data(column) for column in block["columns"]]
-    elif block["kind"] == "foot":
-        made["blocks"] = data(block["blocks"])
-    elif "figure" in block:
-        figure: Figure = made.pop("figure")
-        if made.pop("axes", None) is not None:
-            _place(block, 72.0 * figure.get_figwidth())
-            del made["around"], made["height"]
-        drawn = io.StringIO()
-        figure.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
-        made["svg"] = drawn.getvalue()
-        made["width"] = 72.0 * figure.get_figwidth()
-    return made
+def _svg(block: Mapping[str, Any]) -> str:
+    if "axes" in block:
+        _place(block)
+    drawn = io.StringIO()
+    block["figure"].savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
+    return drawn.getvalue()
 
 
-def _place(block: Mapping[str, Any], width: float) -> None:
+def _place(block: Mapping[str, Any]) -> None:
     """Give the axes of a panel their place, with room for the ticks and the label that they have.
 
     The figure is as high as that asks for.
     """
-    axes: Axes = block["axes"]
+    axes, width, height = block["axes"], block["width"], block["height"]
     left, right, below, above = block["around"]
     shown = axes.axison and axes.xaxis.get_tick_params()["labelbottom"]
     below += (TICKS if shown else BARE) + (AXIS_LABEL if axes.get_xlabel() else 0.0)
-    total = above + block["height"] + below
+    total = above + height + below
     block["figure"].set_size_inches(width / 72.0, total / 72.0)
-    axes.set_position(
-        (left / width, below / total, (width - left - right) / width, block["height"] / total)
-    )
-
-
-def _words(text: str, size: float, bold: bool = False, colour: str = "black") -> Block:
-    return {
-        "text": printable(text), "size": size, "colour": _hex(colour),
-        "weight": "bold" if bold else "regular",
-    }  # fmt: skip
-
-
-def _coloured(cell: Cell) -> tuple[str, str]:
-    text, colour = cell if isinstance(cell, tuple) else (cell, "black")
-    return text, _hex(colour)
-
-
-def _hex(colour: str) -> str:
-    return "#000000" if colour == "black" else colour
+    axes.set_position((left / width, below / total, (width - left - right) / width, height / total))

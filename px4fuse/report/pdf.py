@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from importlib import metadata
-from importlib.resources import files
+from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -27,7 +27,6 @@ from px4fuse.report import (
     innovations,
     loop,
     notes,
-    other_axes,
     provenance,
     sensitivity,
     whatif,
@@ -50,23 +49,35 @@ RESULTS_NAME = "results.json"
 STANDARDS: list[Any] = ["a-3a", "ua-1"]
 PAGES: Mapping[type, tuple[Callable[[Any], Iterator[Page]], ...]] = {
     Document: (
-        cover.draw,
-        flight.draw,
-        innovations.draw,
-        why.draw,
-        other_axes.draw,
-        consistency.draw,
-        sensitivity.draw,
-        clock.draw,
-        loop.draw,
-        notes.draw,
-        provenance.draw,
+        cover.draw, flight.draw, innovations.draw, why.draw, flight.draw_other_axes,
+        consistency.draw, sensitivity.draw, clock.draw, loop.draw, notes.draw, provenance.draw,
     ),
     LoopDocument: (loop.draw_report, notes.draw, provenance.draw_loop),
     WhatIfDocument: (whatif.draw,),
     EvaluationDocument: (evaluation.draw,),
     ChangesDocument: (changes.draw,),
-}
+}  # fmt: skip
+
+
+def _named(document: Report) -> tuple[str, str, str]:
+    """Title of the PDF, and name and SHA-256 of the file that it is about."""
+    match document:
+        case Document(analysis):
+            log = analysis.flight.log
+            return f"px4fuse compare {log.name}", log.name, log.sha256
+        case WhatIfDocument(made_of):
+            log = made_of.flight.log
+            return f"px4fuse whatif {log.name}", log.name, log.sha256
+        case LoopDocument(loop=found):
+            track = found.odometry.trajectory
+            return f"px4fuse loop {track.name}", track.name, track.sha256
+        case EvaluationDocument(score):
+            one, other = score.estimate, score.reference
+            return f"px4fuse evaluate {one.name} {other.name}", one.name, one.sha256
+        case ChangesDocument(results):
+            a, b = results.a, results.b
+            name = f"A {a.log}, SHA-256 {a.log_sha256[:12]} · B {b.log}"
+            return f"px4fuse diff {a.given} {b.given}", name, b.log_sha256
 
 
 def render(document: Report, results_json: str) -> bytes:
@@ -85,28 +96,25 @@ def render(document: Report, results_json: str) -> bytes:
     """
     with report_style():
         pages = [page for draw in PAGES[type(document)] for page in draw(document)]
-        blocks = [block for page in pages for block in data(page.blocks)]
-    name, sha256 = document.log
-    made_by = f"px4fuse {metadata.version('px4fuse')}"
-    student = document.student
-    families = fonts.families(
-        "".join((document.title, student.name, student.id, student.notes, document.command))
-    )
+        blocks = data([block for page in pages for block in page.blocks])
+    title, name, sha256 = _named(document)
+    made_by, student = f"px4fuse {metadata.version('px4fuse')}", document.student
+    from_outside = title, student.name, student.id, student.notes, document.command
     return compiled(
         {
-            "title": document.title,
+            "title": title,
             "author": made_by,
-            "head": _shortened(f"px4fuse · {name} · SHA-256 {sha256[:12]}", 90),
-            "student": _shortened(who(student, " · "), 40),
+            "head": _line(f"px4fuse · {name} · SHA-256 {sha256[:12]}", 90),
+            "student": _line(who(student, " · "), 40),
             "foot": made_by,
-            "fonts": families,
+            "fonts": fonts.families("".join(from_outside)),
             "blocks": blocks,
             "results": results_json,
         }
     )
 
 
-def _shortened(text: str, most: int) -> str:
+def _line(text: str, most: int) -> str:
     """One line of so many letters at most."""
     line = " ".join(printable(text).split())
     return line if len(line) <= most else f"{line[: most - 1]}…"
@@ -140,4 +148,4 @@ def compiled(report: Mapping[str, Any], template: str | None = None) -> bytes:
 
 @cache
 def _template() -> str:
-    return files("px4fuse.report").joinpath("report.typ").read_text(encoding="utf-8")
+    return Path(__file__).with_name("report.typ").read_text(encoding="utf-8")

@@ -6,13 +6,77 @@ In a pipe a paragraph is one line, however long, so that other programs find wha
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import zip_longest
+from typing import Literal
 
 from rich.console import Console
 from rich.style import StyleType
 from rich.table import Table
 from rich.text import Text
 
+from px4fuse.report.commands import runnable
+from px4fuse.report.page import Block
+from px4fuse.report.style import GOOD, MUTED, SEVERITY_COLOURS
+from px4fuse.request import Request
+
 INDENT = 9
+# Colours of paper that a screen has too; others stand for lines of panels, and are left out
+STYLES = {
+    MUTED: "dim", SEVERITY_COLOURS["error"]: "bold red", SEVERITY_COLOURS["warning"]: "yellow",
+    SEVERITY_COLOURS["info"]: "cyan", GOOD: "green",
+}  # fmt: skip
+
+
+def show(console: Console, blocks: Iterable[Block], request: Request | None = None) -> None:
+    """Print the words and tables of a page.
+
+    Parameters
+    ----------
+    console : Console
+    blocks : iterable of Block
+    request : Request, optional
+        As it was typed: commands in labelled sentences are printed so that they run.
+    """
+    for block in blocks:
+        match block["kind"]:
+            case "text" | "heading":
+                say(console, _styled(block))
+            case "labelled":
+                _show_labelled(console, block, request)
+            case "table":
+                table = plain_table(
+                    *((head, "right" if at in block["right"] else "left")
+                      for at, head in enumerate(block["head"]))
+                )  # fmt: skip
+                for row in block["rows"]:
+                    table.add_row(*map(_cell, row))
+                console.print(table)
+            case "beside":
+                for column in block["columns"]:
+                    show(console, column, request)
+
+
+def _show_labelled(console: Console, block: Block, request: Request | None) -> None:
+    lines = block["label"]["text"].split("\n")
+    labels = [line for line in lines if len(line) < INDENT]
+    aside = "".join(f" ({line})" for line in lines if len(line) >= INDENT)
+    for place, (label, part) in enumerate(zip_longest(labels, block["texts"])):
+        words, commands = Text() if part is None else _styled(part), list[str]()
+        if request is not None:
+            words.plain, commands = runnable(words.plain, request)
+        words.append("" if place else aside)
+        say(console, words, _styled({**block["label"], "text": label or ""}), INDENT)
+        for command in commands:
+            print_command(console, command)
+
+
+def _styled(block: Block) -> Text:
+    style = STYLES.get(block["colour"], "")
+    return Text(block["text"], f"{style} bold" if block["weight"] == "bold" else style)
+
+
+def _cell(cell: str | tuple[str, str]) -> Text:
+    return Text(cell) if isinstance(cell, str) else Text(cell[0], STYLES.get(cell[1], ""))
 
 
 def say(console: Console, text: str | Text, head: str | Text = "", indent: int = 0) -> None:
@@ -76,10 +140,13 @@ def plain_table(*heads: tuple[str, str]) -> Table:
     *heads : tuple of (str, str)
         Head of each column, whose lines are its group, name and unit, and "left" or "right".
     """
+    vertical: Literal["bottom", "top"] = "top"
+    if any("\n" in head for head, _ in heads):
+        vertical = "bottom"
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
     for head, justify in heads:
         table.add_column(
             Text(head), justify="left" if justify == "left" else "right", overflow="fold",
-            vertical="bottom",
+            vertical=vertical,
         )  # fmt: skip
     return table

@@ -9,15 +9,20 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
 
 from px4fuse.arrays import Array
 
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+
 FONT = "DejaVu Sans"
+SHEET = Path(__file__).with_name("report.mplstyle")
 TIME_LABEL = "time since first data (s)"
 
 OURS = "#123f7a"
@@ -27,7 +32,7 @@ EKF2_BAND = "#f6c99f"
 TRUTH = "#111111"
 MEASUREMENT = "#9a9a9a"
 MUTED = "#555555"
-RULE = "#bbbbbb"
+GOOD = "#1f6b3a"
 SEVERITY_COLOURS = {"error": "#a61b1b", "warning": "#8a5a00", "info": "#33556b"}
 
 OURS_LINE: dict[str, Any] = {"color": OURS, "lw": 1.0, "ls": "-"}
@@ -42,57 +47,70 @@ EKF2_REJECTED: dict[str, Any] = {
 MEASURED: dict[str, Any] = {
     "color": MEASUREMENT, "marker": ".", "ms": 1.8, "mew": 0, "ls": "none",
 }  # fmt: skip
+# By the names that a reader sees
+LINES = {"ours": OURS_LINE, "EKF2": EKF2_LINE, "truth": TRUTH_LINE}
+DOTS = {"ours": OURS_DOTS, "EKF2": EKF2_DOTS}
 
 # What the eye can see across a page, and across a third of it: longer series are thinned to their
 # extremes per bucket.
-MAX_POINTS = 1500
-MAX_POINTS_NARROW = 500
+MAX_POINTS, MAX_POINTS_NARROW, WIDE_INCHES = 1500, 500, 3.0
 
 
 @contextmanager
 def report_style() -> Iterator[None]:
     """Matplotlib settings of the panels, for the duration of a block."""
-    with mpl.rc_context(
-        {
-            "font.family": [FONT],
-            "font.size": 7.5,
-            "axes.titlesize": 8.5,
-            "axes.titlelocation": "left",
-            "axes.titlepad": 4,
-            "axes.titley": 1.0,  # fixed: placing titles automatically lays every axis out twice
-            "axes.labelsize": 7.5,
-            "axes.labelpad": 2,
-            "axes.linewidth": 0.6,
-            "axes.spines.top": False,
-            "axes.spines.right": False,
-            "axes.unicode_minus": True,
-            "axes.grid": True,
-            "axes.grid.axis": "y",
-            "grid.color": "#e3e3e3",
-            "grid.linewidth": 0.5,
-            "axes.axisbelow": True,
-            "xtick.labelsize": 7,
-            "ytick.labelsize": 7,
-            "xtick.major.width": 0.6,
-            "ytick.major.width": 0.6,
-            "xtick.major.size": 2.5,
-            "ytick.major.size": 2.5,
-            "legend.fontsize": 7,
-            "legend.frameon": False,
-            "legend.handlelength": 2.4,
-            "text.parse_math": False,
-            "svg.fonttype": "none",  # text stays text: it can be selected and searched
-            "svg.hashsalt": "px4fuse",  # the same bytes each time
-            "path.simplify": True,
-            "path.simplify_threshold": 0.5,
-        }
-    ):
+    import matplotlib as mpl  # noqa: PLC0415 - not where words alone are shown
+
+    with mpl.rc_context({"font.family": [FONT]}, SHEET):
         yield
+
+
+def curve(axes: Axes, values: pd.Series[float], **style: Any) -> None:
+    """Draw a series over its index, with as many points as the eye can see in these axes."""
+    axes.plot(*thin(values.index.to_numpy(), np.asarray(values, np.float64), _seen(axes)), **style)
+
+
+def band(axes: Axes, middle: pd.Series[float], sigma: pd.Series[float]) -> None:
+    """Draw our ±2σ about a series."""
+    time = middle.index.to_numpy()
+    shown, upper = thin(time, np.asarray(middle + 2.0 * sigma, np.float64), _seen(axes))
+    lower = np.interp(shown, time, (middle - 2.0 * sigma).to_numpy())
+    axes.fill_between(shown, lower, upper, color=OURS_BAND, lw=0)
+
+
+def _seen(axes: Axes) -> int:
+    return MAX_POINTS if axes.bbox.width / axes.figure.dpi > WIDE_INCHES else MAX_POINTS_NARROW
+
+
+def log_ticks(axes: Axes) -> None:
+    """Log scale of y with some room, and with plain numbers."""
+    axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    axes.set_ylim(low / 1.15, high * 1.25)
+    plain_ticks(axes.yaxis)
+
+
+def plain_ticks(axis: Axis) -> None:
+    """Plain numbers on a log axis, at 1, 2 and 5 in each decade; of many decades at 1."""
+    from matplotlib.ticker import LogLocator, NullLocator  # noqa: PLC0415
+
+    low, high = axis.get_view_interval()
+    subs = (1.0, 2.0, 5.0) if high / low < 30.0 else (1.0, 3.0) if high / low < 300.0 else (1.0,)
+    axis.set_major_locator(LogLocator(base=10.0, subs=subs))
+    axis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.set_minor_locator(NullLocator())
 
 
 def bare_x(axes: Axes) -> None:
     """Leave out the numbers of an x axis that another below it shows."""
     axes.tick_params(axis="x", labelbottom=False)
+
+
+def as_map(axes: Axes, right: str, up: str) -> None:
+    """Make both directions of the same scale, with a grid and their names (m)."""
+    axes.set_aspect("equal", adjustable="datalim", anchor="W")
+    axes.grid(True, axis="both")
+    axes.set(xlabel=f"{right} (m)", ylabel=f"{up} (m)")
 
 
 def empty(axes: Axes, reason: str) -> None:

@@ -4,95 +4,98 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
-from matplotlib.axes import Axes
-from matplotlib.ticker import LogLocator, NullLocator
+from rich.console import Console
 
 from px4fuse.analysis import Counterfactual
 from px4fuse.ekf2.agreement import REJECTING_SHARE
 from px4fuse.ekf2.replay import HORIZONTAL
 from px4fuse.ekf2.whatif import Summary
 from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital, number_words
 from px4fuse.report.document import WhatIfDocument
 from px4fuse.report.page import Page
-from px4fuse.report.style import EKF2_BAND, EKF2_LINE, MUTED, OURS_LINE
-from px4fuse.report.why import agreement_words
+from px4fuse.report.screen import show
+from px4fuse.report.style import EKF2_BAND, EKF2_LINE, OURS_LINE, log_ticks
+from px4fuse.report.why import agreement_words, write_why
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 SIZE = 8.0
-PANEL_POINTS = 80.0
+PANEL_POINTS = 60.0
 MAX_TICKS = 10
 WIDE = 5.0  # values that span more are drawn on a logarithmic scale
+Of = Callable[[Summary, str], float | Unavailable]
+# Of each EKF2 along an axis
+AXIS_ROWS: tuple[tuple[str, Callable[[Summary, str], str]], ...] = (
+    ("{}: mean NIS", lambda s, axis: number_words(s.axes[axis].nis_mean)),
+    ("    consistent is", lambda s, axis: "{:.2f} to {:.2f}".format(*s.axes[axis].nis_band)),
+    ("    std ν (m)", lambda s, axis: _number(s.axes[axis].innovation_std_m)),
+    ("    σ_p (m)", lambda s, axis: _number(s.axes[axis].sigma_p_median_m)),
+    ("    RMSE to truth (m)", lambda s, axis: _number(s.axes[axis].position_rmse_to_truth_m)),
+)
+# and over both
+ROWS: tuple[tuple[str, Callable[[Summary], str]], ...] = (
+    ("samples", lambda s: f"{s.samples}"),
+    ("rejected", lambda s: f"{s.rejected_share:.1%}"),
+    ("longest without fusion (s)", lambda s: _number(s.longest_without_fusion_s, 2)),
+    ("position resets", lambda s: f"{s.resets}"),
+)
 
 
-def change_words(changed: dict[str, float]) -> str:
-    """Parameters with their values and units."""
-    return ", ".join(
-        " ".join(filter(None, (name, number_words(value), PARAMETERS[name].unit)))
-        for name, value in changed.items()
-    )
+def _named(name: str) -> str:
+    """A parameter with its unit in brackets."""
+    unit = PARAMETERS[name].unit
+    return f"{name} ({unit})" if unit else name
 
 
 def heads(made_of: Counterfactual) -> list[str]:
     """Heads of the columns of :func:`rows`."""
-    said = change_words(dict(made_of.changes))
+    changed = ", ".join(
+        f"{name} {number_words(value)} {PARAMETERS[name].unit}".rstrip()
+        for name, value in made_of.changes.items()
+    )
     asked = " (what the data ask for)" if made_of.asked else ""
-    return ["as logged", "replayed", *([f"what if {said}{asked}"] if said else [])]
+    return ["as logged", "replayed", *([f"what if {changed}{asked}"] if changed else [])]
 
 
 def rows(made_of: Counterfactual) -> list[list[str]]:
     """Label and one cell per EKF2: as logged, as replayed, and with the changes."""
     found = made_of.whatif
     every = [found.logged, found.replayed, *(found.whatif[:1] if made_of.changes else ())]
-    made = []
-    for axis in HORIZONTAL:
-        of = [summary.axes[axis] for summary in every]
-        made.append([f"{axis}: mean NIS", *(number_words(a.nis_mean) for a in of)])
-        made.append(
-            ["    consistent is", *(f"{a.nis_band[0]:.2f} to {a.nis_band[1]:.2f}" for a in of)]
-        )
-        made.append(["    std ν (m)", *(f"{a.innovation_std_m:.3f}" for a in of)])
-        made.append(["    σ_p (m)", *(_number(a.sigma_p_median_m, 3) for a in of)])
-        made.append(
-            ["    RMSE to truth (m)", *(_number(a.position_rmse_to_truth_m, 3) for a in of)]
-        )
-    made.append(["samples", *(f"{s.samples}" for s in every)])
-    made.append(["rejected", *(f"{s.rejected_share:.1%}" for s in every)])
-    made.append(
-        ["longest without fusion (s)", *(_number(s.longest_without_fusion_s, 2) for s in every)]
-    )
-    made.append(["position resets", *(f"{s.resets}" for s in every)])
-    return made
+    made = [
+        [label.format(axis), *(cell(summary, axis) for summary in every)]
+        for axis in HORIZONTAL
+        for label, cell in AXIS_ROWS
+    ]
+    return made + [[label, *map(cell, every)] for label, cell in ROWS]
 
 
 def sweep_heads(made_of: Counterfactual) -> list[str]:
     """Heads of the columns of :func:`sweep_rows`."""
-    unit = PARAMETERS[swept(made_of)].unit
     return [
-        f"{swept(made_of)}{f' ({unit})' if unit else ''}", "mean NIS N, E", "rejected",
-        "longest gap (s)", "resets", "σ_p N, E (m)", "RMSE to truth N, E (m)",
+        _named(swept(made_of)), "mean NIS N/E", "rejected", "longest gap (s)", "resets",
+        "σ_p N/E (m)", "RMSE to truth N/E (m)",
     ]  # fmt: skip
 
 
 def sweep_rows(made_of: Counterfactual) -> list[list[str]]:
     """One row per value of the sweep."""
     name = swept(made_of)
-    made = []
-    for summary in sweep_of(made_of):
-        axes = [summary.axes[axis] for axis in HORIZONTAL]
-        made.append(
-            [
-                number_words(summary.changed[name]),
-                ", ".join(number_words(a.nis_mean) for a in axes),
-                f"{summary.rejected_share:.1%}",
-                _number(summary.longest_without_fusion_s, 2),
-                f"{summary.resets}",
-                ", ".join(_number(a.sigma_p_median_m, 3) for a in axes),
-                ", ".join(_number(a.position_rmse_to_truth_m, 3) for a in axes),
-            ]
-        )
-    return made
+    nis, _, _, sigma, rmse = (cell for _, cell in AXIS_ROWS)
+    return [
+        [
+            number_words(summary.changed[name]),
+            "/".join(nis(summary, axis) for axis in HORIZONTAL),
+            *(cell(summary) for _, cell in ROWS[1:]),
+            *("/".join(cell(summary, axis) for axis in HORIZONTAL) for cell in (sigma, rmse)),
+        ]
+        for summary in sweep_of(made_of)
+    ]
 
 
 def sweep_of(made_of: Counterfactual) -> tuple[Summary, ...]:
@@ -136,75 +139,90 @@ def reading(made_of: Counterfactual) -> list[str]:
     return [*lines, *(f"{note}." for note in made_of.whatif.notes)]
 
 
-def _number(value: float | Unavailable, digits: int) -> str:
+def _number(value: float | Unavailable, digits: int = 3) -> str:
     return "n/a" if isinstance(value, Unavailable) else f"{value:.{digits}f}"
 
 
 def draw(document: WhatIfDocument) -> Iterator[Page]:
     """Draw one page, and another where a sweep needs it."""
-    made_of = document.made_of
-    log, found = made_of.flight.log, made_of.whatif
     page = Page(
         "EKF2 with other parameters",
         "EKF2 replayed from the log by px4fuse's model of it, which is not PX4's own code: as "
         "flown, and with other parameters. All columns are judged over the same times.",
     )
-    for text in (
-        f"{log.name}, {log.firmware}, {log.duration_s:.1f} s of data",
-        document.command,
-        "Judged: " + ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in found.judged),
-        f"Replay against log: {agreement_words(found.agreement)}.",
-    ):
-        page.write(text, size=7.5, colour=MUTED, above=-2.0)
-    page.table(["", *heads(made_of)], rows(made_of), size=SIZE)
+    page.labelled("Command", document.command)
+    _tables(page, document.made_of)
+    if sweep_of(document.made_of):
+        _panels(page, document.made_of)
+    yield page
+
+
+def print_what_if(console: Console, made_of: Counterfactual) -> None:
+    """Print EKF2 as logged, as replayed and with other parameters, and a sweep where there is one.
+
+    Parameters
+    ----------
+    console : Console
+        Standard output.
+    made_of : Counterfactual
+    """
+    page = Page()
+    if AISLE in made_of.why:
+        write_why(page, made_of.why[AISLE])
+    _tables(page, made_of)
+    page.write("Replays are of px4fuse's model of EKF2, not of PX4's own code.")
+    show(console, page.blocks)
+
+
+def _tables(page: Page, made_of: Counterfactual) -> None:
+    """All that is said in words and numbers."""
+    log, found = made_of.flight.log, made_of.whatif
+    page.labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
+    spans = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in found.judged)
+    page.labelled("Judged", spans)
+    page.labelled("Replay", agreement_words(found.agreement))
+    head = ["", *heads(made_of)]
+    page.table(head, rows(made_of), right=range(1, len(head)), size=SIZE)
+    if sweep_of(made_of):
+        page.table(sweep_heads(made_of), sweep_rows(made_of), right=range(1, 7), size=SIZE)
     for line in reading(made_of):
         page.write(line, size=8.5, above=2.0)
-    if sweep_of(made_of):
-        _panels(page, made_of)
-        page.table(sweep_heads(made_of), sweep_rows(made_of), size=SIZE)
-    yield page
 
 
 def _panels(page: Page, made_of: Counterfactual) -> None:
     """Mean NIS, share rejected, and error or σ_p over the values."""
     summaries, name = sweep_of(made_of), swept(made_of)
     values = [summary.changed[name] for summary in summaries]
-    panels: list[tuple[str, Callable[[Summary, str], float | Unavailable]]] = [
-        ("mean NIS", lambda s, axis: s.axes[axis].nis_mean),
-        ("rejected (%)", lambda s, _: 100.0 * s.rejected_share),
-    ]
+    panels: dict[str, Of] = {
+        "mean NIS": lambda s, axis: s.axes[axis].nis_mean,
+        "rejected (%)": lambda s, _: 100.0 * s.rejected_share,
+        "σ_p (m)": lambda s, axis: s.axes[axis].sigma_p_median_m,
+    }
     if isinstance(summaries[0].position_rmse_to_truth_m, float):
-        panels.append(
-            ("position RMSE to truth (m)", lambda s, axis: s.axes[axis].position_rmse_to_truth_m)
-        )
-    else:
-        panels.append(("σ_p (m)", lambda s, axis: s.axes[axis].sigma_p_median_m))
-    flown = made_of.whatif.replayed
-    for title, of in panels:
+        del panels["σ_p (m)"]
+        panels["position RMSE to truth (m)"] = lambda s, ax: s.axes[ax].position_rmse_to_truth_m
+    for title, of in panels.items():
         axes = page.panel(capital(title), "", PANEL_POINTS)
-        _panel(axes, values, [[of(s, axis) for s in summaries] for axis in HORIZONTAL])
+        _curves(axes, values, [[of(s, axis) for s in summaries] for axis in HORIZONTAL])
         if title == "rejected (%)":
             axes.set_ylim(0.0, max(1.0, axes.get_ylim()[1]))
         elif axes.dataLim.ymax > WIDE * axes.dataLim.ymin:
-            axes.set_yscale("log")
-            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-            axes.yaxis.set_major_formatter("{x:g}")
-            axes.yaxis.set_minor_locator(NullLocator())
+            log_ticks(axes)
         if title == "mean NIS":
-            axes.axhspan(*flown.axes["north"].nis_band, color=EKF2_BAND, lw=0)
+            band = made_of.whatif.replayed.axes["north"].nis_band
+            axes.axhspan(*band, color=EKF2_BAND, lw=0)
             axes.legend(loc="upper right", ncols=2)
-        if title == panels[-1][0]:
-            axes.set_xlabel(f"{name} ({PARAMETERS[name].unit})" if PARAMETERS[name].unit else name)
+    axes.set_xlabel(_named(name))
 
 
-def _panel(axes: Axes, values: list[float], lines: list[list[float | Unavailable]]) -> None:
-    styles = (OURS_LINE, EKF2_LINE)
-    for axis, line, style in zip(HORIZONTAL, lines, styles, strict=True):
+def _curves(axes: Axes, values: list[float], lines: list[list[float | Unavailable]]) -> None:
+    """A line for north and one for east, over the values of a parameter."""
+    for axis, line, style in zip(HORIZONTAL, lines, (OURS_LINE, EKF2_LINE), strict=True):
         known = [(x, y) for x, y in zip(values, line, strict=True) if isinstance(y, float)]
-        axes.plot([x for x, _ in known], [y for _, y in known], marker=".", label=axis, **style)
+        axes.plot(*zip(*known, strict=True), marker=".", label=axis, **style)
     if min(values) > 0.0:
         axes.set_xscale("log")
     ticks = values[:: math.ceil(len(values) / MAX_TICKS)]
     axes.set_xticks(ticks, [number_words(value) for value in ticks])
-    axes.xaxis.set_minor_locator(NullLocator())
+    axes.minorticks_off()
     axes.margins(x=0.02)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+import pandas as pd
 
+from px4fuse.arrays import Array
 from px4fuse.ekf2.replay import Agreement, Ekf2Replay
 from px4fuse.ekf2.walk import Why
 from px4fuse.filter.signals import AISLE
@@ -17,16 +17,10 @@ from px4fuse.plain import capital
 from px4fuse.report import marks
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page
-from px4fuse.report.style import (
-    EKF2,
-    EKF2_BAND,
-    MUTED,
-    OURS,
-    OURS_BAND,
-    OURS_LINE,
-    TIME_LABEL,
-    thin,
-)
+from px4fuse.report.style import EKF2, EKF2_BAND, LINES, MUTED, OURS, OURS_BAND, curve
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 TITLE = "Why EKF2 differs"
 LEAD = (
@@ -38,6 +32,7 @@ ROW_POINTS = 12.0
 AROUND = 42.0  # points above and below the bars
 LABELS, GAP = 0.25, 0.04  # of the width: names of the steps, and between both
 TIME_POINTS = 105.0
+AWAY = {"color": "white", "hatch": "////"}  # bars of steps that lead away from EKF2
 
 
 def draw(document: Document) -> Iterator[Page]:
@@ -62,10 +57,18 @@ def _walks(document: Document) -> Mapping[str, Why | Unavailable]:
     return {AISLE: found[AISLE]} if AISLE in found else found
 
 
+def write_why(page: Page, why: Why | Unavailable) -> None:
+    """Write in one sentence why EKF2 differs."""
+    if isinstance(why, Unavailable):
+        page.labelled("Why", f"EKF2 differs is not known: {why.reason}.")
+    else:
+        page.labelled("Why", why.sentences[0])
+
+
 def nothing_concluded(document: Document) -> str:
     """Why there is no such page, in a line; empty where there is one, or no EKF2 to explain."""
     found = list(_walks(document).values())
-    if isinstance(document.comparison.flight.ekf2, Unavailable) or any(
+    if isinstance(document.analysis.flight.ekf2, Unavailable) or any(
         isinstance(why, Why) for why in found
     ):
         return ""
@@ -99,6 +102,8 @@ def agreement_words(agreement: Agreement) -> str:
 
 
 def _axis(page: Page, name: str, why: Why, document: Document) -> None:
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
     spans = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in why.spans_s)
     page.heading(f"{name}, {spans}", 9.5, above=10.0)
     for sentence in why.sentences:
@@ -107,66 +112,50 @@ def _axis(page: Page, name: str, why: Why, document: Document) -> None:
     height = ROW_POINTS * (len(names) + 2) + AROUND
     figure = Figure(figsize=(page.width / 72.0, height / 72.0))
     share = (0.985 - LABELS - GAP) / 2.0
-    for column, (what, unit, total, steps, left) in enumerate(
-        (
-            (
-                "position",
-                "m",
-                why.position_mean_square_m2,
-                [step.position_mean_square_m2 for step in why.steps],
-                why.position_left_mean_square_m2,
-            ),
-            (
-                "velocity",
-                "m/s",
-                why.velocity_mean_square_m2_s2,
-                [step.velocity_mean_square_m2_s2 for step in why.steps],
-                why.velocity_left_mean_square_m2_s2,
-            ),
-        )
+    for column, (what, unit, power) in enumerate(
+        (("position", "m", "m2"), ("velocity", "m/s", "m2_s2"))
     ):
         start = LABELS + column * (share + GAP)
         axes = figure.add_axes((start, 26.0 / height, share, 1.0 - AROUND / height))
+        total = getattr(why, f"{what}_mean_square_{power}")
+        steps = np.array([getattr(step, f"{what}_mean_square_{power}") for step in why.steps])
+        left = getattr(why, f"{what}_left_mean_square_{power}")
+        _waterfall(axes, names, 100.0 * steps / total, 100.0 * left / total)
         axes.set_title(f"{what}, {np.sqrt(total):.3f} {unit} rms")
-        _waterfall(axes, names, total, steps, left)
         if column:
             axes.set_yticklabels([])
     page.drawing(figure, f"What each step brings, in per cent: {', '.join(names)}")
-    axes = page.panel(
-        "Position apart (m): ours - EKF2 (dark), and what the model leaves of it (light)",
-        _time_words(why), TIME_POINTS, above=12.0 if document.events.modes else 4.0,
-    )  # fmt: skip
-    _over_time(axes, why)
-    marks.draw(axes, document, axis=name, strip=True)
-    axes.set_xlabel(TIME_LABEL)
+    title = "Position apart (m): ours - EKF2 (dark), and what the model leaves of it (light)"
+    axes = marks.panel(page, document, title, _time_words(why), TIME_POINTS, axis=name, strip=True)
+    apart, left_over = (pd.Series(v, why.times_s) for v in (why.apart_m, why.left_m))
+    for start, end in why.spans_s:
+        curve(axes, apart.loc[start:end], **LINES["ours"])
+        curve(axes, left_over.loc[start:end], color=EKF2, lw=0.8)
+    if why.coast is not None:
+        end = why.coast.start_s + why.coast.duration_s
+        axes.axvspan(why.coast.start_s, end, color=EKF2_BAND, lw=0, zorder=0.5)
 
 
-def _waterfall(axes: Axes, names: list[str], total: float, steps: list[float], left: float) -> None:
+def _waterfall(axes: Axes, names: list[str], shares: Array, left: float) -> None:
     """Bars from the whole difference down to what is left, in per cent of the whole."""
-    shares = 100.0 * np.array(steps) / total
     before = 100.0 - np.concatenate([[0.0], np.cumsum(shares)])
-    rows = len(names) + 2
-    style: dict[str, Any] = {"height": 0.7, "edgecolor": OURS, "lw": 0.6}
-    axes.barh(0, 100.0, color=OURS, **style)
+    rows, farthest = len(names) + 2, max(100.0, float(before.max()))
+    style: dict[str, Any] = {"height": 0.7, "edgecolor": OURS, "lw": 0.6, "color": OURS}
+    axes.barh(0, 100.0, **style)
     for row, (share, start) in enumerate(zip(shares, before, strict=False), start=1):
-        axes.barh(row, -share, left=start, color=OURS_BAND if share >= 0.0 else "white",
-                  hatch="" if share >= 0.0 else "////", **style)  # fmt: skip
+        style |= {"color": OURS_BAND, "hatch": ""} if share >= 0.0 else AWAY
+        axes.barh(row, -share, left=start, **style)
         axes.plot([start] * 2, [row - 1.35, row + 0.35], color=MUTED, lw=0.5)
-    axes.barh(rows - 1, 100.0 * left / total, color=EKF2_BAND, height=0.7, edgecolor=EKF2, lw=0.6)
-    farthest = max(100.0, float(before.max()))
-    numbers = [100.0, *shares, 100.0 * left / total]
-    for row, number in enumerate(numbers):
-        axes.text(1.03 * farthest, row, _percent(number), va="center", size=6.5)
+    style |= {"color": EKF2_BAND, "edgecolor": EKF2, "hatch": ""}
+    axes.barh(rows - 1, left, **style)
+    for row, number in enumerate((100.0, *shares, left)):
+        digits = 1 if 0.05 <= abs(number) < 9.95 else 0
+        axes.text(1.03 * farthest, row, f"{number:z.{digits}f} %", va="center", size=6.5)
     axes.set_yticks(range(rows), ["ours to EKF2, all of it", *names, "left unexplained"])
     axes.set_ylim(rows - 0.4, -0.6)
     axes.set_xlim(min(0.0, float(before.min())), 1.2 * farthest)
     axes.set_xlabel("% of the mean square")
     axes.grid(visible=False)
-
-
-def _percent(number: float) -> str:
-    small = abs(number) < 0.05
-    return "0 %" if small else f"{number:.1f} %" if abs(number) < 9.95 else f"{number:.0f} %"
 
 
 def _time_words(why: Why) -> str:
@@ -184,15 +173,3 @@ def _time_words(why: Why) -> str:
         f"{words}. EKF2's longest run of rejections, {start:.1f} s to {start + length:.1f} s, "
         "is shaded."
     )
-
-
-def _over_time(axes: Axes, why: Why) -> None:
-    """Where along the flight both differ, and what the model leaves of it."""
-    for start, end in why.spans_s:
-        inside = (why.times_s > start) & (why.times_s < end)
-        time = why.times_s[inside]
-        axes.plot(*thin(time, why.apart_m[inside]), **OURS_LINE)
-        axes.plot(*thin(time, why.left_m[inside]), color=EKF2, lw=0.8)
-    if why.coast is not None:
-        start = why.coast.start_s
-        axes.axvspan(start, start + why.coast.duration_s, color=EKF2_BAND, lw=0, zorder=0.5)

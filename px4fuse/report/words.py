@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import permutations
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from px4fuse.comparison.model import AgainstTruth, Comparison, Difference
+from px4fuse.comparison.model import AxisComparison, Comparison, Difference, FilterSummary
+from px4fuse.comparison.model import UnjudgedFilter as Unjudged
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
-from px4fuse.filter.consistency import Consistency
+from px4fuse.filter.consistency import Consistency, verdict_of
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings import Finding
@@ -18,11 +20,17 @@ from px4fuse.findings.variance import VARIANCE_FACTOR
 from px4fuse.flight import Alignment, Unavailable
 from px4fuse.plain import factor_words, number_words, p_words
 from px4fuse.recording import ClockMap
+from px4fuse.report.style import GOOD, MUTED, SEVERITY_COLOURS
+
+if TYPE_CHECKING:
+    from px4fuse.report.document import Document
+    from px4fuse.report.page import Cell
 
 # One update of EKF2 (EKF2_PREDICT_US)
 NEGLIGIBLE_OFFSET_S = 0.010
 # Below, "white" is wrong: of the eight verdicts of a flight one in a hundred by chance
 WHITE_P = 0.001
+RMSE = ("position_rmse_m", "velocity_rmse_m_s")
 
 
 def settings_words(settings: Settings) -> str:
@@ -43,37 +51,62 @@ def verdict_words(statement: Consistency | Unavailable) -> str:
     return f"{_side(statement)} {factor_words(_factor(statement))}×"
 
 
-@dataclass(frozen=True)
-class VerdictCells:
-    """Mean NIS, its band and the verdict, as every table shows them."""
+def filters(result: AxisComparison) -> dict[str, FilterSummary | Unjudged]:
+    """Both filters of an axis by the names that a reader sees; ours alone where EKF2 is missing."""
+    known = {"ours": result.filters["kf"]}
+    if not isinstance(result.ekf2_state, Unavailable):
+        known["EKF2"] = result.filters["ekf2"]
+    return known
 
-    nis: str
-    band: str
-    words: str
 
-
-def statement_cells(statement: Consistency | Unavailable) -> VerdictCells:
-    """A verdict and its numbers, empty where there is none."""
-    words = verdict_words(statement)
-    if isinstance(statement, Unavailable):
-        return VerdictCells("", "", words)
+def band_words(statement: Consistency) -> str:
+    """The 95 % band of the mean NIS."""
     low, high = statement.nis_band
-    return VerdictCells(number_words(statement.nis_mean), f"{low:.2f} – {high:.2f}", words)
+    return f"{low:.2f} – {high:.2f}"
 
 
-def error_cells(truth: AgainstTruth | Unavailable) -> tuple[str, str]:
-    """RMSE of position (m) and velocity (m/s) to the truth, empty where there is none."""
-    if isinstance(truth, Unavailable):
-        return "", ""
-    velocity = truth.velocity_rmse_m_s
-    return f"{truth.position_rmse_m:.3f}", "" if velocity is None else f"{velocity:.3f}"
+VERDICT_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "innovation\nvariance")
 
 
-def difference_cells(difference: Difference | Unavailable) -> tuple[str, str]:
-    """RMSE of position (m) and velocity (m/s) of ours against EKF2, empty where there is none."""
-    if isinstance(difference, Unavailable):
-        return "", ""
-    return f"{difference.position_rmse_m:.3f}", f"{difference.velocity_rmse_m_s:.3f}"
+def verdict_rows(
+    axes: Iterable[AxisComparison],
+    more: Callable[[AxisComparison, str, FilterSummary | Unjudged], Sequence[str]],
+) -> list[list[Cell]]:
+    """A row for each axis and filter: what :data:`VERDICT_HEAD` says, and more cells."""
+    rows: list[list[Cell]] = []
+    for result in axes:
+        for name, one in filters(result).items():
+            label = result.axis.name if name == "ours" else ""
+            nis, colour = ("", ""), MUTED
+            if isinstance(one, Consistency):
+                nis = (number_words(one.nis_mean), band_words(one))
+                colour = GOOD if one.verdict == "consistent" else SEVERITY_COLOURS["warning"]
+            rows.append([label, name, *nis, (verdict_words(one), colour), *more(result, name, one)])
+    return rows
+
+
+def error_rows(document: Document) -> tuple[list[str], list[list[Cell]]]:
+    """Head and rows of verdicts and errors, the main axis first.
+
+    Between both filters, and between each and the truth, where the flight has these.
+    """
+    axes = (document.analysis.main, *document.other_axes)
+    has_ekf2 = any(isinstance(result.difference, Difference) for result in axes)
+
+    def more(result: AxisComparison, name: str, one: FilterSummary | Unjudged) -> list[str]:
+        found: list[Any] = [result.difference if name == "ours" else None] if has_ekf2 else []
+        found += [one.truth] if document.truth_known else []
+        return [_metres(part, field) for part in found for field in RMSE]
+
+    head = [*VERDICT_HEAD, *(["apart\n(m)", "\n(m/s)"] if has_ekf2 else [])]
+    head += ["to truth\n(m)", "\n(m/s)"] if document.truth_known else []
+    return head, verdict_rows(axes, more)
+
+
+def _metres(part: object, field: str) -> str:
+    """A root mean square of three digits; empty where there is none."""
+    value = getattr(part, field, None)
+    return "" if value is None else f"{value:.3f}"
 
 
 def _side(statement: Consistency) -> str:
@@ -93,7 +126,7 @@ def verdict_notes(comparison: Comparison) -> list[str]:
     stated = [
         (result.axis.name, owner, statement)
         for result in comparison.axes.values()
-        for owner, statement in (("ours", result.filters["kf"]), ("EKF2", result.filters["ekf2"]))
+        for owner, statement in filters(result).items()
         if isinstance(statement, Consistency)
     ]
     notes = []
@@ -130,28 +163,19 @@ def verdict_notes(comparison: Comparison) -> list[str]:
 
 def _same_nis(stated: Sequence[tuple[str, str, Consistency]]) -> Iterator[str]:
     """Two filters on one axis of which only the one with more samples is called wrong."""
-    for axis, owner, wrong in stated:
-        for other, fine in ((o, s) for a, o, s in stated if a == axis):
-            low, high = wrong.nis_band
-            if wrong.verdict == "consistent" or fine.verdict != "consistent":
-                continue
-            same_side = max(wrong.nis_mean, fine.nis_mean) < low or (
-                min(wrong.nis_mean, fine.nis_mean) > high
+    for (axis, owner, wrong), (on, other, fine) in permutations(stated, 2):
+        if on != axis or wrong.verdict == "consistent" or fine.verdict != "consistent":
+            continue
+        # the same mean in the wider band of the other
+        outside = verdict_of(fine.nis_mean, wrong.nis_band) == wrong.verdict
+        inside = verdict_of(wrong.nis_mean, fine.nis_band) == "consistent"
+        if outside and inside and fine.count < wrong.count:
+            bands = " and ".join("{:.2f}-{:.2f}".format(*one.nis_band) for one in (wrong, fine))
+            yield (
+                f"Along {axis} only {owner} is called {_side(wrong)} although {other} has "
+                f"nearly the same mean NIS ({wrong.nis_mean:.2f}, {fine.nis_mean:.2f}): with "
+                f"{wrong.count} samples against {fine.count} the band is narrower ({bands})."
             )
-            wide_low, wide_high = fine.nis_band
-            if same_side and fine.count < wrong.count and wide_low < wrong.nis_mean < wide_high:
-                bands = " and ".join("{:.2f}-{:.2f}".format(*s.nis_band) for s in (wrong, fine))
-                yield (
-                    f"Along {axis} only {owner} is called {_side(wrong)} although {other} has "
-                    f"nearly the same mean NIS ({wrong.nis_mean:.2f}, {fine.nis_mean:.2f}): with "
-                    f"{wrong.count} samples against {fine.count} the band is narrower ({bands})."
-                )
-
-
-def finding_words(finding: Finding) -> str:
-    """What a finding says, with when it shows where the message does not say that."""
-    said = finding.says_when or not finding.when
-    return finding.message if said else f"{finding.message} At {finding.when}."
 
 
 def consequences_words(followers: Sequence[Finding]) -> str:
@@ -171,123 +195,95 @@ def clock_words(clock: ClockMap) -> str:
     )
 
 
-def alignment_words(alignment: Alignment) -> list[tuple[str, str]]:
+def alignment_words(alignment: Alignment) -> dict[str, str]:
     """How a position file was placed into the flight: labels and sentences."""
-    yaw_sigma, clock_sigma = alignment.yaw_sigma_deg, alignment.clock_offset_sigma_s
     north, east, down = alignment.origin_m
-    lines = [
-        ("frame", f"{alignment.frame} ({alignment.frame_reason})"),
-        (
-            "yaw",
-            f"{alignment.yaw_deg:.2f}°"
-            + (f" ± {yaw_sigma:.2f}°" if yaw_sigma is not None else "")
-            + f" ({alignment.yaw_reason})",
-        ),
-        ("origin", f"north {north:.3f} m, east {east:.3f} m, down {down:.3f} m"),
-        (
-            "clock",
-            f"{alignment.clock_offset_s:+.3f} s"
-            + (f" ± {clock_sigma:.3f} s" if clock_sigma is not None else "")
-            + f" to the boot clock ({alignment.clock_reason})",
-        ),
-    ]
+    yaw = "" if alignment.yaw_sigma_deg is None else f" ± {alignment.yaw_sigma_deg:.2f}°"
+    sigma, residual = alignment.clock_offset_sigma_s, alignment.residual_rms_m
+    clock = "" if sigma is None else f" ± {sigma:.3f} s"
+    lines = {
+        "frame": f"{alignment.frame} ({alignment.frame_reason})",
+        "yaw": f"{alignment.yaw_deg:.2f}°{yaw} ({alignment.yaw_reason})",
+        "origin": f"north {north:.3f} m, east {east:.3f} m, down {down:.3f} m",
+        "clock": f"{alignment.clock_offset_s:+.3f} s{clock} to the boot clock "
+        f"({alignment.clock_reason})",
+    }
     if alignment.correlation is not None:
-        residual = alignment.residual_rms_m
-        lines.append(
-            (
-                "match",
-                f"correlation {alignment.correlation:.4f} with {alignment.reference}"
-                + (f", {residual:.3f} m RMS per axis" if residual is not None else ""),
-            )
-        )
+        apart = "" if residual is None else f", {residual:.3f} m RMS per axis"
+        like = f"correlation {alignment.correlation:.4f} with {alignment.reference}"
+        lines["match"] = like + apart
     return lines
 
 
 def tuning_advice(
     comparison: Comparison, tuned: Mapping[str, AxisTuning | Unavailable]
-) -> list[str]:
+) -> dict[str, str]:
     """What follows from tuning: the command to run again, PX4's parameter, and cautions.
 
-    Lines whose first nine columns are a label; ``px4fuse compare LOG`` as in
-    :mod:`px4fuse.report.commands`.
+    Labels and sentences, with ``px4fuse compare LOG`` as in :mod:`px4fuse.report.commands`.
     """
-    name = next(
-        (n for n in (HORIZONTAL, "aisle", *tuned) if isinstance(tuned.get(n), AxisTuning)), None
-    )
-    if name is None:
-        return []
-    found = tuned[name]
-    assert isinstance(found, AxisTuning)
-    lines = []
-    drifts = comparison.source.origin.may_drift
+    names = (HORIZONTAL, "aisle", *tuned)
+    name = next((name for name in names if isinstance(tuned.get(name), AxisTuning)), "")
+    found = tuned.get(name)
+    if not isinstance(found, AxisTuning):
+        return {}
+    advice, sigma_a, sigma_z = {}, found.filter_sigma_a, found.sigma_z
+    drifts, log = comparison.source.origin.may_drift, comparison.flight.log
     if drifts:
-        noise = found.sigma_z.value or found.sigma_z.high
-        lines.append(
-            "Drift    the source may drift: these noises make a filter follow it"
+        noise = sigma_z.value or sigma_z.high
+        advice["Drift"] = (
+            "the source may drift: these noises make a filter follow it"
             + ("" if noise is None else f", {noise:.2g} m is how it scatters from second to second")
             + ", not how wrong it is. Take no SIGMA_Z and no EKF2_EVP_NOISE below what truth or a "
             "loop shows."
         )
     options = [
-        f"{option} {noise.value:.3g}"
-        for option, noise in (("--sigma-a", found.filter_sigma_a), ("--sigma-z", found.sigma_z))
+        f" {option} {noise.value:.3g}"
+        for option, noise in (("--sigma-a", sigma_a), ("--sigma-z", sigma_z))
         if noise.value is not None and not drifts
     ]
     if options:
-        typed = f"px4fuse compare LOG {' '.join(options)}"
-        lines.append(f"Re-run   with the noises of {name}: {typed}")
-    now = comparison.flight.log.parameters.get("EKF2_EVP_NOISE")
-    if found.sigma_z.value is None and found.sigma_z.low is not None:
-        lines.append(
-            f"SIGMA_Z  is at least {found.sigma_z.low:.2g} m: is this a position source at all?"
+        typed = f"px4fuse compare LOG{''.join(options)}"
+        advice["Re-run"] = f"with the noises of {name}: {typed}"
+    if sigma_z.value is None and sigma_z.low is not None:
+        advice["SIGMA_Z"] = f"is at least {sigma_z.low:.2g} m: is this a position source at all?"
+    elif sigma_z.value is None:
+        bound = "" if sigma_z.high is None else f" (at most {sigma_z.high:.2g} m)"
+        advice["SIGMA_Z"] = (
+            f"is below what this logging rate can show{bound}: between samples the process noise "
+            "hides it. Log the source at a higher rate."
         )
-    elif found.sigma_z.value is None:
-        bound = found.sigma_z.high
-        lines.append(
-            "SIGMA_Z  is below what this logging rate can show"
-            + (f" (at most {bound:.2g} m)" if bound is not None else "")
-            + ": between samples the process noise hides it. Log the source at a higher rate."
-        )
-    elif comparison.flight.log.autopilot == "PX4" and not drifts:
-        lines.append(
-            f"PX4      EKF2_EVP_NOISE {found.sigma_z.value:.3g}"
-            + (f" (now {now:g})" if now is not None else "")
-        )
-    needed = found.filter_sigma_a
-    if needed.value is None:
-        lines.append(
-            "SIGMA_A  is not determined by this flight: too little motion, or too short."
-            if needed.low is None
-            else f"SIGMA_A  is at least {needed.low:.2g} m/s²: the acceleration is wrong."
+    elif log.autopilot == "PX4" and not drifts:
+        now = log.parameters.get("EKF2_EVP_NOISE")
+        advice["PX4"] = f"EKF2_EVP_NOISE {sigma_z.value:.3g}"
+        advice["PX4"] += "" if now is None else f" (now {now:g})"
+    if sigma_a.value is None:
+        advice["SIGMA_A"] = (
+            "is not determined by this flight: too little motion, or too short."
+            if sigma_a.low is None
+            else f"is at least {sigma_a.low:.2g} m/s²: the acceleration is wrong."
         )
     elif found.biases_fitted:
-        lines.append(f"SIGMA_A  {noise_and_bias_words(found)}")
+        alone = found.sigma_a.value or found.sigma_a.high
+        bound = "" if found.sigma_a.value is not None else "at most "
+        advice["SIGMA_A"] = (
+            "covers noise, bias and tilt together; this flight does not tell them apart"
+            if alone is None
+            else f"of the acceleration alone is {bound}{alone:.2g} m/s²; the filter has no state "
+            f"for the accelerometer's bias and tilt, and needs {sigma_a.value:.2g} m/s² to cover "
+            "them"
+        )
     if len(found.outlier_time_s):
-        lines.append(
-            f"Outliers {len(found.outlier_time_s)} of {found.count} measurements ({name}), the "
-            f"first at {found.outlier_time_s[0]:.1f} s; they do not enter the noises"
+        advice["Outliers"] = (
+            f"{len(found.outlier_time_s)} of {found.count} measurements ({name}), the first at "
+            f"{found.outlier_time_s[0]:.1f} s; they do not enter the noises"
         )
-    held = found.held_out
-    if not isinstance(held, Unavailable) and held.gain_nats <= 0.0:
-        lines.append(
-            "Held out the settings found on the first half do no better on the second than the "
-            "chosen ones: these are as good as any"
+    if not isinstance(found.held_out, Unavailable) and found.held_out.gain_nats <= 0.0:
+        advice["Held out"] = (
+            "the settings found on the first half do no better on the second than the chosen "
+            "ones: these are as good as any"
         )
-    return lines
-
-
-def noise_and_bias_words(found: AxisTuning) -> str:
-    """Why the filter's SIGMA_A is larger than the noise."""
-    noise = found.sigma_a
-    value = noise.value if noise.value is not None else noise.high
-    if value is None:
-        return "covers noise, bias and tilt together; this flight does not tell them apart"
-    bound = "" if noise.value is not None else "at most "
-    return (
-        f"of the acceleration alone is {bound}{value:.2g} m/s²; the filter has no state for the "
-        f"accelerometer's bias and tilt, and needs {found.filter_sigma_a.value:.2g} m/s² to cover "
-        "them"
-    )
+    return advice
 
 
 def stamps_wrong(comparison: Comparison, clock: ClockOffset) -> bool:
@@ -307,47 +303,42 @@ def delay_wrong(comparison: Comparison, clock: ClockOffset) -> bool:
     return not -(asked[1] + margin) <= delay * 1e-3 <= -(asked[0] - margin)
 
 
-def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> list[str]:
-    """What the clock estimate says, and what follows from it: lines as of tuning_advice."""
+def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> dict[str, str]:
+    """What the clock estimate says, and what follows from it, as in :func:`tuning_advice`."""
     if isinstance(clock, Unavailable):
-        return [f"Offset   not determinable: {clock.reason}. {clock.remedy}"]
-    offset, (low, high) = clock.offset_s, clock.interval_s
-    log = comparison.flight.log
-    lines = []
+        return {"Offset": f"not determinable: {clock.reason}. {clock.remedy}"}
     if not clock.determinable:
-        lines.append(f"Offset   not determinable: {clock.reason}.")
-        lines.append("Next     fly passes of 5 m or more with clear starts and stops.")
-        return lines
-    lines.append(
-        f"Offset   {offset:+.3f} s, 95 % {low:+.3f} s to {high:+.3f} s, to be "
-        "added to the stamps of the source"
-    )
-    side = "late" if offset < 0.0 else "early"
-    if not stamps_wrong(comparison, clock):
-        lines.append("Reading  the stamps are right as far as this flight can tell")
-    else:
-        lines.append(f"Reading  the stamps are {side} by {abs(offset):.3f} s")
+        return {
+            "Offset": f"not determinable: {clock.reason}.",
+            "Next": "fly passes of 5 m or more with clear starts and stops.",
+        }
+    offset, (low, high) = clock.offset_s, clock.interval_s
+    advice = {
+        "Offset": f"{offset:+.3f} s, 95 % {low:+.3f} s to {high:+.3f} s, to be added to the stamps "
+        "of the source",
+        "Reading": "the stamps are right as far as this flight can tell",
+    }
+    if stamps_wrong(comparison, clock):
+        side = "late" if offset < 0.0 else "early"
+        advice["Reading"] = f"the stamps are {side} by {abs(offset):.3f} s"
         typed = typed_offset_s(comparison, clock)
-        lines.append(f"Re-run   px4fuse compare LOG --clock-offset {typed:.3f}")
-    delay = log.parameters.get("EKF2_EV_DELAY")
-    if delay is not None:
-        if not delay_wrong(comparison, clock):
-            lines.append(f"PX4      EKF2_EV_DELAY {delay:g} ms fits")
-        elif offset > 0.0 and delay <= 0.0:
-            lines.append(
-                "PX4      EKF2_EV_DELAY is 0 ms and cannot be negative: correct the sender's clock"
-            )
-        else:
-            lines.append(
-                f"PX4      EKF2_EV_DELAY is {delay:g} ms, the data ask for "
-                f"{max(-offset * 1e3, 0.0):.0f} ms ({max(-high * 1e3, 0.0):.0f} to "
-                f"{max(-low * 1e3, 0.0):.0f}); set it, or correct the sender's clock"
-            )
+        advice["Re-run"] = f"px4fuse compare LOG --clock-offset {typed:.3f}"
+    delay = comparison.flight.log.parameters.get("EKF2_EV_DELAY")
+    if delay is not None and not delay_wrong(comparison, clock):
+        advice["PX4"] = f"EKF2_EV_DELAY {delay:g} ms fits"
+    elif delay is not None and offset > 0.0 and delay <= 0.0:
+        advice["PX4"] = "EKF2_EV_DELAY is 0 ms and cannot be negative: correct the sender's clock"
+    elif delay is not None:
+        asked, least, most = (max(-s * 1e3, 0.0) for s in (offset, high, low))
+        advice["PX4"] = (
+            f"EKF2_EV_DELAY is {delay:g} ms, the data ask for {asked:.0f} ms ({least:.0f} to "
+            f"{most:.0f}); set it, or correct the sender's clock"
+        )
     if clock.change_p is not None and clock.change_p < CHANGE_P:
         parts = ", ".join(f"{p.offset_s:+.2f} s from {p.start_s:.0f} s" for p in clock.parts)
-        lines.append(
-            f"Changes  the offset is not the same throughout ({p_words(clock.change_p)}): {parts}"
+        advice["Changes"] = (
+            f"the offset is not the same throughout ({p_words(clock.change_p)}): {parts}"
         )
     if clock.drift_ppm is not None and clock.drift_sigma_ppm is not None:
-        lines.append(f"Drift    {clock.drift_ppm:+.0f} ± {1.96 * clock.drift_sigma_ppm:.0f} ppm")
-    return lines
+        advice["Drift"] = f"{clock.drift_ppm:+.0f} ± {1.96 * clock.drift_sigma_ppm:.0f} ppm"
+    return advice

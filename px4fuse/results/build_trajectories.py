@@ -12,7 +12,7 @@ from px4fuse.results.contract import LOOP, EvaluationResults, GraphResults, Loop
 from px4fuse.results.model import Student
 from px4fuse.results.parts import provenance, schema_of
 from px4fuse.trajectory.evaluation import Evaluation
-from px4fuse.trajectory.graph.analysis import Graph, SolvedGraph
+from px4fuse.trajectory.graph.analysis import SolvedGraph
 
 
 def loop_results(
@@ -42,15 +42,6 @@ def evaluation_results(score: Evaluation, command: str) -> EvaluationResults:
     )
 
 
-def graph_results(name: str, solved: SolvedGraph, command: str) -> GraphResults:
+def graph_results(solved: SolvedGraph, command: str) -> GraphResults:
     """What ``px4fuse loop`` found about a pose graph; edges by the vertex numbers of the file."""
-    graph = Graph(
-        name=name,
-        dimension=solved.graph.dimension,
-        poses=len(solved.graph),
-        edges=len(solved.graph.first),
-        initialised=solved.graph.initialised,
-        gates=solved.gates,
-        solutions=written(solved.solutions),
-    )
-    return GraphResults(schema_of("px4fuse-graph"), graph, provenance(command))
+    return GraphResults(schema_of("px4fuse-graph"), written(solved), provenance(command))

@@ -127,17 +127,13 @@ class Trajectory(Shown):
 
     def track(self) -> Track:
         """What results say about it."""
+        own = ("name", "sha256", "size_bytes", "kind", "frame", "notes")
         return Track(
-            name=self.name,
-            sha256=self.sha256,
-            size_bytes=self.size_bytes,
-            kind=self.kind,
-            frame=self.frame,
+            **{name: getattr(self, name) for name in own},
             poses=len(self),
             start_s=float(self.time_s[0]),
             end_s=float(self.time_s[-1]),
             orientations=self.rotation is not None,
-            notes=self.notes,
         )
 
 

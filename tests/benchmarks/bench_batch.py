@@ -22,7 +22,8 @@ import psutil
 from px4fuse.fleet.engine import connected
 from px4fuse.fleet.job import Job, analyse
 from px4fuse.fleet.logs import find_logs
-from px4fuse.fleet.run import fleet_request, run
+from px4fuse.fleet.run import run
+from px4fuse.request import ComparisonRequest
 from px4fuse.simulation.flights import simulate, to_ulog
 from px4fuse.simulation.scenario import Scenario
 
@@ -38,7 +39,7 @@ def main(count: int, workers: int) -> None:
         for seed in range(count):
             flight = simulate(Scenario(passes=2, length_m=8.0, seed=seed))
             (folder / f"{seed:04d}.ulg").write_bytes(to_ulog(flight))
-        logs, request = find_logs([str(folder)]), fleet_request({})
+        logs, request = find_logs([str(folder)]), ComparisonRequest(log="LOG")
         version = metadata.version("px4fuse")
         jobs = [Job(log.address, request, False, 2 * 10**9, version) for log in logs]
         for job in jobs[:WARM]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -26,8 +26,19 @@ SOLUTIONS: Mapping[str, str] = {
 }
 
 
-class Graph(Record, frozen=True):
-    """A pose graph from a file, its closures and its solutions, as results have them."""
+class Graph(Record, frozen=True, kw_only=True):
+    """A pose graph from a file, its closures and its solutions.
+
+    Attributes
+    ----------
+    name : str
+    dimension, poses, edges : int
+    initialised : str
+        Where the poses come from.
+    gates : tuple of GateResult, or Unavailable
+        Of every edge that is no odometry.
+    solutions : mapping from name, as in :data:`SOLUTIONS`
+    """
 
     name: str
     dimension: Count
@@ -35,28 +46,25 @@ class Graph(Record, frozen=True):
     edges: Count
     initialised: str
     gates: tuple[GateResult, ...] | Unavailable
-    solutions: dict[str, GraphSolution]
+    solutions: Mapping[str, GraphSolution]
 
 
-@dataclass(frozen=True)
-class SolvedGraph:
-    """A pose graph and its solutions.
+class SolvedGraph(Graph, frozen=True, kw_only=True, eq=False):
+    """A pose graph with its solutions.
 
     Attributes
     ----------
     graph : PoseGraph
         With the poses of the plain solution.
-    gates : tuple of GateResult, or Unavailable
-        Of every edge that is no odometry.
-    solutions : mapping from name, as in :data:`SOLUTIONS`, to Solution
     """
 
-    graph: PoseGraph
-    gates: tuple[GateResult, ...] | Unavailable
+    written_as = Graph
     solutions: Mapping[str, Solution]
+    graph: PoseGraph
 
 
 def analyse_graph(
+    name: str,
     graph: PoseGraph,
     progress: Callable[[str], None] = lambda _: None,
     *,
@@ -68,6 +76,8 @@ def analyse_graph(
 
     Parameters
     ----------
+    name : str
+        What the graph is called.
     robust : bool, optional
         Whether to solve it robustly too; by default up to 1000 closures, since it takes minutes
         for more.
@@ -85,11 +95,18 @@ def analyse_graph(
         gates = tuple(gate(graph, np.flatnonzero(closures), alpha=GATE_ALPHA))
     except TrajectoryError as error:
         gates = Unavailable("gate", str(error), "It needs an odometry edge between all successors.")
-    count = np.count_nonzero(closures)
-    if robust is None:
-        robust = bool(count <= MANY_CLOSURES)
-    if robust and count > 1:
-        for name in ("dcs", "gnc"):
-            progress(f"solving: {SOLUTIONS[name]}")
-            solutions[name] = solve(graph, robust="dcs" if name == "dcs" else "gnc", loops=closures)
-    return SolvedGraph(replace(graph, poses=solutions["all"].poses), gates, solutions)
+    count = int(np.count_nonzero(closures))
+    if count > 1 and (count <= MANY_CLOSURES if robust is None else robust):
+        for key in ("dcs", "gnc"):
+            progress(f"solving: {SOLUTIONS[key]}")
+            solutions[key] = solve(graph, robust="dcs" if key == "dcs" else "gnc", loops=closures)
+    return SolvedGraph(
+        name=name,
+        dimension=graph.dimension,
+        poses=len(graph),
+        edges=len(graph.first),
+        initialised=graph.initialised,
+        gates=gates,
+        solutions=solutions,
+        graph=replace(graph, poses=solutions["all"].poses),
+    )

@@ -95,48 +95,30 @@ class PoseGraph:
         return made
 
 
-def residuals(graph: PoseGraph, poses: Array | None = None) -> Array:
-    """Residual of every edge, ``log(Z^-1 X_i^-1 X_j)``, as GTSAM's BetweenFactor has it.
+def chi_square(graph: PoseGraph, poses: Array | None = None) -> Array:
+    """Squared residuals in units of the measurements' own covariance, ``r' Omega r``.
+
+    The residual of an edge is ``log(Z^-1 X_i^-1 X_j)``, as GTSAM's BetweenFactor has it.
 
     Parameters
     ----------
     poses : ndarray, shape (n, 3) or (n, 7), optional
         Instead of the graph's own.
-
-    Returns
-    -------
-    ndarray, shape (m, 3) or (m, 6)
-        Translation (m), then rotation (rad), in the axes of the measured pose.
-    """
-    x = graph.poses if poses is None else poses
-    return lie.log(lie.between(graph.measurements, lie.between(x[graph.first], x[graph.second])))
-
-
-def chi_square(graph: PoseGraph, residual: Array) -> Array:
-    """Squared residuals in units of the measurements' own covariance, ``r' Omega r``.
-
-    Parameters
-    ----------
-    residual : ndarray, shape (m, 3) or (m, 6)
-        From :func:`residuals`.
 
     Returns
     -------
     ndarray, shape (m,)
     """
+    x = graph.poses if poses is None else poses
+    seen = lie.between(x[graph.first], x[graph.second])
+    residual = lie.log(lie.between(graph.measurements, seen))
     made: Array = np.sum(residual * (graph.information @ residual[..., None])[..., 0], axis=-1)
     return made
 
 
 def cost(graph: PoseGraph, poses: Array | None = None) -> float:
-    """Half the sum of the squared residuals, as GTSAM's ``graph.error`` has it.
-
-    Parameters
-    ----------
-    poses : ndarray, shape (n, 3) or (n, 7), optional
-        Instead of the graph's own.
-    """
-    return 0.5 * float(np.sum(chi_square(graph, residuals(graph, poses))))
+    """Half the sum of the squared residuals, as GTSAM's ``graph.error`` has it."""
+    return 0.5 * float(np.sum(chi_square(graph, poses)))
 
 
 def observed_directions(information: Array) -> tuple[Array, Array]:

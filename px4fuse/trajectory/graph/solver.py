@@ -106,7 +106,6 @@ def solve(
     *,
     robust: Robust = "none",
     loops: BoolArray | None = None,
-    max_iterations: int = MAX_ITERATIONS,
 ) -> Solution:
     """Poses of least cost, by Levenberg and Marquardt's method with GTSAM's schedule.
 
@@ -136,8 +135,6 @@ def solve(
     loops : ndarray of bool, shape (m,), optional
         Edges that may be false; all others keep the weight 1. By default those that do not join
         successive poses.
-    max_iterations : int
-        Accepted steps of each minimisation.
 
     Raises
     ------
@@ -157,14 +154,14 @@ def solve(
             "The pose graph has a pose or measurement that is not a finite number, or one too "
             "large to square. Correct it, or take the edge out."
         )
-    plain = problem.minimise(start, _least_squares(np.ones(len(doubtful))), max_iterations)
+    plain = problem.minimise(start, _least_squares(np.ones(len(doubtful))))
     weights = np.ones(len(doubtful))
     run = plain
     if robust != "none" and np.any(doubtful):
-        run, weights = _gnc(problem, start, plain, doubtful, max_iterations)
+        run, weights = _gnc(problem, start, plain, doubtful)
         if robust == "dcs":
             kernel = _dcs(doubtful)
-            last = problem.minimise(run.state, kernel, max_iterations)
+            last = problem.minimise(run.state, kernel)
             run = _Descent(last.state, last.cost, run.iterations + last.iterations, last.converged)
             weights = kernel(run.state.chi2)[0]
     return Solution(
@@ -193,7 +190,11 @@ class _GraphProblem:
         return _State(poses, relative, residual, weighted, np.sum(residual * weighted, axis=-1))
 
     def minimise(
-        self, start: _State, kernel: Kernel, max_iterations: int, tolerance: float = _TOLERANCE
+        self,
+        start: _State,
+        kernel: Kernel,
+        tolerance: float = _TOLERANCE,
+        max_iterations: int = MAX_ITERATIONS,
     ) -> _Descent:
         """Walk down from some poses, as GTSAM's LevenbergMarquardtOptimizer does."""
         state, damping, iterations = start, _FIRST_DAMPING, 0
@@ -266,7 +267,7 @@ def _dcs(doubtful: BoolArray) -> Kernel:
 
 
 def _gnc(
-    problem: _GraphProblem, start: _State, plain: _Descent, doubtful: BoolArray, max_iterations: int
+    problem: _GraphProblem, start: _State, plain: _Descent, doubtful: BoolArray
 ) -> tuple[_Descent, Array]:
     """Truncated least squares over the doubtful edges, from two starts."""
     freedom = ranks(problem.graph.information)
@@ -281,7 +282,7 @@ def _gnc(
 
     spent, found = plain.iterations, []
     for first in (plain.state, start):
-        run, weights = _graduated(problem, first, bound, max_iterations)
+        run, weights = _graduated(problem, first, bound)
         spent += run.iterations
         found.append((priced(run.state, weights), run, weights))
     lowest, run, weights = min(found, key=lambda each: each[0])
@@ -289,7 +290,7 @@ def _gnc(
     for edge in dropped[np.argsort(run.state.chi2[dropped])][:_SECOND_LOOKS]:
         again = weights.copy()
         again[edge] = 1.0
-        trial = problem.minimise(run.state, _least_squares(again), max_iterations)
+        trial = problem.minimise(run.state, _least_squares(again))
         spent += trial.iterations
         if (cost := priced(trial.state, again)) < lowest:
             lowest, run, weights = cost, trial, again
@@ -297,9 +298,7 @@ def _gnc(
     return _Descent(run.state, run.cost, spent, run.converged), weights
 
 
-def _graduated(
-    problem: _GraphProblem, start: _State, bound: Array, max_iterations: int
-) -> tuple[_Descent, Array]:
+def _graduated(problem: _GraphProblem, start: _State, bound: Array) -> tuple[_Descent, Array]:
     """One descent of graduated non-convexity (Yang 2020, algorithm 1, eq. 13 and 14)."""
     state, spent = start, 0
     # Infinite bounds are edges that are not doubted
@@ -310,7 +309,7 @@ def _graduated(
             ratio = np.maximum(state.chi2 / bound, 1e-200)  # where the weight is 1 anyway
             weights = np.clip(np.sqrt(control * (control + 1.0) / ratio) - control, 0.0, 1.0)
             stage = problem.minimise(
-                state, _least_squares(weights), _STAGE_ITERATIONS, _STAGE_TOLERANCE
+                state, _least_squares(weights), _STAGE_TOLERANCE, _STAGE_ITERATIONS
             )
             state, spent = stage.state, spent + stage.iterations
             if np.all((weights < 1e-6) | (weights > 1.0 - 1e-6)):
@@ -318,7 +317,7 @@ def _graduated(
             control *= _GNC_FACTOR
     weights = (state.chi2 <= bound).astype(float)
     for _ in range(_TLS_ROUNDS):
-        run = problem.minimise(state, _least_squares(weights), max_iterations)
+        run = problem.minimise(state, _least_squares(weights))
         state, spent = run.state, spent + run.iterations
         # Lowers the truncated cost every time, so it ends
         again = (state.chi2 <= bound).astype(float)
