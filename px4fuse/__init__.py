@@ -45,43 +45,31 @@ if _typing.TYPE_CHECKING:
     from px4fuse.trajectory.evaluation import Evaluation as Evaluation
     from px4fuse.trajectory.model import Trajectory as Trajectory
 
-# Where each public name lives
-_HOMES = {
-    "Analysis": "analysis",
-    "AxisTuning": "filter.tuning",
-    "Changes": "fleet.changes",
-    "ClockOffset": "filter.clock",
-    "Comparison": "comparison.model",
-    "ComparisonRequest": "request",
-    "Consistency": "filter.consistency",
-    "Evaluation": "trajectory.evaluation",
-    "Finding": "findings",
-    "Flight": "flight",
-    "Loop": "loop.loop",
-    "LoopRequest": "request",
-    "Model": "ekf2.model",
-    "PositionFile": "request",
-    "Px4FuseError": "errors",
-    "Settings": "filter.settings",
-    "Trajectory": "trajectory.model",
-    "Unavailable": "flight",
-    "WhatIf": "ekf2.whatif",
-    "assess": "filter.consistency",
-    "batch": "fleet.run",
-    "close_loop": "notebook.commands",
-    "compare": "notebook.commands",
-    "diff": "fleet.changes",
-    "evaluate": "notebook.commands",
-    "explain": "analysis",
-    "find": "findings",
-    "open_model": "ekf2.model",
-    "read_log": "readers",
-    "read_trajectory": "readers.trajectory",
-    "replay": "filter.kalman",
-    "run": "analysis",
-    "tune": "filter.tuning",
-    "what_if": "notebook.commands",
+# The public names of each module
+_PUBLIC = {
+    "analysis": ("Analysis", "explain", "run"),
+    "comparison.model": ("Comparison",),
+    "ekf2.model": ("Model", "open_model"),
+    "ekf2.whatif": ("WhatIf",),
+    "errors": ("Px4FuseError",),
+    "filter.clock": ("ClockOffset",),
+    "filter.consistency": ("Consistency", "assess"),
+    "filter.kalman": ("replay",),
+    "filter.settings": ("Settings",),
+    "filter.tuning": ("AxisTuning", "tune"),
+    "findings": ("Finding", "find"),
+    "fleet.changes": ("Changes", "diff"),
+    "fleet.run": ("batch",),
+    "flight": ("Flight", "Unavailable"),
+    "loop.loop": ("Loop",),
+    "notebook.commands": ("close_loop", "compare", "evaluate", "what_if"),
+    "readers": ("read_log",),
+    "readers.trajectory": ("read_trajectory",),
+    "request": ("ComparisonRequest", "LoopRequest", "PositionFile"),
+    "trajectory.evaluation": ("Evaluation",),
+    "trajectory.model": ("Trajectory",),
 }
+_HOMES = {name: module for module, names in _PUBLIC.items() for name in names}
 __all__ = list(_HOMES)
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from px4fuse.errors import SettingsError
 
@@ -24,10 +24,8 @@ class Aid:
     ----------
     name : str
         PX4's own, as in ``estimator_aid_src_<name>``.
-    switch, switch_bit : str, int
-        The bit that has EKF2 fuse it, from v1.14 on.
-    old_switch : str
-        The same in words, up to v1.13.
+    switch : str
+        What has EKF2 fuse it, from v1.14 on; EKF2_AID_MASK before.
     noise, gate, delay : str
         Standard deviation of the measurement, its gate in standard deviations, its age in ms.
     noise_mode : str
@@ -36,17 +34,10 @@ class Aid:
 
     name: str
     switch: str
-    switch_bit: int
-    old_switch: str
     noise: str
     gate: str
     delay: str
     noise_mode: str = ""
-
-    @property
-    def switched_on(self) -> str:
-        """What has EKF2 fuse it, in words."""
-        return f"bit {self.switch_bit} of {self.switch} ({self.old_switch} before v1.14)"
 
     def in_log(self, logged: Mapping[str, float]) -> dict[str, float]:
         """Its parameters among those of a log, and what switches it."""
@@ -56,14 +47,9 @@ class Aid:
 
 AID_MASK = "EKF2_AID_MASK"
 EV_POS = Aid(
-    "ev_pos", "EKF2_EV_CTRL", 0, f"bit 3 of {AID_MASK}",
-    "EKF2_EVP_NOISE", "EKF2_EVP_GATE", "EKF2_EV_DELAY", "EKF2_EV_NOISE_MD",
-)  # fmt: skip
-EV_HGT = replace(EV_POS, name="ev_hgt", switch_bit=1, old_switch="EKF2_HGT_MODE 3")
-GNSS_POS = Aid(
-    "gnss_pos", "EKF2_GPS_CTRL", 0, f"bit 0 of {AID_MASK}",
-    "EKF2_GPS_P_NOISE", "EKF2_GPS_P_GATE", "EKF2_GPS_DELAY",
-)  # fmt: skip
+    "ev_pos", "EKF2_EV_CTRL", "EKF2_EVP_NOISE", "EKF2_EVP_GATE", "EKF2_EV_DELAY", "EKF2_EV_NOISE_MD"
+)
+GNSS_POS = Aid("gnss_pos", "EKF2_GPS_CTRL", "EKF2_GPS_P_NOISE", "EKF2_GPS_P_GATE", "EKF2_GPS_DELAY")
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,6 @@ from px4fuse.flight import (
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
     Alignment,
-    Ekf2,
     Flight,
     PositionTrack,
     Reset,
@@ -133,13 +132,11 @@ def placed(
     flight: Flight, file: PositionRecording, **options: Any
 ) -> tuple[Alignment, PositionTrack]:
     track = place(flight, file, **options).positions[0]
-    assert track.alignment is not None
     return track.alignment, track
 
 
 def off_s(alignment: Alignment, true_s: float = OFFSET_S, sigma_s: Span = (0.0, np.inf)) -> float:
     """How far the clock offset is off (s), with a standard deviation between two bounds."""
-    assert alignment.clock_offset_sigma_s is not None
     assert sigma_s[0] < alignment.clock_offset_sigma_s < sigma_s[1]
     return abs(alignment.clock_offset_s - true_s)
 
@@ -249,7 +246,6 @@ def test_turned_mirrored_and_shifted_sample_is_recovered(
         )
         alignment, _ = placed(sample_flight, file, frame=frame, yaw_deg="auto")
         assert turn(alignment.yaw_deg, yaw_deg) < 0.5
-        assert alignment.yaw_sigma_deg is not None
         assert 0.02 < alignment.yaw_sigma_deg < 0.3
         np.testing.assert_allclose(alignment.origin_m[:2], origin[:2], atol=0.05)
         # EKF2's height as published, of which one reset on the ground is not undone
@@ -396,7 +392,6 @@ def test_a_given_offset_is_used_and_warned_of_where_it_is_wrong(flight: Flight) 
     wrong, _ = placed(flight, recorded(flight), frame="enu", clock_offset_s=OFFSET_S + 11.0)
     (warning,) = wrong.warnings
     assert warning.startswith("The file hardly follows the EKF2 position (correlation ")
-    assert wrong.correlation is not None
     assert wrong.correlation < 0.7
     file = recorded(flight, yaw_deg=40.0)
     alignment, track = placed(flight, file, yaw_deg="auto", clock_offset_s=OFFSET_S)
@@ -410,7 +405,6 @@ def test_a_flight_that_is_nearly_a_point_leaves_the_yaw_open() -> None:
     alignment, _ = placed(
         flight, recorded(flight), frame="enu", yaw_deg="auto", clock_offset_s=OFFSET_S
     )  # fmt: skip
-    assert alignment.yaw_sigma_deg is not None
     assert alignment.yaw_sigma_deg > 2.0
     assert any("yaw is poorly determined" in warning for warning in alignment.warnings)
 
@@ -477,7 +471,6 @@ def test_without_ekf2_the_imu_gives_clock_and_yaw(noise: float) -> None:
     assert alignment.yaw_deg == pytest.approx(25.0, abs=3.0)
     assert alignment.origin_m == (0.0, 0.0, 0.0)
     assert alignment.residual_rms_m is None
-    assert alignment.correlation is not None
     assert alignment.correlation > 0.7
     assert any("which was left at 0" in warning for warning in alignment.warnings)
 
@@ -491,7 +484,6 @@ def test_the_imu_tells_the_frame_and_that_it_is_turned() -> None:
     assert "seems turned by 1" in alignment.warnings[-1]
     assert "shifted" not in alignment.warnings[-1]
     # an EKF2 that stands still leaves it to the IMU
-    assert isinstance(flight.ekf2, Ekf2)
     still = replace(flight, ekf2=replace(flight.ekf2, state=flight.ekf2.state * 0.0))
     alignment, _ = placed(still, recorded(flight), frame="enu")
     assert alignment.reference == IMU

@@ -128,60 +128,51 @@ def test_without_quaternions_or_topic_there_is_no_record(record_of):
     assert isinstance(record_of(make_log("v1.11")).record, Unavailable)
 
 
-class TestBiasAndHorizon:
-    """From ULogs of every generation."""
+STEP_S = 0.010  # of EKF2 at the made flight's 100 Hz
 
-    STEP_S = 0.010  # of EKF2 at the made flight's 100 Hz
 
-    def read(self, tmp_path, log) -> Ekf2:
-        ekf2 = read_log(log.write(tmp_path / "made.ulg")).ekf2
-        assert isinstance(ekf2, Ekf2)
-        return ekf2
+@pytest.mark.parametrize("generation", GENERATIONS)
+def test_bias_is_in_m_s2_whatever_the_state_vector_holds(record_of, generation):
+    log = make_log(generation)
+    number = int(generation.removeprefix("v1."))
+    holder = log["estimator_states" if number >= 12 else "estimator_status"]
+    holder["states"][:, 13:16] = BIAS * (STEP_S if number < 15 else 1.0)
+    ekf2 = record_of(log)
+    assert ekf2.step_s == pytest.approx(STEP_S)
+    np.testing.assert_allclose(
+        ekf2.accelerometer_bias, np.tile(BIAS, (len(ekf2.accelerometer_bias), 1)), rtol=1e-5
+    )
 
-    @pytest.mark.parametrize("generation", GENERATIONS)
-    def test_bias_is_in_m_s2_whatever_the_state_vector_holds(self, tmp_path, generation: str):
-        log = make_log(generation)
-        number = int(generation.removeprefix("v1."))
-        holder = log["estimator_states" if number >= 12 else "estimator_status"]
-        holder["states"][:, 13:16] = BIAS * (self.STEP_S if number < 15 else 1.0)
-        ekf2 = self.read(tmp_path, log)
-        assert ekf2.step_s == pytest.approx(self.STEP_S)
-        np.testing.assert_allclose(
-            ekf2.accelerometer_bias, np.tile(BIAS, (len(ekf2.accelerometer_bias), 1)), rtol=1e-5
-        )
 
-    def test_its_own_topic_is_preferred(self, tmp_path):
-        log = make_log("v1.14")
-        time = stamps(10.0, 1.0)
-        log.add(topic("estimator_sensor_bias", time, {"accel_bias": np.tile(BIAS, (10, 1))},
-                      sampled=True))  # fmt: skip
-        bias = self.read(tmp_path, log).accelerometer_bias
-        np.testing.assert_allclose(bias.iloc[0], BIAS, rtol=1e-6)
-        assert bias.index[1] == pytest.approx(1.0)
+def test_its_own_topic_is_preferred(record_of):
+    log = make_log("v1.14")
+    own = {"accel_bias": np.tile(BIAS, (10, 1))}
+    log.add(topic("estimator_sensor_bias", stamps(10.0, 1.0), own, sampled=True))
+    bias = record_of(log).accelerometer_bias
+    np.testing.assert_allclose(bias.iloc[0], BIAS, rtol=1e-6)
+    assert bias.index[1] == pytest.approx(1.0)
 
-    def test_step_is_a_whole_number_of_imu_samples(self, tmp_path):
-        log = make_log("v1.14", imu_hz=1.0 / 0.004)
-        log.parameters["EKF2_PREDICT_US"] = 10_000
-        log["estimator_states"]["states"][:, 13:16] = BIAS * 0.012
-        ekf2 = self.read(tmp_path, log)
-        assert ekf2.step_s == pytest.approx(0.012)  # 2.5 samples round to 3: roundf, away from 0
-        np.testing.assert_allclose(ekf2.accelerometer_bias.iloc[0], BIAS, rtol=1e-5)
 
-    def test_horizon_is_the_age_at_publication(self, tmp_path):
-        assert self.read(tmp_path, make_log("v1.16")).horizon_s == pytest.approx(0.060)
-        assert isinstance(self.read(tmp_path, make_log("v1.11")).horizon_s, Unavailable)
+def test_step_is_a_whole_number_of_imu_samples(record_of):
+    log = make_log("v1.14", imu_hz=1.0 / 0.004)
+    log.parameters["EKF2_PREDICT_US"] = 10_000
+    log["estimator_states"]["states"][:, 13:16] = BIAS * 0.012
+    ekf2 = record_of(log)
+    assert ekf2.step_s == pytest.approx(0.012)  # 2.5 samples round to 3: roundf, away from 0
+    np.testing.assert_allclose(ekf2.accelerometer_bias.iloc[0], BIAS, rtol=1e-5)
+    imu = log["sensor_combined"]
+    for name in imu:
+        imu[name] = imu[name][:1]
+    assert record_of(log).step_s == STEP_S
 
-    def test_no_states_and_no_horizon_are_said(self, tmp_path):
-        ekf2 = self.read(tmp_path, make_log("v1.16").drop("estimator_states"))
-        assert isinstance(ekf2.accelerometer_bias, Unavailable)
-        assert isinstance(ekf2.horizon_s, Unavailable)
 
-    def test_unusable_horizons_and_few_imu_samples_are_passed_over(self, tmp_path):
-        log = make_log("v1.16")
-        log["estimator_states"]["timestamp_sample"] = log["estimator_states"]["timestamp"].copy()
-        assert isinstance(self.read(tmp_path, log).horizon_s, Unavailable)
-        lone = make_log("v1.16")
-        imu = lone["sensor_combined"]
-        for name in imu:
-            imu[name] = imu[name][:1]
-        assert self.read(tmp_path, lone).step_s == 0.010
+def test_horizon_is_the_age_at_publication_where_that_is_told(record_of):
+    log = make_log("v1.16")
+    assert record_of(log).horizon_s == pytest.approx(0.060)
+    states = log["estimator_states"]
+    states["timestamp_sample"] = states["timestamp"].copy()
+    assert isinstance(record_of(log).horizon_s, Unavailable)
+    assert isinstance(record_of(make_log("v1.11")).horizon_s, Unavailable)
+    without = record_of(log.drop("estimator_states"))
+    assert isinstance(without.accelerometer_bias, Unavailable)
+    assert isinstance(without.horizon_s, Unavailable)

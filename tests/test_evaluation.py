@@ -39,7 +39,6 @@ from px4fuse.trajectory.scores import (
     MIN_BLOCKS,
     Delta,
     Interval,
-    Statistics,
     autocorrelation_time,
     pairs,
     relative_error,
@@ -102,7 +101,6 @@ def test_ate_is_that_of_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
     got = evaluate(*map(published, pair), alignment=kind, association="nearest", rpe_deltas=())
     np.testing.assert_array_equal(got.reference_m, true.positions_xyz)
     np.testing.assert_allclose(got.estimate_m, made.positions_xyz, rtol=0, atol=1e-9)
-    assert isinstance(got.ate.rotation_deg, Statistics)
     for relation, errors, ours in (
         (PoseRelation.translation_part, got.position_error_m, got.ate.translation_m),
         (PoseRelation.rotation_angle_deg, got.rotation_error_deg, got.ate.rotation_deg),
@@ -134,27 +132,17 @@ def test_rpe_is_that_of_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
     from evo.core.units import Unit
 
     true, made = evo_aligned(*pair, kind)
-    for all_pairs, pairs_from in ((True, "estimate"), (False, "estimate"), (True, "reference")):
-        got = evaluate(
-            *map(published, pair),
-            alignment=kind,
-            association="nearest",
-            rpe_deltas=DELTAS,
-            all_pairs=all_pairs,
-            pairs_from=pairs_from,  # type: ignore[arg-type]
-        )
+    for all_pairs, side in ((True, "estimate"), (False, "estimate"), (True, "reference")):
+        how = {"rpe_deltas": DELTAS, "all_pairs": all_pairs, "pairs_from": side}
+        got = evaluate(*map(published, pair), alignment=kind, association="nearest", **how)
         for ours in got.rpe:
             if kind != "se3" and ours.unit == "frames":
                 continue  # scale and turn do not change these pairs; evo takes its time
             unit = Unit.frames if ours.unit == "frames" else Unit.meters
-            is_reference = pairs_from == "reference"
             metric = RPE(
-                PoseRelation.translation_part,
-                ours.delta,
-                unit,
-                all_pairs=all_pairs,
-                pairs_from_reference=is_reference,
-            )
+                PoseRelation.translation_part, ours.delta, unit, all_pairs=all_pairs,
+                pairs_from_reference=side == "reference",
+            )  # fmt: skip
             try:
                 metric.process_data((true, made))
             except FilterException:
@@ -162,10 +150,8 @@ def test_rpe_is_that_of_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
                 continue
             np.testing.assert_array_equal(ours.end, metric.delta_ids)
             np.testing.assert_allclose(ours.translation_error_m, metric.error, rtol=0, atol=1e-9)
-            turns = Rotation.from_matrix(np.array(metric.E)[:, :3, :3]).magnitude()
-            np.testing.assert_allclose(
-                ours.rotation_error_deg, np.degrees(turns), rtol=0, atol=1e-9
-            )
+            turns = np.degrees(Rotation.from_matrix(np.array(metric.E)[:, :3, :3]).magnitude())
+            np.testing.assert_allclose(ours.rotation_error_deg, turns, rtol=0, atol=1e-9)
 
 
 # -- alignment -------------------------------------------------------------------------------------
@@ -259,7 +245,6 @@ def test_interpolation_is_exact_where_the_motion_is_uniform_and_stops_at_a_gap()
     inside = (at >= 0.0) & (at <= time[-1])
     assert (got.poses, got.outside, got.in_gaps) == (inside.sum(), (~inside).sum(), 0)
     np.testing.assert_allclose(matched.position_m, at[inside, None] * [1, 2, 3], atol=1e-12)
-    assert matched.rotation is not None
     expected = Rotation.from_rotvec(at[inside, None] * [0.1, 0.5, 0.2])
     assert (matched.rotation.inv() * expected).magnitude().max() < 1e-12
     assert got.coverage_estimate == pytest.approx(inside.mean())
@@ -330,12 +315,9 @@ def test_a_transformed_copy_has_no_error(kind: AlignmentKind) -> None:
     copied = moved(reference, turn, SHIFT, 0.3 if kind == "sim3" else 1.0, kind="vio")
     got = evaluate(copied, reference, alignment=kind)
     assert got.ate.translation_m.max < 1e-9
-    assert isinstance(got.ate.rotation_deg, Statistics)
     assert got.ate.rotation_deg.max < 1e-9
     assert [one.delta_words for one in got.rpe] == ["1 m", "5 m", "10 m", "1 s", "10 s"]
     for one in got.rpe:
-        assert isinstance(one.translation_m, Statistics)
-        assert isinstance(one.rotation_deg, Statistics)
         assert one.translation_m.max < 1e-9
         assert one.rotation_deg.max < 1e-9
     assert not got.warnings
@@ -346,7 +328,6 @@ def test_a_tilt_shows_after_yaw_and_hides_after_se3() -> None:
     tilted = moved(reference, Rotation.from_euler("x", 5.0, degrees=True), SHIFT, kind="vio")
     got = evaluate(tilted, reference)
     assert got.alignment == "yaw"
-    assert isinstance(got.ate.rotation_deg, Statistics)
     assert got.ate.rotation_deg.rmse == pytest.approx(5.0, abs=0.1)
     assert got.ate.translation_m.rmse > 0.1
     assert evaluate(tilted, reference, alignment="se3").ate.translation_m.rmse < 1e-9
@@ -453,8 +434,7 @@ def test_the_alignment_follows_from_what_the_two_are(
 
 def test_an_aisle_is_aligned_by_yaw_where_z_is_vertical() -> None:
     x, y = line(0.02)
-    time = np.arange(len(x)) * 0.1
-    aisle = Trajectory("aisle", "truth", time, y, None, "NED")
+    aisle = Trajectory("aisle", "truth", np.arange(len(x)) * 0.1, y, None, "NED")
     got = evaluate(replace(aisle, kind="unknown", position_m=x), aisle)
     assert got.alignment == "yaw"
     assert "along a line" in got.alignment_reason
@@ -467,16 +447,12 @@ def test_a_camera_is_compared_around_its_constant_rotation_in_the_vehicle() -> N
     assert reference.rotation is not None
     mounted = Rotation.from_euler("ZYX", [90.0, 0.0, 90.0], degrees=True)
     camera = moved(reference, TURN, SHIFT, kind="slam", frame="camera")
-    assert camera.rotation is not None
     noise = Rotation.from_rotvec(np.random.default_rng(1).normal(0.0, 0.01, (len(camera), 3)))
     camera = replace(camera, rotation=camera.rotation * mounted * noise)
     got = evaluate(camera, reference)
-    assert isinstance(got.ate.rotation_deg, Statistics)
     assert got.ate.rotation_deg.rmse == pytest.approx(np.degrees(0.01 * np.sqrt(3)), rel=0.05)
-    assert got.body_rotation is not None
     assert (got.body_rotation * mounted).magnitude() < 0.01
     assert "constant rotation of 120" in got.notes[0]
-    assert isinstance(got.rpe[0].translation_m, Statistics)
     assert got.rpe[0].translation_m.rmse < 0.03
     for same in (replace(camera, frame="unknown", kind="unknown"), replace(camera, frame="NED")):
         assert evaluate(same, reference, alignment="se3").body_rotation is None
@@ -485,16 +461,18 @@ def test_a_camera_is_compared_around_its_constant_rotation_in_the_vehicle() -> N
 def test_interchanged_and_doubtful_arguments_are_warned_about() -> None:
     truth = flight()
     vio = moved(truth, Rotation.from_euler("z", 1.0), SHIFT, kind="vio", name="log:vio")
-    assert not evaluate(vio, truth).warnings
-    assert "is ground truth and log:vio is not" in evaluate(truth, vio).warnings[0]
     slam = replace(vio, kind="slam", name="slam")
-    every = np.arange(0, len(truth), 8)
-    assert "one pose in 0.4 s" in evaluate(vio, slam[every], max_gap_s=1.0).warnings[0]
-    assert "lasts 20.0 s" in evaluate(vio, slam[:400]).warnings[0]
-    assert "Only 33%" in evaluate(vio, truth[:400]).warnings[0]
-    assert "covers only 33%" in evaluate(vio[:400], truth).warnings[0]
-    large = evaluate(moved(truth, TURN, SHIFT, 1.5, kind="vio"), truth, alignment="se3")
-    assert "0.667 times it would fit best" in large.warnings[0]
+    large = moved(truth, TURN, SHIFT, 1.5, kind="vio")
+    assert not evaluate(vio, truth).warnings
+    for said, estimate, reference, how in (
+        ("is ground truth and log:vio is not", truth, vio, {}),
+        ("one pose in 0.4 s", vio, slam[np.arange(0, len(truth), 8)], {"max_gap_s": 1.0}),
+        ("lasts 20.0 s", vio, slam[:400], {}),
+        ("Only 33%", vio, truth[:400], {}),
+        ("covers only 33%", vio[:400], truth, {}),
+        ("0.667 times it would fit best", large, truth, {"alignment": "se3"}),
+    ):
+        assert said in evaluate(estimate, reference, **how).warnings[0]
 
 
 # -- clocks ----------------------------------------------------------------------------------------
@@ -513,7 +491,6 @@ def test_an_offset_between_clocks_is_recovered(offset_s: float, rate_hz: float) 
     got = estimate_time_offset(estimate, reference)
     assert got.determinable
     assert got.offset_s == pytest.approx(offset_s, abs=2e-3)
-    assert got.interval_s is not None
     assert got.interval_s[0] - 1e-3 < offset_s < got.interval_s[1] + 1e-3
     back = estimate_time_offset(reference, estimate)
     assert back.offset_s == pytest.approx(-offset_s, abs=2e-3)
@@ -527,7 +504,6 @@ def test_the_interval_of_an_offset_holds_it() -> None:
         noise = lfilter([0.05], [1.0, -0.9], random.normal(size=(len(estimate), 3)), axis=0)
         estimate = replace(estimate, position_m=estimate.position_m + noise)
         got = estimate_time_offset(estimate, reference)
-        assert got.interval_s is not None
         held += got.interval_s[0] <= 0.0 <= got.interval_s[1]
     assert held >= 22
 
@@ -587,7 +563,6 @@ def test_a_motion_that_repeats_is_ambiguous() -> None:
 def test_published_trajectories_that_were_shifted_are_shifted_back(pair: tuple[str, str]) -> None:
     estimate, reference = map(published, pair)
     base = estimate_time_offset(estimate, reference)
-    assert base.offset_s is not None
     assert abs(base.offset_s) < 0.06  # their own clocks are not perfect
     for shift_s in (0.137, -2.5, 30.0):
         shifted = replace(estimate, time_s=estimate.time_s + shift_s)
@@ -630,7 +605,6 @@ def test_too_few_blocks_give_no_interval() -> None:
     assert f"fewer than the {MIN_BLOCKS:.0f} independent blocks" in str(got)
     assert isinstance(rmse_interval(np.ones(100), "ATE", min_block=30), Unavailable)
     same = rmse_interval(np.full(100, 0.5), "ATE")
-    assert isinstance(same, Interval)
     assert (same.low, same.high) == (pytest.approx(0.5), pytest.approx(0.5))
     assert rmse_interval(np.sin(drift * 99), "ATE") == rmse_interval(np.sin(drift * 99), "ATE")
 
@@ -654,9 +628,7 @@ def test_the_sample_slam_against_the_log_that_it_was_made_from() -> None:
     assert got.alignment == "se3"
     assert got.time_offset.determinable
     assert got.ate.translation_m.rmse < 0.08
-    assert isinstance(got.ate.rotation_deg, Statistics)
     assert got.ate.rotation_deg.rmse < 0.6
-    assert got.body_rotation is not None
     assert np.degrees(got.body_rotation.magnitude()) == pytest.approx(120.0, abs=1.0)
     assert got.association.coverage_reference < 1.0
     assert len(got.time_s) == len(got.distance_m) == len(got.position_error_m)

@@ -20,7 +20,7 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.model import MODEL_NOTE
 from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.settings import Settings
-from px4fuse.findings import NAMES, SEVERITIES, Finding, find
+from px4fuse.findings import NAMES, Finding, find
 from px4fuse.flight import (
     AXIS_NAMES,
     QUATERNION_COLUMNS,
@@ -338,78 +338,6 @@ def test_a_flight_of_a_moment_does_not_break_a_detector(fault: Fault, duration_s
     comparison = compare(fault.fly(**short), Settings(**fault.settings))
     few = len(next(iter(comparison.axes.values())).replay.updates) < MIN_INNOVATIONS
     assert ("too_few_innovations" in ids(found(comparison))) == few
-
-
-@pytest.mark.parametrize("axis", ["north", "east", "aisle"])
-def test_rejections_are_named_whichever_axis_is_analysed(axis: str) -> None:
-    """A rejection is of the whole horizontal vector."""
-    flight = aisle_flight(**ekf2(rejected_share=0.5))
-    assert "ekf2_rejecting" in ids(found(compare(flight, axes=(axis,))))
-
-
-@pytest.mark.parametrize("share", [0.02, 0.05])
-def test_outliers_are_not_answered_by_raising_the_noise(share: float) -> None:
-    findings = found(compare(aisle_flight(uwb=Uwb(outlier_share=share))), tuned=True)
-    finding = next(each for each in findings if each.id == "kf_variance_understated")
-    assert finding.evidence["outside_gate"] > 0.005
-    assert "remove the outliers" in finding.remedy
-
-
-@pytest.mark.parametrize(
-    ("nis", "noise_m", "direction"),
-    [(3.0, 0.10, "under"), (3.0, 0.20, "under"), (0.3, 0.10, "over"), (0.3, 0.05, "over")],
-)
-def test_a_wrong_ekf2_variance_is_not_answered_by_a_noise_that_would_make_it_worse(
-    nis: float, noise_m: float, direction: str
-) -> None:
-    """The source's noise is 0.10 m: where that is not the other side of R, R is not the cause."""
-    findings = found(compare(aisle_flight(**ekf2(nis=nis, noise_m=noise_m))))
-    assert ids(findings) == {f"ekf2_variance_{direction}stated"}
-    for finding in findings:
-        told = re.search(r"set EKF2_EVP_NOISE to ([0-9.]+\d)", finding.remedy)
-        change = float(told[1]) / noise_m if told else None
-        assert change is None or (change > 1.2 if nis > 1 else change < 0.8), finding.remedy
-
-
-@pytest.mark.parametrize(
-    ("settings", "uwb"),
-    [(Settings(sigma_a_m_s2=0.5, sigma_z_m=1.0), Uwb(rate_hz=100.0)),
-     (Settings(sigma_a_m_s2=0.02), Uwb())],
-)  # fmt: skip
-def test_process_noise_that_lets_the_variance_grow_is_not_called_forgotten(
-    settings: Settings, uwb: Uwb
-) -> None:
-    """With the lesson's, and with a small one, whose gain is still above 0.05."""
-    findings = found(compare(aisle_flight(uwb=uwb, duration_s=60.0), settings))
-    assert "process_noise_forgotten" not in ids(findings)
-
-
-@pytest.mark.parametrize("sigma_a", [0.02, 0.05, 0.1])
-def test_process_noise_too_small_is_answered_by_more_of_it(sigma_a: float) -> None:
-    """Q too small looks like R too small to the NIS; the correlation tells them apart."""
-    compared = compare(aisle_flight(imu=Imu(sigma_a_m_s2=2.0)), Settings(sigma_a_m_s2=sigma_a))
-    of_kf = [f for f in found(compared, tuned=True) if f.id == "kf_variance_understated"]
-    (finding,) = [each for each in of_kf if "horiz" in each.message]
-    assert "raise SIGMA_A" in finding.remedy
-    assert "--sigma-z" not in finding.remedy
-
-
-def test_a_variance_is_named_on_the_axis_where_it_is_worst() -> None:
-    flight = aisle_flight(**ekf2(nis=0.2))
-    innovations = flight.ekf2.innovations
-    worst = innovations["north"].assign(innovation_m=innovations["north"]["innovation_m"] / 5.0)
-    findings = found(compare(with_ekf2(innovations={**innovations, "north": worst})(flight)))
-    assert [each.evidence["axis"] for each in findings] == ["north", "down"]
-    assert [each.caused_by for each in findings] == [None, "ekf2_variance_overstated"]
-
-
-def test_findings_are_ordered_by_severity_and_the_recording_before_noises() -> None:
-    flight = aisle_flight(**ekf2(nis=0.02, noise_m=0.7, every=3), uwb=Uwb(gap_s=(40.0, 48.0)))
-    findings = [finding for finding in found(compare(flight)) if finding.caused_by is None]
-    assert {finding.severity for finding in findings} == set(SEVERITIES)
-    assert [finding.id for finding in findings] == [
-        "source_gap", "ekf2_variance_overstated", "ekf2_innovations_decimated",
-    ]  # fmt: skip
 
 
 def test_the_remedy_for_the_sample_log_is_right_and_typing_it_removes_the_finding(

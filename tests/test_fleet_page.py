@@ -85,8 +85,10 @@ def test_what_speaks_for_a_log_is_its_horizontal_axes() -> None:
     # weighted by how many updates there are
     first["updates"] *= pd.Series((3, 1, 1))
     assert ours(first) == pytest.approx(4.0 / (3.0 * north + east))
-    aisle = first.iloc[:1].assign(axis="aisle", kf_nis_mean=4.0)
-    assert ours(pd.concat([first, aisle])) == pytest.approx(0.25)
+    aisle = first.iloc[:1].assign(axis="aisle", kf_nis_mean=4.0, position_rmse_m=9.0)
+    both = pd.concat([aisle, first])
+    assert ours(both) == pytest.approx(0.25)
+    assert logs_of(both)[0]["position_rmse_m"] == 9.0
 
 
 def test_a_column_without_numbers_is_absent_not_zero() -> None:

@@ -369,11 +369,17 @@ def test_pictures_are_axes(results, name):
     assert np.atleast_1d(again).ravel()[0] is drawn[0]
 
 
-def test_another_axis_can_be_drawn(results):
-    ours = results["Analysis"].plot(axis="down")[0].lines[0]
+def test_another_axis_can_be_drawn_as_the_report_draws_it(results):
+    """Our error lies about zero, with the band ±2σ about zero, so that it may leave the band."""
+    drawn = results["Analysis"].plot(axis="down")[0]
     table = results["Analysis"]["down"].to_frame()
-    expected = table["kf_position_m"] - table["truth_position_m"]
-    np.testing.assert_array_equal(ours.get_ydata(), expected)
+    error = (table["kf_position_m"] - table["truth_position_m"]).dropna()
+    ours = drawn.lines[-1]
+    np.testing.assert_allclose(ours.get_ydata(), np.interp(ours.get_xdata(), error.index, error))
+    assert np.abs(ours.get_ydata()).max() == error.abs().max()
+    (band,) = drawn.collections
+    assert band.get_paths()[0].vertices[:, 1].min() < -0.05
+    assert drawn.get_title() == "down"
 
 
 def test_what_has_no_picture_says_so(results):
@@ -395,4 +401,4 @@ def test_a_flight_without_anything_shows_itself(analysis):
     )  # fmt: skip
     assert "no EKF2" in repr(without)
     assert not any(column.startswith(("ekf2", "truth")) for column in without.to_frame())
-    assert without.plot()[0].get_ylabel() == "position, m"
+    assert without.plot()[0].get_ylabel() == "Position (m)"

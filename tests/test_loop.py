@@ -19,7 +19,7 @@ from px4fuse.lesson import ODOMETRY_M, loop_lines
 from px4fuse.loop.analysis import analyse, loop_in
 from px4fuse.loop.corrections import BY_DISTANCE, PLAIN, SINGLE_LOOP
 from px4fuse.loop.loop import Loop
-from px4fuse.loop.model import CorrectedPath, OdometryNoise
+from px4fuse.loop.model import OdometryNoise
 from px4fuse.loop.odometry import odometry_variances
 from px4fuse.loop.sources import LoopSource, read_source, split_part
 from px4fuse.readers.closures import parse_closure, read_closures
@@ -49,12 +49,9 @@ def close_loop(trajectory: Trajectory, **how: Any) -> Loop:
     return analyse(LoopSource(trajectory, None), **how)
 
 
-def path(loop: Loop, way: str) -> CorrectedPath:
+def path(loop: Loop, way: Any) -> Any:
     """The path that was corrected in this way; a pose graph's by the name of its solution."""
-    ways: dict[str, CorrectedPath | Unavailable] = dict(loop.corrections.items())  # type: ignore[arg-type]
-    found = ways.get(way, ways.get(f"pose_graph_{way}"))
-    assert isinstance(found, CorrectedPath)
-    return found
+    return loop.corrections.get(way) or loop.corrections[f"pose_graph_{way}"]  # type: ignore[index]
 
 
 def score(loop: Loop, way: str, index: int = 0) -> Evaluation:
@@ -68,7 +65,6 @@ def rmse(loop: Loop, way: str, index: int = 0) -> float:
 
 
 def missed(loop: Loop) -> np.ndarray:
-    assert loop.closure_error_axes_m is not None
     return np.array(list(loop.closure_error_axes_m.values()))
 
 
@@ -111,7 +107,6 @@ def test_both_corrections_bring_the_sample_closer_and_end_where_the_vehicle_did(
         before = rmse(sample_loop, "uncorrected", reference)
         for way in ("by_distance", "gated"):
             assert rmse(sample_loop, way, reference) < 0.8 * before
-    assert not isinstance(sample_loop.known_end, Unavailable)
     end = sample_loop.known_end.displacement
     for way, within in (("by_distance_plain", 1e-9), ("by_distance", 1e-9), ("gated", 0.02)):
         position = path(sample_loop, way).trajectory.position_m
@@ -126,7 +121,6 @@ def test_example_2_through_the_loop_is_the_lessons_digit_for_digit() -> None:
     corners = np.column_stack([np.array(ODOMETRY_M), np.zeros(len(ODOMETRY_M))])
     found = close_loop(Trajectory("corners", "vio", np.arange(5.0), corners, None, "FRD"))
     error, total = missed(found), found.path_length_m
-    assert found.closure_error_m is not None
     corrected = path(found, "by_distance_plain").trajectory.position_m
     assert list(loop_lines()) == [
         f"loop closure error ({error[0]:.1f}, {error[1]:.1f}) m over {total:.1f} m = "
@@ -173,7 +167,6 @@ def test_without_a_known_heading_there_is_one_correction_by_distance(
 
 
 def test_a_tape_gives_what_the_truth_gives(sample: LoopSource, sample_loop: Loop) -> None:
-    assert not isinstance(sample_loop.known_end, Unavailable)
     forward, right, _ = sample_loop.known_end.displacement  # its nose points along x
     heading = sample_loop.known_end.heading_change_deg
     taped = analyse(sample, landed_at=(forward, right, heading))
@@ -194,7 +187,6 @@ def test_an_absolute_track_is_not_taken_for_odometry() -> None:
     found = analyse(source)
     assert found.absolute
     assert "loop_of_absolute_track" in {finding.id for finding in find_loop(found)}
-    assert source.flight is not None
     assert isinstance(loop_in(source.flight), Unavailable)
 
 
@@ -311,7 +303,6 @@ def test_the_heading_at_landing_counts_only_where_it_may_be_the_same() -> None:
     turned = close_loop(odometry, noise=noise)  # it ends facing west
     assert isinstance(turned.heading_error_deg, Unavailable)
     assert turned.closures[0].degrees_of_freedom == 3
-    assert odometry.rotation is not None
     quaternions = odometry.rotation.as_quat()
     quaternions[-1] = odometry.rotation[0].as_quat()
     same = replace(odometry, rotation=Rotation.from_quat(quaternions))
@@ -335,7 +326,6 @@ def test_a_doubtful_closure_is_named() -> None:
 def test_dropping_most_closures_points_to_the_drift() -> None:
     """An odometry with a turn in every step, which is said to be almost perfect."""
     _, odometry = laps(3, 7, OdometryNoise())
-    assert odometry.rotation is not None
     turn = Rotation.from_rotvec(np.outer(np.linspace(0.0, 0.7, len(odometry)), [0, 0, 1]))
     steps = turn[:-1].apply(np.diff(odometry.position_m, axis=0))
     biased = replace(
@@ -349,7 +339,6 @@ def test_dropping_most_closures_points_to_the_drift() -> None:
 
 def test_an_assumed_landing_is_said_to_be_assumed(sample: LoopSource, sample_loop: Loop) -> None:
     assert find_loop(sample_loop) == ()  # the log has the truth
-    assert sample.flight is not None
     blind = Unavailable("ground truth", "left out", "")
     found = analyse(LoopSource(sample.trajectory, replace(sample.flight, truth=blind)))
     (finding,) = find_loop(found)
@@ -377,15 +366,12 @@ def test_reported_variances_count_where_they_grow() -> None:
 def test_poses_between_key_frames_move_with_them(sample_loop: Loop) -> None:
     solved, before = path(sample_loop, "gated"), sample_loop.odometry.trajectory
     after, nodes = solved.trajectory, sample_loop.nodes
-    assert solved.solution is not None
     poses = solved.solution.poses
     np.testing.assert_allclose(after.position_m[nodes], poses[:, :3], atol=1e-9)
     # and no jump between them that the odometry does not have
     jumps = [np.linalg.norm(np.diff(one.position_m, axis=0), axis=1) for one in (after, before)]
     assert np.max(np.abs(jumps[0] - jumps[1])) < 0.02
     # orientations are corrected along the geodesic of their neighbours' corrections
-    assert after.rotation is not None
-    assert before.rotation is not None
     turn, (a, b) = after.rotation * before.rotation.inv(), nodes[40:42]
     expected = Slerp(before.time_s[[a, b]], turn[[a, b]])(before.time_s[a:b])
     assert np.max((turn[a:b] * expected.inv()).magnitude()) < 1e-9
@@ -406,7 +392,6 @@ def test_the_slam_file_is_levelled_and_closes_better_than_the_odometry() -> None
     source = read_source(str(SLAM))
     found = analyse(source, landed_at=(0.0, 0.0, None))
     assert found.odometry.trajectory.frame == "FRD"
-    assert found.closure_error_m is not None
     assert found.closure_error_m < 0.7  # it truly ended 0.4 m away
     height = found.odometry.trajectory.position_m[:, 2]
     assert np.ptp(height) < 2.5

@@ -11,7 +11,6 @@ from flights import unexplained
 
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.comparison import compare
-from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import (
     Finding,
@@ -85,12 +84,6 @@ def test_a_flight_of_a_moment_says_nothing() -> None:
     assert found(explain(short)) == {}
 
 
-def test_the_process_noise_of_a_hovering_vehicle_is_not_judged() -> None:
-    flight = simulate_flight(Scenario(seed=SEED), parse(["no-motion"]))
-    named = found(explain(compare(flight, Settings(sigma_a_m_s2=5.0), axes=("north", "east"))))
-    assert named == {}
-
-
 @pytest.mark.reallogs
 @pytest.mark.parametrize(
     ("log", "name"),
@@ -105,21 +98,3 @@ def test_simulated_px4_flights(shared_logs: Path, log, name) -> None:
     flight = read_log(shared_logs / "simulated" / f"{log}.ulg")
     named = list(found(explain(compare(flight, Settings(0.35, 0.10), axes=("north", "east")))))
     assert named[:1] == ([] if name is None else [name])
-
-
-@pytest.mark.parametrize(
-    ("offset_s", "says", "remedy"),
-    [
-        (-0.120, "the data ask for 120 ms (95 % 110 to 130)", "EKF2_EV_DELAY"),
-        (0.080, "the stamps are early by 80 ms (95 % 70 to 90)", "Correct the stamps"),
-    ],
-)
-def test_no_delay_is_negative(offset_s, says, remedy) -> None:
-    clean = flown()
-    assert isinstance(clean.clock, ClockOffset)
-    interval = offset_s - 0.01, offset_s + 0.01
-    clock = replace(clean.clock, offset_s=offset_s, interval_s=interval, sigma_s=0.005)
-    (finding,) = source_clock.delay(clean, clock)
-    assert says in finding.message
-    assert remedy in finding.remedy
-    assert "EKF2_EV_DELAY to -" not in finding.remedy

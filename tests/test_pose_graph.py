@@ -114,7 +114,6 @@ def test_chordal_initialisation_is_two_dense_least_squares(dimension: int, seed:
         right.append(weight @ rotation[i] @ pose[:d] - row[:, :d] @ graph.poses[0, :d])
     position = np.linalg.lstsq(np.vstack(rows), np.concatenate(right))[0].reshape(n - 1, d)
     made = _chordal(graph)
-    assert made is not None
     assert made.initialised == FROM_CHORDAL
     np.testing.assert_array_equal(made.poses[0], graph.poses[0])
     np.testing.assert_allclose(lie.rotation_matrix(made.poses), rotation, atol=1e-7)
@@ -294,7 +293,6 @@ def test_both_starts_are_exact_without_noise(dimension: int) -> None:
     made = initialise(replace(graph, poses=held))
     np.testing.assert_allclose(lie.log(lie.between(held, made.poses)), 0.0, atol=1e-6)
     by_chordal = _chordal(graph)
-    assert by_chordal is not None
     np.testing.assert_allclose(lie.log(lie.between(graph.poses, by_chordal.poses)), 0.0, atol=1e-6)
 
 

@@ -10,7 +10,6 @@ from flights import Estimator, Uwb, aisle_flight, motion, unexplained, with_nois
 
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
-from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
 from px4fuse.findings.story import MOST_SENTENCES, story
 from px4fuse.flight import Reset
@@ -43,30 +42,6 @@ def test_a_clean_flight_is_told_in_one_sentence_with_its_errors() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("settings", "knows", "since"),
-    [
-        (Settings(sigma_z_m=0.03), "too sure of itself", "SIGMA_Z 0.03 is smaller than the 0.1"),
-        (Settings(sigma_z_m=0.3), "too modest", "SIGMA_Z 0.3 is larger than the 0.1"),
-        (Settings(sigma_a_m_s2=3.0), "too modest", "SIGMA_A 3 is larger than the 0."),
-    ],
-)
-def test_a_wrong_setting_is_told_with_what_the_flight_asks_for(
-    settings: Settings, knows: str, since: str
-) -> None:
-    first, *_ = told(compare(aisle_flight(), settings))
-    ours = first.split("our filter was ")[1]
-    assert knows in ours
-    assert f"since {since}" in ours
-
-
-def test_a_setting_is_not_blamed_for_what_it_does_not_cause() -> None:
-    # a larger SIGMA_Z makes no filter too sure of itself
-    flight = aisle_flight(uwb=Uwb(outlier_share=0.1))
-    first, *_ = told(compare(flight, Settings(sigma_z_m=0.5)))
-    assert "smaller" not in first
-
-
 def test_a_silent_source_is_told_with_how_far_both_filters_coasted() -> None:
     silence = (50.0, 58.0)
     comparison = compare(aisle_flight(uwb=Uwb(gap_s=silence), heading_deg=ALONG_DEG))
@@ -85,13 +60,6 @@ def test_an_ekf2_that_is_too_sure_is_told_by_how_much() -> None:
     first, *_ = told(compare(aisle_flight(ekf2=Estimator(nis=9.0, every=1))), tuned=False)
     factor = float(re.search(r"and ([\d.]+) times too sure of itself; our", first)[1])
     assert factor == pytest.approx(9.0, rel=0.15)
-
-
-def test_without_truth_nobody_is_called_right() -> None:
-    first, *_ = told(compare(aisle_flight(truth=False)))
-    assert "the log has no truth" in first
-    assert "from the truth" not in first
-    assert "by their own innovations both are honest about it" in first
 
 
 def test_without_ekf2_its_absence_is_told_with_the_reason() -> None:

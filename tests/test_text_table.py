@@ -15,12 +15,8 @@ def test_text_in_any_encoding(encoding: str) -> None:
 
 
 @pytest.mark.parametrize("end", ["\r\n", "\r", "\n"])
-def test_ends_of_lines(end: str) -> None:
-    assert text_of(TEXT.replace("\n", end).encode()) == TEXT
-
-
-def test_nuls_of_a_power_cut_are_no_text() -> None:
-    assert text_of(TEXT.encode() + bytes(512)) == TEXT
+def test_ends_of_lines_and_nuls_of_a_power_cut(end: str) -> None:
+    assert text_of(TEXT.replace("\n", end).encode() + bytes(512)) == TEXT
 
 
 @pytest.mark.parametrize(

@@ -249,13 +249,14 @@ def test_what_is_no_trajectory_is_refused_in_one_line(case: str, tmp_path: Path)
 def test_paths_that_cannot_be_read_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(TrajectoryError, match="cannot be read"):
-        read_trajectory(tmp_path / "none.tum")
-    with pytest.raises(TrajectoryError, match="a folder"):
-        read_trajectory(tmp_path)
     monkeypatch.setattr(reader, "MAX_FILE_BYTES", 10)
-    with pytest.raises(TrajectoryError, match="more than the limit"):
-        read_trajectory(SAMPLE)
+    for path, words in (
+        (tmp_path / "none.tum", "cannot be read"),
+        (tmp_path, "a folder"),
+        (SAMPLE, "more than the limit"),
+    ):
+        with pytest.raises(TrajectoryError, match=words):
+            read_trajectory(path)
 
 
 NUMBER = st.floats(-1e6, 1e6)

@@ -50,7 +50,6 @@ def moved(
     one: Trajectory, turn: Rotation, shift: np.ndarray, scale: float = 1.0, **changes: Any
 ) -> Trajectory:
     """The same motion in another world."""
-    assert one.rotation is not None
     position = scale * turn.apply(one.position_m) + shift
     return replace(one, position_m=position, rotation=turn * one.rotation, **changes)
 

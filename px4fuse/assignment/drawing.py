@@ -209,23 +209,18 @@ def draw(
         )
         for choice, difficulty in zip(chosen, hard, strict=True)
     )
-    scenario = draw_scenario(secret, student_id, kind, truth)
-    return Drawn(scenario, tuple(chosen), typed, round(max(hard, default=HARDEST), 2))
-
-
-def draw_scenario(secret: bytes, student_id: str, kind: Kind, truth: bool = True) -> Scenario:
-    """Noises, speed and heading of one student's flight, without mistakes."""
     numbers: dict[str, Any] = {
-        name: round(low + (high - low) * uniform(secret, student_id, kind, name), decimals)
+        name: round(low + (high - low) * one(name), decimals)
         for name, (low, high, decimals) in NOISES[kind].items()
     }
-    return Scenario(
+    scenario = Scenario(
         kind=kind,
         passes=PASSES[kind],
         truth=truth and kind == "aisle",
-        seed=int(uniform(secret, student_id, kind, "seed") * 2**32),
+        seed=int(one("seed") * 2**32),
         **numbers,
     )
+    return Drawn(scenario, tuple(chosen), typed, round(max(hard, default=HARDEST), 2))
 
 
 def most_mistakes(kind: Kinds) -> int:

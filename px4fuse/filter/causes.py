@@ -12,6 +12,7 @@ from scipy.special import chdtri
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.display import brief
 from px4fuse.filter.hypotheses import (
+    CAUSES,
     FORWARD,
     MIN_MEASUREMENTS,
     RIGHT,
@@ -21,11 +22,10 @@ from px4fuse.filter.hypotheses import (
     HypothesisFit,
     hypotheses_of,
     steps,
-    too_few,
 )
 from px4fuse.filter.likelihood import parabola_vertex
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis
+from px4fuse.filter.signals import Axis, too_few
 from px4fuse.flight import Flight, Unavailable
 
 # With biases and tilt taken out, less noise of the acceleration is left than the filter needs
@@ -117,28 +117,28 @@ def explained(
     -------
     Explained, or Unavailable where there is no acceleration or too few measurements.
     """
-    lines = hypotheses_of(flight, axes, settings, sigma_z_m, clock_offset_s)
-    if isinstance(lines, Unavailable):
-        return lines
-    skip = np.isin(axes[0].measurement_time_s[-len(lines.time_s) :], outlier_time_s)
-    if np.count_nonzero(~skip) < MIN_MEASUREMENTS:
-        return too_few(int(np.count_nonzero(~skip)))
+    model = hypotheses_of(flight, axes, settings, sigma_z_m, clock_offset_s)
+    if isinstance(model, Unavailable):
+        return model
+    skip = np.isin(axes[0].measurement_time_s[-len(model.time_s) :], outlier_time_s)
+    if (count := int(np.count_nonzero(~skip))) < MIN_MEASUREMENTS:
+        return too_few(CAUSES, count, MIN_MEASUREMENTS)
     levels = sigma_a_m_s2 * SIGMA_A_FACTORS
-    sigma_a, found = _fit_noise(lines, levels, skip)
-    jumps = _jumps(lines, sigma_a, skip)
+    sigma_a, found = _fit_noise(model, levels, skip)
+    jumps = _jumps(model, sigma_a, skip)
     if jumps:
         for jump in jumps:
-            skip = skip & ~_from(lines.time_s, jump.time_s, AFTER_STEP_S)
-        lines = replace(lines, steps=steps(lines.time_s, [jump.time_s for jump in jumps]))
-        sigma_a, found = _fit_noise(lines, levels, skip)
+            skip = skip & ~_from(model.time_s, jump.time_s, AFTER_STEP_S)
+        model = replace(model, steps=steps(model.time_s, [jump.time_s for jump in jumps]))
+        sigma_a, found = _fit_noise(model, levels, skip)
     return Explained(
-        found.estimate(FORWARD), found.estimate(RIGHT), _scale(lines, sigma_a, skip), jumps, sigma_a
+        found.estimate(FORWARD), found.estimate(RIGHT), _scale(model, sigma_a, skip), jumps, sigma_a
     )
 
 
-def _fit_noise(lines: Hypotheses, levels: Array, skip: BoolArray) -> tuple[float, HypothesisFit]:
+def _fit_noise(model: Hypotheses, levels: Array, skip: BoolArray) -> tuple[float, HypothesisFit]:
     """The most likely of some SIGMA_A, and what is fitted with it."""
-    fitted = cache(lambda at: lines.fit(float(levels[at]), skip))
+    fitted = cache(lambda at: model.fit(float(levels[at]), skip))
     best = _lowest(lambda at: fitted(at).score, len(levels))
     return float(levels[best]), fitted(best)
 
@@ -152,9 +152,9 @@ def _lowest(score: Callable[[int], float], count: int) -> int:
     return at
 
 
-def _scale(lines: Hypotheses, sigma_a: float, skip: BoolArray) -> Estimate:
+def _scale(model: Hypotheses, sigma_a: float, skip: BoolArray) -> Estimate:
     """Scale of the source minus 1, from the likelihood of a few; a turn's share is put back."""
-    fitted = cache(lambda at: lines.fit(sigma_a, skip, float(SCALES[at])))
+    fitted = cache(lambda at: model.fit(sigma_a, skip, float(SCALES[at])))
     # with S's logarithm, which grows with the scale, this would be biased towards zero
     lowest = _lowest(lambda at: fitted(at).square, len(SCALES))
     at = int(np.clip(lowest, 1, len(SCALES) - 2))
@@ -169,7 +169,7 @@ def _scale(lines: Hypotheses, sigma_a: float, skip: BoolArray) -> Estimate:
     return Estimate(float(found * turned - 1.0), float(sigma))
 
 
-def _jumps(lines: Hypotheses, sigma_a: float, skip: BoolArray) -> tuple[Jump, ...]:
+def _jumps(model: Hypotheses, sigma_a: float, skip: BoolArray) -> tuple[Jump, ...]:
     """Steps of the source that stay, the largest first found, in order of time.
 
     Times are proposed by a scan over all, and by where runs of outliers begin: a step begins with
@@ -179,18 +179,18 @@ def _jumps(lines: Hypotheses, sigma_a: float, skip: BoolArray) -> tuple[Jump, ..
     jumps: list[Jump] = []
     found = skip
     for _ in range(MAX_JUMPS):
-        lines = replace(lines, steps=steps(lines.time_s, [jump.time_s for jump in jumps]))
+        model = replace(model, steps=steps(model.time_s, [jump.time_s for jump in jumps]))
         starts = np.flatnonzero(found & ~np.concatenate([[False], found[:-1]]))
-        proposed = [float(lines.time_s[at]) for at in starts]
-        proposed += _scan(lines, sigma_a, found)
+        proposed = [float(model.time_s[at]) for at in starts]
+        proposed += _scan(model, sigma_a, found)
         chance = STEP_FALSE_ALARM / max(len(proposed), 1)
-        judged = [_judge(lines, sigma_a, found, time_s, chance) for time_s in proposed]
+        judged = [_judge(model, sigma_a, found, time_s, chance) for time_s in proposed]
         named = [jump for jump in judged if jump is not None]
         if not named:
             break
         best = max(named, key=lambda jump: jump.chi_square)
         jumps.append(best)
-        found = found & ~_from(lines.time_s, best.time_s, AFTER_STEP_S)
+        found = found & ~_from(model.time_s, best.time_s, AFTER_STEP_S)
     return tuple(sorted(jumps, key=lambda jump: jump.time_s))
 
 
@@ -198,50 +198,50 @@ def _from(time_s: Array, start_s: float, length_s: float) -> BoolArray:
     return np.asarray((time_s >= start_s) & (time_s < start_s + length_s))
 
 
-def _scan(lines: Hypotheses, sigma_a: float, skip: BoolArray) -> list[float]:
+def _scan(model: Hypotheses, sigma_a: float, skip: BoolArray) -> list[float]:
     """The time at which a step would explain most, where that is more than chance would."""
-    base = lines.fit(sigma_a, skip)
-    times = lines.time_s[EDGE:-EDGE]
+    base = model.fit(sigma_a, skip)
+    times = model.time_s[EDGE:-EDGE]
     times = times[:: max(1, -(-len(times) // MAX_STEPS))]
     if not len(times):
         return []
     # what a step at each time takes away of the squares, summed over the axes
     chi_square = np.zeros(len(times))
-    for axis in range(len(lines.legs)):
+    for axis in range(len(model.legs)):
         rows = base.axis == axis
         columns, rest = base.columns[rows], base.rest[rows]
         for few in np.array_split(np.arange(len(times)), -(-len(times) // STEPS_AT_ONCE)):
-            response = lines.respond(axis, steps(lines.time_s, times[few]), sigma_a, skip)
+            response = model.respond(axis, steps(model.time_s, times[few]), sigma_a, skip)
             mixed = columns.T @ response
             size = np.sum(response**2, axis=0) - np.sum(mixed * (base.covariance @ mixed), axis=0)
             chi_square[few] += (rest @ response) ** 2 / np.maximum(size, 1e-9)
     chi_square /= max(base.spread, 1.0) ** 2
     best = int(np.argmax(chi_square))
-    if chi_square[best] < chdtri(len(lines.legs), STEP_FALSE_ALARM / len(lines.time_s)):
+    if chi_square[best] < chdtri(len(model.legs), STEP_FALSE_ALARM / len(model.time_s)):
         return []
     return [float(times[best])]
 
 
 def _judge(
-    lines: Hypotheses, sigma_a: float, skip: BoolArray, time_s: float, chance: float
+    model: Hypotheses, sigma_a: float, skip: BoolArray, time_s: float, chance: float
 ) -> Jump | None:
     """A step at a time, where what comes later still asks for it; None where that is chance."""
-    after = _from(lines.time_s, time_s, AFTER_STEP_S)
-    burst = _from(lines.time_s, time_s, BURST_S)
-    lines = replace(lines, steps=np.hstack([lines.steps, steps(lines.time_s, [time_s])]))
-    columns = len(lines.prior) + lines.steps.shape[1] * (1 + np.arange(len(lines.legs))) - 1
+    after = _from(model.time_s, time_s, AFTER_STEP_S)
+    burst = _from(model.time_s, time_s, BURST_S)
+    model = replace(model, steps=np.hstack([model.steps, steps(model.time_s, [time_s])]))
+    columns = len(model.prior) + model.steps.shape[1] * (1 + np.arange(len(model.legs))) - 1
     later = (skip & ~after) | burst
-    before = np.count_nonzero(~later & (lines.time_s < time_s))
-    if min(before, np.count_nonzero(~later & (lines.time_s >= time_s))) < EDGE:
+    before = np.count_nonzero(~later & (model.time_s < time_s))
+    if min(before, np.count_nonzero(~later & (model.time_s >= time_s))) < EDGE:
         return None
-    found = lines.fit(sigma_a, later)
+    found = model.fit(sigma_a, later)
     size, covariance = found.coefficients[columns], found.covariance[np.ix_(columns, columns)]
     chi_square = float(size @ np.linalg.solve(covariance, size)) / max(found.spread, 1.0) ** 2
     if chi_square < chdtri(len(columns), chance):
         return None
-    near = np.tile(after[~later], len(lines.legs))
+    near = np.tile(after[~later], len(model.legs))
     if np.mean(found.rest[near] ** 2) > STEP_NIS * max(found.spread, 1.0) ** 2:
         return None
     # its size from all, now that it is known to be one
-    whole = lines.fit(sigma_a, skip & ~after)
+    whole = model.fit(sigma_a, skip & ~after)
     return Jump(time_s, tuple(whole.estimate(int(at)) for at in columns), chi_square)

@@ -85,10 +85,24 @@ class Likelihood:
     ) -> None:
         self.parts, self.weight, self.sigma_z_m = parts, weight, sigma_z_m
         self.tabulated = not any(part.noise_fixed.any() for part in parts)
-        self.nodes, self.step = ROUGH_NODES if rough else NODES
-        self._fits: dict[int, tuple[Fitted, ...]] = {}
-        self._rows: dict[tuple[int, int], Array] = {}
-        self._values: dict[tuple[int, int], Array] = {}
+        self.nodes, self.step = nodes, step = ROUGH_NODES if rough else NODES
+
+        @cache
+        def fits(of_ratio: int) -> list[Fitted]:
+            ratio = float(np.exp(step * of_ratio))
+            return [of_ratios([part], [ratio], 0.0, weight, sigma_z_m)[0] for part in parts]
+
+        @cache
+        def row(of_ratio: int, of_z: int) -> Array:
+            scales = np.exp(step * (of_z + np.arange(nodes)))
+            return np.sum([each.totals(scales)[:, 0] for each in fits(of_ratio)], axis=0)
+
+        @cache
+        def values(of_ratio: int, of_z: int) -> Array:
+            """At the nodes about one place, from the first ones on."""
+            return np.array([row(of_ratio + at, of_z) for at in range(nodes)])
+
+        self._values = values
 
     def __call__(self, noises: Noises) -> float:
         """-ln p with some noises."""
@@ -97,26 +111,10 @@ class Likelihood:
         ln_z = log(noises.sigma_z_m) / self.step
         ln_ratio = log(noises.sigma_a_m_s2) / self.step - ln_z
         before = (self.nodes - 1) // 2
-        first = (floor(ln_ratio) - before, floor(ln_z) - before)
-        if first not in self._values:
-            self._values[first] = self._around(*first)
-        across = _between(ln_ratio - first[0], self.nodes)
-        along = _between(ln_z - first[1], self.nodes)
-        return float(across @ self._values[first] @ along)
-
-    def _around(self, of_ratio: int, of_z: int) -> Array:
-        """Values at the nodes about one place, from the first ones on."""
-        rows = range(of_ratio, of_ratio + self.nodes)
-        new = [row for row in rows if row not in self._fits]
-        ratios = np.exp(self.step * np.array(new)).tolist()
-        fits = [of_ratios([part], ratios, 0.0, self.weight, self.sigma_z_m) for part in self.parts]
-        self._fits |= dict(zip(new, zip(*fits, strict=True), strict=True))
-        scales = np.exp(self.step * (of_z + np.arange(self.nodes)))
-        for row in rows:
-            if (row, of_z) not in self._rows:
-                totals = [each.totals(scales)[:, 0] for each in self._fits[row]]
-                self._rows[row, of_z] = np.sum(totals, axis=0)
-        return np.array([self._rows[row, of_z] for row in rows])
+        first, first_z = floor(ln_ratio) - before, floor(ln_z) - before
+        across = _between(ln_ratio - first, self.nodes)
+        along = _between(ln_z - first_z, self.nodes)
+        return float(across @ self._values(first, first_z) @ along)
 
 
 @cache

@@ -28,10 +28,11 @@ from scipy.spatial.transform import Rotation
 from px4fuse.arrays import Array, BoolArray, IntArray, cumulative_integral
 from px4fuse.filter.likelihood import Preintegrated, innovations_of_signals, moved, preintegrate
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis, ned_acceleration
+from px4fuse.filter.signals import Axis, ned_acceleration, too_few
 from px4fuse.filter.steps import Timeline, timeline
 from px4fuse.flight import AXIS_NAMES, QUATERNION_COLUMNS, Flight, Unavailable
 
+CAUSES = "causes beyond noise"
 MIN_MEASUREMENTS = 50
 # Slow error of the logged attitude: its root mean square, and how far apart it is independent
 TILT_SIGMA_RAD = 0.002
@@ -195,15 +196,6 @@ def _with_signals(legs: Preintegrated, dp: Array, dv: Array, measured_m: Array) 
     return replace(legs, delta_position_m=dp, delta_velocity_m_s=dv, measurement_m=measured_m)
 
 
-def too_few(count: int) -> Unavailable:
-    """What stands in for an estimate from so few measurements."""
-    return Unavailable(
-        "causes beyond noise",
-        f"{count} measurements are too few (at least {MIN_MEASUREMENTS})",
-        "Analyse a longer segment, or log the source at a higher rate.",
-    )
-
-
 def hypotheses_of(
     flight: Flight,
     axes: tuple[Axis, ...],
@@ -232,7 +224,7 @@ def hypotheses_of(
     assert isinstance(acceleration, pd.DataFrame)
     assert isinstance(attitude, pd.DataFrame)
     if len(axes[0].measurement_time_s) <= MIN_MEASUREMENTS:
-        return too_few(len(axes[0].measurement_time_s))
+        return too_few(CAUSES, len(axes[0].measurement_time_s), MIN_MEASUREMENTS)
     shifted = [
         replace(axis, measurement_time_s=axis.measurement_time_s + clock_offset_s) for axis in axes
     ]

@@ -94,7 +94,7 @@ class PreparedMotion:
     time_s : ndarray, shape (m,)
         Stamps of the measurements that lie in a stretch.
     measurement_m : ndarray, shape (m, a)
-        NaN where there is none.
+        From the first of each stretch; NaN where there is none.
     weight : ndarray, shape (m,)
         What each counts.
     edges : ndarray of int, shape (s + 1,)
@@ -145,9 +145,6 @@ class PreparedMotion:
         """
         length = np.diff(self.time_s)
         unit = self.dt_s * np.stack(noise_of_many_steps(length))
-        # from the first of each stretch, whose place nothing says: numbers stay small
-        stretch = np.repeat(np.arange(len(self.signals)), np.diff(self.edges))
-        first = pd.DataFrame(self.measurement_m).groupby(stretch).transform("first").to_numpy()
         initial = np.zeros((len(self.time_s), 2))
         initial[self.edges[:-1]] = START_PRECISION
         shape = len(self.directions), len(offset_s), 1 + len(CONSTANT_SIGMA), len(length)
@@ -163,7 +160,7 @@ class PreparedMotion:
             dv[leg] = np.diff(velocity)
             dp[leg] = np.diff(position) - velocity[..., :-1] * np.diff(time)
         return Positions(
-            measurement_m=self.measurement_m - first,
+            measurement_m=self.measurement_m,
             start=self.edges[:-1],
             length_s=length,
             noise_unit=unit,
@@ -270,11 +267,15 @@ def motion(
             f"(at least {MIN_MEASUREMENTS})",
             "Analyse a longer segment.",
         )
+    edges = np.cumsum([0, *map(len, rows)])
+    # from the first of each stretch, whose place nothing says: numbers stay small
+    measured = pd.DataFrame(measurement_m[row])
+    first = measured.groupby(np.repeat(np.arange(len(rows)), np.diff(edges))).transform("first")
     return PreparedMotion(
         time_s[row],
-        measurement_m[row],
+        (measured - first).to_numpy(),
         np.ones(len(row)) if weight is None else weight[row],
-        np.cumsum([0, *map(len, rows)]),
+        edges,
         tuple(of_stretch),
         directions,
         dt_s,

@@ -221,6 +221,15 @@ def make_axes(
     return tuple(axes)
 
 
+def too_few(what: str, count: int, least: int) -> Unavailable:
+    """What stands in for an estimate from so few measurements."""
+    return Unavailable(
+        what,
+        f"{count} measurements are too few (at least {least})",
+        "Analyse a longer segment, or log the source at a higher rate.",
+    )
+
+
 def along(frame: pd.DataFrame, columns: list[str], weights: Array) -> Array:
     """Weighted sum of columns; a column of weight zero may be NaN."""
     total = np.zeros(len(frame))

@@ -17,7 +17,7 @@ import numpy as np
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis
+from px4fuse.filter.signals import Axis, too_few
 from px4fuse.flight import Unavailable
 
 MIN_MEASUREMENTS = 100
@@ -83,11 +83,7 @@ def smoothing(
         return axes[0].acceleration
     count = len(axes[0].measurement_time_s)
     if count < MIN_MEASUREMENTS:
-        return Unavailable(
-            "low pass in the source",
-            f"{count} measurements are too few (at least {MIN_MEASUREMENTS})",
-            "Analyse a longer segment, or log the source at a higher rate.",
-        )
+        return too_few("low pass in the source", count, MIN_MEASUREMENTS)
     first = max(0, (count - MAX_MEASUREMENTS) // 2)
     middle = slice(first, first + MAX_MEASUREMENTS)
     time = axes[0].measurement_time_s[middle]

@@ -36,7 +36,7 @@ from px4fuse.filter.likelihood import (
 )
 from px4fuse.filter.motion import SignalCache, motion
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis
+from px4fuse.filter.signals import Axis, too_few
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.record import Count, Maybe, NotNegative, Record
 
@@ -269,11 +269,7 @@ def tune_axes(
     legs = [preintegrate(axis, settings) for axis in axes]
     count = len(legs[0].measurement_m)
     if count < MIN_MEASUREMENTS:
-        return Unavailable(
-            f"tuning, {name}",
-            f"{count} measurements are too few (at least {MIN_MEASUREMENTS})",
-            "Analyse a longer segment, or log the source at a higher rate.",
-        )
+        return too_few(f"tuning, {name}", count, MIN_MEASUREMENTS)
     parts = [filter_part(leg) for leg in legs]
     chosen = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
     alone = most_likely(parts, chosen, np.ones(count))

@@ -117,10 +117,9 @@ def grade(
     for sheet in course.worksheets:
         grade_column(sheet, course.column)
     found, notes = submissions.collect(paths)
-    register = register_of(course, key)
+    register, times = register_of(course, key)
     records = output / RECORDS
     graded, reused = grade_all(found, logs, rubric, records, key, register, processes, progress)
-    times = _moodle_times(course, register)
     entries, unknown = class_entries(graded, found, register, course, times, overrides)
     entries = _flagged(entries, key)
     written, more = write_class(
@@ -136,29 +135,29 @@ def grade(
     return GradeOutcome(entries, (*notes, *unknown, *more), reused, written)
 
 
-def register_of(course: Course, key: AnswerKey | None) -> Register | None:
-    """Who is in the class, with what the worksheets know of them; None where nothing says it."""
+def register_of(
+    course: Course, key: AnswerKey | None
+) -> tuple[Register | None, dict[int, datetime]]:
+    """Who is in the class, and when Moodle's worksheets say that each of them handed in.
+
+    With what all worksheets know of them; None where nothing says who is in it.
+    """
     listed = [people_of_sheet(sheet) for sheet in course.worksheets]
     people = course.roster or (people_of_key(key) if key else next(iter(listed), None))
     if people is None:
-        return None
+        return None, {}
     register = Register(people)
+    times = {}
     for others in listed:
         register.add(others)
-    return register
-
-
-def _moodle_times(course: Course, register: Register | None) -> dict[int, datetime]:
-    """When Moodle's worksheets say that people of the class handed in."""
-    times = {}
     for sheet in course.worksheets:
-        for row in sheet.rows if kind_of(sheet) == "moodle" and register else ():
+        for row in sheet.rows if kind_of(sheet) == "moodle" else ():
             time = moodle_time(sheet.cell(row, ("lastmodifiedsubmission",)))
             person = person_of_row(sheet, row)
-            place = register.place(person) if person and register else None
+            place = register.place(person) if person else None
             if time is not None and place is not None:
                 times[place] = time
-    return times
+    return register, times
 
 
 def _flagged(entries: Sequence[Entry], key: AnswerKey | None) -> tuple[Entry, ...]:

@@ -30,9 +30,9 @@ from px4fuse.verification.verification import verify
 from px4fuse.verification.workers import bounded
 from px4fuse.writing import write_all
 
-HANDED_IN, REDRAWN, RESULTS = ".handed-in.png", ".pdf", ".results.json"
+HANDED_IN, REDRAWN = ".handed-in.png", ".pdf"
 MADE_WITH = ("px4fuse", "numpy", "scipy", "matplotlib", "pypdfium2", "pillow")
-_SHA256 = re.compile(rb'"([0-9a-f]{64})"')
+_SHA256 = re.compile(r'"([0-9a-f]{64})"')
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,8 @@ class Record:
     ----------
     made_with : dict
         Versions that it holds for.
+    results : str
+        As they were attached.
     files : dict
         SHA-256 of every file that the report rests on, and whether it was at hand.
     gap : bool
@@ -53,6 +55,7 @@ class Record:
 
     made_with: dict[str, str]
     refused: Refused | None = None
+    results: str = ""
     files: dict[str, bool] = field(default_factory=dict)
     gap: bool = False
     verdict: Verdict | None = None
@@ -98,15 +101,11 @@ def verified(
     handed_in: object = b""
     if verdict.pages or not verdict.redrawn:
         handed_in = bounded(partial(picture, page=page - 1), pdf, TIMEOUT_S, MEMORY_BYTES)
-    results = to_json(report.results).encode()
+    results = to_json(report.results)
     unread = replace(verdict, redrawn=b"")
-    kept = Record(_versions(), None, _files(results, logs), gap, unread, page)
-    parts = {
-        RESULTS: results,
-        HANDED_IN: handed_in if isinstance(handed_in, bytes) else b"",
-        REDRAWN: verdict.redrawn,
-    }
-    _keep(records, sha256, kept, parts)
+    kept = Record(_versions(), None, results, _files(results, logs), gap, unread, page)
+    shown = handed_in if isinstance(handed_in, bytes) else b""
+    _keep(records, sha256, kept, {HANDED_IN: shown, REDRAWN: verdict.redrawn})
     return (report.results, unread, page), False
 
 
@@ -115,9 +114,9 @@ def _is_gap(results: Reported, logs: Mapping[str, Path], handed_out: frozenset[s
     return log in handed_out and log not in logs
 
 
-def _files(results: bytes, logs: Mapping[str, Path]) -> dict[str, bool]:
+def _files(results: str, logs: Mapping[str, Path]) -> dict[str, bool]:
     """Of every file that a report rests on, whether it is at hand."""
-    return {name: name in logs for name in sorted({n.decode() for n in _SHA256.findall(results)})}
+    return {name: name in logs for name in sorted(set(_SHA256.findall(results)))}
 
 
 @cache
@@ -142,12 +141,13 @@ def _recalled(
         kept = msgspec.json.decode(file_of(records, sha256).read_bytes(), type=Record)
         if kept.made_with != _versions() or kept.verdict is None:
             return kept.refused if kept.made_with == _versions() else None
-        data = file_of(records, sha256, RESULTS).read_bytes()
-        results = read_results(data)
+        results = read_results(kept.results.encode())
     # none, or not one of ours: done again
     except (OSError, msgspec.MsgspecError, ResultsError):
         return None
     if not isinstance(results, ComparisonResults | LoopResults):
         return None
-    same = kept.files == _files(data, logs) and kept.gap == _is_gap(results, logs, handed_out)
+    same = kept.files == _files(kept.results, logs) and kept.gap == _is_gap(
+        results, logs, handed_out
+    )
     return (results, kept.verdict, kept.page) if same else None

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,8 +23,8 @@ TIMEOUT_S = 120.0
 MEMORY_BYTES = 4_000_000_000
 # What a picture looks like besides its report; a change draws all anew
 DRAWN_AS = "700 px, 16 colours"
-# Which reports this tool has drawn into a folder: pictures of no others are ever deleted
-LIST = "drawn.txt"
+# What the pictures are called; nothing else in their folder is ever deleted
+NAMED = re.compile(r"([0-9a-f]{16})-\d{3}-of-\d{3}\.png")
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,6 @@ def draw_sheets(
     """
     jobs = {key: SheetJob(pdf, tuple(hide), folder) for key, (pdf, hide) in reports.items()}
     stems = {key: job.stem for key, job in jobs.items()}
-    listed = _listed(folder)
-    if listed | set(stems.values()):
-        _list(folder, listed | set(stems.values()))
     missing = [jobs[key] for key, stem in stems.items() if not _drawn(folder, stem)]
     for _ in run_bounded(
         draw,
@@ -81,12 +78,10 @@ def draw_sheets(
         memory_bytes=MEMORY_BYTES,
     ):
         pass
-    gone = listed - set(stems.values())
-    for stem in gone:
-        for path in folder.glob(f"{stem}-*-of-*.png"):
+    for path in folder.glob("*.png"):
+        named = NAMED.fullmatch(path.name)
+        if named and named[1] not in stems.values():
             path.unlink(missing_ok=True)
-    if gone:
-        _list(folder, stems.values())
     return {key: _drawn(folder, stem) for key, stem in stems.items()}
 
 
@@ -97,16 +92,6 @@ def draw(job: SheetJob) -> None:
         ends = (f"-{number:03}-of-{len(drawn):03}.png" for number in range(1, len(drawn) + 1))
         named = zip((job.folder / f"{job.stem}{end}" for end in ends), drawn, strict=True)
         write_all(dict(named))
-
-
-def _listed(folder: Path) -> set[str]:
-    path = folder / LIST
-    words = path.read_text(encoding="utf-8").split() if path.is_file() else []
-    return {word for word in words if re.fullmatch(r"[0-9a-f]{16}", word)}
-
-
-def _list(folder: Path, stems: Collection[str]) -> None:
-    write_all({folder / LIST: "".join(f"{stem}\n" for stem in sorted(set(stems))).encode()})
 
 
 def _drawn(folder: Path, stem: str) -> tuple[str, ...]:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from textwrap import fill
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 
@@ -19,9 +19,10 @@ from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.loop import Loop
-from px4fuse.notebook.tables import EKF2, OURS, tracks, variants
+from px4fuse.notebook.tables import EKF2, tracks, variants
+from px4fuse.report.panels import ERROR, INNOVATIONS, POSITION, SIGMA_P, error_reference
 from px4fuse.report.style import EKF2 as EKF2_COLOUR
-from px4fuse.report.style import EKF2_DOTS, EKF2_LINE, MEASUREMENT, OURS_BAND, OURS_DOTS, OURS_LINE
+from px4fuse.report.style import EKF2_LINE, OURS_BAND, OURS_DOTS, OURS_LINE
 from px4fuse.report.style import OURS as OURS_COLOUR
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.model import Trajectory
@@ -29,8 +30,8 @@ from px4fuse.trajectory.scores import PairwiseError
 
 # Negative log-likelihood by which a pair of noises may lie above the best one, 95 %: χ²(2)/2
 REGION_DROP, SHOWN_DROP = 3.0, 12.0
-# Of what 95 % of the time stay below, an axis reaches so many times as far
-SETTLED = 2.0
+# Characters in a line of what stands beside an axis
+LABEL_WIDTH = 26
 # Of a frame, which coordinates a map shows to the right and upwards
 ACROSS = {"NED": (1, 0), "FRD": (1, 0), "ENU": (0, 1), "camera": (0, 2), "unknown": (0, 1)}
 
@@ -59,46 +60,21 @@ def flight(result: Flight, ax: Axes | None = None) -> Axes:
 
 
 def axis_comparison(result: AxisComparison, ax: Any = None) -> Any:
-    """Error, innovations and standard deviation over time: three axes."""
+    """Error, innovations and standard deviation over time, as in the report: three axes."""
     if ax is None:
         _, ax = plt.subplots(3, 1, sharex=True, figsize=(8, 7), layout="constrained")
-    table = frame(result)
-    known = "truth_position_m" in table
-    zero: Any = table["truth_position_m"] if known else 0.0
-    top, middle, bottom = ax
-    ours = table["kf_position_m"] - zero
-    two_sigma = 2.0 * table["kf_sigma_p_m"]
-    top.fill_between(table.index, ours - two_sigma, ours + two_sigma, color=OURS_BAND, lw=0)
-    top.plot(table.index, ours, label=OURS, **OURS_LINE)
-    if "ekf2_position_m" in table:
-        top.plot(table.index, table["ekf2_position_m"] - zero, label=EKF2, **EKF2_LINE)
-    if not known:
-        top.plot(table.index, table["measurement_m"], ".", ms=3, color=MEASUREMENT)
-    top.set(ylabel="error, m" if known else "position, m", title=f"{result.axis.name}, band ±2σ")
-    top.legend()
-    # the filter starts with the lesson's P₀, beside which the rest would be a line
-    settled = SETTLED * float(np.nanquantile(abs(ours - ours.median()) + two_sigma, 0.95))
-    if known:
-        top.set_ylim(-settled, settled)
-    updates = table.dropna(subset="kf_innovation_m")
-    limit = 2.0 * updates["kf_sqrt_s_m"]
-    middle.fill_between(updates.index, -limit, limit, color=OURS_BAND, lw=0)
-    middle.plot(updates.index, updates["kf_innovation_m"], **OURS_DOTS)
-    if isinstance(result.ekf2_innovations, pd.DataFrame):
-        middle.plot(result.ekf2_innovations["innovation_m"], **EKF2_DOTS)
-    middle.set_ylabel("innovation, m")
-    bottom.plot(table.index, table["kf_sigma_p_m"], **OURS_LINE)
-    if "ekf2_sigma_p_m" in table:
-        bottom.plot(table.index, table["ekf2_sigma_p_m"], **EKF2_LINE)
-    highest = SETTLED * float(table[["kf_sigma_p_m"]].quantile(0.95).max())
-    bottom.set(ylabel="σ of position, m", xlabel="time, s", ylim=(0.0, highest))
+    first = POSITION if isinstance(error_reference(result), Unavailable) else ERROR
+    for axes, panel in zip(ax, (first, INNOVATIONS, SIGMA_P), strict=True):
+        panel.draw(axes, result)
+        axes.set_ylabel(fill(panel.named(result), LABEL_WIDTH))
+    ax[0].set_title(result.axis.name)
+    ax[-1].set_xlabel("time (s)")
     return ax
 
 
 def comparison(result: Comparison | Analysis, axis: str | None = None, ax: Any = None) -> Any:
     """One axis, by default the aisle where there is one."""
-    whole = result
-    return axis_comparison(whole.main if axis is None else whole[axis], ax)
+    return axis_comparison(result.main if axis is None else result[axis], ax)
 
 
 def why(result: Why, ax: Axes | None = None) -> Axes:
