@@ -20,6 +20,7 @@ import pytest
 from batch_tools import environment, started, tiny_log, tiny_logs
 from click.testing import CliRunner
 from made_up_fleet import DAMAGED, made_up
+from msgspec import structs
 
 import px4fuse
 from px4fuse.cli import cli
@@ -29,7 +30,7 @@ from px4fuse.fleet import engine, job, run, store
 from px4fuse.fleet.engine import connected
 from px4fuse.fleet.job import Job
 from px4fuse.fleet.logs import find_logs
-from px4fuse.fleet.rows import COLUMNS, csv_bytes, table_of
+from px4fuse.fleet.rows import COLUMNS, csv_bytes, rows_of, table_of
 from px4fuse.fleet.run import Fleet
 from px4fuse.fleet.terminal import print_fleet
 from px4fuse.request import ComparisonRequest
@@ -106,6 +107,12 @@ def test_every_log_is_in_the_table_with_its_numbers_or_its_line(client, tmp_path
     assert results.axes["east"].filters["kf"].nis_mean == first.loc[1, "kf_nis_mean"]
     assert results.story == tuple(first.loc[0, "story"].split("\n"))
     assert (output / first.loc[0, "report"]).read_bytes().startswith(b"%PDF")
+    # a clock offset is there where it is determinable
+    rows = rows_of(
+        structs.replace(results, clock=structs.replace(results.clock, determinable=False))
+    )
+    assert first["clock_offset_s"].tolist() == [results.clock.offset_s] * 4
+    assert all("clock_offset_s" not in row for row in rows)
 
     twin = of["twin.ulg"].loc[0]
     assert (twin["status"], twin["log_sha256"]) == ("not judged", first.loc[0, "log_sha256"])

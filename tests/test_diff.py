@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
 from exchange import replace
-from results_tools import EXAMPLE
 from scipy.signal import lfilter
 from scipy.special import ndtr
 from scipy.stats import f as fisher
@@ -33,7 +32,7 @@ from px4fuse.fleet.measures import (
 )
 from px4fuse.fleet.significance import contrast, corrected, spreads
 from px4fuse.flight import Unavailable
-from px4fuse.report.changes_words import change_line
+from px4fuse.report.changes_words import change_line, printed
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
 from px4fuse.results.changes import NumberChange
@@ -237,6 +236,7 @@ def test_a_number_that_cannot_be_tested_says_so_and_one_may_be_in_one_alone():
     )
     assert (it.status, it.q, it.change) == ("not tested", None, pytest.approx(3.0))
     assert change_line(it) == "it, no test: 0.1 to 0.3 m, × 3"
+    assert printed(SimpleNamespace(numbers=(it, none, only_a))) == [it]  # since it is large
     assert (none.status, none.change) == ("not tested", None)
     assert (only_a.status, only_a.b) == ("only in A", None)
     assert (only_b.status, only_b.a) == ("only in B", None)
@@ -360,10 +360,9 @@ def test_every_kind_that_has_an_interval_has_a_measured_spread(clean):
     assert {number.measure.path for number in found if number.interval} <= spreads().keys()
 
 
-def test_what_one_side_lacks_is_listed():
-    down = {**EXAMPLE, "axes": {"north": EXAMPLE["axes"]["north"]}}
-    whole, part = (read_results(json.dumps(found).encode()) for found in (EXAMPLE, down))
-    found = changes(DiffInput("a.json", "results", whole), DiffInput("b.json", "results", part))
-    status = {change.path: change.status for change in found.results.numbers}
+def test_what_one_side_lacks_is_listed(clean):
+    part = replace(clean.results, axes={"north": clean.results.axes["north"]})
+    whole, part = (DiffInput("r.json", "results", found) for found in (clean.results, part))
+    status = {change.path: change.status for change in changes(whole, part).results.numbers}
     assert status["axes.down.filters.kf.nis_mean"] == "only in A"
     assert set(status.values()) == {"only in A", "same"}
