@@ -181,14 +181,14 @@ class Answers(Record, frozen=True, kw_only=True):
         return [claim.kind for claim in self.mistakes] == [NONE]
 
 
-QuantityKind = Literal["gain", "variance", "innovation", "nis", "silence", "gate"]
+AskedKind = Literal["gain", "variance", "innovation", "nis", "silence", "gate"]
 # One of each pair is asked
-_DRAWN: tuple[tuple[QuantityKind, QuantityKind], ...] = (
+_DRAWN: tuple[tuple[AskedKind, AskedKind], ...] = (
     ("gain", "variance"), ("innovation", "nis"), ("silence", "gate"),
 )  # fmt: skip
 
 
-class Quantity(Record, frozen=True):
+class AskedNumber(Record, frozen=True):
     """A number that no report prints, asked at settings of each log's own.
 
     Attributes
@@ -203,7 +203,7 @@ class Quantity(Record, frozen=True):
         Seconds of silence, or the gate in standard deviations.
     """
 
-    kind: QuantityKind
+    kind: AskedKind
     update: int
     sigma_a_m_s2: float
     sigma_z_m: float
@@ -229,7 +229,7 @@ class Quantity(Record, frozen=True):
 GATED = 20
 
 
-def asked(log_sha256: str) -> tuple[Quantity, ...]:
+def asked(log_sha256: str) -> tuple[AskedNumber, ...]:
     """Three quantities, which follow from the log and differ between logs."""
     drawn = iter(hashlib.sha256(f"px4fuse answers {log_sha256}".encode()).digest())
 
@@ -240,9 +240,9 @@ def asked(log_sha256: str) -> tuple[Quantity, ...]:
     early, late, last = (pair[next(drawn) % 2] for pair in _DRAWN)
     extra = between(1.0, 4.0, 1) if last == "silence" else between(1.3, 2.0, 1)
     return (
-        Quantity(early, 2 + next(drawn) % 7, *settings),
-        Quantity(late, 20 + next(drawn) % 130, *settings),
-        Quantity(last, 20 + next(drawn) % 100, *settings, extra),
+        AskedNumber(early, 2 + next(drawn) % 7, *settings),
+        AskedNumber(late, 20 + next(drawn) % 130, *settings),
+        AskedNumber(last, 20 + next(drawn) % 100, *settings, extra),
     )
 
 

@@ -138,7 +138,6 @@ CHOICES: dict[Kind, tuple[AssignableMistake, ...]] = {
     ),
     "loop": (AssignableMistake("open-end", "false_loop_closure", "end", 4, "m"),),
 }  # fmt: skip
-POSSIBLE_FINDINGS = frozenset(choice.finding for kind in CHOICES.values() for choice in kind)
 
 
 @dataclass(frozen=True)

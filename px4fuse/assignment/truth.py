@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from px4fuse.answers import GATED, Quantity, asked
+from px4fuse.answers import GATED, AskedNumber, asked
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import noises_and_clock
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
@@ -188,7 +188,9 @@ def _ekf2_did(
     return tuple(dict.fromkeys(must)), tuple(one for one in dict.fromkeys(also) if one not in must)
 
 
-def quantity_truth(result: AxisComparison, quantity: Quantity) -> float | tuple[float, ...] | None:
+def quantity_truth(
+    result: AxisComparison, quantity: AskedNumber
+) -> float | tuple[float, ...] | None:
     """The answer to a question, from a replay with its settings; None where it never comes so far.
 
     "silence" is the variance after the update, taken on by F and Q for so long (DT steps).

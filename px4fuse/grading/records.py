@@ -36,7 +36,7 @@ _SHA256 = re.compile(r'"([0-9a-f]{64})"')
 
 
 @dataclass(frozen=True)
-class Record:
+class VerificationRecord:
     """What was found of one PDF; of what is no report only why.
 
     Attributes
@@ -93,7 +93,7 @@ def verified(
         return found, True
     report = read_report(pdf, "The file")
     if isinstance(report, Refused):
-        _keep(records, sha256, Record(_versions(), report), {})
+        _keep(records, sha256, VerificationRecord(_versions(), report), {})
         return report, False
     gap = _is_gap(report.results, logs, handed_out)
     verdict = verify(report, {} if gap else logs)
@@ -103,7 +103,7 @@ def verified(
         handed_in = bounded(partial(picture, page=page - 1), pdf, TIMEOUT_S, MEMORY_BYTES)
     results = to_json(report.results)
     unread = replace(verdict, redrawn=b"")
-    kept = Record(_versions(), None, results, _files(results, logs), gap, unread, page)
+    kept = VerificationRecord(_versions(), None, results, _files(results, logs), gap, unread, page)
     shown = handed_in if isinstance(handed_in, bytes) else b""
     _keep(records, sha256, kept, {HANDED_IN: shown, REDRAWN: verdict.redrawn})
     return (report.results, unread, page), False
@@ -128,7 +128,7 @@ def _versions() -> dict[str, str]:
     return found
 
 
-def _keep(records: Path, sha256: str, kept: Record, parts: Mapping[str, bytes]) -> None:
+def _keep(records: Path, sha256: str, kept: VerificationRecord, parts: Mapping[str, bytes]) -> None:
     files = {file_of(records, sha256, end): content for end, content in parts.items()}
     write_all({**files, file_of(records, sha256): msgspec.json.encode(kept)})
 
@@ -138,7 +138,7 @@ def _recalled(
 ) -> tuple[Reported, Verdict, int] | Refused | None:
     """What an earlier run found, if nothing that it rests on has changed."""
     try:
-        kept = msgspec.json.decode(file_of(records, sha256).read_bytes(), type=Record)
+        kept = msgspec.json.decode(file_of(records, sha256).read_bytes(), type=VerificationRecord)
         if kept.made_with != _versions() or kept.verdict is None:
             return kept.refused if kept.made_with == _versions() else None
         results = read_results(kept.results.encode())
