@@ -339,6 +339,40 @@ def test_parts_and_change_are_those_of_their_profiles(
     assert p == pytest.approx(chi2.sf(ratio, 2), abs=0.03)
 
 
+def test_what_is_simulated_for_the_scatter_is_the_noise_of_the_imu(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of legs and measurements as large as the noises say, with the velocity that goes with it."""
+    given: list[tuple[list[Array], list[Array]]] = []
+
+    def products(_: object, sigma_a: float, variance: Array, *pair: list[Array]) -> Array:
+        given.append(pair)
+        assert sigma_a == 0.5
+        np.testing.assert_allclose(variance, 0.1**2)
+        return np.arange(pair[0][0].shape[1])[None, :]
+
+    monkeypatch.setattr(clock, "paired_products", products)
+    flight, _ = made_flight()
+    samples = flight.positions[0].samples[POSITION_COLUMNS]
+    time = samples.index.to_numpy()
+    moved = motion(flight, time, samples.to_numpy(), directions=np.eye(3), dt_s=DT)
+    factor = clock._scatter(moved, 0.0, Noises(0.5, 0.1, 0.2), 40.0)
+    assert factor == pytest.approx(1.0 + (32**2 - 1) / 12.0 / 40.0)
+    error, dp, dv = (
+        np.concatenate(part, axis=1) for part in zip(*(one for one, _ in given), strict=True)
+    )
+    speed = np.concatenate([two[0] for _, two in given], axis=1)
+    joined, length = moved.at(0.0).joined, np.diff(moved.time_s)
+    for noise, expected in (
+        (error, 0.1**2),
+        (dv[..., joined], (0.5**2 * DT * length)[joined]),
+        (dp[..., joined], (0.5**2 * DT * length**3 / 3.0 + 0.2**2 * length)[joined]),
+    ):
+        assert np.mean(noise**2 / expected) == pytest.approx(1.0, abs=0.03)
+    np.testing.assert_allclose(np.diff(speed)[..., joined], dv[..., joined], atol=1e-12)
+    assert not speed[..., moved.edges[:-1]].any()
+
+
 # --- recovery ---
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cli_tools import run_main
 from hypothesis import given
 from hypothesis import strategies as st
-from test_cli import run_main
 
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.g2o import g2o_text, parse_g2o, read_g2o

@@ -160,13 +160,6 @@ def test_a_scale_is_not_drawn_to_zero_by_the_noise_of_the_acceleration() -> None
     assert np.mean(scales) == pytest.approx(0.0, abs=0.04)
 
 
-def test_a_small_scale_is_below_what_a_log_shows() -> None:
-    causes = flown("scale=5%").explained
-    assert isinstance(causes, Explained)
-    assert 2.0 * causes.scale.sigma > 0.05
-    assert "source_scale_wrong" not in found(flown("scale=5%"))
-
-
 def test_outliers_that_end_are_no_jump_and_a_jump_is_no_outliers() -> None:
     assert set(found(flown("nlos=5%"))) == {"source_outliers"}
     assert "source_outliers" not in found(flown("jump=1,40s"))
@@ -195,11 +188,6 @@ def test_a_shift_of_the_stamps_that_explains_as_much_is_no_smoothing() -> None:
     assert told.gain_nats == 0.0
 
 
-@pytest.mark.parametrize(("kept", "named"), [("3Hz", True), ("2.5Hz", False), ("1Hz", False)])
-def test_thinning_shows_in_the_intervals_unless_they_stay_regular(kept, named) -> None:
-    assert ("source_thinned" in found(flown(f"decimate={kept}"))) is named
-
-
 @pytest.mark.parametrize(
     ("intervals", "named"),
     [
@@ -212,14 +200,12 @@ def test_thinning_shows_in_the_intervals_unless_they_stay_regular(kept, named) -
     ],
 )
 def test_intervals_of_a_thinned_source_are_whole_multiples(intervals, named) -> None:
-    rng = np.random.default_rng(1)
-    steps = np.array((intervals * 300)[:300]) + rng.normal(0.0, 0.002, 300)
-    time = np.cumsum(steps)
+    noise = np.random.default_rng(1).normal(0.0, 0.002, 300)
+    time = 5.0 + np.cumsum((intervals * 300)[:300] + noise)
     (track,) = flight().positions
-    samples = track.samples.iloc[: len(time)].set_axis(pd.Index(time + 5.0, name="time_s"))
+    samples = track.samples.iloc[:300].set_axis(pd.Index(time, name="time_s"))
     other = replace(flown(), source=replace(track, samples=samples))
-    finding = list(source_intervals.thinning(other))
-    assert bool(finding) is named
+    assert bool(list(source_intervals.thinning(other))) is named
 
 
 # ------------------------------------------------------------------ stamps of arrival
@@ -306,9 +292,7 @@ def test_what_was_not_tuned_is_unavailable_with_a_remedy() -> None:
     assert found(untuned) == {}
 
 
-@pytest.mark.parametrize(
-    "mistake", ["accel-bias=0.4", "scale=25%", "jump=1,21s", "smoothed=0.5", "decimate=2Hz"]
-)
+@pytest.mark.parametrize("mistake", ["accel-bias=0.4", "jump=1,21s", "decimate=2Hz"])
 def test_a_flight_of_a_moment_says_nothing(mistake) -> None:
     short = analysed(flight(mistake), start_s=20.0, end_s=25.0)
     assert found(short) == {}
@@ -316,8 +300,9 @@ def test_a_flight_of_a_moment_says_nothing(mistake) -> None:
     assert isinstance(short.smoothing, Unavailable)
 
 
-def test_a_vehicle_that_hovers_has_no_scale() -> None:
-    still = flown("no-motion")
-    assert isinstance(still.explained, Explained)
-    assert still.explained.scale.sigma > 0.15
-    assert found(still) == {}
+def test_a_scale_that_is_small_or_of_a_vehicle_that_hovers_is_not_told() -> None:
+    for mistake, least_sigma in (("no-motion", 0.15), ("scale=5%", 0.025)):
+        causes = flown(mistake).explained
+        assert isinstance(causes, Explained)
+        assert causes.scale.sigma > least_sigma
+        assert "source_scale_wrong" not in found(flown(mistake))

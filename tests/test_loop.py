@@ -97,6 +97,7 @@ def test_the_samples_closure_error_is_the_true_one(sample_loop: Loop) -> None:
     assert sample_loop.closure_error_m == pytest.approx(1.42, abs=0.05)  # sample_logs/README.md
     assert sample_loop.path_length_m == pytest.approx(87.7, abs=1.5)
     assert sample_loop.heading_error_deg == pytest.approx(5.09, abs=0.3)
+    assert sample_loop.closures[0].distance_m == pytest.approx(sample_loop.closure_error_m)
     assert sample_loop.part_reason == "from take-off to landing, by the land detector"
 
 

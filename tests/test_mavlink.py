@@ -855,26 +855,18 @@ def hostile_frame(rng: np.random.Generator) -> bytes:
 def mutated(rng: np.random.Generator, content: bytes) -> bytes:
     """Flip, cut, insert, duplicate and reorder."""
     for _ in range(rng.integers(1, 6)):
-        size = max(len(content), 1)
-        a, b = sorted(rng.integers(0, size + 1, 2).tolist())
+        a, b = sorted(rng.integers(0, len(content) + 1, 2).tolist())
         b = min(b, a + int(rng.integers(1, 2000)))
-        action = rng.integers(0, 6)
-        if action == 0:
-            changed = bytearray(content)
-            for at in rng.integers(0, size, rng.integers(1, 60)).tolist():
-                if at < len(changed):
-                    changed[at] ^= 1 << rng.integers(0, 8)
-            content = bytes(changed)
-        elif action == 1:
-            content = content[:a] + content[b:]
-        elif action == 2:
-            content = content[:a] + rng.bytes(int(rng.integers(1, 300))) + content[a:]
-        elif action == 3:
-            content = content[:b] + content[a:b] * int(rng.integers(1, 4)) + content[b:]
-        elif action == 4:
-            content = content[b:] + content[a:b] + content[:a]
-        else:
-            content = content[:a]
+        before, part, after = content[:a], content[a:b], content[b:]
+        flipped = np.frombuffer(part, np.uint8) ^ rng.binomial(1, 0.01, len(part)).astype(np.uint8)
+        content = [
+            before + flipped.tobytes() + after,
+            before + after,
+            before + rng.bytes(int(rng.integers(1, 300))) + part + after,
+            before + part * int(rng.integers(2, 5)) + after,
+            after + part + before,
+            before,
+        ][rng.integers(0, 6)]
     return content
 
 

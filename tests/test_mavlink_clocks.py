@@ -30,10 +30,10 @@ from mavlink_tools import (
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Flight, sample_rate
 from px4fuse.readers import read_log
-from px4fuse.readers.mavlink_clocks import Exchanges, Line, least_delay, map_clock
+from px4fuse.readers.mavlink_clocks import Line, least_delay, map_clock
 
 NOTHING = np.zeros(0)
-NO_EXCHANGES = Exchanges(NOTHING, NOTHING, NOTHING, NOTHING)
+NO_EXCHANGES = (NOTHING, NOTHING), (NOTHING, NOTHING)
 
 
 @pytest.fixture
@@ -498,9 +498,9 @@ def test_a_timesync_of_another_clock_is_passed_over():
     stamps = UNIX_S + np.arange(0.0, 60.0, 0.2)
     received = np.arange(0.0, 60.0, 0.2) + 0.01
     asked = np.arange(0.0, 60.0, 0.1)
-    wrong = Exchanges(UNIX_S + 3600.0 + asked, asked, NOTHING, NOTHING)
+    wrong = (asked, UNIX_S + 3600.0 + asked), NO_EXCHANGES[1]
     mapped = map_clock(
-        "x", stamps, received, Line(0.0, 0.0, 1.0, 0.0, 9), wrong, None, has_receipt=True
+        "x", stamps, received, Line(0.0, 0.0, 1.0, 0.0, 9), *wrong, None, has_receipt=True
     )
     assert mapped.statement.method == "receive time"
     assert mapped.to_boot is not None
@@ -512,7 +512,7 @@ def test_the_statement_says_what_the_map_does():
     stamps = UNIX_S + np.arange(0.0, 100.0, 0.1)
     received = 20.0 + 1.0001 * np.arange(0.0, 100.0, 0.1)
     mapped = map_clock(
-        "x", stamps, received, Line(0.0, 0.0, 1.0, 0.0, 9), NO_EXCHANGES, None, has_receipt=True
+        "x", stamps, received, Line(0.0, 0.0, 1.0, 0.0, 9), *NO_EXCHANGES, None, has_receipt=True
     )
     statement, line = mapped.statement, mapped.to_boot
     assert line is not None

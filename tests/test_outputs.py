@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_tools import run_main
+from cli_tools import contents, run_main
 from click.testing import CliRunner
 from ulog_tools import ev_error, ev_stamps, make_log, position
 
@@ -46,10 +46,6 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "soft.json").symlink_to(tmp_path / "l.ulg")
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 REFUSED = {

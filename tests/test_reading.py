@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from cli_tools import run_main
 from conftest import REPOSITORY
 from patience import patience
-from test_cli import run_main
 
 from px4fuse.errors import LogError, Px4FuseError
 from px4fuse.reading import max_log_bytes, read_text, read_whole, shown

@@ -35,7 +35,7 @@ def document(flight: px4fuse.Flight, explained: bool = True, **options: object) 
 
 
 def results(made: Document) -> ComparisonResults:
-    request = ComparisonRequest(log=made.log[0])
+    request = ComparisonRequest(log=made.analysis.flight.log.name)
     return build.results(request, made.analysis, made.findings, made.student, made.command)
 
 

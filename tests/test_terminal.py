@@ -143,6 +143,13 @@ def test_a_paragraph_hangs_beside_its_label(capsys) -> None:
     ]
 
 
+def test_words_alone_import_no_pictures() -> None:
+    """Matplotlib costs a third of a second, which `sync` and `loop` need not wait for."""
+    rooms = ", ".join(f"px4fuse.report.{n}" for n in ("terminal", "loop", "whatif", "evaluation"))
+    code = f"import sys, {rooms}; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
 def test_how_wide_a_pipe_is_can_be_said(monkeypatch) -> None:
     monkeypatch.setenv("COLUMNS", "44")
     assert terminal().width == 44

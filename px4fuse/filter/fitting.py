@@ -95,7 +95,8 @@ class Likelihood:
         @cache
         def row(of_ratio: int, of_z: int) -> Array:
             scales = np.exp(step * (of_z + np.arange(nodes)))
-            return np.sum([each.totals(scales)[:, 0] for each in fits(of_ratio)], axis=0)
+            totals = [each.totals(scales)[:, 0] for each in fits(of_ratio)]
+            return np.asarray(np.sum(totals, axis=0))
 
         @cache
         def values(of_ratio: int, of_z: int) -> Array:

@@ -121,24 +121,6 @@ def spread(values: Array) -> float:
 
 
 @dataclass(frozen=True)
-class Exchanges:
-    """TIMESYNC readings of one sender, in s.
-
-    Attributes
-    ----------
-    replied_s, autopilot_s : ndarray, shape (n,)
-        The sender's clock when it replied, and the autopilot's when it had asked.
-    asked_s, answered_s : ndarray, shape (m,)
-        The sender's clock when it asked, and the autopilot's when it answered.
-    """
-
-    replied_s: Array
-    autopilot_s: Array
-    asked_s: Array
-    answered_s: Array
-
-
-@dataclass(frozen=True)
 class Mapped:
     """A sender's stamps on the boot clock.
 
@@ -154,7 +136,8 @@ def map_clock(
     stamp_s: Array,
     received_s: Array,
     boot_of_receipt: Line,
-    exchanges: Exchanges,
+    replies: tuple[Array, Array],
+    answers: tuple[Array, Array],
     unix_of_boot: Line | None,
     *,
     has_receipt: bool,
@@ -169,8 +152,10 @@ def map_clock(
         All that the sender stamped with this clock, and when it was received.
     boot_of_receipt : Line
         From time of receipt to boot clock.
-    exchanges : Exchanges
-        TIMESYNC; may be empty.
+    replies : tuple of ndarray, shape (n,), s
+        TIMESYNC: the autopilot's clock when it had asked, and the sender's when it replied.
+    answers : tuple of ndarray, shape (m,), s
+        The sender's clock when it asked, and the autopilot's when it answered.
     unix_of_boot : Line or None
         From boot clock to UNIX time by the autopilot's SYSTEM_TIME.
     has_receipt : bool
@@ -189,7 +174,7 @@ def map_clock(
         regular = intervals[intervals < MAX_INTERVAL_S]
         jitter = float(np.std(regular) / np.sqrt(2.0)) if len(regular) > 1 else 0.0
         return Mapped(None, ClockMap(name, receipt, len(stamp_s), 0.0, 0.0, jitter, note, distinct))
-    synchronised = _by_exchange(exchanges)
+    synchronised = _by_exchange(replies, answers)
     as_it_is = abs(float(np.median(boot_at_receipt - stamp_s)))
     # a clock of its own may have started seconds after the autopilot's
     gained = 0.0
@@ -221,14 +206,14 @@ def map_clock(
     return Mapped(by_receipt, _statement(clock, receipt, by_receipt, stamp_s, note))
 
 
-def _by_exchange(exchanges: Exchanges) -> Line | None:
+def _by_exchange(replies: tuple[Array, Array], answers: tuple[Array, Array]) -> Line | None:
     """From the sender's clock to the boot clock, between the two envelopes where both exist."""
     lines = []
-    if len(exchanges.replied_s) >= MIN_PAIRS:
+    if len(replies[0]) >= MIN_PAIRS:
         # asked before replied: the reply is the later reading
-        lines.append(least_delay(exchanges.autopilot_s, exchanges.replied_s).inverse())
-    if len(exchanges.asked_s) >= MIN_PAIRS:
-        lines.append(least_delay(exchanges.asked_s, exchanges.answered_s))
+        lines.append(least_delay(*replies).inverse())
+    if len(answers[0]) >= MIN_PAIRS:
+        lines.append(least_delay(*answers))
     if not lines:
         return None
     x0 = lines[0].x0

@@ -9,7 +9,6 @@ from px4fuse.arrays import IntArray
 from px4fuse.errors import SettingsError
 from px4fuse.readers.mavlink_clocks import (
     OTHER_SPEED,
-    Exchanges,
     Line,
     Mapped,
     map_clock,
@@ -139,7 +138,8 @@ def _map_sender(recording: Recording, sender: Address, unix: Line | None) -> Map
         np.concatenate(stamps),
         np.concatenate(received),
         recording.boot_of_receipt,
-        Exchanges(replied[replies], asked[replies], question[answers], answered[answers]),
+        (asked[replies], replied[replies]),
+        (question[answers], answered[answers]),
         unix,
         has_receipt=frames.received_us is not None,
     )

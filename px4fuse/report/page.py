@@ -10,7 +10,6 @@ import io
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from px4fuse.report import fonts
 from px4fuse.report.style import MUTED
 
 if TYPE_CHECKING:
@@ -175,6 +174,8 @@ def legend_above(axes: Axes, **options: Any) -> None:
 
 def printable(text: str) -> str:
     """Text without control characters, and a white square for what no font here can draw."""
+    from px4fuse.report import fonts  # noqa: PLC0415 - as in :meth:`Page.panel`
+
     return "".join(
         character if character in KEPT or fonts.font_of(character) else fonts.NO_GLYPH
         for character in text.expandtabs(4)
