@@ -217,7 +217,7 @@ def _of_innovations(judged: FilterSummary, field: str, value: float) -> Bounds |
     if field not in ("nis_mean", "innovation_std_m") or not _is_normal(judged, count):
         return None
     ends = count / chi2.ppf((0.5 + LEVEL / 2, 0.5 - LEVEL / 2), count)
-    low, high = (ends if field == "nis_mean" else np.sqrt(ends)).tolist()
+    low, high = np.power(ends, 1.0 if field == "nis_mean" else 0.5).tolist()
     return value * low, value * high
 
 
