@@ -18,9 +18,9 @@ from pypdf import PdfReader, PdfWriter
 
 from px4fuse.flight import Unavailable
 from px4fuse.grading.sheets import draw_sheets
-from px4fuse.verification.pictures import (
+from px4fuse.verification.pages import (
     COVER,
-    MAX_BYTES,
+    MAX_PICTURE_BYTES,
     MAX_PIXELS,
     page_pictures,
     picture,
@@ -36,7 +36,7 @@ def _pdfium() -> None:
 
 def opened(made: bytes | Unavailable) -> Image.Image:
     assert isinstance(made, bytes), made
-    assert len(made) <= MAX_BYTES
+    assert len(made) <= MAX_PICTURE_BYTES
     image = Image.open(io.BytesIO(made))
     image.load()
     assert image.format == "PNG"

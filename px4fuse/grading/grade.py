@@ -208,14 +208,10 @@ def grade_all(
     )
     with closing(work):
         for index, result in work:
-            one, recalled = (
-                (
-                    refused(rubric, key, Refused(f"Grading it failed: {result.reason}", FAILED)),
-                    False,
-                )
-                if isinstance(result, Failed)
-                else result
-            )
+            if isinstance(result, Failed):
+                why = Refused(f"Grading it failed: {result.reason}", FAILED)
+                result = refused(rubric, key, why), False  # noqa: PLW2901
+            one, recalled = result
             submission = found[index]
             nameless = not one.student and not one.student_id
             graded[index] = replace(
