@@ -35,10 +35,6 @@ PINNED = ((759547191, 0.109, -14.4), ("clock-jump=53ms", "ekf2-off"))
 CLASS = tuple(Person(f"s{n:02d}", f"Name {n}") for n in range(3))
 
 
-def student(name):
-    return Person(name)
-
-
 def roster(tmp_path, content):
     path = tmp_path / "roster.csv"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -58,7 +54,7 @@ def files(folder):
 
 class TestDraw:
     def test_same_secret_and_id_same_bytes(self):
-        assert fly(SECRET, student("s1"), "aisle") == fly(SECRET, student("s1"), "aisle")
+        assert fly(SECRET, Person("s1"), "aisle") == fly(SECRET, Person("s1"), "aisle")
         # as a platform may spell it in another export
         assert draw(SECRET, "S1 ", "aisle") == draw(SECRET, "s1", "aisle")
 

@@ -74,6 +74,7 @@ def results(entry: Entry, text: str, seconds: float) -> dict[str, Any]:
     seconds : float
         That grading took.
     """
+    graded = entry.counting
     tests: list[dict[str, Any]] = [
         {
             "name": one_line(item.title, 200),
@@ -82,13 +83,12 @@ def results(entry: Entry, text: str, seconds: float) -> dict[str, Any]:
             "score": item.points,
             "max_score": item.of,
             "status": "passed" if item.points >= item.of else "failed",
-            "tags": ["px4fuse", graded.status],
+            "tags": ["px4fuse", graded.status if graded else "missing"],
         }
-        for graded in filter(None, [entry.counting])
-        for item in graded.items
+        for item in (graded.items if graded else ())
     ]
-    pending = entry.counting.pending if entry.counting else ""
-    if said := [*([f"Pending: {pending}"] if pending else []), *entry.flags]:
+    said = [f"Pending: {graded.pending}"] if graded and graded.pending else []
+    if said := [*said, *entry.flags]:
         tests.append(
             {
                 "name": "For the instructor",
@@ -100,7 +100,7 @@ def results(entry: Entry, text: str, seconds: float) -> dict[str, Any]:
             }
         )
     for number, test in enumerate(tests, start=1):
-        test |= {"number": str(number), "name_format": "text", "output_format": "text"}
+        test.update(number=str(number), name_format="text", output_format="text")
     return {
         "score": entry.total or 0.0,
         "output": text,

@@ -8,7 +8,6 @@ drawn twice and none says whose it is.
 from __future__ import annotations
 
 import hashlib
-import os
 import re
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -19,8 +18,6 @@ from px4fuse.verification.pages import page_pictures
 from px4fuse.verification.workers import run_bounded
 from px4fuse.writing import write_all
 
-TIMEOUT_S = 120.0
-MEMORY_BYTES = 4_000_000_000
 # What a picture looks like besides its report; a change draws all anew
 DRAWN_AS = "700 px, 16 colours"
 # What the pictures are called; nothing else in their folder is ever deleted
@@ -57,13 +54,7 @@ def draw_sheets(
     """
     stems = {key: _stem(report) for key, report in reports.items()}
     missing = [reports[key] for key, stem in stems.items() if not _drawn(folder, stem)]
-    for _ in run_bounded(
-        partial(draw, folder=folder),
-        missing,
-        processes=min(processes or os.cpu_count() or 1, len(missing)),
-        timeout_s=TIMEOUT_S,
-        memory_bytes=MEMORY_BYTES,
-    ):
+    for _ in run_bounded(partial(draw, folder=folder), missing, processes=processes):
         pass
     for path in folder.glob("*.png"):
         named = NAMED.fullmatch(path.name)
