@@ -158,6 +158,17 @@ def test_pages_more_fewer_and_of_another_size() -> None:
     assert (found.page, found.picture) == (2, 1.0)
 
 
+def test_a_page_that_cannot_be_drawn_says_why() -> None:
+    two = drawn("a", "b")
+    writer = PdfWriter(clone_from=io.BytesIO(two))
+    writer.pages[1].mediabox.upper_right = (20_000, 20_000)
+    huge = saved(writer)
+    for one, other in ((huge, two), (two, huge)):
+        (found,) = compared(one, other)
+        assert (found.page, found.picture) == (2, 1.0)
+        assert "its size is 20000 by 20000 points" in found.what
+
+
 def test_a_thousand_pages_are_not_all_drawn() -> None:
     many = PdfWriter()
     page = PdfReader(io.BytesIO(drawn("a"))).pages[0]
