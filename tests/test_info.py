@@ -7,14 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from cli_tools import run, run_main
 from exchange import replace
 from flights import Estimator, Uwb, aisle_flight
 from mavlink_tools import AUTOPILOT, UNIX_S, Aisle, Recorder, heartbeat
-from test_cli import run_main
 from ulog_tools import Log, load, make_log, odometry, stamps, take, topic
 
-from px4fuse.cli import cli
 from px4fuse.cli.info import _print
 from px4fuse.cli.outputs import terminal
 from px4fuse.comparison.comparison import compare
@@ -22,8 +20,7 @@ from px4fuse.comparison.preparation import choose_source
 from px4fuse.errors import Px4FuseError
 from px4fuse.findings import find
 from px4fuse.flight import Flight, Unavailable
-from px4fuse.inspect.inventory import Inventory, Source, take_inventory, to_plain
-from px4fuse.inspect.outlook import Ability
+from px4fuse.inspect.inventory import Ability, Inventory, Source, take_inventory, to_plain
 from px4fuse.origin import GNSS
 from px4fuse.readers import read_log
 from px4fuse.recording import ClockMap, Dropout, Sender
@@ -39,7 +36,7 @@ def screen(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def info(*arguments: str | Path) -> str:
-    result = CliRunner().invoke(cli, ["info", *map(str, arguments)])
+    result = run("info", *arguments)
     assert result.exit_code == 0, result.output
     return result.stdout
 
@@ -72,18 +69,14 @@ def without_position(log: Log) -> Log:
 # ---- the sample log ---------------------------------------------------------------------------
 
 
-def test_it_fits_the_screen_and_is_plain_in_a_pipe(sample_log):
+def test_it_fits_the_screen_and_says_what_the_log_is(sample_log, sample_flight):
     text = info(sample_log)
     assert widest(text) <= WIDTH
     assert len(text.splitlines()) <= 50
     assert "\x1b" not in text
     assert "…" not in text
-    assert "position ->   vehicle_visual_odometry" in text
-
-
-def test_it_says_what_the_log_is(sample_log, sample_flight):
-    text = info(sample_log)
-    for words in ("PX4 v1.16.1", "3.3 MB", sample_flight.log.sha256[:12], "129.7 s", "no UTC"):
+    for words in ("position ->   vehicle_visual_odometry", "PX4 v1.16.1", "3.3 MB", "129.7 s",
+                  sample_flight.log.sha256[:12], "no UTC"):  # fmt: skip
         assert words in text
 
 
@@ -114,14 +107,11 @@ def test_every_row_says_what_the_flight_holds(sample_flight):
     assert source(inventory, "land detector").start_s == sample_flight.airborne[0][0]
 
 
-def test_everything_is_possible_with_the_sample(sample_flight):
-    assert all(ability.possible for ability in take_inventory(sample_flight).abilities)
-
-
 def test_abilities_are_what_compare_then_does(sample_flight):
     """The counts are of the very samples that compare uses."""
     inventory = take_inventory(sample_flight)
     comparison = compare(sample_flight)
+    assert all(ability.possible for ability in inventory.abilities)
     assert inventory.segment == comparison.segment
     said = ability(inventory, "EKF2 innovations").reason
     for axis in comparison.axes.values():
@@ -130,13 +120,6 @@ def test_abilities_are_what_compare_then_does(sample_flight):
     assert f"{len(next(iter(comparison.axes.values())).ekf2_state)} samples" in ability(
         inventory, "EKF2 states"
     ).reason  # fmt: skip
-
-
-def test_both_new_commands_have_help():
-    for command in ("info", "extract"):
-        result = CliRunner().invoke(cli, [command, "--help"])
-        assert result.exit_code == 0
-        assert "Usage:" in result.output
 
 
 # ---- JSON -------------------------------------------------------------------------------------
@@ -194,20 +177,20 @@ def test_a_log_of_other_topics_is_described_all_the_same(tmp_path):
     assert "SDLOG_PROFILE to 129" in remedies(inventory)[0]
 
 
-def test_no_imu(tmp_path):
-    inventory = inventory_of(make_log().drop("sensor_combined"), tmp_path)
-    assert "sensor_combined" in source(inventory, "IMU").unavailable
-    assert not ability(inventory, "acceleration").possible
-    assert ability(inventory, "compare").possible
-    assert ability(inventory, "EKF2 innovations").possible
+@pytest.mark.parametrize(
+    ("topic_", "part", "lost"),
+    [
+        ("sensor_combined", "IMU", {"acceleration"}),
+        ("vehicle_local_position", "EKF2 state",
+         {"EKF2 states", "EKF2 variances", "EKF2 innovations"}),
+    ],
+)  # fmt: skip
+def test_what_a_topic_is_needed_for(tmp_path, topic_, part, lost):
+    inventory = inventory_of(make_log().drop(topic_), tmp_path)
+    assert topic_ in source(inventory, part).unavailable
+    assert {can.name for can in inventory.abilities if not can.possible} - {"truth"} == lost
+    assert all(f"no topic {topic_}" in ability(inventory, name).reason for name in lost)
     assert "Record with SDLOG_PROFILE bit 0 (default)." in remedies(inventory)
-
-
-def test_no_ekf2(tmp_path):
-    inventory = inventory_of(make_log().drop("vehicle_local_position"), tmp_path)
-    for name in ("EKF2 states", "EKF2 variances", "EKF2 innovations"):
-        assert ability(inventory, name) == Ability(name, False, "no topic vehicle_local_position")
-    assert ability(inventory, "compare").possible
 
 
 def test_no_position(tmp_path):
@@ -232,39 +215,40 @@ def test_a_source_that_was_not_logged_names_the_profile_that_logs_it(tmp_path, p
     log = make_log().drop("vehicle_visual_odometry")
     log.parameters["SDLOG_PROFILE"] = profile
     inventory = inventory_of(log, tmp_path)
-    assert remedies(inventory)[0].startswith(f"Set SDLOG_PROFILE to {wanted} (it is {profile})")
+    assert remedies(inventory)[0] == f"Set SDLOG_PROFILE to {wanted} and fly again."
     assert source(inventory, "position").name == "estimator_aid_src_ev_pos"
 
 
 def test_slow_topics_name_the_line_that_logs_them(tmp_path):
     log = make_log(imu_hz=20.0)
     said = remedies(inventory_of(log, tmp_path))
-    assert any('"sensor_combined 0"' in remedy and "20.0 Hz" in remedy for remedy in said)
+    assert any('"sensor_combined 0"' in remedy for remedy in said)
     assert not any("vehicle_attitude" in remedy for remedy in said)
 
 
 @pytest.mark.parametrize(
     ("imu_hz", "said"),
-    [(4.0, "IMU at 4.0 Hz"), (20.0, "IMU at 20 Hz"), (49.5, None), (50.0, None), (100.0, None)],
+    [
+        (4.0, "sensor_combined was logged at 4.0 Hz"),
+        (20.0, "at 20.0 Hz"),
+        (49.5, None),
+        (50.0, None),
+        (100.0, None),
+    ],
 )
 def test_an_imu_that_is_too_slow_is_no_acceleration(tmp_path, imu_hz, said):
     found = ability(inventory_of(make_log(imu_hz=imu_hz), tmp_path), "acceleration")
     assert found.possible == (said is None)
     if said is not None:
         assert said in found.reason
-        assert "50 Hz are needed" in found.reason
+        assert "below the 50 Hz" in found.reason
 
 
 def test_an_attitude_that_is_too_slow_is_no_acceleration_either():
     found = ability(take_inventory(aisle_flight(attitude_hz=5.0)), "acceleration")
     assert not found.possible
-    assert "attitude at 5.0 Hz" in found.reason
-    assert "10 Hz are needed" in found.reason
-
-
-def test_a_stream_a_little_below_its_rate_is_not_told_to_be_faster():
-    advised = take_inventory(aisle_flight(attitude_hz=9.97)).advice
-    assert not any("is below" in advice.remedy for advice in advised)
+    assert "vehicle_attitude was logged at 5.0 Hz, below the 10 Hz" in found.reason
+    assert ability(take_inventory(aisle_flight(attitude_hz=9.97)), "acceleration").possible
 
 
 def test_a_recording_with_damage_blames_no_sd_card(tmp_path):
@@ -295,8 +279,11 @@ def test_a_replay_is_told_by_its_speed_and_not_in_millions_of_ppm(sample_flight,
     assert "ppm" not in said
 
 
-def test_a_slow_source_is_told_to_be_faster(tmp_path):
-    assert any("10 Hz" in remedy for remedy in remedies(inventory_of(make_log(), tmp_path)))
+def test_a_slow_source_that_ekf2_does_not_fuse_is_told_to_be_faster():
+    flight = aisle_flight(
+        ekf2=Estimator(fusing=((0.0, 0.0),)), parameters={"EKF2_EV_CTRL": 15.0}, uwb=Uwb(rate_hz=4)
+    )
+    assert any("10 Hz" in advice.remedy for advice in take_inventory(flight).advice)
 
 
 def test_few_of_ekf2s_innovations_name_the_line_that_logs_them(tmp_path):
