@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from px4fuse.cli.inputs import Named, comparison_request, json_option, recording_options
-from px4fuse.cli.outputs import progress, terminal, write_json
+from px4fuse.cli.outputs import finish, progress, result_files
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
@@ -38,9 +38,8 @@ def info(log: Path, json_path: Path | None, **given: Any) -> None:
         flight = read_flight(request, step)
         step("looking at what is in it")
         inventory = take_inventory(flight)
-    if write_json(to_plain(inventory), json_path):
-        return
-    _print(terminal(), inventory, request)
+    contents = result_files(to_plain(inventory), json_path)
+    finish(contents, lambda console: _print(console, inventory, request))
 
 
 def _print(console: Console, inventory: Inventory, request: ComparisonRequest) -> None:

@@ -17,7 +17,7 @@ from px4fuse.cli.inputs import (
     request_options,
     text_of,
 )
-from px4fuse.cli.outputs import finish, progress, report_paths, spare_inputs
+from px4fuse.cli.outputs import finish, progress, report_paths, result_files, spare_inputs
 from px4fuse.errors import SettingsError
 from px4fuse.reading import shown
 from px4fuse.request import LOOP_OPTIONS, Landing, LoopRequest, command_line
@@ -104,7 +104,6 @@ def loop(
     from px4fuse.report.document import LoopDocument
     from px4fuse.report.loop import print_loop
     from px4fuse.results.build_trajectories import loop_results
-    from px4fuse.results.contract import to_json
 
     person = read_person(given)
     for option, path in (("--tum", tum), ("--g2o", g2o)):
@@ -115,24 +114,14 @@ def loop(
         return
     request = loop_request(source, given)
     _spare(tum, g2o, *((json_path,) if output is None else report_paths(output, json_path)))
-    alone = json_path == STANDARD_OUTPUT
-    with progress(alone, STEPS) as step:
+    with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
         found = run_loop(request, step)
         findings = find_loop(found)
-        command = command_line(request)
-        results = loop_results(request, found, findings, person, command)
+        document = LoopDocument(found, findings, person, command_line(request))
+        results = loop_results(request, found, findings, person, document.command)
         contents = _files(found, tum, g2o)
-        if output is not None:
-            from px4fuse.report.pdf import render
-
-            step("drawing the report")
-            pdf, beside = report_paths(output, json_path)
-            text = to_json(results)
-            document = LoopDocument(found, findings, person, command)
-            contents |= {pdf: render(document, text), beside: text.encode()}
-    if json_path is not None and (alone or output is None):
-        contents[json_path] = to_json(results).encode()
-    finish(contents, lambda console: print_loop(console, found, findings, request), alone=alone)
+        contents |= result_files(results, json_path, output, document, step)
+    finish(contents, lambda console: print_loop(console, found, findings, request))
 
 
 def loop_request(source: Path, given: dict[str, Any]) -> LoopRequest:
@@ -185,7 +174,6 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
     from px4fuse.readers.g2o import g2o_text, read_g2o
     from px4fuse.report.loop import print_graph
     from px4fuse.results.build_trajectories import graph_results
-    from px4fuse.results.contract import to_json
     from px4fuse.trajectory.graph.analysis import analyse_graph
 
     path, part = split_part(str(source))
@@ -200,13 +188,10 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
                 "pose graph. With one, give only --g2o FILE and --json FILE."
             )
     _spare(json_path, g2o)
-    alone = json_path == STANDARD_OUTPUT
-    with progress(alone) as step:
+    with progress(json_path == STANDARD_OUTPUT) as step:
         step(f"reading {shown(source)}")
         solved = analyse_graph(shown(source), read_g2o(path), step, robust=robust)
     command = command_line(LoopRequest(source=str(source))) + (" --robust" if robust else "")
-    results = graph_results(solved, command)
     contents = {} if g2o is None else {g2o: g2o_text(solved.graph).encode()}
-    if json_path is not None:
-        contents[json_path] = to_json(results).encode()
-    finish(contents, lambda to: print_graph(to, solved), alone=alone)
+    contents |= result_files(graph_results(solved, command), json_path)
+    finish(contents, lambda to: print_graph(to, solved))

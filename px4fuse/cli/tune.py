@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from px4fuse.cli.inputs import Named, analysis_options, comparison_request, json_option
-from px4fuse.cli.outputs import progress, terminal, write_json
+from px4fuse.cli.outputs import finish, progress, result_files
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
@@ -47,8 +47,7 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
         compared = run_preparation(request, step)
         tuned = tuned_noises(compared, progress=step)
     results = tuning_results(request, compared, tuned, command_line(request, "tune"))
-    if not write_json(results, json_path):
-        _print(terminal(), compared, tuned, request)
+    finish(result_files(results, json_path), lambda to: _print(to, compared, tuned, request))
     if all(isinstance(found, Unavailable) for found in tuned.values()):
         raise MissingDataError(f"{compared.flight.log.name}: no noise could be determined.")
 
