@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import Named, max_size_option, path_option, request_options
+from px4fuse.cli.inputs import Named, max_size_option, path_option, request_options, results_option
 from px4fuse.cli.outputs import finish, free_report, progress, report_paths, result_files
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.request import EVALUATION_OPTIONS, EvaluationRequest, command_line, settings_name
@@ -52,14 +51,6 @@ class DeltaType(click.ParamType["Delta"]):
 @click.argument("estimate", type=Named())
 @click.argument("reference", type=Named())
 @click.option(
-    "--max-gap",
-    "max_gap_s",
-    type=click.FloatRange(min=0.0, min_open=True),
-    metavar="S",
-    help="Longest gap of the reference to interpolate across; for nearest the largest difference "
-    "in time.  [default: from its rate; 0.01 for nearest]",
-)
-@click.option(
     "--rpe",
     type=DeltaType(),
     multiple=True,
@@ -80,12 +71,7 @@ class DeltaType(click.ParamType["Delta"]):
     metavar="FILE.png",
     help="The picture: the path by its error, APE, RPE.  [default: beside the PDF]",
 )
-@path_option(
-    "--json",
-    "json_path",
-    metavar="FILE",
-    help="The results; - prints them alone on standard output.  [default: beside the PDF]",
-)
+@results_option
 def evaluate(
     estimate: Path,
     reference: Path,
@@ -109,13 +95,11 @@ def evaluate(
     from px4fuse.results.build_trajectories import evaluation_results
     from px4fuse.trajectory.evaluation import evaluate as score
 
-    for name in ("max_gap_s", "time_offset_s"):
-        if isinstance(given[name], float) and not math.isfinite(given[name]):
-            option = EVALUATION_OPTIONS[name].name
-            raise SettingsError(f"{option} {given[name]:g} is not a finite number.")
     request = EvaluationRequest(
         estimate=str(estimate), reference=str(reference), rpe=tuple(map(str, rpe)), **given
     )
+    if request.max_gap_s is not None and request.max_gap_s <= 0.0:
+        raise SettingsError(f"--max-gap {request.max_gap_s:g}: give more than 0 seconds.")
     _picture(output, picture, json_path)  # before the work, not after it
     with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
         step("reading")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import click
+from click.core import ParameterSource
 from msgspec import NODEFAULT, Struct
 from msgspec.structs import fields
 
@@ -213,6 +214,14 @@ def _position(given: dict[str, Any]) -> PositionFile | None:
         if value is not None:
             raise SettingsError(f"{typed[field]} requires --position.")
     return None
+
+
+def typed_parameters() -> Iterator[click.Parameter]:
+    """What was typed of the running command, and not left at its default."""
+    context = click.get_current_context()
+    for parameter in context.command.params:
+        if context.get_parameter_source(parameter.name or "") == ParameterSource.COMMANDLINE:
+            yield parameter
 
 
 def text_of(path: Path | None) -> str | None:

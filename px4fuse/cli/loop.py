@@ -6,16 +6,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from click.core import ParameterSource
 
 from px4fuse.cli.inputs import (
     Named,
+    json_option,
     max_size_option,
     path_option,
     person_options,
     read_person,
     request_options,
     text_of,
+    typed_parameters,
 )
 from px4fuse.cli.outputs import finish, progress, report_paths, result_files, spare_inputs
 from px4fuse.errors import SettingsError
@@ -80,7 +81,7 @@ class LandingType(click.ParamType[Landing]):
 @max_size_option
 @person_options
 @path_option("-o", "--output", metavar="FILE.pdf", help="A report, and its results beside it.")
-@path_option("--json", "json_path", metavar="FILE", help="The results; - prints them alone.")
+@json_option
 @path_option(
     "--tum", metavar="FILE", help="Write the corrected path as a TUM file, in the axes of SOURCE."
 )
@@ -179,10 +180,8 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
     path, part = split_part(str(source))
     if part is not None:
         raise SettingsError(f"{shown(source)}: a pose graph has no part {part!r}. Leave it out.")
-    context = click.get_current_context()
-    for parameter in context.command.params:
-        chosen = context.get_parameter_source(parameter.name or "") == ParameterSource.COMMANDLINE
-        if chosen and parameter.name not in FOR_GRAPHS:
+    for parameter in typed_parameters():
+        if parameter.name not in FOR_GRAPHS:
             raise SettingsError(
                 f"{shown(source)}: {parameter.opts[-1]} is for flights and trajectories, not for a "
                 "pose graph. With one, give only --g2o FILE and --json FILE."

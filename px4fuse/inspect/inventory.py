@@ -282,10 +282,9 @@ def _source(
         about |= {"topics": stream.topics, "clock": stream.clock, "log": stream.log}
     if isinstance(data, pd.DataFrame):
         about["samples"] = len(data)
-        ends = data.index[[0, -1]].tolist() if len(data) else None
-    else:
-        ends = (data[0][0], data[-1][1]) if data else None
-    if ends is not None:
+    if len(data):
+        whole = isinstance(data, pd.DataFrame)
+        ends = data.index[[0, -1]].tolist() if whole else [data[0][0], data[-1][1]]
         about |= {"start_s": ends[0], "end_s": ends[1]}
     if isinstance(data, pd.DataFrame) and len(data) > 1:
         about |= {"rate_hz": sample_rate(data), "gaps": _gaps(data, of_imu=part == PARTS["imu"])}
@@ -305,24 +304,26 @@ def _gaps(frame: pd.DataFrame, *, of_imu: bool) -> Gaps:
 
 def _abilities(flight: Flight, compared: Comparison | None, reason: str) -> Iterator[Ability]:
     """What compare does, with what, or why not."""
+    given: object
     if compared is None:
         yield Ability("compare", False, reason)
-        acceleration = ned_acceleration(flight)
+        given = ned_acceleration(flight)
     else:
         source, segment = compared.source, compared.segment
         count, span = len(within(source.samples, segment)), (segment.start_s, segment.end_s)
         said = "our filter on {}, {} samples, {:.1f} s to {:.1f} s"
         yield Ability("compare", True, said.format(source.name, count, *span))
-        acceleration = compared.lines[0].acceleration
+        given = compared.lines[0].acceleration
     slow = " ".join(found.message for found in imu.rates(flight))
-    if isinstance(acceleration, Unavailable):
-        slow = f"{acceleration.reason}; velocity is held constant"
+    if isinstance(given, Unavailable):
+        slow = f"{given.reason}; velocity is held constant"
     turned = "IMU turned into NED by the attitude, gravity removed"
     yield Ability("acceleration", not slow, slow or turned)
-    parts, done = _parts(flight), {} if compared is None else _done(compared)
+    parts = _parts(flight)
+    done: dict[str, str | Unavailable] = {} if compared is None else _done(compared)
     for name, key in OF_PARTS.items():
-        part, said = parts.get(key, flight.ekf2), done.get(name, NO_AXIS)
-        found = part if isinstance(part, Unavailable) else said
+        part = parts.get(key, flight.ekf2)
+        found = part if isinstance(part, Unavailable) else done.get(name, NO_AXIS)
         if isinstance(found, Unavailable):
             yield Ability(name, False, found.reason)
         else:

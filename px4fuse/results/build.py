@@ -117,7 +117,7 @@ def _of_flight(
         description=track.description,
         reason=comparison.source_reason,
         rate_hz=track.rate_hz,
-        frame=track.frame,
+        frame=cast(Any, track.frame),
         clock=track.clock,
         reconstructed=origin.reconstructed,
         topics=track.topics,
@@ -126,7 +126,7 @@ def _of_flight(
         log=track.log,
         alignment=track.alignment,
     )
-    used = asdict(settings) | {"clock_offset_s": settings.clock_offset_s + placed_s}
+    used: dict[str, Any] = asdict(settings) | {"clock_offset_s": settings.clock_offset_s + placed_s}
     ends = {"start_s": segment.start_s, "end_s": segment.end_s, "segment_reason": segment.reason}
     return {
         "schema": schema_of(name),
