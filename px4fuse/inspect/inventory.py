@@ -282,10 +282,11 @@ def _source(
         about |= {"topics": stream.topics, "clock": stream.clock, "log": stream.log}
     if isinstance(data, pd.DataFrame):
         about["samples"] = len(data)
-    if len(data):
-        whole = isinstance(data, pd.DataFrame)
-        ends = data.index[[0, -1]].tolist() if whole else [data[0][0], data[-1][1]]
-        about |= {"start_s": ends[0], "end_s": ends[1]}
+        times_s = data.index.tolist()
+    else:
+        times_s = [time_s for span in data for time_s in span]
+    if times_s:
+        about |= {"start_s": times_s[0], "end_s": times_s[-1]}
     if isinstance(data, pd.DataFrame) and len(data) > 1:
         about |= {"rate_hz": sample_rate(data), "gaps": _gaps(data, of_imu=part == PARTS["imu"])}
     return Source(part, **about)

@@ -127,13 +127,17 @@ def _of_flight(
         alignment=track.alignment,
     )
     used: dict[str, Any] = asdict(settings) | {"clock_offset_s": settings.clock_offset_s + placed_s}
-    ends = {"start_s": segment.start_s, "end_s": segment.end_s, "segment_reason": segment.reason}
     return {
         "schema": schema_of(name),
         "request": request.recorded(),
         "log": log_part(comparison.flight),
         "source": source,
-        "settings": ChosenSettings(**used, **ends),
+        "settings": ChosenSettings(
+            **used,
+            start_s=segment.start_s,
+            end_s=segment.end_s,
+            segment_reason=segment.reason,
+        ),
         "provenance": provenance(command),
     }
 
