@@ -433,7 +433,10 @@ REFUSED = {
     "page as text": ("evaluate s.tum s.tum -o page.txt", "ends in .pdf"),
     "picture as JPEG": ("evaluate s.tum s.tum --picture p.jpg", "ends in .png"),
     "picture to print": ("evaluate s.tum s.tum --picture -", "ends in .png"),
-    "picture for results": ("evaluate s.tum s.tum --picture p.png --json p.png", "Give two names"),
+    "picture for results": (
+        "evaluate s.tum s.tum --picture p.png --json p.png",
+        "two outputs name the same file",
+    ),
     "picture into a file": ("evaluate s.tum s.tum --picture n.md/e.png", "cannot be written"),
 }
 

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from px4fuse.cli.inputs import Named, max_size_option, path_option, request_options, results_option
-from px4fuse.cli.outputs import finish, free_report, progress, report_paths, result_files
+from px4fuse.cli.outputs import (
+    check_targets,
+    finish,
+    free_report,
+    progress,
+    report_paths,
+    result_files,
+)
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.request import EVALUATION_OPTIONS, EvaluationRequest, command_line, settings_name
 from px4fuse.writing import STANDARD_OUTPUT
@@ -152,7 +159,7 @@ def _picture(output: Path | None, picture: Path | None, json_path: Path | None) 
     OutputError
         It is no PNG, or two outputs are the same file.
     """
-    results = None if json_path == STANDARD_OUTPUT else json_path
+    results = json_path
     if output is not None:
         output, results = report_paths(output, json_path)
         picture = picture or output.with_suffix(".png")
@@ -160,6 +167,5 @@ def _picture(output: Path | None, picture: Path | None, json_path: Path | None) 
         raise OutputError(
             f"{picture}: the picture is a PNG. Give a name that ends in .png with --picture."
         )
-    if picture is not None and results is not None and picture.resolve() == results.resolve():
-        raise OutputError(f"{picture}: --picture and --json name the same file. Give two names.")
+    check_targets([output, picture, results])
     return picture

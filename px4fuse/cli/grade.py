@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from px4fuse.cli.inputs import Named, max_size_option, path_option
-from px4fuse.cli.outputs import Interrupted, progress, terminal, write_outputs
+from px4fuse.cli.outputs import Interrupted, progress, terminal, write_new
 from px4fuse.errors import OutputError, SettingsError
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ def grade(
     from px4fuse.grading.rubric import read_rubric, rubric_text
 
     if write_rubric is not None:
-        _write_new(write_rubric, rubric_text().encode())
+        write_new(write_rubric, rubric_text().encode())
         return
     rule = late_rule(late) if late else None
     if gradescope is not None:
@@ -125,7 +125,7 @@ def grade(
     if write_autograder is not None:
         from px4fuse.grading.gradescope import autograder_zip
 
-        _write_new(write_autograder, autograder_zip(logs, rubric, key, rule))
+        write_new(write_autograder, autograder_zip(logs, rubric, key, rule))
         return
     if rule is not None and due is None:
         raise SettingsError("--late: say with --due when it was due.")
@@ -184,13 +184,6 @@ def _check_places(output: Path, given: tuple[Path, ...]) -> None:
                 f"-o {output}: lies inside {path}, which is read; its own output would be graded. "
                 "Choose another folder."
             )
-
-
-def _write_new(path: Path, content: bytes) -> None:
-    if path.exists():
-        raise OutputError(f"{path}: exists already; it was not overwritten.")
-    write_outputs({path: content})
-    click.echo(f"Wrote    {path}")
 
 
 def _print(outcome: GradeOutcome) -> None:

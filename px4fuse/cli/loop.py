@@ -18,7 +18,7 @@ from px4fuse.cli.inputs import (
     text_of,
     typed_parameters,
 )
-from px4fuse.cli.outputs import finish, progress, report_paths, result_files, spare_inputs
+from px4fuse.cli.outputs import check_targets, finish, progress, report_paths, result_files
 from px4fuse.errors import SettingsError
 from px4fuse.reading import shown
 from px4fuse.request import LOOP_OPTIONS, Landing, LoopRequest, command_line
@@ -114,14 +114,15 @@ def loop(
         _solve(source, json_path, g2o, True if given["robust"] else None)
         return
     request = loop_request(source, given)
-    _spare(tum, g2o, *((json_path,) if output is None else report_paths(output, json_path)))
+    results = (json_path,) if output is None else report_paths(output, json_path)
+    check_targets([tum, g2o, *results])
     with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
         found = run_loop(request, step)
         findings = find_loop(found)
         document = LoopDocument(found, findings, person, command_line(request))
-        results = loop_results(request, found, findings, person, document.command)
+        made = loop_results(request, found, findings, person, document.command)
         contents = _files(found, tum, g2o)
-        contents |= result_files(results, json_path, output, document, step)
+        contents |= result_files(made, json_path, output, document, step)
     finish(contents, lambda console: print_loop(console, found, findings, request))
 
 
@@ -139,14 +140,6 @@ def loop_request(source: Path, given: dict[str, Any]) -> LoopRequest:
         came_back=not given.pop("opened"),
         **given,
     )
-
-
-def _spare(*targets: Path | None) -> None:
-    """Refuse outputs that name the same file, or one that this command reads."""
-    files = [path for path in targets if path not in (None, STANDARD_OUTPUT)]
-    if len({path.resolve() for path in files}) < len(files):
-        raise SettingsError("two outputs name the same file. Give each a name of its own.")
-    spare_inputs(files)
 
 
 def _files(found: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]:
@@ -186,7 +179,7 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
                 f"{shown(source)}: {parameter.opts[-1]} is for flights and trajectories, not for a "
                 "pose graph. With one, give only --g2o FILE and --json FILE."
             )
-    _spare(json_path, g2o)
+    check_targets([json_path, g2o])
     with progress(json_path == STANDARD_OUTPUT) as step:
         step(f"reading {shown(source)}")
         solved = analyse_graph(shown(source), read_g2o(path), step, robust=robust)

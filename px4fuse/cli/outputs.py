@@ -160,14 +160,12 @@ def report_paths(output: Path, json_path: Path | None) -> tuple[Path, Path]:
     Raises
     ------
     OutputError
-        The report is no PDF, both are the same file, or one of them is read by this command.
+        The report is no PDF, or as :func:`check_targets` says.
     """
     if output.suffix.lower() != ".pdf":
         raise OutputError(f"{output}: the report is a PDF. Give a name that ends in .pdf with -o.")
     beside = output.with_suffix(".json") if json_path in (None, STANDARD_OUTPUT) else json_path
-    if beside.resolve() == output.resolve():
-        raise OutputError(f"{beside}: --json and -o name the same file. Give two names.")
-    spare_inputs([output, beside])
+    check_targets([output, beside])
     return output, beside
 
 
@@ -212,7 +210,7 @@ def write_outputs(contents: Mapping[Path, bytes]) -> None:
     OutputError
         A target is one of the inputs, or cannot be written.
     """
-    spare_inputs(contents)
+    check_targets(contents)
     written: list[Path] = click.get_current_context().meta.setdefault(WRITTEN, [])
     write_all(contents, written.append)
 
@@ -223,20 +221,37 @@ def written_so_far(context: click.Context) -> str:
     return f"{', '.join(map(str, written))} written before." if written else "nothing was written."
 
 
-def spare_inputs(targets: Iterable[Path]) -> None:
-    """Refuse to write over a file that this command reads.
+def write_new(path: Path, content: bytes) -> None:
+    """Write a file that is not there yet, and say so.
 
     Raises
     ------
     OutputError
-        A target is one of the inputs.
+        It is there.
     """
+    if path.exists():
+        raise OutputError(f"{path}: exists already; it was not overwritten. Give another name.")
+    write_outputs({path: content})
+    click.echo(f"Wrote    {path}")
+
+
+def check_targets(targets: Iterable[Path | None]) -> None:
+    """Refuse outputs that name the same file, or one that this command reads.
+
+    Raises
+    ------
+    OutputError
+        Two targets are the same file, or a target is one of the inputs.
+    """
+    files = [target for target in targets if target not in (None, STANDARD_OUTPUT)]
+    if len({file.resolve() for file in files}) < len(files):
+        raise OutputError("two outputs name the same file. Give each a name of its own.")
     params = click.get_current_context().params
     given = [params[name] for name in INPUTS if params.get(name) is not None]
     several = [one if isinstance(one, tuple) else (one,) for one in given]
     paths = [Path(path) for some in several for path in some]  # URLs are texts
     read = [path if path.exists() else Path(str(path).rpartition(":")[0]) for path in paths]
-    for target in targets:
+    for target in files:
         try:
             there = target.exists()
         except OSError as error:  # a name that is too long

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from px4fuse.cli.inputs import path_option, typed_parameters
-from px4fuse.cli.outputs import progress, terminal, write_outputs
+from px4fuse.cli.outputs import check_targets, progress, terminal, write_outputs
 from px4fuse.cli.quantity import TypedQuantity
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.reading import read_text
@@ -191,8 +191,7 @@ def simulate(
         raise SettingsError(f"--kind {MIXED} requires --assignment ROSTER.csv.")
     if output.suffix.lower() != ".ulg":
         raise OutputError(f"{output}: the log is a ULog. Give a name that ends in .ulg with -o.")
-    if answer_path is not None and answer_path.resolve() == output.resolve():
-        raise OutputError(f"{output}: --answer and -o name the same file. Give two names.")
+    check_targets([output, answer_path])
     parsed = parse(mistakes)
     chosen = Scenario(
         passes=passes if passes is not None else PASSES[scenario["kind"]],

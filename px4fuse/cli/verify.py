@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from px4fuse.cli.inputs import Named, json_option, max_size_option, path_option
-from px4fuse.cli.outputs import finish, progress, result_files, spare_inputs
+from px4fuse.cli.outputs import check_targets, finish, progress, result_files
 from px4fuse.errors import LogError
 from px4fuse.reading import files_by_sha256, read_whole, shown
 from px4fuse.writing import STANDARD_OUTPUT
@@ -60,7 +60,7 @@ def verify(
     read = read_report(content, shown(report))
     if isinstance(read, Refused):
         raise LogError(read.reason)
-    spare_inputs([path for path in (json_path, output) if path not in (None, STANDARD_OUTPUT)])
+    check_targets([json_path, output])
     with progress(json_path == STANDARD_OUTPUT, ("hashing", "running")) as step:
         step("hashing the logs")
         files = files_by_sha256(logs)
