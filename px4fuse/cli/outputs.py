@@ -85,22 +85,15 @@ def progress(quiet: bool = False, steps: Sequence[str] = ()) -> Iterator[ShowSte
     if not console.is_terminal or quiet:  # an older rich ends a disabled bar with an empty line
         yield silent
         return
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        SpinnerColumn,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich import progress as bars
 
     columns = (
-        SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(),
-        TextColumn("{task.fields[count]}"), TimeElapsedColumn(),
+        bars.SpinnerColumn(), bars.TextColumn("{task.description}", markup=False), bars.BarColumn(),
+        bars.TextColumn("{task.fields[count]}"), bars.TimeElapsedColumn(),
         # of work that is counted; steps are not equally long
-        *(() if steps else (TextColumn("of which left"), TimeRemainingColumn())),
+        *(() if steps else (bars.TextColumn("of which left"), bars.TimeRemainingColumn())),
     )  # fmt: skip
-    with Progress(*columns, console=console, transient=True) as bar:
+    with bars.Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("starting", total=len(steps) or None, count="")
         at = 0
 
