@@ -193,9 +193,10 @@ def take_inventory(flight: Flight) -> Inventory:
         reason = compared.source_reason
     except Px4FuseError as error:
         text = with_options(str(error)).removeprefix(f"{flight.log.name}: ")
-        reason, _, remedy = text.removesuffix(".").partition(". ")
+        first, _, remedy = text.partition(". ")
+        reason = first.removesuffix(".")
         if not isinstance(error, MissingDataError):
-            remedy = "Record more of the flight: the logger from arming on (SDLOG_MODE 0)"
+            remedy = "Record more of the flight: the logger from arming on (SDLOG_MODE 0)."
     log = flight.log
     cut = log.ends_in_flight and not log.damage
     return Inventory(
