@@ -243,13 +243,21 @@ def test_table_names_are_file_names_on_every_system(sample_flight):
     assert all(re.fullmatch(r"[A-Za-z0-9_-]{1,90}", name) for name in tables)
 
 
-def test_a_file_in_the_folders_place_is_refused(tmp_path, monkeypatch, capsys, sample_log):
-    target = tmp_path / "tables"
-    target.write_text("mine")
-    code, out, err = run_main(monkeypatch, capsys, "extract", sample_log, "-o", target)
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [([], "is a file"), (["--format", "parquet"], 'pip install "px4fuse[parquet]"')],
+)
+def test_what_cannot_be_written_is_one_line(
+    tmp_path, monkeypatch, capsys, sample_log, options, said
+):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    folder = tmp_path / "tables"
+    if not options:
+        folder.write_text("mine")
+    code, out, err = run_main(monkeypatch, capsys, "extract", sample_log, "-o", folder, *options)
     assert (code, out, len(err.splitlines())) == (2, "", 1)
-    assert "is a file" in err
-    assert target.read_text() == "mine"
+    assert said in err
+    assert folder.exists() == (not options)
 
 
 def test_a_failed_run_overwrites_nothing(tmp_path, monkeypatch, capsys, sample_log):
@@ -277,17 +285,6 @@ def test_parquet_holds_the_same_tables(tmp_path, sample_log, sample_flight):
         back = pd.read_parquet(tmp_path / f"{name}.parquet")
         pd.testing.assert_frame_equal(back, table, check_exact=True)
     assert (tmp_path / "data_dictionary.csv").exists()
-
-
-def test_parquet_without_pyarrow_is_one_line(tmp_path, monkeypatch, capsys, sample_log):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    folder = tmp_path / "tables"
-    code, out, err = run_main(
-        monkeypatch, capsys, "extract", sample_log, "-o", folder, "--format", "parquet"
-    )
-    assert (code, out, len(err.splitlines())) == (2, "", 1)
-    assert 'pip install "px4fuse[parquet]"' in err
-    assert not folder.exists()
 
 
 # ---- the lesson by hand -----------------------------------------------------------------------
