@@ -30,28 +30,17 @@ MAX_DELTA = 1e6
 _DELTA = re.compile(r"(\d+\.?\d*|\.\d+) ?(m|s|frames|f)")
 
 
-class DeltaType(click.ParamType["Delta"]):
-    """A distance, a time or a number of frames: ``5m``, ``10s``, ``1f``."""
+def delta(text: str) -> Delta:
+    """Read a distance, a time or a number of frames: ``5m``, ``10s``, ``1f``."""
+    from px4fuse.trajectory.scores import Delta
 
-    name = "delta"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> Delta:
-        """Convert what was typed."""
-        from px4fuse.trajectory.scores import Delta
-
-        if isinstance(value, Delta):
-            return value
-        match = _DELTA.fullmatch(value.strip())
-        if match is None or not 0.0 < float(match[1]) <= MAX_DELTA:
-            self.fail(
-                f"{value!r} is not a distance (5m), a time (10s) or a number of frames (1f).",
-                param,
-                ctx,
-            )
-        unit = {"m": "m", "s": "s"}.get(match[2], "frames")
-        return Delta(float(match[1]), unit)  # type: ignore[arg-type]
+    match = _DELTA.fullmatch(text.strip())
+    if match is None or not 0.0 < float(match[1]) <= MAX_DELTA:
+        raise click.BadParameter(
+            f"{text!r} is not a distance (5m), a time (10s) or a number of frames (1f)."
+        )
+    unit = {"m": "m", "s": "s"}.get(match[2], "frames")
+    return Delta(float(match[1]), unit)  # type: ignore[arg-type]
 
 
 @click.command()
@@ -59,7 +48,7 @@ class DeltaType(click.ParamType["Delta"]):
 @click.argument("reference", type=Named())
 @click.option(
     "--rpe",
-    type=DeltaType(),
+    type=delta,
     multiple=True,
     metavar="DELTA",
     help="RPE over a distance (5m), a time (10s) or frames (1f); may be repeated.  [default: some "

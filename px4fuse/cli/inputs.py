@@ -32,16 +32,9 @@ if TYPE_CHECKING:
     from px4fuse.results.model import Student
 
 
-class ColumnNames(click.ParamType["tuple[str, ...]"]):
-    """Names or numbers of columns, with commas between them."""
-
-    name = "columns"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, ...]:
-        """Convert what was typed."""
-        return tuple(value.split(",")) if isinstance(value, str) else value
+def column_names(text: str) -> tuple[str, ...]:
+    """Read names or numbers of columns, with commas between them."""
+    return tuple(text.split(","))
 
 
 Option = Callable[[Callable[..., None]], Callable[..., None]]
@@ -56,14 +49,6 @@ def _together(*options: Option) -> Option:
         return command
 
     return add
-
-
-class AnyCase(click.Choice[str]):
-    """One of some words, in any case, given as the field writes it."""
-
-    def normalize_choice(self, choice: Any, ctx: click.Context | None) -> str:
-        """Compare in small letters."""
-        return str(choice).lower()
 
 
 class Named(click.Path):
@@ -114,10 +99,10 @@ def _option(field: str, declared: Declared, hint: Any, default: Any) -> Option:
         details["type"] = click.IntRange(0, 255)
     elif get_origin(inner) is tuple:
         choices = get_args(get_args(inner)[0])
-        details["type"] = click.Choice(choices) if choices else ColumnNames()
+        details["type"] = click.Choice(choices) if choices else column_names
         details["multiple"] = bool(choices)
     elif get_origin(inner) is Literal:
-        details["type"] = AnyCase(get_args(inner))
+        details["type"] = click.Choice(get_args(inner), case_sensitive=False)
     return click.option(declared.name, name, **details)
 
 
@@ -240,10 +225,12 @@ def read_person(given: dict[str, Any]) -> Student:
     from msgspec import UNSET
 
     from px4fuse.answers import read_answers
-    from px4fuse.results.model import Student
+    from px4fuse.results.model import MAX_NOTES_BYTES, Student
 
     name, number = given.pop("student") or "", given.pop("student_id") or ""
-    notes, form = _read_notes(given.pop("notes")), given.pop("answers")
+    path, form, notes = given.pop("notes"), given.pop("answers"), ""
+    if path is not None:
+        notes = read_text(path, SettingsError, MAX_NOTES_BYTES, name=f"--notes {path}")
     answers = UNSET if form is None else read_answers(form)
     person = Student(encodable(name), encodable(number), notes, answers)
     _tell_fonts(person.name + person.id + person.notes)
@@ -258,14 +245,6 @@ def _tell_fonts(text: str) -> None:
 
     if lacking := missing(text):
         click.echo(f"px4fuse: {advice(lacking)}", err=True)
-
-
-def _read_notes(path: Path | None) -> str:
-    from px4fuse.results.model import MAX_NOTES_BYTES
-
-    if path is None:
-        return ""
-    return read_text(path, SettingsError, MAX_NOTES_BYTES, name=f"--notes {path}")
 
 
 def encodable(text: str) -> str:

@@ -37,31 +37,22 @@ MAX_LANDED_AT = 10_000.0
 FOR_GRAPHS = ("source", "json_path", "g2o", "robust")
 
 
-class LandingType(click.ParamType[Landing]):
-    """``FORWARD,RIGHT`` or ``FORWARD,RIGHT,DEG``."""
-
-    name = "landing"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> Landing:
-        """Convert what was typed."""
-        if isinstance(value, Landing):
-            return value
-        try:
-            numbers = [float(part) for part in value.split(",")]
-        except ValueError:
-            numbers = []
-        if len(numbers) not in (2, 3) or not all(abs(n) <= MAX_LANDED_AT for n in numbers):
-            self.fail(f"{value!r} is not FORWARD,RIGHT in m, or FORWARD,RIGHT,DEG.", param, ctx)
-        return Landing(*numbers)
+def landing(text: str) -> Landing:
+    """Read ``FORWARD,RIGHT`` or ``FORWARD,RIGHT,DEG``."""
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (2, 3) or not all(abs(n) <= MAX_LANDED_AT for n in numbers):
+        raise click.BadParameter(f"{text!r} is not FORWARD,RIGHT in m, or FORWARD,RIGHT,DEG.")
+    return Landing(*numbers)
 
 
 @click.command()
 @click.argument("source", type=Named())
 @click.option(
     "--landed-at",
-    type=LandingType(),
+    type=landing,
     metavar="FORWARD,RIGHT[,DEG]",
     help="Where it really landed, by tape from the place of take-off: m along its nose there, m to "
     "the right, and degrees it was turned clockwise.  [default: the log's ground truth, else 0,0]",
