@@ -54,8 +54,8 @@ def _together(*options: Option) -> Option:
 class Named(click.Path):
     """A file or folder; an empty name, which would be the current folder, is a slip."""
 
-    def __init__(self) -> None:
-        super().__init__(path_type=Path)
+    def __init__(self, path_type: type[Path | str] = Path) -> None:
+        super().__init__(path_type=path_type)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Convert what was typed."""
@@ -90,7 +90,7 @@ def _option(field: str, declared: Declared, hint: Any, default: Any) -> Option:
     if default is not NODEFAULT:
         details["default"] = default or None
     if field in ("path", "mavlink", "reference"):
-        details["type"] = Named()
+        details["type"] = Named(str)
     elif declared.unit:
         details["type"] = TypedQuantity(declared.unit, declared.example, auto=len(parts) > 2)
     elif inner is bool:
@@ -185,16 +185,14 @@ def comparison_request(log: Path, given: dict[str, Any]) -> ComparisonRequest:
     SettingsError
         An option is about a position file, and none is given.
     """
-    return ComparisonRequest(
-        log=str(log), mavlink=text_of(given.pop("mavlink")), position=_position(given), **given
-    )
+    return ComparisonRequest(log=str(log), position=_position(given), **given)
 
 
 def _position(given: dict[str, Any]) -> PositionFile | None:
     typed = {field: option.name for field, option in POSITION_OPTIONS.items()}
     how = {field: given.pop(name[2:].replace("-", "_")) for field, name in typed.items()}
     if how["path"] is not None:
-        return PositionFile(**how | {"path": str(how["path"])})
+        return PositionFile(**how)
     for field, value in how.items():
         if value is not None:
             raise SettingsError(f"{typed[field]} requires --position.")
@@ -207,11 +205,6 @@ def typed_parameters() -> Iterator[click.Parameter]:
     for parameter in context.command.params:
         if context.get_parameter_source(parameter.name or "") == ParameterSource.COMMANDLINE:
             yield parameter
-
-
-def text_of(path: Path | None) -> str | None:
-    """A path as a request has it."""
-    return None if path is None else str(path)
 
 
 def read_person(given: dict[str, Any]) -> Student:

@@ -15,7 +15,6 @@ from px4fuse.cli.inputs import (
     person_options,
     read_person,
     request_options,
-    text_of,
     typed_parameters,
 )
 from px4fuse.cli.outputs import check_targets, finish, progress, report_paths, result_files
@@ -126,7 +125,6 @@ def loop_request(source: Path, given: dict[str, Any]) -> LoopRequest:
     del given["robust"]
     return LoopRequest(
         source=str(source),
-        reference=text_of(given.pop("reference")),
         closures=closures if file is None else closures + read_closures(file),
         came_back=not given.pop("opened"),
         **given,

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import Named, flight_options, json_option, path_option, text_of
+from px4fuse.cli.inputs import Named, flight_options, json_option, path_option
 from px4fuse.cli.outputs import finish, progress, report_paths, result_files
 from px4fuse.cli.quantity import NAMES, in_unit
 from px4fuse.errors import SettingsError
@@ -41,10 +41,9 @@ def whatif(
     log: Path,
     changes: tuple[str, ...],
     sweep: str | None,
-    mavlink: Path | None,
-    system: int | None,
     output: Path | None,
     json_path: Path | None,
+    **given: Any,
 ) -> None:
     """Replay EKF2 from LOG as flown and with other parameters, side by side.
 
@@ -62,10 +61,9 @@ def whatif(
         report_paths(output, json_path)  # before the work, not after it
     request = WhatIfRequest(
         log=str(log),
-        mavlink=text_of(mavlink),
-        system=system,
         changes=_changes(changes),
         sweep=None if sweep is None else _sweep(sweep),
+        **given,
     )
     with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
         found = run_what_if(request, step)
