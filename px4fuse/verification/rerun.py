@@ -21,7 +21,7 @@ from px4fuse.errors import Px4FuseError, ResultsError, SettingsError
 from px4fuse.report.document import Document, LoopDocument
 from px4fuse.request import command_line
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json
-from px4fuse.results.model import Provenance
+from px4fuse.results.model import LIBRARIES, Provenance
 from px4fuse.results.reading import one_line
 from px4fuse.verification.model import Refused
 
@@ -82,8 +82,6 @@ def recompute(results: Reported, logs: Mapping[str, Path]) -> Recomputed | Refus
         Refused where the command is not px4fuse's, a file is missing, or the analysis fails.
     """
     try:
-        from px4fuse.results.parts import LIBRARIES  # noqa: PLC0415
-
         if tuple(results.provenance.libraries) != LIBRARIES:
             raise ResultsError("the results do not say which libraries they were made with", ASK)
         with tempfile.TemporaryDirectory(prefix="px4fuse-") as folder:
