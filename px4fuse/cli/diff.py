@@ -48,7 +48,7 @@ def diff(
     Writes a PDF report and its results as JSON.
     """
     from px4fuse.fleet.changes import diff as compared
-    from px4fuse.report.changes_terminal import print_changes
+    from px4fuse.report.changes import print_changes
     from px4fuse.report.document import ChangesDocument
     from px4fuse.results.contract import to_json
 

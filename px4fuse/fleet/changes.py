@@ -24,7 +24,7 @@ from px4fuse.fleet.significance import (
     corrected,
     spreads,
 )
-from px4fuse.report.changes_words import change_line
+from px4fuse.report.changes import change_line
 from px4fuse.results.changes import Compared, Judgement, NumberChange, Status
 from px4fuse.results.contract import CHANGES, ChangeResults
 from px4fuse.results.parts import provenance, schema_of

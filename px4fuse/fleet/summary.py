@@ -10,7 +10,7 @@ from px4fuse.findings import named
 from px4fuse.fleet.inputs import DiffInput
 from px4fuse.fleet.measures import LEAST_RATIO, at
 from px4fuse.fleet.significance import FALSE_DISCOVERY_RATE
-from px4fuse.report.changes_words import change_line
+from px4fuse.report.changes import change_line
 from px4fuse.results.changes import FindingChange, TextChange, Which
 from px4fuse.results.contract import ChangeResults, ComparisonResults
 
