@@ -8,7 +8,6 @@ from rich.console import Console
 
 from px4fuse.ekf2.walk import Why
 from px4fuse.findings import by_root
-from px4fuse.flight import Unavailable
 from px4fuse.report.cover import facts, write_axes, write_finding
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page
@@ -54,7 +53,8 @@ def print_summary(
     for note in (LEGEND, *verdict_notes(analysis)):
         page.write(note, colour=MUTED)
     why = analysis.why.get(analysis.main.axis.name)
-    if why is not None and not _told(why, document.story):
+    is_told = isinstance(why, Why) and why.cause in document.story
+    if why is not None and not is_told:
         write_why(page, why)
     if not document.findings:
         page.write("No findings.")
@@ -66,13 +66,6 @@ def print_summary(
     show(console, page.blocks, request)
     if report is not None:
         print_file(console, "Report", report)
-
-
-def _told(why: Why | Unavailable, story: tuple[str, ...]) -> bool:
-    """Whether the story has the sentence, which it cuts where it names the moment."""
-    if isinstance(why, Unavailable):
-        return False
-    return any(why.sentences[0].startswith(sentence.removesuffix(".")) for sentence in story)
 
 
 def print_advice(console: Console, advice: Mapping[str, str], request: Request) -> None:
