@@ -87,8 +87,8 @@ def _write(page: Page, results: ChangeResults, *, short: bool = False) -> None:
     if len(changes) > len(rows):
         page.write(f"and {len(changes) - len(rows)} more in the report and in the results")
     page.write(_not_shown(results), size=SIZE, colour=MUTED, above=3.0)
-    for text in results.texts:
-        page.labelled(LABELS[text.kind], f"{text.what}: {text.a} → {text.b}", size=SIZE)
+    for fact in results.texts:
+        page.labelled(LABELS[fact.kind], f"{fact.what}: {fact.a} → {fact.b}", size=SIZE)
     for finding in results.findings:
         said, colour = f"{finding.severity}: {finding.message}", SEVERITY_COLOURS[finding.severity]
         page.labelled(LABELS[finding.only_in], words(said, SIZE, colour), size=SIZE)

@@ -100,7 +100,7 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
             f"EKF2_EV_DELAY is {delay:g} ms, the data ask for {asked:.0f} ms ({least:.0f} to "
             f"{most:.0f}); set it, or correct the sender's clock"
         )
-    if _changes(clock):
+    if clock.change_p is not None and _changes(clock):
         parts = ", ".join(f"{p.offset_s:+.2f} s from {p.start_s:.0f} s" for p in clock.parts)
         advice["Changes"] = (
             f"the offset is not the same throughout ({p_words(clock.change_p)}): {parts}"

@@ -22,10 +22,10 @@ from px4fuse.report.style import EKF2, LINES, MEASURED, MUTED, OURS, SEVERITY_CO
 from px4fuse.report.words import (
     clock_words,
     consequences_words,
-    error_rows,
     filters,
     settings_words,
     verdict_words,
+    write_errors,
 )
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def draw(document: Document) -> Iterator[Page]:
     for sentence in document.story:
         page.write(sentence, size=10.5, above=2.0)
     _verdict(page, document)
-    write_axes(page, document)
+    write_errors(page, document)
     page.heading("Findings", 10.5, above=12.0)
     if not document.findings:
         page.write("None: no detector has anything to say about this flight.")
@@ -83,11 +83,6 @@ def _verdict(page: Page, document: Document) -> None:
     if not document.truth_known:
         said.append("The log has no truth to say who is right.")
     page.write(" ".join(said), size=7.0, colour=MUTED)
-
-
-def write_axes(page: Page, document: Document) -> None:
-    """Write a row for each axis and filter: verdict, distance from one another, errors."""
-    page.table(*error_rows(document), right=(2, 3, 5, 6, 7, 8))
 
 
 def facts(document: Document) -> dict[str, str]:

@@ -8,13 +8,13 @@ from rich.console import Console
 
 from px4fuse.ekf2.walk import Why
 from px4fuse.findings import by_root
-from px4fuse.report.cover import facts, write_axes, write_finding
+from px4fuse.report.cover import facts, write_finding
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page
 from px4fuse.report.screen import print_file, show
 from px4fuse.report.style import MUTED
 from px4fuse.report.why import write_why
-from px4fuse.report.words import verdict_notes
+from px4fuse.report.words import verdict_notes, write_errors
 from px4fuse.request import Request
 
 MOST_FINDINGS = 4
@@ -49,7 +49,7 @@ def print_summary(
     for label, text in facts(document).items():
         if label in FACTS:
             page.labelled(label, text)
-    write_axes(page, document)
+    write_errors(page, document)
     for note in (LEGEND, *verdict_notes(analysis)):
         page.write(note, colour=MUTED)
     why = analysis.why.get(analysis.main.axis.name)

@@ -22,7 +22,7 @@ from px4fuse.report.style import GOOD, MUTED, SEVERITY_COLOURS
 
 if TYPE_CHECKING:
     from px4fuse.report.document import Document
-    from px4fuse.report.page import Cell
+    from px4fuse.report.page import Cell, Page
 
 # Below, "white" is wrong: of the eight verdicts of a flight one in a hundred by chance
 WHITE_P = 0.001
@@ -81,8 +81,8 @@ def verdict_rows(
     return rows
 
 
-def error_rows(document: Document) -> tuple[list[str], list[list[Cell]]]:
-    """Head and rows of verdicts and errors, the main axis first.
+def write_errors(page: Page, document: Document) -> None:
+    """Write verdicts and errors as a table, the main axis first.
 
     Between both filters, and between each and the truth, where the flight has these.
     """
@@ -96,7 +96,7 @@ def error_rows(document: Document) -> tuple[list[str], list[list[Cell]]]:
 
     head = [*VERDICT_HEAD, *(["apart\n(m)", "\n(m/s)"] if has_ekf2 else [])]
     head += ["to truth\n(m)", "\n(m/s)"] if document.truth_known else []
-    return head, verdict_rows(axes, more)
+    page.table(head, verdict_rows(axes, more), right=(2, 3, 5, 6, 7, 8))
 
 
 def _metres(part: object, field: str) -> str:

@@ -30,8 +30,12 @@ class Scale:
 
     @classmethod
     def of(cls, values: npt.ArrayLike, least: float, *, log: bool = False) -> Scale:
-        """One that holds values but for a hundredth at each end; at least so wide (a factor)."""
-        found = np.log(values) if log else np.asarray(values, float)
+        """One that holds values but for a hundredth at each end; at least so wide (a factor).
+
+        Without any values it is about 1.
+        """
+        held = np.asarray(values if np.size(values) else [1.0], float)
+        found = np.log(held) if log else held
         low, high = np.quantile(found, (0.01, 0.99))
         reach = 0.54 * max(high - low, math.log(least) if log else least)
         ends = (low + high) / 2.0 + np.array((-reach, reach))
