@@ -20,7 +20,6 @@ from scipy.spatial.transform import Rotation
 from trajectory_tools import PUBLISHED, flight, moved, published
 
 from px4fuse.loop.sources import read_source
-from px4fuse.report.document import EvaluationDocument
 from px4fuse.report.evaluation import (
     before_words,
     colours,
@@ -74,7 +73,7 @@ def across(values: np.ndarray) -> np.ndarray:
 
 def pages(score: Evaluation) -> list[Page]:
     with report_style():
-        return list(draw(EvaluationDocument(score)))
+        return list(draw(score))
 
 
 def panels(score: Evaluation) -> dict[str, Axes]:
@@ -89,7 +88,7 @@ def panel(score: Evaluation, title: str) -> Axes:
 
 
 def said(score: Evaluation) -> str:
-    pages = PdfReader(io.BytesIO(render(EvaluationDocument(score), "{}"))).pages
+    pages = PdfReader(io.BytesIO(render(score, "{}"))).pages
     return " ".join(" ".join(page.extract_text().split()) for page in pages)
 
 
@@ -320,10 +319,9 @@ def test_same_bytes_with_the_results_inside_and_no_date() -> None:
     score = sample()
     name = "$x^2_{y$ <b>&.tum:vio"  # from outside: drawn as it is
     score = replace(score, estimate=replace(score.estimate, name=name))
-    document = EvaluationDocument(score)
     assert name in said(score)
-    pdf = render(document, '{"a": 1}')
-    assert pdf == render(document, '{"a": 1}')
+    pdf = render(score, '{"a": 1}')
+    assert pdf == render(score, '{"a": 1}')
     reader = PdfReader(io.BytesIO(pdf))
     assert reader.attachments["results.json"] == [b'{"a": 1}']
     assert reader.metadata is not None
@@ -341,6 +339,6 @@ def test_same_bytes_with_the_results_inside_and_no_date() -> None:
 def test_published_trajectories_are_drawn_on_one_page(pair: tuple[str, str]) -> None:
     estimate, reference = map(published, pair)
     score = evaluate(estimate, reference)
-    assert len(PdfReader(io.BytesIO(render(EvaluationDocument(score), "{}"))).pages) == 1
+    assert len(PdfReader(io.BytesIO(render(score, "{}"))).pages) == 1
     text = said(score)
     assert f"{score.ate.translation_m.rmse:.4f}" in text

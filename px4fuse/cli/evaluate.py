@@ -142,11 +142,10 @@ def evaluate(
             output = _default(estimate, reference, settings_name(request), results)
         output, picture, beside = _targets(output, picture, json_path)
         if output is not None:
-            from px4fuse.report.document import EvaluationDocument
             from px4fuse.report.pdf import render
 
             step("drawing the page")
-            contents[output] = render(EvaluationDocument(found), text)
+            contents[output] = render(found, text)
         if picture is not None:
             from px4fuse.report.evaluation import picture as draw
 

@@ -17,7 +17,6 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.flight import Unavailable
 from px4fuse.loop.analysis import SMALLEST_STAMP_S
 from px4fuse.report import style
-from px4fuse.report.document import EvaluationDocument
 from px4fuse.report.page import WIDTH, Page, halves, legend_above
 from px4fuse.report.screen import show
 from px4fuse.report.style import EKF2, MUTED, OURS, TRUTH, report_style
@@ -108,9 +107,8 @@ def views(score: Evaluation) -> list[View]:
     return seen if extent[vertical] > FLAT * extent[level] else seen[:1]
 
 
-def draw(document: EvaluationDocument) -> Iterator[Page]:
+def draw(score: Evaluation) -> Iterator[Page]:
     """Draw the page, and another where the table of a run over many deltas fills the first."""
-    score = document.score
     page = Page(
         "Trajectory error",
         "APE: how far a pose is from the reference; over all poses, the ATE. RPE: how wrong a "
