@@ -95,13 +95,15 @@ def render(document: Report, results_json: str) -> bytes:
     """
     with report_style():
         pages = [page for draw in PAGES[type(document)] for page in draw(document)]
-        blocks = data([block for page in pages for block in page.blocks])
+        written = [block for page in pages for block in page.blocks]
+        blocks = data(written)
     title, name, sha256 = _named(document)
     made_by = f"px4fuse {metadata.version('px4fuse')}"
     student = ""
     if isinstance(document, Document | LoopDocument):
         student = who(document.student, " · ")
-    shown = title + name + student + json.dumps(blocks, ensure_ascii=False)
+    # figures have no text of others
+    words = title + name + student + json.dumps(written, ensure_ascii=False, default=repr)
     return compiled(
         {
             "title": title,
@@ -109,7 +111,7 @@ def render(document: Report, results_json: str) -> bytes:
             "head": _line(f"px4fuse · {name} · SHA-256 {sha256[:12]}", 90),
             "student": _line(student, 40),
             "foot": made_by,
-            "fonts": fonts.families(shown),
+            "fonts": fonts.families(words),
             "blocks": blocks,
             "results": results_json,
         }
