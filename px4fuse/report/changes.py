@@ -76,7 +76,7 @@ def _write(page: Page, results: ChangeResults, *, short: bool = False) -> None:
         kind = {"log": "its log", "report": "its report", "results": "its results"}[side.kind]
         of = "" if side.given == side.log else f" of {side.log}"
         said = f"{side.given}, {kind}{of}; SHA-256 {side.log_sha256[:12]}, px4fuse {side.px4fuse}"
-        page.labelled(name, said, size=SIZE)
+        page.labelled(name, said, size=SIZE, above=1.0)
     changes = printed(results)
     rows: list[list[Cell]] = []
     for change in changes[:most_rows]:
@@ -93,7 +93,7 @@ def _write(page: Page, results: ChangeResults, *, short: bool = False) -> None:
         said, colour = f"{finding.severity}: {finding.message}", SEVERITY_COLOURS[finding.severity]
         page.labelled(LABELS[finding.only_in], words(said, SIZE, colour), size=SIZE)
     for text in results.notes[:most_notes]:
-        page.write(text, size=SIZE, colour=MUTED, above=1.0)
+        page.write(text, size=SIZE, colour=MUTED, above=3.0)
 
 
 def _flights(a: AxisComparison, b: AxisComparison) -> Page:
