@@ -54,7 +54,7 @@ from px4fuse.filter.motion import (
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import POSITION_COLUMNS, Flight, Unavailable
 from px4fuse.readers import read_log
-from px4fuse.report.words import clock_advice
+from px4fuse.report.clock import clock_advice
 
 DT = SETTINGS.dt_s
 

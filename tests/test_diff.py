@@ -32,7 +32,7 @@ from px4fuse.fleet.measures import (
 )
 from px4fuse.fleet.significance import contrast, corrected, spreads
 from px4fuse.flight import Unavailable
-from px4fuse.report.changes_words import change_line, printed
+from px4fuse.report.changes import change_line, printed
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
 from px4fuse.results.changes import NumberChange

@@ -25,9 +25,8 @@ from px4fuse.cli.outputs import progress, terminal
 from px4fuse.cli.quantity import NAMES, in_unit
 from px4fuse.comparison.estimates import tuned
 from px4fuse.findings import find
-from px4fuse.report.commands import runnable
 from px4fuse.report.document import Document
-from px4fuse.report.screen import say
+from px4fuse.report.screen import runnable, say
 from px4fuse.report.terminal import print_summary
 from px4fuse.request import (
     ComparisonRequest,

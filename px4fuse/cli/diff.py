@@ -45,7 +45,7 @@ def diff(
     Writes a PDF report and its results as JSON.
     """
     from px4fuse.fleet.changes import diff as compared
-    from px4fuse.report.changes_terminal import print_changes
+    from px4fuse.report.changes import print_changes
     from px4fuse.report.document import ChangesDocument
 
     alone = json_path == STANDARD_OUTPUT
@@ -57,7 +57,7 @@ def diff(
             output = free_report(f"{a.stem}_to_{b.stem}", "", results, _same)
         document = ChangesDocument(results, found.a.analysis, found.b.analysis)
         contents = result_files(results, json_path, output, document, step)
-    finish(contents, lambda console: print_changes(console, results, output))
+    finish(contents, lambda console: print_changes(console, results))
     if fail_on is not None and found.is_worse:
         sys.exit(1)
 

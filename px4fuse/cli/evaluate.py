@@ -85,7 +85,6 @@ def evaluate(
     the PDF.
     """
     from px4fuse.loop.sources import read_source
-    from px4fuse.report.document import EvaluationDocument
     from px4fuse.report.evaluation import picture as draw
     from px4fuse.report.evaluation import print_evaluation
     from px4fuse.results.build_trajectories import evaluation_results
@@ -116,7 +115,7 @@ def evaluate(
         if output is None and picture is None and json_path is None:
             name = f"{_name(estimate)}_against_{_name(reference)}"
             output = free_report(name, settings_name(request), results, _same)
-        contents = result_files(results, json_path, output, EvaluationDocument(found), step)
+        contents = result_files(results, json_path, output, found, step)
         picture = _picture(output, picture, json_path)
         if picture is not None:
             step("drawing the picture")

@@ -28,8 +28,8 @@ def sync(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.comparison.estimates import noises_and_clock
     from px4fuse.errors import MissingDataError
     from px4fuse.flight import Unavailable
+    from px4fuse.report.clock import clock_advice
     from px4fuse.report.terminal import print_advice
-    from px4fuse.report.words import clock_advice
     from px4fuse.request import command_line
     from px4fuse.results.build import sync_results
 

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import shorten
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
 import pandas as pd
 
 from px4fuse.display import Shown, draw, frame, words
-from px4fuse.fleet import summary
+from px4fuse.findings import named
 from px4fuse.fleet.inputs import DiffInput, Progress, read_inputs
-from px4fuse.fleet.measures import Number, numbers
+from px4fuse.fleet.measures import LEAST_RATIO, Number, at, numbers
 from px4fuse.fleet.significance import (
     FALSE_DISCOVERY_RATE,
     Contrast,
@@ -24,14 +25,38 @@ from px4fuse.fleet.significance import (
     corrected,
     spreads,
 )
-from px4fuse.report.changes_words import change_line
-from px4fuse.results.changes import Compared, Judgement, NumberChange, Status
-from px4fuse.results.contract import CHANGES, ChangeResults
+from px4fuse.report.changes import change_line
+from px4fuse.results.changes import (
+    Compared,
+    FindingChange,
+    Judgement,
+    NumberChange,
+    Status,
+    TextChange,
+    Which,
+)
+from px4fuse.results.contract import CHANGES, ChangeResults, ComparisonResults
 from px4fuse.results.model import provenance, schema_of
 
 # What stands first of the significant changes; and of these, causes before what they bring
 _ORDER: tuple[Judgement, ...] = ("worse", "better", "changed", "")
 _CAUSES = ("tuning", "clock", "heading")
+# What is compared as text, and where it stands in the results; the segment of one flight alone
+_SETTINGS = {
+    "SIGMA_A (m/s²)": "settings.sigma_a_m_s2",
+    "SIGMA_Z (m)": "settings.sigma_z_m",
+    "DT (s)": "settings.dt_s",
+    "input": "settings.input",
+    "clock offset added (s)": "settings.clock_offset_s",
+}
+_SEGMENT = {"start (s)": "settings.start_s", "end (s)": "settings.end_s"}
+_FLIGHT = {
+    "firmware": "log.firmware",
+    "firmware hash": "log.firmware_hash",
+    "hardware": "log.hardware",
+    "position source": "source.name",
+    "px4fuse": "provenance.px4fuse",
+}
 MAX_LINE, MAX_CHANGES, MAX_DRAWN = 160, 4, 20
 
 
@@ -121,12 +146,12 @@ def changes(a: DiffInput, b: DiffInput) -> Changes:
         numbers=number_changes(
             numbers(a.results, a.analysis), numbers(b.results, b.analysis), paired=paired
         ),
-        texts=tuple(summary.texts(a.results, b.results, paired=paired)),
-        findings=tuple(summary.findings(a.results, b.results)),
-        notes=tuple(summary.notes(a, b, paired=paired)),
+        texts=tuple(_texts(a.results, b.results, paired=paired)),
+        findings=tuple(_findings(a.results, b.results)),
+        notes=tuple(_notes(a, b, paired=paired)),
         provenance=provenance(shlex.join(["px4fuse", "diff", a.given, b.given])),
     )
-    said = tuple(summary.sentences(found))
+    said = tuple(_sentences(found))
     return Changes(msgspec.structs.replace(found, summary=said), a, b)
 
 
@@ -211,4 +236,96 @@ def _compared(side: DiffInput) -> Compared:
         log=log.name,
         log_sha256=log.sha256,
         px4fuse=side.results.provenance.px4fuse,
+    )
+
+
+# ------------------------------------------------------------- what else is not the same, in words
+
+
+def _texts(a: ComparisonResults, b: ComparisonResults, *, paired: bool) -> Iterator[TextChange]:
+    """Settings, parameters of PX4 and facts about the flight that are not the same."""
+    places = {**_SETTINGS, **(_SEGMENT if paired else {}), **_FLIGHT}
+    for what, place in places.items():
+        if (first := at(a, place)) != (second := at(b, place)):
+            kind: Literal["setting", "flight"]
+            kind = "setting" if place.startswith("settings.") else "flight"
+            yield TextChange(kind, what, _plain(first), _plain(second))
+    one, other = _parameters(a), _parameters(b)
+    for name in sorted(one.keys() | other.keys()):
+        if one.get(name) != other.get(name):
+            yield TextChange("parameter", name, _plain(one.get(name)), _plain(other.get(name)))
+
+
+def _parameters(found: ComparisonResults) -> dict[str, float]:
+    """Of PX4: those that EKF2 was replayed with, and those that the log has."""
+    replayed, logged = at(found, "ekf2_replay.settings") or {}, found.log.parameters
+    return {name: float(value) for name, value in (*replayed.items(), *logged.items())}
+
+
+def _plain(value: object) -> str:
+    if value is None:
+        return "not logged"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _findings(a: ComparisonResults, b: ComparisonResults) -> Iterator[FindingChange]:
+    """Findings that only one of the two has, as a cause or as a consequence."""
+    both: tuple[tuple[ComparisonResults, ComparisonResults, Which], ...]
+    both = ((b, a, "B"), (a, b, "A"))
+    for mine, other, only_in in both:
+        known = {one.id for one in other.findings}
+        for one in mine.findings:
+            if one.id not in known:
+                yield FindingChange(one.id, one.severity, one.message, only_in)
+
+
+def _sentences(found: ChangeResults) -> Iterator[str]:
+    """What changed, in a few sentences."""
+    judgements = Counter(change.judgement for change in found.numbers)
+    changed = judgements.total() - judgements[""]
+    judged = [f"{n} {word}" for word in ("worse", "better") if (n := judgements[word])]
+    of_these = f" ({', '.join(judged)})" if judged else ""
+    tested = sum(change.q is not None for change in found.numbers)
+    if found.paired:
+        compared = sum(not change.status.startswith("only") for change in found.numbers)
+        yield f"Both are of {found.a.log}: {changed} of {compared} numbers differ{of_these}."
+    elif not tested:
+        yield "No number has an interval in both, so none can be tested."
+    else:
+        yield (
+            f"{changed or 'None'} of {tested} tested numbers changed by more than chance from A to "
+            f"B{of_these}."
+        )
+    if changed:
+        yield f"The first of them: {change_line(found.numbers[0])}."
+    for only_in, word in (("B", "New"), ("A", "Gone")):
+        if those := dict.fromkeys(named(f.id) for f in found.findings if f.only_in == only_in):
+            yield f"{word} findings: {', '.join(those)}."
+    if found.texts:
+        yield f"Not the same: {', '.join(text.what for text in found.texts)}."
+
+
+def _notes(a: DiffInput, b: DiffInput, *, paired: bool) -> Iterator[str]:
+    """What to mind, and how significance was decided, a sentence each."""
+    lacking = [(name, side) for name, side in (("A", a), ("B", b)) if side.analysis is None]
+    logs = " and ".join(f"{side.results.log.name} for {name}" for name, side in lacking)
+    if lacking:
+        untested = "" if paired else "RMSE is not tested without the logs. "
+        yield f"{untested}Flights are drawn from their logs. Give {logs}."
+    if paired:
+        yield (
+            "Both are of one flight: each difference is exact for it, and nothing says whether "
+            f"another flight would show it too. Less than {LEAST_RATIO:.0%} counts as the same."
+        )
+        return
+    if any(at(a.results, place) != at(b.results, place) for place in _SETTINGS.values()):
+        yield "The filter's settings are not the same: numbers of ours differ by them too."
+    yield (
+        f"Of the changes that are called significant, {FALSE_DISCOVERY_RATE:.0%} are expected to "
+        "be chance (Benjamini and Hochberg 1995); q is the p-value after that correction. "
+        "Intervals are from the likelihood, of innovations and errors from a bootstrap over blocks "
+        "(without the log of innovations from chi-square), of shares from Wilson's formula; they "
+        "are combined after Zou and Donner (2008), and widened by what flights of one simulated "
+        "vehicle differ by. A real one may vary more: px4fuse batch --baseline takes that from "
+        "your own flights."
     )

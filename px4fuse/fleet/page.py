@@ -58,10 +58,10 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
     names = short_names(logs)
     factors = [factor for log in logs for factor in log["factors"].values()]
     # the same to both sides of 1
-    factor = _scale([*factors, *(1.0 / each for each in factors)], 10.0, log=True)
-    sigma_z = _scale([log["sigma_z_m"] for log in logs if "sigma_z_m" in log], 0.01)
-    clock = _scale([log["clock_offset_s"] for log in logs if "clock_offset_s" in log], 0.02)
-    zero = clock.share(0.0) if clock and clock.low < 0.0 < clock.high else None
+    factor = Scale.of([*factors, *(1.0 / each for each in factors)], 10.0, log=True)
+    sigma_z = Scale.of([log["sigma_z_m"] for log in logs if "sigma_z_m" in log], 0.01)
+    clock = Scale.of([log["clock_offset_s"] for log in logs if "clock_offset_s" in log], 0.02)
+    zero = clock.share(0.0) if clock.low < 0.0 < clock.high else None
     rows = []
     for log in logs:
         said = [named(finding) for finding in log["findings"]]
@@ -106,20 +106,16 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
     )
 
 
-def _scale(values: Sequence[float], least: float, *, log: bool = False) -> Scale | None:
-    return Scale.of(values, least, log=log) if values else None
-
-
-def _factor(value: float | None, scale: Scale | None) -> Cell:
-    if value is None or scale is None:
+def _factor(value: float | None, scale: Scale) -> Cell:
+    if value is None:
         return Cell()
     at = scale.share(value)
     return frame.figure(value, overstated_words(value), (min(at, 0.5), at, max(at, 0.5)))
 
 
-def _interval(log: Log, columns: Sequence[str], scale: Scale | None) -> Cell:
+def _interval(log: Log, columns: Sequence[str], scale: Scale) -> Cell:
     value, low, high = map(log.get, columns)
-    if value is None or scale is None:
+    if value is None:
         return Cell()
     ends = (value if low is None else low, value, value if high is None else high)
     return frame.figure(value, f"{value:.3g}", tuple(map(scale.share, ends)))

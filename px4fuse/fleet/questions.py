@@ -25,19 +25,17 @@ MOST_REASONS = 3
 
 
 def above(
-    logs: Sequence[Log], names: Mapping[str, str], factor: Scale | None, sigma_z: Scale | None,
-    clock: Scale | None,
-) -> str:  # fmt: skip
+    logs: Sequence[Log], names: Mapping[str, str], factor: Scale, sigma_z: Scale, clock: Scale
+) -> str:
     """HTML of all that stands above the table; ``names`` are short ones of vehicles."""
     return template("fleet/above.html").render(
         summary=_summary(logs),
         honesty=[
-            (by, list(_honesty(logs, by, names, factor)) if factor else [])
-            for by in ("firmware", "vehicle")
+            (by, list(_honesty(logs, by, names, factor))) for by in ("firmware", "vehicle")
         ],
-        factors=[factor_words(end) for end in (factor.low, factor.high)] if factor else (),
+        factors=[factor_words(end) for end in (factor.low, factor.high)],
         drifts=[
-            (title, hint, list(_drift(logs, names, column, scale)) if scale else [])
+            (title, hint, list(_drift(logs, names, column, scale)))
             for title, hint, column, scale in (
                 ("SIGMA_Z that the data ask for, m",
                  "A drifting anchor or a changed antenna shows as a step or a rise.",

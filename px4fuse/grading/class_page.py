@@ -11,7 +11,8 @@ import math
 import posixpath
 import statistics
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 from px4fuse.answers import form_rows
 from px4fuse.grading.anonymous import Veil
@@ -19,27 +20,25 @@ from px4fuse.grading.class_table import number
 from px4fuse.grading.flags import copied_notes
 from px4fuse.grading.model import Entry, Graded, Item, Override, columns
 from px4fuse.grading.overrides import TOTAL
-from px4fuse.webpage.charts import bins, histogram
+from px4fuse.plain import number_words
+from px4fuse.webpage.charts import tenths
 from px4fuse.webpage.frame import (
     Cell,
     Column,
     Part,
     Row,
     boxes,
-    card,
     figure,
     links,
     listed,
-    note,
     page,
     pairs,
     pictures,
     prose,
-    summary,
     tabled,
     words,
 )
-from px4fuse.webpage.safe import escaped, local_link
+from px4fuse.webpage.safe import local_link, template
 
 MISSING = "nothing handed in"
 # How each status looks, and its sign, from the best to what says nothing
@@ -82,7 +81,7 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
         title=title,
         subtitle=f"{len(entries)} {'student' if len(entries) == 1 else 'students'}, graded with "
         f"{made_with}",
-        above=_summary(entries) + _items(entries, veil),
+        above=_above(entries, veil),
         noun=("student", "students"),
         columns=(
             Column("Student"),
@@ -102,7 +101,8 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
     )
 
 
-def _summary(entries: Sequence[Entry]) -> str:
+def _above(entries: Sequence[Entry], veil: Veil) -> str:
+    """What stands above the table: counts, the points of all, and those of each item."""
     totals = [entry.total for entry in entries if entry.total is not None]
     graded = [one for entry in entries if (one := entry.counting)]
     most = {entry.of for entry in entries if entry.of > 0.0}
@@ -122,40 +122,27 @@ def _summary(entries: Sequence[Entry]) -> str:
     if pending := [one.points for one in graded if one.pending]:
         said = f"{number(sum(pending))} points, not counted"
         cells.append(("Pending", f"{len(pending)} <small>{said}</small>"))
-    drawn = histogram(totals, max(most, default=1.0), "Students by points")
-    return summary(cells, drawn, note("Points that are pending are in no sum here."))
+    largest = max(most, default=1.0)
+    return template("grading/above.html").render(
+        entries=cells,
+        totals=tenths(totals, largest) if totals else (),
+        most=number_words(largest),
+        items=list(_items(entries, veil)),
+    )
 
 
-def _items(entries: Sequence[Entry], veil: Veil) -> str:
-    """Distribution of points per item, as they count."""
+def _items(entries: Sequence[Entry], veil: Veil) -> Iterator[tuple[Any, ...]]:
+    """Distribution of points per item, as they count: a row of the table each."""
     found: dict[str, list[Item]] = defaultdict(list)
     for entry in entries:
         one = entry.counting
         for title, item in one.by_title.items() if one and not one.pending else ():
             found[title].append(item)
-    if not found:
-        return ""
-    lines = []
     for title, items in found.items():
         shares = [item.points / item.of if item.of else 0.0 for item in items]
         mean, most = statistics.fmean(i.points for i in items), max(i.of for i in items)
         none, full = sum(share <= 0.0 for share in shares), sum(share >= 1.0 for share in shares)
-        lines.append(
-            f'<tr><th scope="row" dir="auto">{escaped(veil.hide(title))}</th>'
-            f'<td class="chart">{bins(shares)}</td>'
-            f'<td class="n">{mean:.1f}&nbsp;/&nbsp;{number(most)}</td>'
-            f'<td class="n wide-only">{none}</td><td class="n wide-only">{full}</td></tr>'
-        )
-    made = card(
-        "Points by item",
-        note("From none to all, in tenths, below none with none; pending reports left out."),
-        '<table class="spread"><thead><tr><th scope="col">Item</th>'
-        '<th scope="col" class="chart">none to all</th><th scope="col" class="n">Mean</th>'
-        '<th scope="col" class="n wide-only">None</th>'
-        '<th scope="col" class="n wide-only">All</th></tr></thead>'
-        f"<tbody>{''.join(lines)}</tbody></table>",
-    )
-    return f'<div class="cards">{made}</div>'
+        yield veil.hide(title), tenths(shares, 1.0), mean, number(most), none, full
 
 
 def status_of(entry: Entry) -> str:

@@ -6,14 +6,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from px4fuse.comparison.model import Comparison
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
+from px4fuse.findings.source_clock import typed_offset_s
 from px4fuse.flight import Unavailable
 from px4fuse.plain import p_words
 from px4fuse.report import marks
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page, legend_above
 from px4fuse.report.style import OURS, OURS_BAND, OURS_LINE
-from px4fuse.report.words import clock_advice, delay_wrong, stamps_wrong
 
 # Heights of the axes in points
 CURVE, PARTS = 170.0, 150.0
@@ -21,32 +22,42 @@ CURVE, PARTS = 170.0, 150.0
 MAX_DROP = 12.0
 # How many intervals the curve is drawn over, to either side
 REACH = 2.5
+# One update of EKF2 (EKF2_PREDICT_US)
+NEGLIGIBLE_S = 0.010
 # |z| of which CHANGE_P is the two-sided p-value
 DRIFT_SIGMAS = 2.81
 
 
 def line(document: Document) -> str:
     """What the clock estimate says, in one line."""
-    clock = document.analysis.clock
-    if isinstance(clock, Unavailable):
-        return f"not determinable: {clock.reason}. {clock.remedy}"
     if has_page(document):
         return "see its page"
-    low, high = clock.interval_s
-    return (
-        f"the stamps are right as far as this flight can tell: {clock.offset_s:+.3f} s "
-        f"(95 % {low:+.3f} to {high:+.3f} s) would have to be added, from "
-        f"{clock.count} measurements"
-    )
+    said = clock_advice(document.analysis, document.analysis.clock)
+    return "; ".join(said[label] for label in ("Reading", "Offset") if label in said)
 
 
 def has_page(document: Document) -> bool:
     """Whether the flight says more about the clock than that it is right."""
-    clock, analysis = document.analysis.clock, document.analysis
+    clock = document.analysis.clock
     if isinstance(clock, Unavailable):
         return False
-    wrong = stamps_wrong(analysis, clock) or delay_wrong(analysis, clock)
+    wrong = _stamps_wrong(clock) or _delay_wrong(document.analysis, clock)
     return not clock.determinable or wrong or _changes(clock) or _drifts(clock)
+
+
+def _stamps_wrong(clock: ClockOffset) -> bool:
+    """Whether the stamps of the source are late or early beyond doubt, as they were recorded."""
+    low, high = clock.interval_s
+    negligible = abs(clock.offset_s) < NEGLIGIBLE_S
+    return clock.determinable and not (low <= 0.0 <= high or negligible)
+
+
+def _delay_wrong(comparison: Comparison, clock: ClockOffset) -> bool:
+    """Whether PX4's EKF2_EV_DELAY is known, and not what the data ask for."""
+    delay, (low, high) = comparison.flight.log.parameters.get("EKF2_EV_DELAY"), clock.interval_s
+    if delay is None or not clock.determinable:
+        return False
+    return not -(high + NEGLIGIBLE_S) <= delay * 1e-3 <= -(low - NEGLIGIBLE_S)
 
 
 def _changes(clock: ClockOffset) -> bool:
@@ -56,6 +67,47 @@ def _changes(clock: ClockOffset) -> bool:
 def _drifts(clock: ClockOffset) -> bool:
     drift, sigma = clock.drift_ppm, clock.drift_sigma_ppm
     return drift is not None and sigma is not None and abs(drift) > DRIFT_SIGMAS * sigma
+
+
+def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> dict[str, str]:
+    """What the clock estimate says, and what follows from it, as labels and sentences."""
+    if isinstance(clock, Unavailable):
+        return {"Offset": f"not determinable: {clock.reason}. {clock.remedy}"}
+    if not clock.determinable:
+        return {
+            "Offset": f"not determinable: {clock.reason}.",
+            "Next": "fly passes of 5 m or more with clear starts and stops.",
+        }
+    offset, (low, high) = clock.offset_s, clock.interval_s
+    advice = {
+        "Offset": f"{offset:+.3f} s, 95 % {low:+.3f} s to {high:+.3f} s, to be added to the stamps "
+        "of the source",
+        "Reading": "the stamps are right as far as this flight can tell",
+    }
+    if _stamps_wrong(clock):
+        side = "late" if offset < 0.0 else "early"
+        advice["Reading"] = f"the stamps are {side} by {abs(offset):.3f} s"
+        typed = typed_offset_s(comparison, clock)
+        advice["Re-run"] = f"px4fuse compare LOG --clock-offset {typed:.3f}"
+    delay = comparison.flight.log.parameters.get("EKF2_EV_DELAY")
+    if delay is not None and not _delay_wrong(comparison, clock):
+        advice["PX4"] = f"EKF2_EV_DELAY {delay:g} ms fits"
+    elif delay is not None and offset > 0.0 and delay <= 0.0:
+        advice["PX4"] = "EKF2_EV_DELAY is 0 ms and cannot be negative: correct the sender's clock"
+    elif delay is not None:
+        asked, least, most = (max(-s * 1e3, 0.0) for s in (offset, high, low))
+        advice["PX4"] = (
+            f"EKF2_EV_DELAY is {delay:g} ms, the data ask for {asked:.0f} ms ({least:.0f} to "
+            f"{most:.0f}); set it, or correct the sender's clock"
+        )
+    if clock.change_p is not None and _changes(clock):
+        parts = ", ".join(f"{p.offset_s:+.2f} s from {p.start_s:.0f} s" for p in clock.parts)
+        advice["Changes"] = (
+            f"the offset is not the same throughout ({p_words(clock.change_p)}): {parts}"
+        )
+    if clock.drift_ppm is not None and clock.drift_sigma_ppm is not None:
+        advice["Drift"] = f"{clock.drift_ppm:+.0f} ± {1.96 * clock.drift_sigma_ppm:.0f} ppm"
+    return advice
 
 
 def draw(document: Document) -> Iterator[Page]:

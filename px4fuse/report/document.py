@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
 
 from px4fuse.analysis import Analysis, Counterfactual
 from px4fuse.comparison.events import Events, happened
@@ -15,16 +14,11 @@ from px4fuse.flight import Unavailable
 from px4fuse.loop.loop import Loop
 from px4fuse.results.contract import ChangeResults
 from px4fuse.results.model import Provenance, Student
-from px4fuse.trajectory.evaluation import Evaluation
 
 
 def who(student: Student, between: str) -> str:
     """Name and id, as far as they are given."""
     return between.join(filter(None, (student.name, student.id)))
-
-
-# Whose the pages are that are not handed in
-NOBODY = Student()
 
 
 @dataclass(frozen=True)
@@ -83,21 +77,6 @@ class WhatIfDocument:
 
     made_of: Counterfactual
     command: str
-    student: ClassVar[Student] = NOBODY
-
-
-@dataclass(frozen=True)
-class EvaluationDocument:
-    """A page on the errors of a trajectory.
-
-    Attributes
-    ----------
-    score : Evaluation
-    """
-
-    score: Evaluation
-    command: ClassVar[str] = ""
-    student: ClassVar[Student] = NOBODY
 
 
 @dataclass(frozen=True)
@@ -114,12 +93,6 @@ class ChangesDocument:
     results: ChangeResults
     a: Analysis | None
     b: Analysis | None
-    student: ClassVar[Student] = NOBODY
-
-    @property
-    def command(self) -> str:
-        """The command line that makes it again, without folders."""
-        return self.results.provenance.command
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.flight import Unavailable
 from px4fuse.loop.analysis import SMALLEST_STAMP_S
 from px4fuse.report import style
-from px4fuse.report.document import EvaluationDocument
 from px4fuse.report.page import WIDTH, Page, halves, legend_above
 from px4fuse.report.screen import show
 from px4fuse.report.style import EKF2, MUTED, OURS, TRUTH, report_style
@@ -65,6 +64,7 @@ FEW_DECIDE = 0.5
 DIFFERS = 1.3
 # Rounding: no error to say anything about
 NEGLIGIBLE_M = 1e-6
+SHADES = "The darker the path, the larger its error; × is the largest."
 SCORE_HEAD = (
     "error", "RMSE", "95 %", "mean", "median", "std", "max", "n", "rotation\nRMSE (°)",
 )  # fmt: skip
@@ -107,9 +107,8 @@ def views(score: Evaluation) -> list[View]:
     return seen if extent[vertical] > FLAT * extent[level] else seen[:1]
 
 
-def draw(document: EvaluationDocument) -> Iterator[Page]:
+def draw(score: Evaluation) -> Iterator[Page]:
     """Draw the page, and another where the table of a run over many deltas fills the first."""
-    score = document.score
     page = Page(
         "Trajectory error",
         "APE: how far a pose is from the reference; over all poses, the ATE. RPE: how wrong a "
@@ -151,7 +150,7 @@ def _maps(page: Page, score: Evaluation) -> None:
     seen, is_aligned = views(score), score.alignment != "none"
     title = "After alignment, by error" if is_aligned else "By error"
     parts = {f"{title}, {view.title}": side_words(score, view.up) for view in seen}
-    parts[f"{title}, {seen[0].title}"] = after_words(score)
+    parts[f"{title}, {seen[0].title}"] = SHADES
     if is_aligned:
         parts = {"Before alignment": before_words(score), **parts}
     width = (WIDTH - GAP * (len(parts) - 1)) / len(parts)
@@ -414,16 +413,6 @@ def before_words(score: Evaluation) -> str:
         f"As they stand {metres(apart)} apart (RMSE). Turned by "
         f"{np.degrees(fitted.rotation.magnitude()):.1f}°, moved {metres(moved)}{scaled}: a choice "
         "of frame, no error."
-    )
-
-
-def after_words(score: Evaluation) -> str:
-    """What the map shows."""
-    worst = int(np.argmax(score.position_error_m))
-    return (
-        f"{metres(score.ate.translation_m.rmse)} (RMSE) {_aligned(score)}. The darker the path, "
-        f"the larger its error; × is the largest, {metres(score.ate.translation_m.max)} at "
-        f"{score.time_s[worst] - zero_s(score):.1f} s."
     )
 
 

@@ -215,7 +215,8 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
     page.labelled("End", "not used" if isinstance(end, Unavailable) else end.source)
     for closure in loop.closures[:1]:
         page.labelled("Gate", gate_words(closure))
-    for text in (by_distance_words(loop), *redundancy_words(loop), *refusals(loop)):
+    single = SINGLE_LOOP if len(loop.closures) == 1 else ""
+    for text in (by_distance_words(loop), single, *refusals(loop)):
         page.write(text, colour=MUTED, above=2.0)
     for group in by_root(findings):
         write_finding(page, group)
@@ -326,11 +327,6 @@ def by_distance_words(loop: Loop) -> str:
         f"{example} Headings too: each step is first turned back by its share of the {turned:+.1f}°"
         " that the heading is off at the end, and what is left of the gap is spread as before."
     )
-
-
-def redundancy_words(loop: Loop) -> list[str]:
-    """That one loop has no redundancy, or nothing."""
-    return [SINGLE_LOOP] if len(loop.closures) == 1 else []
 
 
 def refusals(loop: Loop) -> list[str]:

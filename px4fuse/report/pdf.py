@@ -35,7 +35,6 @@ from px4fuse.report import (
 from px4fuse.report.document import (
     ChangesDocument,
     Document,
-    EvaluationDocument,
     LoopDocument,
     WhatIfDocument,
     who,
@@ -43,8 +42,9 @@ from px4fuse.report.document import (
 from px4fuse.report.page import Page, data, printable
 from px4fuse.report.seal import sealed
 from px4fuse.report.style import report_style
+from px4fuse.trajectory.evaluation import Evaluation
 
-Report = Document | LoopDocument | WhatIfDocument | EvaluationDocument | ChangesDocument
+Report = Document | LoopDocument | WhatIfDocument | Evaluation | ChangesDocument
 RESULTS_NAME = "results.json"
 STANDARDS: list[Any] = ["a-3a", "ua-1"]
 PAGES: Mapping[type, tuple[Callable[[Any], Iterator[Page]], ...]] = {
@@ -54,7 +54,7 @@ PAGES: Mapping[type, tuple[Callable[[Any], Iterator[Page]], ...]] = {
     ),
     LoopDocument: (loop.draw_report, notes.draw, provenance.draw_loop),
     WhatIfDocument: (whatif.draw,),
-    EvaluationDocument: (evaluation.draw,),
+    Evaluation: (evaluation.draw,),
     ChangesDocument: (changes.draw,),
 }  # fmt: skip
 
@@ -71,8 +71,7 @@ def _named(document: Report) -> tuple[str, str, str]:
         case LoopDocument(loop=found):
             track = found.odometry.trajectory
             return f"px4fuse loop {track.name}", track.name, track.sha256
-        case EvaluationDocument(score):
-            one, other = score.estimate, score.reference
+        case Evaluation(estimate=one, reference=other):
             return f"px4fuse evaluate {one.name} {other.name}", one.name, one.sha256
         case ChangesDocument(results):
             a, b = results.a, results.b
@@ -85,7 +84,7 @@ def render(document: Report, results_json: str) -> bytes:
 
     Parameters
     ----------
-    document : Document, LoopDocument, WhatIfDocument, EvaluationDocument or ChangesDocument
+    document : Document, LoopDocument, WhatIfDocument, Evaluation or ChangesDocument
     results_json : str
         Attached inside the PDF as ``results.json``, so that the PDF alone can be checked.
 
@@ -96,18 +95,23 @@ def render(document: Report, results_json: str) -> bytes:
     """
     with report_style():
         pages = [page for draw in PAGES[type(document)] for page in draw(document)]
-        blocks = data([block for page in pages for block in page.blocks])
+        written = [block for page in pages for block in page.blocks]
+        blocks = data(written)
     title, name, sha256 = _named(document)
-    made_by, student = f"px4fuse {metadata.version('px4fuse')}", document.student
-    from_outside = title, student.name, student.id, student.notes, document.command
+    made_by = f"px4fuse {metadata.version('px4fuse')}"
+    student = ""
+    if isinstance(document, Document | LoopDocument):
+        student = who(document.student, " · ")
+    # figures have no text of others
+    words = title + name + student + json.dumps(written, ensure_ascii=False, default=repr)
     return compiled(
         {
             "title": title,
             "author": made_by,
             "head": _line(f"px4fuse · {name} · SHA-256 {sha256[:12]}", 90),
-            "student": _line(who(student, " · "), 40),
+            "student": _line(student, 40),
             "foot": made_by,
-            "fonts": fonts.families("".join(from_outside)),
+            "fonts": fonts.families(words),
             "blocks": blocks,
             "results": results_json,
         }

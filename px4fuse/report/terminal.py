@@ -8,14 +8,13 @@ from rich.console import Console
 
 from px4fuse.ekf2.walk import Why
 from px4fuse.findings import by_root
-from px4fuse.flight import Unavailable
-from px4fuse.report.cover import facts, write_axes, write_finding
+from px4fuse.report.cover import facts, write_finding
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page
 from px4fuse.report.screen import show
 from px4fuse.report.style import MUTED
 from px4fuse.report.why import write_why
-from px4fuse.report.words import verdict_notes
+from px4fuse.report.words import verdict_notes, write_errors
 from px4fuse.request import Request
 
 MOST_FINDINGS = 4
@@ -50,11 +49,12 @@ def print_summary(
     for label, text in facts(document).items():
         if label in FACTS:
             page.labelled(label, text)
-    write_axes(page, document)
+    write_errors(page, document)
     for note in (LEGEND, *verdict_notes(analysis)):
         page.write(note, colour=MUTED)
     why = analysis.why.get(analysis.main.axis.name)
-    if why is not None and not _told(why, document.story):
+    is_told = isinstance(why, Why) and why.cause in document.story
+    if why is not None and not is_told:
         write_why(page, why)
     if not document.findings:
         page.write("No findings.")
@@ -64,13 +64,6 @@ def print_summary(
     if (more := len(groups) - MOST_FINDINGS) > 0:
         page.write(f"and {more} more in the report" if report else f"and {more} more")
     show(console, page.blocks, request)
-
-
-def _told(why: Why | Unavailable, story: tuple[str, ...]) -> bool:
-    """Whether the story has the sentence, which it cuts where it names the moment."""
-    if isinstance(why, Unavailable):
-        return False
-    return any(why.sentences[0].startswith(sentence.removesuffix(".")) for sentence in story)
 
 
 def print_advice(console: Console, advice: Mapping[str, str], request: Request) -> None:

@@ -10,12 +10,10 @@ import numpy as np
 
 from px4fuse.comparison.model import AxisComparison, Comparison, Difference, FilterSummary
 from px4fuse.comparison.model import UnjudgedFilter as Unjudged
-from px4fuse.filter.clock import CHANGE_P, ClockOffset
 from px4fuse.filter.consistency import Consistency, verdict_of
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings import Finding
-from px4fuse.findings.source_clock import typed_offset_s
 from px4fuse.findings.variance import VARIANCE_FACTOR
 from px4fuse.flight import Alignment, Unavailable
 from px4fuse.plain import factor_words, number_words, p_words
@@ -24,10 +22,8 @@ from px4fuse.report.style import GOOD, MUTED, SEVERITY_COLOURS
 
 if TYPE_CHECKING:
     from px4fuse.report.document import Document
-    from px4fuse.report.page import Cell
+    from px4fuse.report.page import Cell, Page
 
-# One update of EKF2 (EKF2_PREDICT_US)
-NEGLIGIBLE_OFFSET_S = 0.010
 # Below, "white" is wrong: of the eight verdicts of a flight one in a hundred by chance
 WHITE_P = 0.001
 RMSE = ("position_rmse_m", "velocity_rmse_m_s")
@@ -85,8 +81,8 @@ def verdict_rows(
     return rows
 
 
-def error_rows(document: Document) -> tuple[list[str], list[list[Cell]]]:
-    """Head and rows of verdicts and errors, the main axis first.
+def write_errors(page: Page, document: Document) -> None:
+    """Write verdicts and errors as a table, the main axis first.
 
     Between both filters, and between each and the truth, where the flight has these.
     """
@@ -100,7 +96,7 @@ def error_rows(document: Document) -> tuple[list[str], list[list[Cell]]]:
 
     head = [*VERDICT_HEAD, *(["apart\n(m)", "\n(m/s)"] if has_ekf2 else [])]
     head += ["to truth\n(m)", "\n(m/s)"] if document.truth_known else []
-    return head, verdict_rows(axes, more)
+    page.table(head, verdict_rows(axes, more), right=(2, 3, 5, 6, 7, 8))
 
 
 def _metres(part: object, field: str) -> str:
@@ -283,62 +279,4 @@ def tuning_advice(
             "the settings found on the first half do no better on the second than the chosen "
             "ones: these are as good as any"
         )
-    return advice
-
-
-def stamps_wrong(comparison: Comparison, clock: ClockOffset) -> bool:
-    """Whether the stamps of the source are late or early beyond doubt, as they were recorded."""
-    low, high = clock.interval_s
-    negligible = abs(clock.offset_s) < NEGLIGIBLE_OFFSET_S
-    return clock.determinable and not (low <= 0.0 <= high or negligible)
-
-
-def delay_wrong(comparison: Comparison, clock: ClockOffset) -> bool:
-    """Whether PX4's EKF2_EV_DELAY is known, and not what the data ask for."""
-    delay = comparison.flight.log.parameters.get("EKF2_EV_DELAY")
-    if delay is None or not clock.determinable:
-        return False
-    asked = clock.interval_s
-    margin = NEGLIGIBLE_OFFSET_S
-    return not -(asked[1] + margin) <= delay * 1e-3 <= -(asked[0] - margin)
-
-
-def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> dict[str, str]:
-    """What the clock estimate says, and what follows from it, as in :func:`tuning_advice`."""
-    if isinstance(clock, Unavailable):
-        return {"Offset": f"not determinable: {clock.reason}. {clock.remedy}"}
-    if not clock.determinable:
-        return {
-            "Offset": f"not determinable: {clock.reason}.",
-            "Next": "fly passes of 5 m or more with clear starts and stops.",
-        }
-    offset, (low, high) = clock.offset_s, clock.interval_s
-    advice = {
-        "Offset": f"{offset:+.3f} s, 95 % {low:+.3f} s to {high:+.3f} s, to be added to the stamps "
-        "of the source",
-        "Reading": "the stamps are right as far as this flight can tell",
-    }
-    if stamps_wrong(comparison, clock):
-        side = "late" if offset < 0.0 else "early"
-        advice["Reading"] = f"the stamps are {side} by {abs(offset):.3f} s"
-        typed = typed_offset_s(comparison, clock)
-        advice["Re-run"] = f"px4fuse compare LOG --clock-offset {typed:.3f}"
-    delay = comparison.flight.log.parameters.get("EKF2_EV_DELAY")
-    if delay is not None and not delay_wrong(comparison, clock):
-        advice["PX4"] = f"EKF2_EV_DELAY {delay:g} ms fits"
-    elif delay is not None and offset > 0.0 and delay <= 0.0:
-        advice["PX4"] = "EKF2_EV_DELAY is 0 ms and cannot be negative: correct the sender's clock"
-    elif delay is not None:
-        asked, least, most = (max(-s * 1e3, 0.0) for s in (offset, high, low))
-        advice["PX4"] = (
-            f"EKF2_EV_DELAY is {delay:g} ms, the data ask for {asked:.0f} ms ({least:.0f} to "
-            f"{most:.0f}); set it, or correct the sender's clock"
-        )
-    if clock.change_p is not None and clock.change_p < CHANGE_P:
-        parts = ", ".join(f"{p.offset_s:+.2f} s from {p.start_s:.0f} s" for p in clock.parts)
-        advice["Changes"] = (
-            f"the offset is not the same throughout ({p_words(clock.change_p)}): {parts}"
-        )
-    if clock.drift_ppm is not None and clock.drift_sigma_ppm is not None:
-        advice["Drift"] = f"{clock.drift_ppm:+.0f} ± {1.96 * clock.drift_sigma_ppm:.0f} ppm"
     return advice

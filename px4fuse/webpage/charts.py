@@ -1,4 +1,4 @@
-"""Charts of a page: bars of plain HTML, intervals on a scale, and numbers over time."""
+"""Charts of a page: counts for bars, intervals on a scale, and numbers over time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from px4fuse.plain import number_words
-from px4fuse.webpage.safe import PICTURE, escaped
+from px4fuse.webpage.safe import PICTURE
 
 BINS = 10
 # In light and in dark pages alike
@@ -30,8 +30,12 @@ class Scale:
 
     @classmethod
     def of(cls, values: npt.ArrayLike, least: float, *, log: bool = False) -> Scale:
-        """One that holds values but for a hundredth at each end; at least so wide (a factor)."""
-        found = np.log(values) if log else np.asarray(values, float)
+        """One that holds values but for a hundredth at each end; at least so wide (a factor).
+
+        Without any values it is about 1.
+        """
+        held = np.asarray(values if np.size(values) else [1.0], float)
+        found = np.log(held) if log else held
         low, high = np.quantile(found, (0.01, 0.99))
         reach = 0.54 * max(high - low, math.log(least) if log else least)
         ends = (low + high) / 2.0 + np.array((-reach, reach))
@@ -47,30 +51,15 @@ class Scale:
         return float((at - ends[0]) / np.ptp(ends))
 
 
-def bar(share: float) -> str:
-    """A bar of a list that says the numbers."""
-    return f'<meter aria-hidden="true" value="{share:.3f}"></meter>'
+def tenths(values: Sequence[float], most: float) -> list[tuple[int, str]]:
+    """How many values lie in each tenth from 0 to ``most``, and where it begins, in words.
 
-
-def bins(shares: Sequence[float]) -> str:
-    """A small histogram of shares from 0 to 1, in tenths, for a table that says the numbers."""
-    counts, _ = np.histogram(np.clip(shares, 0.0, 1.0), BINS, (0.0, 1.0))
-    return (
-        f'<span class="bins" aria-hidden="true">{"".join(map(bar, counts / counts.max()))}</span>'
-    )
-
-
-def histogram(values: Sequence[float], most: float, caption: str) -> str:
-    """Bars of how many values lie in each tenth from 0 to ``most``; empty without any."""
-    if not values:
-        return ""
+    >>> tenths([0.0, 5.0, 5.5, 9.0], 10.0)[5]
+    (2, '5')
+    """
     counts, edges = np.histogram(np.clip(values, 0.0, most), BINS, (0.0, most))
-    columns = "".join(
-        f"<span>{count}{bar(count / counts.max())}{number_words(round(edge, 2))}</span>"
-        for count, edge in zip(counts, edges.tolist(), strict=False)
-    )
-    told = f"{escaped(caption)}, to {number_words(most)}"
-    return f'<figure><div class="bins">{columns}</div><figcaption>{told}</figcaption></figure>'
+    words = (number_words(round(edge, 2)) for edge in edges.tolist())
+    return list(zip(counts.tolist(), words, strict=False))
 
 
 def sketched(parts: Iterable[float], scale: Scale) -> str:

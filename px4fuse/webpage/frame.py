@@ -7,7 +7,7 @@ Without scripts the page shows its first rows as a plain table.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -160,31 +160,6 @@ def boxes(
     return ["boxes", title, owner, rows, kept]
 
 
-# ------------------------------------------------------------------ above the table
-
-
-def _macro(name: str) -> Callable[..., str]:
-    """A macro of ``parts.html``, which gives HTML."""
-    parts: Any = template("webpage/parts.html").module
-    macro = getattr(parts, name)
-    # as a plain text: what is put together of these is not escaped once more
-    return lambda *given: str(macro(*given))
-
-
-#: A box: ``card(title, *content)``, where content is HTML
-card = _macro("card")
-#: A box with a list, its first lines: ``ranking(title, said, lines, most, rest)``
-ranking = _macro("ranking")
-#: The box on top: ``summary(entries, *content)``, names with their values, which are HTML
-summary = _macro("summary")
-#: A small grey paragraph: ``note(text)``
-note = _macro("note")
-#: A button that chooses a filter's tag: ``picks(tag, text)``
-picks = _macro("picks")
-#: A button that shows and unfolds a row, counted from 0: ``opens(index, text)``
-opens = _macro("opens")
-
-
 # ------------------------------------------------------------------ the page
 
 
@@ -206,7 +181,7 @@ def page(
     Parameters
     ----------
     above : str
-        HTML for above the table, of text made safe with :func:`~px4fuse.webpage.safe.escaped`.
+        HTML for above the table, of a :func:`~px4fuse.webpage.safe.template`.
     noun : (str, str)
         What a row is, one and many.
     filters : sequence of (label, ((tag, words), ...))
