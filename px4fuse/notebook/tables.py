@@ -182,11 +182,6 @@ def _(comparison: Comparison) -> pd.DataFrame:
 
 
 @frame.register
-def _(analysis: Analysis) -> pd.DataFrame:
-    return frame.dispatch(Comparison)(analysis)
-
-
-@frame.register
 def _(result: AxisComparison) -> pd.DataFrame:
     """Over time, at the filter's steps; EKF2 and truth interpolated, innovations at updates."""
     steps, updates = result.replay.steps, result.replay.updates

@@ -210,7 +210,7 @@ def answer(simulation: Simulation) -> dict[str, Any]:
                 "outlier_time_s": (stamps[outlier] * 1e-6).tolist(),
                 "path_length_m": source.distance_m,
                 "closure_error_m": float(np.linalg.norm((last - first)[:2])),
-                "source_drift_m": list(source.drift_m),
+                "source_drift_m": source.drift_m.tolist(),
             },
         }
     )
