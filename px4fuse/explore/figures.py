@@ -142,10 +142,7 @@ def _plots(number: int, data: dict[str, Any], time_range: Range1d) -> dict[str, 
             lod_threshold=None, min_border_left=LEFT,
         )  # fmt: skip
         if name == "position":
-            made.scatter(
-                "t", "z", source=sources["measured"], size=3, fill_color=MEASUREMENT,
-                line_color=None, name="measured",
-            )  # fmt: skip
+            _dots(made, sources["measured"], MEASUREMENT, 3, name="measured")
         if name == "innovation":
             _innovations(made, sources, with_ekf2="ekf2" not in lacking)
         if name == "nis":
@@ -174,13 +171,8 @@ def _innovations(made: Any, sources: dict[str, ColumnDataSource], *, with_ekf2: 
     )
     if with_ekf2:
         square: dict[str, Any] = {"marker": "square", "name": "ekf2"}
-        fused = made.scatter(
-            "t", "nu", source=sources["fused"], size=4, fill_color=EKF2, line_color=None, **square
-        )
-        rejected = made.scatter(
-            "t", "nu", source=sources["rejected"], size=7, fill_color=None, line_color=EKF2,
-            **square,
-        )  # fmt: skip
+        fused = _dots(made, sources["fused"], EKF2, 4, **square)
+        rejected = _dots(made, sources["rejected"], None, 7, line_color=EKF2, **square)
         _hover(made, fused, ("EKF2", "@nu{0.000} m"))
         _hover(made, rejected, ("EKF2 rejected", "@nu{0.000} m"))
     ours = made.scatter(
