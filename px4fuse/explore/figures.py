@@ -255,7 +255,7 @@ def _map(number: int, tuning: Tuning) -> Any:
     trail = _source("trail", number, "x y")
     best = _source("best", number, "x y")
     point = _source("point", number, "x y")
-    white = {"line_color": "white"}
+    white: dict[str, Any] = {"line_color": "white"}
     made.line("x", "y", source=trail, line_color=EKF2, line_width=1.2, name="ekf2")
     _dots(made, trail, EKF2, 3, name="ekf2")
     made.scatter("x", "y", source=best, size=13, marker="cross", line_width=2.5, **white)
