@@ -191,9 +191,7 @@ def test_dragging_gives_what_the_command_on_the_page_gives(
     page.click("#axes input[value=north]")
     settle(page)
     request = of_command(page, sample_log)
-    values = page.ask(
-        "[...document.querySelectorAll('.knob input[type=number]')].map(n => n.value)"
-    )
+    values = page.ask(VALUES)
     assert [float(value) for value in values] == [
         request.sigma_a_m_s2, request.sigma_z_m, request.dt_s, request.clock_offset_s
     ]  # fmt: skip
@@ -256,9 +254,7 @@ def test_a_bad_address_or_number_is_refused_in_words(page: Browser) -> None:
     settle(page)
     said = page.ask("document.getElementById('said').textContent")
     assert said == "The address has no usable sigma-a, dt, axis, input: left as it was."
-    values = page.ask(
-        "[...document.querySelectorAll('.knob input[type=number]')].map(n => n.value)"
-    )
+    values = page.ask(VALUES)
     assert values[:3] == ["0.5", "0.2", "0.1"]
     page.ask(
         "(() => { const n = document.getElementById('sigma-z-value'); n.value = '500';"

@@ -13,7 +13,6 @@ import pandas as pd
 from scipy import stats
 
 from px4fuse.analysis import Analysis
-from px4fuse.arrays import Array
 from px4fuse.comparison.events import happened
 from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
 from px4fuse.comparison.preparation import choose_source
@@ -63,25 +62,24 @@ def flight_data(
     beside : bool
         Whether it stands beside another flight: then times are from the start of its segment.
     """
-    comparison = analysis
-    signals = signals_of(comparison, packer)
-    settings, segment = comparison.settings, comparison.segment
-    events = happened(comparison)
+    signals = signals_of(analysis, packer)
+    settings, segment = analysis.settings, analysis.segment
+    events = happened(analysis)
     return {
-        "log": comparison.flight.log.name,
-        "source": comparison.source.name,
+        "log": analysis.flight.log.name,
+        "source": analysis.source.name,
         "shift": segment.start_s if beside else 0.0,
         "story": list(story(analysis, findings)),
         "settings": _settings(settings),
-        "main": comparison.main.axis.name,
+        "main": analysis.main.axis.name,
         **signals,
         "axes": [
             own | _others(analysis, result, packer)
-            for own, result in zip(signals["axes"], comparison.axes.values(), strict=True)
+            for own, result in zip(signals["axes"], analysis.axes.values(), strict=True)
         ],
         "maps": _maps(analysis),
         "grid": "only for one log" if beside else grid_data(analysis, packer),
-        "plan": _plan(comparison, packer),
+        "plan": _plan(analysis, packer),
         "events": {
             "silent": list(events.gaps),
             "dropout": list(events.dropouts),
@@ -93,7 +91,7 @@ def flight_data(
             {**_finding(first), "more": [_finding(one) for one in followers]}
             for first, *followers in by_root(findings)
         ],
-        "command": _command(request, comparison),
+        "command": _command(request, analysis),
         "offset": _offset(request, settings),
     }
 
@@ -295,11 +293,7 @@ def _plan(comparison: Comparison, packer: Packer) -> list[int] | str:
     if not len(track):
         return "the source has no horizontal position"
     some = track.iloc[:: max(1, -(-len(track) // MAX_PLAN_POINTS))]
-    columns: list[Array] = list(some.to_numpy().T)
-    return [
-        packer.add_times(some.index.to_numpy()),
-        *(packer.add(column, COARSE) for column in columns),
-    ]
+    return _frame(some, POSITION_COLUMNS[:2], packer)
 
 
 def _finding(finding: Finding) -> dict[str, Any]:

@@ -142,10 +142,7 @@ def _plots(number: int, data: dict[str, Any], time_range: Range1d) -> dict[str, 
             lod_threshold=None, min_border_left=LEFT,
         )  # fmt: skip
         if name == "position":
-            made.scatter(
-                "t", "z", source=sources["measured"], size=3, fill_color=MEASUREMENT,
-                line_color=None, name="measured",
-            )  # fmt: skip
+            _dots(made, sources["measured"], MEASUREMENT, 3, name="measured")
         if name == "innovation":
             _innovations(made, sources, with_ekf2="ekf2" not in lacking)
         if name == "nis":
@@ -174,13 +171,8 @@ def _innovations(made: Any, sources: dict[str, ColumnDataSource], *, with_ekf2: 
     )
     if with_ekf2:
         square: dict[str, Any] = {"marker": "square", "name": "ekf2"}
-        fused = made.scatter(
-            "t", "nu", source=sources["fused"], size=4, fill_color=EKF2, line_color=None, **square
-        )
-        rejected = made.scatter(
-            "t", "nu", source=sources["rejected"], size=7, fill_color=None, line_color=EKF2,
-            **square,
-        )  # fmt: skip
+        fused = _dots(made, sources["fused"], EKF2, 4, **square)
+        rejected = _dots(made, sources["rejected"], None, 7, line_color=EKF2, **square)
         _hover(made, fused, ("EKF2", "@nu{0.000} m"))
         _hover(made, rejected, ("EKF2 rejected", "@nu{0.000} m"))
     ours = made.scatter(
@@ -263,14 +255,19 @@ def _map(number: int, tuning: Tuning) -> Any:
     trail = _source("trail", number, "x y")
     best = _source("best", number, "x y")
     point = _source("point", number, "x y")
+    white: dict[str, Any] = {"line_color": "white"}
     made.line("x", "y", source=trail, line_color=EKF2, line_width=1.2, name="ekf2")
-    made.scatter("x", "y", source=trail, size=3, fill_color=EKF2, line_color=None, name="ekf2")
-    made.scatter("x", "y", source=best, size=13, marker="cross", line_color="white", line_width=2.5)
-    made.scatter(
-        "x", "y", source=point, size=12, marker="circle", fill_color=EKF2, line_color="white",
-        line_width=2.0,
-    )  # fmt: skip
+    _dots(made, trail, EKF2, 3, name="ekf2")
+    made.scatter("x", "y", source=best, size=13, marker="cross", line_width=2.5, **white)
+    _dots(made, point, EKF2, 12, marker="circle", line_width=2.0, **white)
     return made
+
+
+def _dots(made: Any, source: ColumnDataSource, colour: str | None, size: int, **style: Any) -> Any:
+    """Dots without an edge, unless the style has one, at a source's last two columns."""
+    x, y = source.column_names[-2:]
+    look = {"size": size, "fill_color": colour, "line_color": None} | style
+    return made.scatter(x, y, source=source, **look)
 
 
 def _outer(values: Array) -> tuple[float, float]:
@@ -290,17 +287,9 @@ def _plan(number: int) -> Any:
     shown = _source("shown", number, "east north")
     here = _source("here", number, "east north")
     made.line("east", "north", source=track, line_color=MEASUREMENT, line_width=1.0)
-    made.scatter(
-        "east", "north", source=track, size=3, fill_color=MEASUREMENT, line_color=None,
-        nonselection_fill_alpha=0.6,
-    )  # fmt: skip
-    made.scatter(
-        "east", "north", source=shown, size=4, fill_color=OURS, line_color=None, name="ours"
-    )
-    made.scatter(
-        "east", "north", source=here, size=12, marker="circle_x", fill_color=None,
-        line_color=EKF2, line_width=2.0, name="ekf2",
-    )  # fmt: skip
+    _dots(made, track, MEASUREMENT, 3, nonselection_fill_alpha=0.6)
+    _dots(made, shown, OURS, 4, name="ours")
+    _dots(made, here, None, 12, marker="circle_x", line_color=EKF2, line_width=2.0, name="ekf2")
     return made
 
 

@@ -150,9 +150,13 @@ def evaluate(
     """
     if not isinstance(estimate, Trajectory):
         estimate = read_source(str(estimate)).trajectory
-    if not isinstance(reference, Trajectory):
-        reference = read_source(str(reference), default="truth").trajectory
-    return evaluation.evaluate(estimate, reference, **how)
+    return evaluation.evaluate(estimate, _reference(reference), **how)
+
+
+def _reference(given: Pathlike | Trajectory) -> Trajectory:
+    if isinstance(given, Trajectory):
+        return given
+    return read_source(str(given), default="truth").trajectory
 
 
 def close_loop(
@@ -201,8 +205,6 @@ def close_loop(
     TrajectoryError, LogError, MissingDataError, SettingsError
         A file cannot be read or lacks what was asked for, or a number is out of range.
     """
-    if reference is not None and not isinstance(reference, Trajectory):
-        reference = read_source(str(reference), default="truth").trajectory
     return analyse(
         LoopSource(source, None)
         if isinstance(source, Trajectory)
@@ -213,7 +215,7 @@ def close_loop(
         came_back=came_back,
         closures=tuple(closures),
         noise=OdometryNoise(position_drift_m, heading_drift_deg),
-        reference=reference,
+        reference=None if reference is None else _reference(reference),
         spacing_m=key_frames_m,
         progress=progress,
     )

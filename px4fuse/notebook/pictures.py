@@ -10,7 +10,6 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 
 from px4fuse.analysis import Analysis
-from px4fuse.arrays import Array
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.display import frame
 from px4fuse.ekf2.walk import Why
@@ -20,9 +19,12 @@ from px4fuse.filter.tuning import AxisTuning
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.loop import Loop
 from px4fuse.notebook.tables import EKF2, tracks, variants
+from px4fuse.report.clock import draw_curve
+from px4fuse.report.evaluation import draw_ape, draw_path, time_label, views, zero_s
+from px4fuse.report.loop import draw_map
 from px4fuse.report.panels import ERROR, INNOVATIONS, POSITION, SIGMA_P, error_reference
 from px4fuse.report.style import EKF2 as EKF2_COLOUR
-from px4fuse.report.style import EKF2_LINE, OURS_BAND, OURS_DOTS, OURS_LINE
+from px4fuse.report.style import EKF2_LINE, OURS_DOTS
 from px4fuse.report.style import OURS as OURS_COLOUR
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.model import Trajectory
@@ -42,6 +44,11 @@ def _one(ax: Axes | None) -> Axes:
 
 def _map(ax: Axes, right: str, up: str) -> Axes:
     ax.set(xlabel=right, ylabel=up, aspect="equal")
+    return _beside(ax)
+
+
+def _beside(ax: Axes) -> Axes:
+    """With a legend to the right."""
     ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), fontsize="small")
     return ax
 
@@ -101,30 +108,18 @@ def tuning(result: AxisTuning, ax: Axes | None = None) -> Axes:
 
 
 def clock(result: ClockOffset, ax: Axes | None = None) -> Axes:
-    """Log-likelihood of each offset, with the 95 % interval."""
+    """Likelihood of each offset, with the 95 % interval, as in the report."""
     ax = _one(ax)
-    ax.plot(result.curve_s, -result.curve_drop, **OURS_LINE)
-    ax.axvspan(*result.interval_s, color=OURS_BAND)
-    ax.set(xlabel="added to the source's stamps, s", ylabel="log-likelihood below its maximum")
+    draw_curve(ax, result)
+    ax.set_ylabel("ln of how much less likely than the best")
     return ax
 
 
 def loop(result: Loop, ax: Axes | None = None) -> Axes:
-    """The path and its corrections, in the frame of the reference where there is one."""
+    """The path and its corrections in the odometry's frame, as in the report."""
     ax = _one(ax)
-    reference = result.references[0] if result.references else None
-    right, up = ACROSS["NED"]
-    for path in result.reported:
-        position = path.trajectory.position_m
-        score = None if reference is None else path.scores.get(reference.name)
-        if isinstance(score, Evaluation):
-            position = score.estimate_m
-        ax.plot(position[:, right], position[:, up], lw=0.9, label=path.name)
-    uncorrected = result.odometry.scores.get(reference.name) if reference is not None else None
-    if isinstance(uncorrected, Evaluation):
-        truth = uncorrected.reference_m
-        ax.plot(truth[:, right], truth[:, up], "k:", lw=0.8, label=uncorrected.reference.name)
-    return _map(ax, "right, m", "ahead, m")
+    draw_map(ax, result)
+    return _beside(ax)
 
 
 def trajectory(result: Trajectory, ax: Axes | None = None) -> Axes:
@@ -137,24 +132,15 @@ def trajectory(result: Trajectory, ax: Axes | None = None) -> Axes:
 
 
 def evaluation(result: Evaluation, ax: Any = None) -> Any:
-    """The path coloured by its error, and the error over time: two axes."""
+    """The path coloured by its error, and the error over time, as in the report: two axes."""
     if ax is None:
-        _, ax = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
-    right, up = ACROSS[result.reference.frame]
-    left, over_time = ax
-    reference: Array = result.reference_m
-    left.plot(reference[:, right], reference[:, up], "k:", lw=0.8, label=result.reference.name)
-    dots = left.scatter(
-        result.estimate_m[:, right], result.estimate_m[:, up], 4, result.position_error_m,
-        cmap="viridis", label=result.estimate.name,
-    )  # fmt: skip
-    left.figure.colorbar(dots, ax=left, label="error, m")
-    _map(left, "right, m", "ahead, m")
-    rmse = result.ate.translation_m.rmse
-    over_time.plot(result.time_s, result.position_error_m, **OURS_LINE)
-    over_time.axhline(rmse, color=EKF2_COLOUR, label=f"ATE {rmse:.3g} m")
-    over_time.set(xlabel="time, s", ylabel="error, m", ylim=(0.0, None))
-    over_time.legend()
+        _, ax = plt.subplots(2, 1, figsize=(7, 8), layout="constrained")
+    path, over_time = ax
+    draw_path(path, result, views(result)[0], path.inset_axes((1.02, 0.0, 0.03, 1.0)))
+    draw_ape(over_time, result, result.time_s - zero_s(result), time_label(result))
+    over_time.set_ylabel("APE (m)")
+    for each in ax:
+        each.legend(fontsize="small")
     return ax
 
 

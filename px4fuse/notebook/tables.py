@@ -30,6 +30,8 @@ from px4fuse.flight import (
 )
 from px4fuse.loop.loop import Loop
 from px4fuse.record import Record, written
+from px4fuse.report.evaluation import interval_words, summary
+from px4fuse.report.loop import closure_words
 from px4fuse.report.words import settings_words, verdict_words
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Trajectory
@@ -113,13 +115,13 @@ def _filters(result: AxisComparison) -> tuple[tuple[str, Any], ...]:
 @words.register
 def _(result: AxisComparison) -> str:
     parts = []
-    for name, summary in _filters(result):
+    for name, judged in _filters(result):
         if name == EKF2 and isinstance(result.ekf2_state, Unavailable):
             parts.append(f"no {name}")
             continue
-        said = _nis(summary)
-        if not isinstance(summary.truth, Unavailable):
-            said += f", {summary.truth.position_rmse_m:.3g} m RMS from the truth"
+        said = _nis(judged)
+        if not isinstance(judged.truth, Unavailable):
+            said += f", {judged.truth.position_rmse_m:.3g} m RMS from the truth"
         parts.append(f"{name} {said}")
     return f"{result.axis.name}: {'; '.join(parts)}"
 
@@ -179,11 +181,6 @@ def _(comparison: Comparison) -> pd.DataFrame:
         for name, summary in _filters(result)
     )
     return table.astype({"count": "Int64"}) if "count" in table else table
-
-
-@frame.register
-def _(analysis: Analysis) -> pd.DataFrame:
-    return frame.dispatch(Comparison)(analysis)
 
 
 @frame.register
@@ -315,10 +312,7 @@ def _(trajectory: Trajectory) -> pd.DataFrame:
 @words.register
 def _(loop: Loop) -> str:
     path = loop.odometry.trajectory
-    gap = loop.closure_error_m
-    closes = "does not say where it ended" if gap is None else f"fails to close by {gap:.2f} m"
-    share = "" if gap is None else f" ({gap / loop.path_length_m:.1%})"
-    lines = [f"{path.name}: {loop.path_length_m:.1f} m, {closes}{share}"]
+    lines = wrap(f"{path.name}: {closure_words(loop)}", WIDTH)
     for reference in loop.references:
         scores = ((path.name, path.scores.get(reference.name)) for path in loop.reported)
         found = ", ".join(
@@ -346,15 +340,9 @@ def _(loop: Loop) -> pd.DataFrame:
 
 @words.register
 def _(found: Evaluation) -> str:
-    ate = found.ate
-    low_high = ""
-    if not isinstance(ate.interval_m, Unavailable):
-        low_high = f" (95 %: {ate.interval_m.low:.3g} to {ate.interval_m.high:.3g} m)"
-    said = (
-        f"{found.estimate.name} against {found.reference.name}, alignment {found.alignment}: "
-        f"ATE {ate.translation_m.rmse:.3g} m{low_high}"
-    )
-    return "\n".join([said, *map(words, found.rpe)])
+    within = interval_words(found.ate.interval_m)
+    lines = wrap(summary(found) + (f" RMSE, 95 %: {within} m." if within else ""), WIDTH)
+    return "\n".join([*lines, *map(words, found.rpe)])
 
 
 @frame.register

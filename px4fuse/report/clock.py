@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,6 +16,9 @@ from px4fuse.report import marks
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page, legend_above
 from px4fuse.report.style import OURS, OURS_BAND, OURS_LINE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 # Heights of the axes in points
 CURVE, PARTS = 170.0, 150.0
@@ -131,14 +135,18 @@ def draw(document: Document) -> Iterator[Page]:
 
 
 def _curve(page: Page, clock: ClockOffset) -> None:
-    """Likelihood over the offset."""
-    (low, high), best, applied = clock.interval_s, clock.offset_s, clock.applied_s
+    (low, high), best = clock.interval_s, clock.offset_s
     say = (
         f"Best at {best:+.3f} s; 95 % from {low:+.3f} to {high:+.3f} s, wider than the curve alone "
         f"would say because the IMU's noise moves it too. From {clock.count} measurements."
     )
     title = "ln of how much less likely each offset is than the best"
-    axes = page.panel(title, say, CURVE, above=14.0)
+    draw_curve(page.panel(title, say, CURVE, above=14.0), clock)
+
+
+def draw_curve(axes: Axes, clock: ClockOffset) -> None:
+    """Likelihood over the offset."""
+    (low, high), best, applied = clock.interval_s, clock.offset_s, clock.applied_s
     axes.axvspan(low, high, color=OURS_BAND, lw=0, label="95 % interval")
     axes.plot(clock.curve_s, clock.curve_drop, **OURS_LINE)
     axes.axvline(applied, color="black", lw=0.8, ls="--", label="as analysed")

@@ -130,11 +130,11 @@ def picture(score: Evaluation) -> bytes:
         title = fill(summary(score), PICTURE_LETTERS)
         figure.text(0.015, 0.985, title, size=9.5, weight="bold", va="top")
         axes = figure.add_axes((0.06, 0.14, 0.40, 0.74), title="the path, by its error (APE)")
-        _path(axes, score, views(score)[0], figure.add_axes((0.475, 0.14, 0.012, 0.74)))
+        draw_path(axes, score, views(score)[0], figure.add_axes((0.475, 0.14, 0.012, 0.74)))
         handles, labels = axes.get_legend_handles_labels()
         figure.legend(handles, labels, loc="lower left", ncols=4, bbox_to_anchor=(0.02, 0.01))
         axes = figure.add_axes((0.58, 0.60, 0.40, 0.28), title="APE over time (m)")
-        _absolute(axes, score, score.time_s - zero_s(score), _time_label(score))
+        draw_ape(axes, score, score.time_s - zero_s(score), time_label(score))
         axes.legend(loc="upper right", bbox_to_anchor=(1.01, -0.19), ncols=4, columnspacing=1.0,
                     handlelength=1.9, borderaxespad=0.0)  # fmt: skip
         title = "RPE per delta (m); diamond: RMSE"
@@ -161,7 +161,7 @@ def _maps(page: Page, score: Evaluation) -> None:
     ]
     for axes, view in zip(panels[int(is_aligned) :], seen, strict=True):
         scale = axes.inset_axes((1.02, 0.0, 0.03, 1.0)) if axes is panels[-1] else None
-        _path(axes, score, view, scale)
+        draw_path(axes, score, view, scale)
     if is_aligned:
         _before(panels[0], score, seen[0])
     entries = {
@@ -184,7 +184,7 @@ def _before(axes: Axes, score: Evaluation, view: View) -> None:
     _framed(axes, score, view)
 
 
-def _path(axes: Axes, score: Evaluation, view: View, scale: Axes | None) -> None:
+def draw_path(axes: Axes, score: Evaluation, view: View, scale: Axes | None) -> None:
     """The aligned path by its error, the reference dashed upon it."""
     from matplotlib.collections import LineCollection  # noqa: PLC0415
 
@@ -223,11 +223,11 @@ def _panels(page: Page, score: Evaluation) -> None:
     """APE over time and over distance; RPE over time and per delta."""
     left, right = halves()
     axes = left.panel("APE over time (m)", "", HEIGHT)
-    _absolute(axes, score, score.time_s - zero_s(score), _time_label(score))
+    draw_ape(axes, score, score.time_s - zero_s(score), time_label(score))
     page.legend(axes.get_legend_handles_labels()[0])
     left.numbers(time_words(score))
     axes = right.panel("APE over distance (m)", "", HEIGHT)
-    _absolute(axes, score, score.distance_m, "distance along the reference (m)")
+    draw_ape(axes, score, score.distance_m, "distance along the reference (m)")
     right.numbers(distance_words(score))
     page.beside(left, right)
     left, right = halves()
@@ -241,7 +241,7 @@ def _panels(page: Page, score: Evaluation) -> None:
     page.beside(left, right)
 
 
-def _absolute(axes: Axes, score: Evaluation, along: Array, label: str) -> None:
+def draw_ape(axes: Axes, score: Evaluation, along: Array, label: str) -> None:
     """APE with its statistics as lines."""
     _line(axes, along, score.position_error_m, score.time_s, color=OURS, lw=0.8)
     for name, title, looks in STATISTICS:
@@ -259,7 +259,7 @@ def _relative(axes: Axes, score: Evaluation, known: list[PairwiseError]) -> list
         ends = score.time_s[error.end]
         _line(axes, ends - zero, error.translation_error_m, ends, label=error.delta_words, **looks)
     highest = max(float(error.translation_error_m.max()) for error in shown)
-    _from_zero(axes, score.time_s - zero, highest, _time_label(score))
+    _from_zero(axes, score.time_s - zero, highest, time_label(score))
     legend_above(axes, handlelength=1.8)
     return shown
 
@@ -294,7 +294,8 @@ def _none(axes: Axes, score: Evaluation) -> None:
     style.empty(axes, f"No RPE: {reason}.")
 
 
-def _time_label(score: Evaluation) -> str:
+def time_label(score: Evaluation) -> str:
+    """What the axis of time counts from."""
     return "time from the first pose (s)" if zero_s(score) else "time (s)"
 
 

@@ -110,6 +110,13 @@ def shown(loop: Loop) -> list[CorrectedPath]:
 
 def _map(page: Page, loop: Loop) -> None:
     axes = page.panel("From above, in the odometry's frame", "", MAP, left=36.0, below=LEGEND)
+    draw_map(axes, loop)
+    below = -(TICKS + AXIS_LABEL + 2.0) / MAP
+    axes.legend(loc="upper left", ncols=4, borderaxespad=0.0, bbox_to_anchor=(0.0, below))
+
+
+def draw_map(axes: Axes, loop: Loop) -> None:
+    """Every path from above, where it ended, and where it should have."""
     path = loop.odometry.trajectory
     names = AXES_OF_FRAME[path.frame]
     _reference(axes, loop)
@@ -126,8 +133,6 @@ def _map(page: Page, loop: Loop) -> None:
         axes.plot([], [], color=RED, lw=1.2, label=f"gap {loop.closure_error_m:.2f} m")
         axes.plot(*true, "x", color=RED, ms=5, mew=1.2, zorder=6, label="where it really ended")
     as_map(axes, names[1], names[0])
-    below = -(TICKS + AXIS_LABEL + 2.0) / MAP
-    axes.legend(loc="upper left", ncols=4, borderaxespad=0.0, bbox_to_anchor=(0.0, below))
 
 
 def _reference(axes: Axes, loop: Loop) -> None:

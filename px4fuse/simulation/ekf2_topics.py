@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,12 +78,8 @@ def _local_position(track: TopicTrack) -> Topic:
     steps = np.array([step for step, _ in track.resets], dtype=np.intp)
     jumps = np.array([[0.0, 0.0], *(jump for _, jump in track.resets)])
     count = np.searchsorted(steps, rows, side="right")
-    fields = _stamped(track.time_us[rows], PUBLISHED_LATER_US)
-    for names, values in (
-        (("x", "y", "z"), track.position_m),
-        (("vx", "vy", "vz"), track.velocity_m_s),
-    ):
-        fields |= {name: values[rows, i].astype(np.float32) for i, name in enumerate(names)}
+    fields = sensors.stamps(track.time_us[rows], PUBLISHED_LATER_US)
+    fields |= sensors.vectors({"": track.position_m[rows], "v": track.velocity_m_s[rows]})
     fields["delta_xy"] = jumps[count].astype(np.float32)
     fields["delta_z"] = np.zeros(len(rows), np.float32)
     fields["delta_vxy"] = np.zeros((len(rows), 2), np.float32)
@@ -118,7 +113,7 @@ def _states(done: Run, track: TopicTrack) -> Topic:
     return Topic(
         "estimator_states",
         {
-            **_stamped(track.time_us[rows], _horizon_us(track, rows)),
+            **sensors.stamps(track.time_us[rows], _horizon_us(track, rows)),
             "states": states,
             "covariances": covariances,
             "n_states": np.full(len(rows), 24, np.uint8),
@@ -150,7 +145,7 @@ def _aid_source(inputs: Inputs, done: Run, track: TopicTrack, rate_hz: float) ->
     return Topic(
         "estimator_aid_src_ev_pos",
         {
-            **_stamped(taken_us, later_us),
+            **sensors.stamps(taken_us, later_us),
             "time_last_fuse": np.where(last >= 0, sensors.START_US + last, 0).astype(np.uint64),
             "observation": measured.astype(np.float32),
             "observation_variance": noise.astype(np.float32),
@@ -179,7 +174,7 @@ def _flags(inputs: Inputs, done: Run, track: TopicTrack) -> Topic:
     return Topic(
         "estimator_status_flags",
         {
-            **_stamped(track.time_us[rows], _horizon_us(track, rows)),
+            **sensors.stamps(track.time_us[rows], _horizon_us(track, rows)),
             "control_status_changes": np.cumsum(changed)[rows].astype(np.uint32),
             "cs_tilt_align": always,
             "cs_yaw_align": always,
@@ -199,12 +194,3 @@ def _horizon_us(track: TopicTrack, rows: IntArray) -> NDArray[np.int64]:
     """How much later what the filter did in a step is published."""
     later: NDArray[np.int64] = track.time_us[rows + track.lag] - track.time_us[rows]
     return later
-
-
-def _stamped(
-    time_us: NDArray[np.int64], later_us: int | NDArray[np.int64]
-) -> dict[str, NDArray[Any]]:
-    return {
-        "timestamp": (sensors.START_US + time_us + later_us).astype(np.uint64),
-        "timestamp_sample": (sensors.START_US + time_us).astype(np.uint64),
-    }

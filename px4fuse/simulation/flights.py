@@ -122,6 +122,7 @@ def to_flight(simulation: Simulation, name: str = "simulation.ulg") -> Flight:
     """The flight as the reader gives it, by the reader's own functions, without the file."""
     tables = {(topic.name, 0): topic.columns() for topic in simulation.topics}
     stamps = tables[IMU[0].topic, 0]["timestamp"].astype(np.int64)
+    logged = {key: float(np.float32(value)) for key, value in simulation.parameters.items()}
     identity = repr((simulation.scenario, simulation.mistakes)).encode()
     topics = Topics(
         log=LogInfo(
@@ -134,21 +135,13 @@ def to_flight(simulation: Simulation, name: str = "simulation.ulg") -> Flight:
             hardware=HARDWARE,
             boot_time_s=int(stamps[0]) * 1e-6,
             duration_s=int(stamps[-1] - stamps[0]) * 1e-6,
-            parameters={
-                key: float(np.float32(simulation.parameters[key]))
-                for key in REPORTED
-                if key in simulation.parameters
-            },
+            parameters={key: logged[key] for key in REPORTED if key in logged},
             notes=(MODEL_NOTE,) if simulation.scenario.ekf2 else (),
         ),
         tables=tables,
         zero_us=int(stamps[0]),
         dropped={},
-        ekf2_parameters={
-            key: float(np.float32(value))
-            for key, value in simulation.parameters.items()
-            if key.startswith("EKF2_")
-        },
+        ekf2_parameters={k: value for k, value in logged.items() if k.startswith("EKF2_")},
     )
     return ulog.to_flight(topics)
 
@@ -210,7 +203,7 @@ def answer(simulation: Simulation) -> dict[str, Any]:
                 "outlier_time_s": (stamps[outlier] * 1e-6).tolist(),
                 "path_length_m": source.distance_m,
                 "closure_error_m": float(np.linalg.norm((last - first)[:2])),
-                "source_drift_m": list(source.drift_m),
+                "source_drift_m": source.drift_m.tolist(),
             },
         }
     )

@@ -8,6 +8,7 @@ direction of the specific force a - g is the attitude (Mellinger and Kumar 2011,
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,6 +54,12 @@ class Ramps:
     start_s: Array
     length_s: Array
     change: Array
+
+    @classmethod
+    def of(cls, ramps: Sequence[tuple[float, float, Array]]) -> Ramps:
+        """Start, length and change of each ramp."""
+        start, length, change = zip(*ramps, strict=True)
+        return cls(np.array(start), np.array(length), np.array(change))
 
     def at(self, time_s: Array) -> tuple[Array, Array, Array, Array]:
         """Position, velocity, acceleration and jerk, each of shape (n, k), from zero at rest."""
@@ -274,8 +281,8 @@ def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Mo
         )
     ramps.change(up, CLIMB_RAMP_S, 0.0)
     return Motion(
-        path=ramps.path(),
-        yaw=ramps.yaw(),
+        path=Ramps.of(ramps.path),
+        yaw=Ramps.of(ramps.yaw),
         wander=Sines.draw(rng, np.full(3, scenario.wander_m), WANDER_PERIODS_S, WANDER_SINES),
         take_off_s=GROUND_S,
         touch_down_s=touch_down_s,
@@ -288,25 +295,17 @@ class _Plan:
 
     def __init__(self, start_s: float, heading_deg: float) -> None:
         self.centre_s = start_s + CLIMB_RAMP_S / 2.0
-        self._path: list[tuple[float, float, Array]] = []
+        self.path: list[tuple[float, float, Array]] = []
         # the nose points along the heading before the clock starts
-        self._yaw = [(-1.0, 1.0, float(np.radians(heading_deg)))]
+        self.yaw = [(-1.0, 1.0, np.radians([heading_deg]))]
 
     def change(self, velocity: Array, length_s: float, then_s: float) -> None:
         """Change velocity about the current time, then let time pass until the next centre."""
-        self._path.append((self.centre_s - length_s / 2.0, length_s, velocity))
+        self.path.append((self.centre_s - length_s / 2.0, length_s, velocity))
         self.centre_s += then_s
 
     def turn(self, angle_rad: float, start_s: float, length_s: float) -> None:
-        self._yaw.append((start_s, length_s, angle_rad))
-
-    def path(self) -> Ramps:
-        start, length, change = zip(*self._path, strict=True)
-        return Ramps(np.array(start), np.array(length), np.array(change))
-
-    def yaw(self) -> Ramps:
-        start, length, change = zip(*self._yaw, strict=True)
-        return Ramps(np.array(start), np.array(length), np.array(change)[:, None])
+        self.yaw.append((start_s, length_s, np.array([angle_rad])))
 
 
 def direction(heading_deg: float) -> Array:

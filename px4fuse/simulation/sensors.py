@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -59,7 +60,7 @@ class SensedPositions:
         What it measured beyond the truth, NED, mistakes of frame and scale included.
     measured_s : ndarray, shape (n,)
         When it truly measured, seconds from the first data.
-    distance_m, drift_m : float, tuple of float
+    distance_m, drift_m : float, ndarray of shape (3,)
         Horizontal distance flown, and the VIO's drift at the end (NED).
     """
 
@@ -68,7 +69,7 @@ class SensedPositions:
     error_m: Array
     measured_s: Array
     distance_m: float
-    drift_m: tuple[float, float, float]
+    drift_m: Array
 
 
 def biases(scenario: Scenario, mistakes: Mistakes) -> tuple[Array, Array]:
@@ -138,16 +139,14 @@ def logged_attitude(scenario: Scenario, motion: Motion) -> Topic:
     time_us = _grid_us(motion.duration_s, scenario.attitude_rate_hz)
     truth = attitude(motion.at(seconds(time_us))).body_to_ned
     error = attitude_error(scenario, seconds(time_us)).as_matrix()
-    return attitude_topic(
-        "vehicle_attitude", time_us, ATTITUDE_LATENCY_US, quaternions(error @ truth)
-    )
+    return _attitude_topic("vehicle_attitude", time_us, ATTITUDE_LATENCY_US, error @ truth)
 
 
 def true_attitude(scenario: Scenario, motion: Motion) -> Topic:
     """vehicle_attitude_groundtruth."""
     time_us = _grid_us(motion.duration_s, scenario.truth_rate_hz)
     truth = attitude(motion.at(seconds(time_us))).body_to_ned
-    return attitude_topic("vehicle_attitude_groundtruth", time_us, 0, quaternions(truth))
+    return _attitude_topic("vehicle_attitude_groundtruth", time_us, 0, truth)
 
 
 def quaternions(body_to_ned: Array) -> Array:
@@ -155,16 +154,12 @@ def quaternions(body_to_ned: Array) -> Array:
     return np.asarray(Rotation.from_matrix(body_to_ned).as_quat(scalar_first=True))
 
 
-def attitude_topic(name: str, time_us: NDArray[np.int64], late_us: int, quaternion: Array) -> Topic:
-    """An attitude from its quaternions, shape (n, 4), published so much later."""
-    return Topic(
-        name,
-        {
-            "timestamp": _boot(time_us + late_us),
-            "timestamp_sample": _boot(time_us),
-            "q": quaternion.astype(np.float32),
-        },
-    )
+def _attitude_topic(
+    name: str, time_us: NDArray[np.int64], late_us: int, body_to_ned: Array
+) -> Topic:
+    """An attitude, published so much later."""
+    quaternion = quaternions(body_to_ned).astype(np.float32)
+    return Topic(name, stamps(time_us, late_us) | {"q": quaternion})
 
 
 def attitude_error(scenario: Scenario, time_s: Array) -> Rotation:
@@ -197,16 +192,9 @@ def ground_truth(scenario: Scenario, motion: Motion) -> Topic:
     """vehicle_local_position_groundtruth."""
     time_us = _grid_us(motion.duration_s, scenario.truth_rate_hz)
     state = motion.at(seconds(time_us))
-    fields: dict[str, NDArray[Any]] = {
-        "timestamp": _boot(time_us),
-        "timestamp_sample": _boot(time_us),
-    }
-    for names, values in (
-        (("x", "y", "z"), state.position_m),
-        (("vx", "vy", "vz"), state.velocity_m_s),
-        (("ax", "ay", "az"), state.acceleration_m_s2),
-    ):
-        fields |= {name: values[:, i].astype(np.float32) for i, name in enumerate(names)}
+    fields = stamps(time_us) | vectors(
+        {"": state.position_m, "v": state.velocity_m_s, "a": state.acceleration_m_s2}
+    )
     heading = np.angle(np.exp(1j * state.yaw_rad))
     fields["heading"] = heading.astype(np.float32)
     for name in ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"):
@@ -260,7 +248,7 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> SensedP
         error_m=(position - state.position_m)[keep],
         measured_s=time_s[keep],
         distance_m=float(distance[-1]),
-        drift_m=(float(drift[-1, 0]), float(drift[-1, 1]), float(drift[-1, 2])),
+        drift_m=drift[-1],
     )  # fmt: skip
 
 
@@ -344,8 +332,7 @@ def _odometry(
     return Topic(
         "vehicle_visual_odometry",
         {
-            "timestamp": _boot(arrival_us),
-            "timestamp_sample": _boot(stamp_us),
+            **stamps(stamp_us, arrival_us - stamp_us),
             "position": position_m.astype(np.float32),
             "q": quaternion.astype(np.float32),
             "velocity": unknown,
@@ -384,6 +371,22 @@ def _grid_us(duration_s: float, rate_hz: float) -> NDArray[np.int64]:
 def seconds(time_us: NDArray[np.int64]) -> Array:
     """Microseconds as seconds."""
     return np.asarray(time_us * 1e-6, dtype=np.float64)
+
+
+def stamps(
+    time_us: NDArray[np.int64], later_us: int | NDArray[np.int64] = 0
+) -> dict[str, NDArray[Any]]:
+    """The two stamps of what was sampled then and published so much later, µs since boot."""
+    return {"timestamp": _boot(time_us + later_us), "timestamp_sample": _boot(time_us)}
+
+
+def vectors(values: Mapping[str, Array]) -> dict[str, NDArray[Any]]:
+    """Vectors, shape (n, 3), as PX4 names their parts: ``vx``, ``vy``, ``vz`` of "v"."""
+    return {
+        f"{name}{axis}": vector[:, i].astype(np.float32)
+        for name, vector in values.items()
+        for i, axis in enumerate("xyz")
+    }
 
 
 def _boot(time_us: NDArray[np.int64]) -> NDArray[np.uint64]:
