@@ -157,7 +157,7 @@ def _carried(path: Trajectory, nodes: IntArray, before: Array, after: Array) -> 
 
 def score_all(
     odometry: Trajectory, made: Mapping[Way, Corrected], references: tuple[Trajectory, ...]
-) -> tuple[CorrectedPath, dict[Way, CorrectedPath | Unavailable]]:
+) -> dict[Way, CorrectedPath | Unavailable]:
     """The odometry, and every path, scored; the clocks are matched once, on the odometry."""
     raw = _scored("uncorrected", odometry, odometry, None, references, {})
     offsets = {
@@ -174,7 +174,7 @@ def score_all(
             found[way] = structs.replace(same, name=NAMES[way])
         else:
             found[way] = _scored(way, odometry, *one, references, offsets)
-    return raw, found
+    return found
 
 
 def _scored(
