@@ -12,7 +12,8 @@ from px4fuse.cli import cli, main
 
 
 def run(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(cli, [str(argument) for argument in arguments])
+    """In a pipe, in which no line is wrapped, whatever runs the tests says of its own width."""
+    return CliRunner(env={"COLUMNS": None}).invoke(cli, [str(argument) for argument in arguments])
 
 
 def run_main(monkeypatch, capsys, *arguments: str | Path) -> tuple[int, str, str]:

@@ -281,19 +281,21 @@ def _assign(
     from px4fuse.assignment.assignment import assign
 
     with progress() as step:
-        made = assign(
+        key, written = assign(
             students, folder, key_file, secret, kind, count, truth, partial(step, "simulating")
         )
-    answers = made.key.answers
+    answers = key.answers
     for line in _class_summary(
         kind,
         [answer.mistakes for answer in answers],
         [answer.difficulty for answer in answers if answer.difficulty is not None],
     ):
         click.echo(line)
-    click.echo(f"Flights   {folder} ({made.written} written, {made.kept} were there already)")
+    click.echo(
+        f"Flights   {folder} ({written} written, {len(answers) - written} were there already)"
+    )
     click.echo(f"Answers   {key_file} (not for students: it says what is wrong in every flight)")
-    if made.key.secret:
+    if key.secret:
         click.echo(
             "Secret    made up, and kept in the answers: the same flights can be made again, and "
             "later students added, while that file is there"

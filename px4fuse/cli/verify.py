@@ -50,11 +50,10 @@ def verify(
     Exit code 0: verified; 1: numbers differ, page differs, other log, or cannot verify; 2: bad
     input.
     """
-    from px4fuse.grading.grade import MEMORY_BYTES
     from px4fuse.verification.intake import MAX_BYTES, read_report
     from px4fuse.verification.model import Refused
     from px4fuse.verification.verification import verify as verify_report
-    from px4fuse.verification.workers import Failed, run_bounded
+    from px4fuse.verification.workers import Failed, bounded
 
     content = read_whole(report, LogError, MAX_BYTES, smaller="Reports are below 2 MB")
     read = read_report(content, shown(report))
@@ -67,10 +66,7 @@ def verify(
         if logs and not files:
             raise LogError("there is no file in what was given as LOG.")
         step("running the analysis again")
-        work = partial(verify_report, logs=files)
-        ((_, verdict),) = run_bounded(
-            work, [read], processes=1, timeout_s=TIMEOUT_S, memory_bytes=MEMORY_BYTES
-        )
+        verdict = bounded(partial(verify_report, logs=files), read, TIMEOUT_S)
     if isinstance(verdict, Failed):
         raise LogError(f"{shown(report)}: cannot be verified: {verdict.reason}")
     if output is not None and verdict.redrawn:
