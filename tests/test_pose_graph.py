@@ -23,9 +23,9 @@ from px4fuse.trajectory.graph.model import (
     FROM_CHORDAL,
     FROM_ODOMETRY,
     PoseGraph,
-    chi_square,
     composed,
     cost,
+    residuals,
 )
 from px4fuse.trajectory.graph.solver import solve
 
@@ -154,7 +154,7 @@ def test_minimum_is_gtsams(name: str, shared: Path) -> None:
     assert solution.converged
     # Of toyExample nothing but rounding is left, 1e-11
     assert solution.cost == pytest.approx(gtsam_cost(gtsam, graph), rel=1e-6, abs=1e-18)
-    assert solution.cost == pytest.approx(cost(graph, solution.poses), rel=1e-12)
+    assert solution.cost == pytest.approx(cost(replace(graph, poses=solution.poses)), rel=1e-12)
     np.testing.assert_allclose(solution.poses[0], graph.poses[0], rtol=1e-15)
 
 
@@ -276,11 +276,6 @@ def test_graphs_that_cannot_be_solved_are_refused() -> None:
     ):  # fmt: skip
         with pytest.raises(TrajectoryError, match=said):
             solve(bad)
-    for change in ({"dimension": 4}, {"poses": np.zeros((30, 7))}, {"first": np.full(44, 30)}):
-        with pytest.raises(ValueError, match=r"dimension is|has shape|edges must"):
-            replace(graph, **change)
-    with pytest.raises(ValueError, match="loops has shape"):
-        solve(graph, loops=np.ones(3, dtype=bool))
 
 
 # --- starts --------------------------------------------------------------------------------------
@@ -387,7 +382,7 @@ def test_lowest_minimum_of_dcs_drops_true_closures() -> None:
     """Why dcs starts from the solution of gnc, and does not choose among minima by their cost."""
 
     def dcs_cost(graph: PoseGraph, poses: np.ndarray) -> float:
-        squared = chi_square(graph, poses)
+        squared = residuals(graph, poses).chi2
         beyond = ~graph.successive & (squared > 1.0)
         lost = 2.0 * squared / (1.0 + squared) - 0.5
         return float(np.sum(np.where(beyond, lost, 0.5 * squared)))
@@ -417,7 +412,7 @@ def test_costs_of_a_solution() -> None:
     graph, _, _ = laps(1)
     for method in ("none", "dcs"):
         solution = solve(graph, robust=method)
-        squared = chi_square(graph, solution.poses)
+        squared = residuals(graph, solution.poses).chi2
         assert solution.cost == pytest.approx(0.5 * np.sum(solution.weights * squared))
         assert solution.cost_initial == pytest.approx(cost(graph))
 

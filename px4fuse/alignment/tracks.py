@@ -23,7 +23,7 @@ from px4fuse.flight import (
 )
 from px4fuse.origin import GIVEN_FILE
 from px4fuse.readers.parts import finite_rows
-from px4fuse.trajectory.association import bracketed
+from px4fuse.trajectory.association import bracketed, gap_limit
 from px4fuse.trajectory.offset import STEP_S
 
 # Which of x, y, z is north, east, down, and with which sign
@@ -34,8 +34,7 @@ FRAMES = {
 }
 EKF2_POSITION, IMU = "EKF2 position", "IMU"
 
-# Nothing is interpolated in an interval longer than this and than three median ones
-GAP_S, GAP_INTERVALS = 0.5, 3.0
+GAP_S = 0.5  # nothing is interpolated in an interval longer than this and three median ones
 MIN_MOTION_M = 0.5
 MIN_SAMPLES = 10
 MIN_OVERLAP_S = 10.0  # or half of the shorter track
@@ -101,8 +100,8 @@ def file_track(samples: pd.DataFrame, frame: str) -> OwnTrack:
 def on_grid(track: OwnTrack) -> OwnTrack:
     """Resample to the grid that begins with the track, gaps marked."""
     grid = np.arange(track.time_s[0], track.time_s[-1], STEP_S)
-    longest = max(GAP_S, GAP_INTERVALS * float(np.median(np.diff(track.time_s))))
-    return OwnTrack(grid, track.at(grid)[0], bracketed(grid, track.time_s, longest))
+    known = bracketed(grid, track.time_s, gap_limit(track.time_s, GAP_S))
+    return OwnTrack(grid, track.at(grid)[0], known)
 
 
 def despiked(track: OwnTrack, window: int = 3) -> OwnTrack:

@@ -6,7 +6,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.findings.model import Finding, Found, error, info, warning
 from px4fuse.loop.loop import Loop
 from px4fuse.loop.model import LANDING, Closure
-from px4fuse.trajectory.graph.analysis import GATE_ALPHA
+from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 
 MOST = 0.5  # of several closures more are true than false
 EVIDENCE = ("time_1_s", "time_2_s", "distance_m", "d2", "degrees_of_freedom", "p")

@@ -38,7 +38,7 @@ from px4fuse.request import LoopRequest
 from px4fuse.results.comparison import ASKED
 from px4fuse.results.contract import ComparisonResults, LoopResults
 from px4fuse.trajectory.evaluation import Score
-from px4fuse.trajectory.graph.analysis import GATE_ALPHA
+from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 from px4fuse.verification.rerun import log_sha256
 from px4fuse.verification.verification import is_number
 

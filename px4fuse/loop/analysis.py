@@ -8,7 +8,6 @@ import numpy as np
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
-from px4fuse.filter.signals import Segment
 from px4fuse.flight import Flight, Truth, Unavailable
 from px4fuse.loop.closure import key_frame_spacing_m, key_frames, upright
 from px4fuse.loop.corrections import by_distance, judge, score_all, solve_all
@@ -21,7 +20,6 @@ from px4fuse.loop.part import (
     heading_change_deg,
     measured_end,
     part_of,
-    part_of_flight,
     true_end,
 )
 from px4fuse.loop.sources import LoopSource
@@ -87,32 +85,17 @@ def analyse(
 
     start = None if start_s is None else stamp(start_s)
     end = None if end_s is None else stamp(end_s)
-    truth, at_rest = None, False
-    if flight is None:
-        span = float(trajectory.time_s[0]), float(trajectory.time_s[-1])
-        segment = chosen_part(Segment(*span, "the whole trajectory"), start, end, span)
-    else:
-        segment, at_rest = part_of_flight(flight, trajectory, start, end)
-        truth = None if trajectory.kind == "truth" else truth_of(flight)
+    segment, at_rest = chosen_part(flight, trajectory, start, end)
+    truth = None if flight is None or trajectory.kind == "truth" else truth_of(flight)
     whole = upright(trajectory)
     path = part_of(whole, segment, at_rest)
     notes = list(whole.notes)
-    known: KnownEnd | Unavailable
-    if not came_back:
-        if landed_at is not None:
-            raise SettingsError("`landed_at` and `came_back` exclude each other. Leave one out.")
-        known = Unavailable(
-            "misclosure", "the vehicle is not said to have come back", "Leave out --open."
-        )
-    elif landed_at is not None:
-        known = measured_end(path, *landed_at)
-    else:
-        known = assumed_end(path)
-        found = None if truth is None else true_end(path, truth, segment, at_rest)
-        if isinstance(found, KnownEnd):
-            known = found
-        elif found is not None:
-            notes.append(f"the truth does not tell where it ended: {found}")
+    by_truth = None
+    if truth is not None and came_back and landed_at is None:
+        by_truth = true_end(path, truth, segment, at_rest)
+    if isinstance(by_truth, str):
+        notes.append(f"the truth does not tell where it ended: {by_truth}")
+    known = _known_end(path, landed_at, came_back, by_truth)
     claims: list[Claim] = [
         (GivenClosure(stamp(one.time_1_s), stamp(one.time_2_s), one.sigma_m), None)
         for one in closures
@@ -133,8 +116,9 @@ def analyse(
     landing = judged[0] if judged and judged[0].source == LANDING else None
     spread = by_distance(path, distance, missed, heading_error, landing)
     references = tuple(part for part in (truth, reference) if part is not None)
-    raw, corrections = score_all(path, spread | solved, references)
-    error = None if isinstance(missed, Unavailable) else float(np.linalg.norm(missed))
+    error = error_axes = None
+    if not isinstance(missed, Unavailable):
+        error, error_axes = float(np.linalg.norm(missed)), by_axis(path.frame, missed)
     return Loop(
         track=path.name,
         kind=path.kind,
@@ -151,22 +135,37 @@ def analyse(
         known_end=known,
         closure_error_m=error,
         closure_percent=None if error is None else 100.0 * error / float(distance[-1]),
-        closure_error_axes_m=None
-        if isinstance(missed, Unavailable)
-        else by_axis(path.frame, missed),
+        closure_error_axes_m=error_axes,
         heading_error_deg=heading_error,
         absolute=flight is not None and _is_absolute(trajectory, flight),
         odometry_noise=noise,
         closures=judged,
-        corrections=corrections,
+        corrections=score_all(path, spread | solved, references),
         notes=tuple(note for note in notes if note),
-        odometry=raw,
         nodes=frames,
         distance_m=distance,
         graph=graph,
         references=references,
         given_frame=trajectory.frame,
     )
+
+
+def _known_end(
+    path: Trajectory,
+    landed_at: tuple[float, float, float | None] | None,
+    came_back: bool,
+    by_truth: KnownEnd | str | None,
+) -> KnownEnd | Unavailable:
+    """Where it really ended: as measured, else by the truth in the log, else where it began."""
+    if landed_at is not None:
+        if not came_back:
+            raise SettingsError("`landed_at` and `came_back` exclude each other. Leave one out.")
+        return measured_end(path, *landed_at)
+    if not came_back:
+        return Unavailable(
+            "misclosure", "the vehicle is not said to have come back", "Leave out --open."
+        )
+    return by_truth if isinstance(by_truth, KnownEnd) else assumed_end(path)
 
 
 def _is_absolute(trajectory: Trajectory, flight: Flight) -> bool:
@@ -252,7 +251,7 @@ def loop_in(flight: Flight, progress: Callable[[str], None] = lambda _: None) ->
         reason = odometry.reason if isinstance(odometry, Unavailable) else str(error).rstrip(".")
         remedy = "A loop is measured on visual-inertial odometry, sent as ODOMETRY."
         return Unavailable("loop closure", reason, remedy)
-    segment, _ = part_of_flight(flight, trajectory, None, None)
+    segment, _ = chosen_part(flight, trajectory, None, None)
     time = trajectory.time_s
     inside = trajectory.position_m[(time >= segment.start_s) & (time <= segment.end_s)]
     extent = gap = 0.0

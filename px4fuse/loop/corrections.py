@@ -18,7 +18,7 @@ from px4fuse.loop.model import LANDING, Closure, CorrectedPath, Way
 from px4fuse.loop.odometry import Claim
 from px4fuse.record import written
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
-from px4fuse.trajectory.graph.analysis import GATE_ALPHA, SOLUTIONS
+from px4fuse.trajectory.graph.analysis import SOLUTIONS
 from px4fuse.trajectory.graph.covariance import gate
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution, solve
@@ -50,11 +50,10 @@ def by_distance(
     landing: Closure | None,
 ) -> dict[Way, Corrected]:
     """Positions alone (the lesson's Example 2), and headings too."""
+    if landing is not None and not landing.accepted:
+        misclosure_m = _refused("correction by distance", landing)
     if isinstance(misclosure_m, Unavailable):
         return {"by_distance_plain": misclosure_m, "by_distance": misclosure_m}
-    if landing is not None and not landing.accepted:
-        refused = _refused("correction by distance", landing)
-        return {"by_distance_plain": refused, "by_distance": refused}
     plain = distribute_by_distance(path.position_m, misclosure_m, distance)
     turned = 0.0 if isinstance(heading, Unavailable) else float(np.radians(heading))
     return {
@@ -79,7 +78,7 @@ def judge(graph: PoseGraph | Unavailable, claims: Sequence[Claim]) -> tuple[Clos
         return ()
     edges = np.arange(len(graph.first) - len(claims), len(graph.first))
     judged = []
-    for result, (given, end) in zip(gate(graph, edges, alpha=GATE_ALPHA), claims, strict=True):
+    for result, (given, end) in zip(gate(graph, edges), claims, strict=True):
         missed = graph.poses[result.second, :3] - graph.poses[result.first, :3]
         facts = structs.asdict(given) | structs.asdict(result)
         del facts["first"], facts["second"]
@@ -158,7 +157,7 @@ def _carried(path: Trajectory, nodes: IntArray, before: Array, after: Array) -> 
 
 def score_all(
     odometry: Trajectory, made: Mapping[Way, Corrected], references: tuple[Trajectory, ...]
-) -> tuple[CorrectedPath, dict[Way, CorrectedPath | Unavailable]]:
+) -> dict[Way, CorrectedPath | Unavailable]:
     """The odometry, and every path, scored; the clocks are matched once, on the odometry."""
     raw = _scored("uncorrected", odometry, odometry, None, references, {})
     offsets = {
@@ -175,7 +174,7 @@ def score_all(
             found[way] = structs.replace(same, name=NAMES[way])
         else:
             found[way] = _scored(way, odometry, *one, references, offsets)
-    return raw, found
+    return found
 
 
 def _scored(

@@ -25,8 +25,6 @@ class Loop(Shown, LoopPart, frozen=True, kw_only=True, eq=False):
     Attributes
     ----------
     corrections : mapping from way to CorrectedPath or Unavailable
-    odometry : CorrectedPath
-        The part between take-off and landing as it was measured, in a frame with z down.
     nodes : ndarray of int, shape (k,)
         Key frames, as indices of poses.
     distance_m : ndarray, shape (n,)
@@ -40,12 +38,16 @@ class Loop(Shown, LoopPart, frozen=True, kw_only=True, eq=False):
 
     written_as = LoopPart
     corrections: Mapping[Way, CorrectedPath | Unavailable]
-    odometry: CorrectedPath
     nodes: IntArray
     distance_m: Array
     graph: PoseGraph | Unavailable
     references: tuple[Trajectory, ...]
     given_frame: Frame
+
+    @property
+    def odometry(self) -> CorrectedPath:
+        """The part between take-off and landing as it was measured, in a frame with z down."""
+        return self.paths["uncorrected"]
 
     @property
     def paths(self) -> dict[Way, CorrectedPath]:

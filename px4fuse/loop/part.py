@@ -54,21 +54,28 @@ def part_of(trajectory: Trajectory, segment: Segment, at_rest: bool = False) -> 
     return replace(part, position_m=position, rotation=rotation)
 
 
-def part_of_flight(
-    flight: Flight, trajectory: Trajectory, start_s: float | None, end_s: float | None
+def chosen_part(
+    flight: Flight | None, trajectory: Trajectory, start_s: float | None, end_s: float | None
 ) -> tuple[Segment, bool]:
     """The part between first take-off and last landing, and whether the vehicle rests at its ends.
 
     Parameters
     ----------
-    trajectory : Trajectory
-        One of its tracks.
+    flight : Flight or None
+        That the trajectory is part of; without one, all of the trajectory is the part.
     start_s, end_s : float or None
         Override either end.
+
+    Raises
+    ------
+    SettingsError
+        The part is empty.
     """
     low, high = span = float(trajectory.time_s[0]), float(trajectory.time_s[-1])
     at_rest = False
-    if isinstance(flight.airborne, Unavailable):
+    if flight is None:
+        reason = "the whole trajectory"
+    elif isinstance(flight.airborne, Unavailable):
         reason = "the whole track: the log has no land detector"
     elif not flight.airborne:
         reason = "the whole track: the land detector never says that it flies"
@@ -79,32 +86,19 @@ def part_of_flight(
         if count > 1:
             reason = f"from the first take-off to the last of {count} landings"
         at_rest = start_s is None and end_s is None
-    return chosen_part(Segment(low, high, reason), start_s, end_s, span), at_rest
-
-
-def chosen_part(
-    segment: Segment, start_s: float | None, end_s: float | None, span: tuple[float, float]
-) -> Segment:
-    """A part with either end overridden, cut at the ends of the data, ``span`` (s).
-
-    Raises
-    ------
-    SettingsError
-        It is empty.
-    """
     given = [n for n, v in (("--from", start_s), ("--to", end_s)) if v is not None]
-    low = segment.start_s if start_s is None else start_s
-    high = segment.end_s if end_s is None else end_s
+    low, high = low if start_s is None else start_s, high if end_s is None else end_s
     if not low < high:
         raise SettingsError(
             f"the part from {low:.12g} s to {high:.12g} s is empty; the track runs from "
             f"{span[0]:.2f} s to {span[1]:.2f} s. Change `start_s` or `end_s`."
         )
-    reason = f"chosen with {' and '.join(given)}" if given else segment.reason
+    if given:
+        reason = f"chosen with {' and '.join(given)}"
     inside = max(low, span[0]), min(high, span[1])
     if inside != (low, high) and inside[0] < inside[1]:
-        return Segment(*inside, f"{reason}, cut at the ends of the data")
-    return Segment(low, high, reason)
+        return Segment(*inside, f"{reason}, cut at the ends of the data"), at_rest
+    return Segment(low, high, reason), at_rest
 
 
 def heading_change_deg(path: Trajectory) -> float | None:

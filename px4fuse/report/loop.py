@@ -27,7 +27,8 @@ from px4fuse.report.screen import show
 from px4fuse.report.style import EKF2, LINES, MUTED, OURS, as_map, bare_x, curve
 from px4fuse.request import LoopRequest
 from px4fuse.trajectory.evaluation import Evaluation
-from px4fuse.trajectory.graph.analysis import GATE_ALPHA, MANY_CLOSURES, SOLUTIONS, SolvedGraph
+from px4fuse.trajectory.graph.analysis import MANY_CLOSURES, SOLUTIONS, SolvedGraph
+from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 from px4fuse.trajectory.model import AXES_OF_FRAME
 from px4fuse.trajectory.scores import Interval, Statistics
 

@@ -111,9 +111,9 @@ def associate(
     return estimate[chosen], matched, found
 
 
-def gap_limit(time_s: Array) -> float:
+def gap_limit(time_s: Array, least_s: float = GAP_S) -> float:
     """Longest interval (s) between stamps across which positions are interpolated."""
-    return max(GAP_INTERVALS * float(np.median(np.diff(time_s))), GAP_S)
+    return max(GAP_INTERVALS * float(np.median(np.diff(time_s))), least_s)
 
 
 def bracketed(time_s: Array, reference_s: Array, limit: float) -> BoolArray:

@@ -29,7 +29,6 @@ from px4fuse.trajectory.scores import (
     Interval,
     PairwiseError,
     RelativeError,
-    Side,
     Statistics,
     default_deltas,
     relative_error,
@@ -131,7 +130,6 @@ def evaluate(
     time_offset_s: float | Literal["auto"] | None = None,
     rpe_deltas: Sequence[Delta] | None = None,
     all_pairs: bool = True,
-    pairs_from: Side = "reference",
 ) -> Evaluation:
     """Score an estimate against a reference.
 
@@ -148,7 +146,6 @@ def evaluate(
         overlap.
     rpe_deltas : sequence of Delta, optional
         By default some distances and times that suit the flight.
-    pairs_from : {"estimate", "reference"}
 
     Raises
     ------
@@ -195,10 +192,7 @@ def evaluate(
         association=matched,
         time_offset=offset,
         ate=AbsoluteError(statistics(error), rmse_interval(error, "ATE"), rotation),
-        rpe=tuple(
-            relative_error(aligned, y, delta, all_pairs=all_pairs, pairs_from=pairs_from)
-            for delta in rpe_deltas
-        ),
+        rpe=tuple(relative_error(aligned, y, delta, all_pairs=all_pairs) for delta in rpe_deltas),
         time_s=x.time_s,
         distance_m=distance,
         unaligned_m=x.position_m,

@@ -42,23 +42,30 @@ def to_vector(q: Array) -> Array:
     return q[..., 1:] * np.where(imaginary > 1e-12, angle / np.maximum(imaginary, 1e-12), 2.0)
 
 
+def from_elements(*rows: tuple[Array | float, ...]) -> Array:
+    """Matrices from their elements, each an array of the same shape or a number."""
+    shape = np.broadcast_shapes(*(np.shape(each) for row in rows for each in row))
+    made = np.empty((*shape, len(rows), len(rows[0])))
+    for i, row in enumerate(rows):
+        for j, each in enumerate(row):
+            made[..., i, j] = each
+    return made
+
+
 def matrix(q: Array) -> Array:
     """Rotation matrices, shape (..., 3, 3)."""
     w, x, y, z = np.moveaxis(q, -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return from_elements(
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
 
 
 def skew(v: Array) -> Array:
     """[v]×, so that [v]× u = v × u; shape (..., 3, 3)."""
     x, y, z = np.moveaxis(v, -1, 0)
-    zero = np.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return from_elements((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
 
 
 def running_product(turns: Array) -> Array:

@@ -21,7 +21,6 @@ from px4fuse.trajectory.correlation import autocovariance
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
 Unit = Literal["frames", "m", "s"]
-Side = Literal["estimate", "reference"]
 
 RELATIVE_TOLERANCE = 0.1  # of a delta where all pairs are used; evo's default too
 # RPE over these, where they are between these shares of the path or of the time
@@ -85,8 +84,8 @@ class RelativeError(Record, frozen=True):
         In ``unit``.
     all_pairs : bool
         Pairs start at every pose, else each where the one before ends.
-    pairs_from : {"estimate", "reference"}
-        Whose path a distance is measured along.
+    pairs_from : str
+        Whose path a distance is measured along: always the reference's, whose length is no error.
     translation_m, rotation_deg : Statistics or Unavailable
     interval_m : Interval or Unavailable
         Of the translation's RMSE.
@@ -95,7 +94,7 @@ class RelativeError(Record, frozen=True):
     delta: float
     unit: Unit
     all_pairs: bool
-    pairs_from: Side
+    pairs_from: Literal["reference"]
     translation_m: Maybe[Statistics]
     interval_m: Maybe[Interval]
     rotation_deg: Maybe[Statistics]
@@ -232,7 +231,6 @@ def relative_error(
     delta: Delta,
     *,
     all_pairs: bool = True,
-    pairs_from: Side = "reference",
 ) -> PairwiseError:
     """RPE over one delta: E = (Q_i⁻¹ Q_j)⁻¹ (P_i⁻¹ P_j), Sturm (2012), eq. 1.
 
@@ -241,13 +239,10 @@ def relative_error(
     aligned, reference : Trajectory
         P and Q, as many poses at the same times. A similarity other than its scale leaves the
         error as it is.
-    delta, all_pairs, relative_tolerance
-        See :func:`pairs`.
-    pairs_from : {"estimate", "reference"}
-        Whose path and times the delta is measured in.
+    delta, all_pairs
+        See :func:`pairs`; measured along the reference.
     """
-    source = reference if pairs_from == "reference" else aligned
-    start, end = pairs(source.position_m, source.time_s, delta, all_pairs=all_pairs)
+    start, end = pairs(reference.position_m, reference.time_s, delta, all_pairs=all_pairs)
     what = f"RPE over {delta}"
     both = rotations_of(aligned, reference, what)
     if not isinstance(both, Unavailable) and not len(start):
@@ -269,7 +264,7 @@ def relative_error(
         interval = rmse_interval(translation, what, min_block=overlap)
         scores = statistics(translation), interval, statistics(rotation)
     return PairwiseError(
-        delta.value, delta.unit, all_pairs, pairs_from, *scores,
+        delta.value, delta.unit, all_pairs, "reference", *scores,
         start=start, end=end, translation_error_m=translation, rotation_error_deg=rotation,
     )  # fmt: skip
 

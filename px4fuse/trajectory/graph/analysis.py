@@ -15,8 +15,6 @@ from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import GraphSolution, Solution, solve
 
 MANY_CLOSURES = 1000
-# Chance that the gate rejects a closure that is true
-GATE_ALPHA = 0.001
 # What the solutions of the pose graph are called
 SOLUTIONS: Mapping[str, str] = {
     "all": "pose graph, all closures",
@@ -92,7 +90,7 @@ def analyse_graph(
     solutions = {"all": solve(graph)}
     gates: tuple[GateResult, ...] | Unavailable
     try:
-        gates = tuple(gate(graph, np.flatnonzero(closures), alpha=GATE_ALPHA))
+        gates = tuple(gate(graph, np.flatnonzero(closures)))
     except TrajectoryError as error:
         gates = Unavailable("gate", str(error), "It needs an odometry edge between all successors.")
     count = int(np.count_nonzero(closures))

@@ -16,8 +16,11 @@ from px4fuse.trajectory.graph.model import (
     observed_directions,
     odometry_chain,
     odometry_steps,
+    unit_diagonal,
 )
 
+# Chance that the gate rejects a closure that is true
+GATE_ALPHA = 0.001
 # Smallest eigenvalue of a correlation matrix below which rounding is larger than what it says
 _SINGULAR = 1e-13
 
@@ -36,7 +39,7 @@ class GateResult(Record, frozen=True):
     p : float
         Probability of such a distance, or a larger one, if the closure is true.
     accepted : bool
-        Whether p is at least alpha.
+        Whether p is at least :data:`GATE_ALPHA`.
     """
 
     first: int
@@ -47,9 +50,7 @@ class GateResult(Record, frozen=True):
     accepted: bool
 
 
-def gate(
-    graph: PoseGraph, edge_indices: Sequence[int] | IntArray, alpha: float = 0.001
-) -> list[GateResult]:
+def gate(graph: PoseGraph, edge_indices: Sequence[int] | IntArray) -> list[GateResult]:
     """Test closures against odometry alone, before they have pulled at anything.
 
     ``d2 = r' (J Sigma J' + Omega^-1)^-1 r`` with r the log of the closure's inverse times the
@@ -64,8 +65,6 @@ def gate(
         Its edges between successive poses are the odometry, except those under test.
     edge_indices : sequence of int
         Edges to test.
-    alpha : float
-        Probability with which a true closure is refused.
 
     Returns
     -------
@@ -94,14 +93,12 @@ def gate(
     jacobian = lie.right_jacobian_inverse(residual)
     covariance = jacobian @ covariance @ jacobian.transpose(0, 2, 1)
     return [
-        _tested(graph, edge, r, sigma, alpha)
+        _tested(graph, edge, r, sigma)
         for edge, r, sigma in zip(tested.tolist(), residual, covariance, strict=True)
     ]
 
 
-def _tested(
-    graph: PoseGraph, edge: int, residual: Array, covariance: Array, alpha: float
-) -> GateResult:
+def _tested(graph: PoseGraph, edge: int, residual: Array, covariance: Array) -> GateResult:
     ends = int(graph.ids[graph.first[edge]]), int(graph.ids[graph.second[edge]])
     directions, variance = observed_directions(graph.information[edge])
     freedom = len(variance)
@@ -112,10 +109,8 @@ def _tested(
         )
     seen = directions.T @ residual
     spread = directions.T @ covariance @ directions + np.diag(variance)
-    scale = np.diag(spread)
-    sound = bool(np.isfinite(spread).all()) and bool((scale > 0.0).all())
-    sigma = np.sqrt(scale, where=scale > 0.0, out=np.ones_like(scale))
-    if not sound or np.linalg.eigvalsh(spread / np.outer(sigma, sigma))[0] <= _SINGULAR:
+    is_finite = bool(np.isfinite(spread).all())
+    if not is_finite or np.linalg.eigvalsh(unit_diagonal(spread)[1])[0] <= _SINGULAR:
         raise TrajectoryError(
             f"Odometry between vertices {ends[0]} and {ends[1]} is too uncertain to test the "
             "closure with the digits that numbers have. Give its edges information that is closer "
@@ -123,7 +118,7 @@ def _tested(
         )
     d2 = float(seen @ np.linalg.solve(spread, seen))
     p = float(chdtrc(freedom, d2))
-    return GateResult(*ends, d2, freedom, p, p >= alpha)
+    return GateResult(*ends, d2, freedom, p, p >= GATE_ALPHA)
 
 
 def _dead_reckoning(graph: PoseGraph, low: int, high: int, chain: IntArray) -> tuple[Array, Array]:
@@ -144,12 +139,8 @@ def _dead_reckoning(graph: PoseGraph, low: int, high: int, chain: IntArray) -> t
 
 def _covariances(graph: PoseGraph, used: IntArray) -> Array:
     """Covariances of odometry edges in the axes of the later pose."""
-    information = graph.information[used]
-    scale = np.sqrt(np.diagonal(information, axis1=1, axis2=2))
-    whole = np.all(scale > 0.0, axis=1)
-    unit = np.where(whole[:, None], scale, 1.0)
-    scaled = information / (unit[:, :, None] * unit[:, None, :])
-    whole &= np.linalg.eigvalsh(scaled)[:, 0] > 1e-12
+    scale, scaled = unit_diagonal(graph.information[used])
+    whole = np.linalg.eigvalsh(scaled)[:, 0] > 1e-12
     if not np.all(whole):
         edge = used[int(np.argmin(whole))]
         raise TrajectoryError(
@@ -157,7 +148,7 @@ def _covariances(graph: PoseGraph, used: IntArray) -> Array:
             f"{graph.ids[graph.second[edge]]} has a direction without information, so its error "
             "has no bound. Give the information of all directions."
         )
-    covariance = np.linalg.inv(scaled) / (unit[:, :, None] * unit[:, None, :])
+    covariance = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
     back = graph.first[used] > graph.second[used]
     # (Z exp(r))^-1 = Z^-1 exp(-Ad(Z) r)
     turn = lie.adjoint(graph.measurements[used[back]])

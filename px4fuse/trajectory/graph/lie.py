@@ -15,7 +15,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval
 
 from px4fuse.arrays import Array
-from px4fuse.trajectory.rotation import matrix, skew
+from px4fuse.trajectory.rotation import from_elements, from_vector, matrix, skew
 
 # Below this angle (rad) series replace quotients that cancel; five terms then reach 1e-14
 SMALL = 0.3
@@ -54,7 +54,7 @@ def rotation_matrix(pose: Array) -> Array:
     """
     if pose.shape[-1] == 3:
         c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
-        return _matrix((c, -s), (s, c))
+        return from_elements((c, -s), (s, c))
     return matrix(pose[..., (6, 3, 4, 5)])
 
 
@@ -122,11 +122,8 @@ def exp(tangent: Array) -> Array:
     rho, phi = tangent[..., :3], tangent[..., 3:]
     theta = np.linalg.norm(phi, axis=-1)[..., None]
     turned = cross(phi, rho)
-    made = np.empty((*tangent.shape[:-1], 7))
-    made[..., :3] = rho + _a(theta) * turned + _b(theta) * cross(phi, turned)
-    made[..., 3:6] = 0.5 * np.sinc(theta / (2.0 * np.pi)) * phi
-    made[..., 6:] = np.cos(0.5 * theta)
-    return made
+    position = rho + _a(theta) * turned + _b(theta) * cross(phi, turned)
+    return np.concatenate([position, from_vector(phi)[..., (1, 2, 3, 0)]], axis=-1)
 
 
 def log(pose: Array) -> Array:
@@ -196,7 +193,9 @@ def right_jacobian_inverse(tangent: Array) -> Array:
         even, odd = theta * _b(np.abs(theta)), _a(np.abs(theta))
         x = even * tangent[..., 0] - odd * tangent[..., 1]
         y = odd * tangent[..., 0] + even * tangent[..., 1]
-        return _matrix((a, -half, half * y - a * x), (half, a, -half * x - a * y), (0.0, 0.0, 1.0))
+        return from_elements(
+            (a, -half, half * y - a * x), (half, a, -half * x - a * y), (0.0, 0.0, 1.0)
+        )
     rho, phi = tangent[..., :3], tangent[..., 3:]
     theta = np.linalg.norm(phi, axis=-1)[..., None, None]
     dot = np.sum(rho * phi, axis=-1)[..., None, None]
@@ -229,16 +228,6 @@ def chain(steps: Array) -> Array:
     while reach < len(made):
         made[reach:] = compose(made[:-reach], made[reach:])
         reach *= 2
-    return made
-
-
-def _matrix(*rows: tuple[Array | float, ...]) -> Array:
-    """Matrices from their elements, each an array of the same shape or a number."""
-    shape = np.broadcast_shapes(*(np.shape(each) for row in rows for each in row))
-    made = np.empty((*shape, len(rows), len(rows[0])))
-    for i, row in enumerate(rows):
-        for j, each in enumerate(row):
-            made[..., i, j] = each
     return made
 
 

@@ -57,24 +57,6 @@ class PoseGraph:
 
     __repr__ = brief
 
-    def __post_init__(self) -> None:
-        if self.dimension not in {2, 3}:
-            raise ValueError(f"dimension is {self.dimension}, not 2 or 3")
-        n, m, wide, free = len(self.ids), len(self.first), self.width, self.freedom
-        for name, shape in (
-            ("ids", (n,)),
-            ("poses", (n, wide)),
-            ("first", (m,)),
-            ("second", (m,)),
-            ("measurements", (m, wide)),
-            ("information", (m, free, free)),
-        ):
-            if getattr(self, name).shape != shape:
-                raise ValueError(f"{name} has shape {getattr(self, name).shape}, not {shape}")
-        ends = np.concatenate([self.first, self.second])
-        if m and (ends.min() < 0 or ends.max() >= n):
-            raise ValueError(f"edges must lead from 0 to {n - 1}: indices, not vertex numbers")
-
     def __len__(self) -> int:
         return len(self.ids)
 
@@ -95,30 +77,41 @@ class PoseGraph:
         return made
 
 
-def chi_square(graph: PoseGraph, poses: Array | None = None) -> Array:
-    """Squared residuals in units of the measurements' own covariance, ``r' Omega r``.
+@dataclass(frozen=True)
+class Residuals:
+    """By how much some poses miss the measurements of a graph.
 
-    The residual of an edge is ``log(Z^-1 X_i^-1 X_j)``, as GTSAM's BetweenFactor has it.
-
-    Parameters
+    Attributes
     ----------
-    poses : ndarray, shape (n, 3) or (n, 7), optional
-        Instead of the graph's own.
-
-    Returns
-    -------
-    ndarray, shape (m,)
+    poses : ndarray, shape (n, 3) or (n, 7)
+    relative : ndarray, shape (m, 3) or (m, 7)
+        Second pose of each edge as seen from the first.
+    residual : ndarray, shape (m, d)
+        ``r = log(Z^-1 X_i^-1 X_j)``, as GTSAM's BetweenFactor has it.
+    weighted : ndarray, shape (m, d)
+        ``Omega r``.
+    chi2 : ndarray, shape (m,)
+        ``r' Omega r``: squared, in units of the measurements' own covariance.
     """
-    x = graph.poses if poses is None else poses
-    seen = lie.between(x[graph.first], x[graph.second])
-    residual = lie.log(lie.between(graph.measurements, seen))
-    made: Array = np.sum(residual * (graph.information @ residual[..., None])[..., 0], axis=-1)
-    return made
+
+    poses: Array
+    relative: Array
+    residual: Array
+    weighted: Array
+    chi2: Array
 
 
-def cost(graph: PoseGraph, poses: Array | None = None) -> float:
+def residuals(graph: PoseGraph, poses: Array) -> Residuals:
+    """Residuals of all edges at given poses, shape (n, 3) or (n, 7)."""
+    relative = lie.between(poses[graph.first], poses[graph.second])
+    residual = lie.log(lie.between(graph.measurements, relative))
+    weighted = (graph.information @ residual[..., None])[..., 0]
+    return Residuals(poses, relative, residual, weighted, np.sum(residual * weighted, axis=-1))
+
+
+def cost(graph: PoseGraph) -> float:
     """Half the sum of the squared residuals, as GTSAM's ``graph.error`` has it."""
-    return 0.5 * float(np.sum(chi_square(graph, poses)))
+    return 0.5 * float(np.sum(residuals(graph, graph.poses).chi2))
 
 
 def observed_directions(information: Array) -> tuple[Array, Array]:
@@ -138,7 +131,7 @@ def observed_directions(information: Array) -> tuple[Array, Array]:
     variance : ndarray, shape (k,)
         ``information == directions @ diag(1 / variance) @ directions.T``.
     """
-    scale, scaled = _scaled(information)
+    scale, scaled = unit_diagonal(information)
     values, vectors = np.linalg.eigh(scaled)
     seen = values > OBSERVED
     return scale[:, None] * vectors[:, seen], 1.0 / values[seen]
@@ -155,15 +148,15 @@ def ranks(information: Array) -> IntArray:
     -------
     ndarray of int, shape (m,)
     """
-    made: IntArray = np.sum(np.linalg.eigvalsh(_scaled(information)[1]) > OBSERVED, axis=1)
+    made: IntArray = np.sum(np.linalg.eigvalsh(unit_diagonal(information)[1]) > OBSERVED, axis=1)
     return made
 
 
-def _scaled(information: Array) -> tuple[Array, Array]:
+def unit_diagonal(matrices: Array) -> tuple[Array, Array]:
     """Roots of the diagonals of matrices, and the matrices divided by them; what is 0 stays 0."""
-    scale = np.sqrt(np.clip(np.diagonal(information, axis1=-2, axis2=-1), 0.0, None))
+    scale = np.sqrt(np.clip(np.diagonal(matrices, axis1=-2, axis2=-1), 0.0, None))
     inverse = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
-    return scale, information * (inverse[..., :, None] * inverse[..., None, :])
+    return scale, matrices * (inverse[..., :, None] * inverse[..., None, :])
 
 
 def require_connected(graph: PoseGraph, used: BoolArray, what: str) -> None:

@@ -15,7 +15,13 @@ from px4fuse.display import brief
 from px4fuse.errors import TrajectoryError
 from px4fuse.record import Count, NotNegative, Record
 from px4fuse.trajectory.graph import lie
-from px4fuse.trajectory.graph.model import PoseGraph, ranks, require_connected
+from px4fuse.trajectory.graph.model import (
+    PoseGraph,
+    Residuals,
+    ranks,
+    require_connected,
+    residuals,
+)
 from px4fuse.trajectory.graph.system import BlockSystem
 
 Robust = Literal["none", "dcs", "gnc"]
@@ -83,19 +89,10 @@ class Solution(GraphSolution, frozen=True, kw_only=True, eq=False):
 
 
 @dataclass(frozen=True)
-class _State:
-    """Poses, and everything about them that a linearisation needs."""
-
-    poses: Array
-    relative: Array
-    residual: Array
-    weighted_residual: Array
-    chi2: Array
-
-
-@dataclass(frozen=True)
 class _Descent:
-    state: _State
+    """Where a minimisation ended."""
+
+    state: Residuals
     cost: float
     iterations: int
     converged: bool
@@ -144,10 +141,8 @@ def solve(
     """
     require_connected(graph, np.ones(len(graph.first), dtype=bool), "the edges")
     doubtful = ~graph.successive if loops is None else loops
-    if doubtful.shape != graph.first.shape:
-        raise ValueError(f"loops has shape {doubtful.shape}, not {graph.first.shape}")
     problem = _GraphProblem(graph)
-    start = problem.state(graph.poses)
+    start = residuals(graph, graph.poses)
     cost_initial = 0.5 * float(np.sum(start.chi2))
     if not np.isfinite(cost_initial):
         raise TrajectoryError(
@@ -182,16 +177,9 @@ class _GraphProblem:
         self.graph = graph
         self._system = BlockSystem(graph.first, graph.second, len(graph), graph.freedom)
 
-    def state(self, poses: Array) -> _State:
-        graph = self.graph
-        relative = lie.between(poses[graph.first], poses[graph.second])
-        residual = lie.log(lie.between(graph.measurements, relative))
-        weighted = (graph.information @ residual[..., None])[..., 0]
-        return _State(poses, relative, residual, weighted, np.sum(residual * weighted, axis=-1))
-
     def minimise(
         self,
-        start: _State,
+        start: Residuals,
         kernel: Kernel,
         tolerance: float = _TOLERANCE,
         max_iterations: int = MAX_ITERATIONS,
@@ -225,8 +213,12 @@ class _GraphProblem:
         return _Descent(state, cost, iterations, cost <= _TOLERANCE)
 
     def _step(
-        self, state: _State, matrix: sparse.csc_array[np.float64], gradient: Array, damping: float
-    ) -> tuple[_State | None, float]:
+        self,
+        state: Residuals,
+        matrix: sparse.csc_array[np.float64],
+        gradient: Array,
+        damping: float,
+    ) -> tuple[Residuals | None, float]:
         """Where a damped step leads, and how much it lowers the linearised cost."""
         step = self._system.solve(matrix, -gradient, damping)
         if step is None:
@@ -234,10 +226,10 @@ class _GraphProblem:
         promised = 0.5 * float(np.sum(step * (damping * step - gradient)))
         if promised < 0.0:
             return None, 0.0
-        return self.state(lie.compose(state.poses, lie.exp(step))), promised
+        return residuals(self.graph, lie.compose(state.poses, lie.exp(step))), promised
 
     def _linearise(
-        self, state: _State, weights: Array
+        self, state: Residuals, weights: Array
     ) -> tuple[sparse.csc_array[np.float64], Array]:
         """Hessian in Gauss and Newton's approximation, and gradient of the cost."""
         # d r / d x_j = J, d r / d x_i = -J A with A the adjoint of x_j's view of x_i
@@ -246,7 +238,7 @@ class _GraphProblem:
         back = lie.adjoint(lie.inverse(state.relative))
         jj = transposed @ (weights[:, None, None] * self.graph.information) @ jacobian
         ij = -back.transpose(0, 2, 1) @ jj
-        j = (transposed @ (weights[:, None] * state.weighted_residual)[..., None])[..., 0]
+        j = (transposed @ (weights[:, None] * state.weighted)[..., None])[..., 0]
         i = -(back.transpose(0, 2, 1) @ j[..., None])[..., 0]
         return self._system.matrix(-ij @ back, jj, ij), self._system.vector(i, j)
 
@@ -267,7 +259,7 @@ def _dcs(doubtful: BoolArray) -> Kernel:
 
 
 def _gnc(
-    problem: _GraphProblem, start: _State, plain: _Descent, doubtful: BoolArray
+    problem: _GraphProblem, start: Residuals, plain: _Descent, doubtful: BoolArray
 ) -> tuple[_Descent, Array]:
     """Truncated least squares over the doubtful edges, from two starts."""
     freedom = ranks(problem.graph.information)
@@ -277,7 +269,7 @@ def _gnc(
     bound[told] = 2.0 * gammaincinv(freedom[told] / 2.0, GNC_PROBABILITY)
     price[told] = 2.0 * gammaincinv(freedom[told] / 2.0, DROP_PROBABILITY)
 
-    def priced(state: _State, kept: Array) -> float:
+    def priced(state: Residuals, kept: Array) -> float:
         return 0.5 * float(np.sum(np.where(kept > 0.0, state.chi2, price)))
 
     spent, found = plain.iterations, []
@@ -298,7 +290,7 @@ def _gnc(
     return _Descent(run.state, run.cost, spent, run.converged), weights
 
 
-def _graduated(problem: _GraphProblem, start: _State, bound: Array) -> tuple[_Descent, Array]:
+def _graduated(problem: _GraphProblem, start: Residuals, bound: Array) -> tuple[_Descent, Array]:
     """One descent of graduated non-convexity (Yang 2020, algorithm 1, eq. 13 and 14)."""
     state, spent = start, 0
     # Infinite bounds are edges that are not doubted
