@@ -357,7 +357,10 @@ EVALUATION_OPTIONS = {
     "association": Option(
         "--association", "Interpolate the reference, or take its nearest pose (as evo does)."
     ),
-    "max_gap_s": Option("--max-gap"),
+    "max_gap_s": Option(
+        "--max-gap", "Longest gap of the reference to interpolate across; for nearest the largest "
+        "difference in time.  [default: from its rate; 0.01 for nearest]", "s",
+    ),
     "time_offset_s": Option(
         "--time-offset", "Added to the estimate's stamps; auto finds it from the motion.  "
         "[default: auto where the two do not overlap]", "s",
@@ -413,13 +416,10 @@ def command_line(
         files alone, as a POSIX shell reads it.
     """
     given = request if typed else request.recorded()
-    if isinstance(given, EvaluationRequest):
-        words = [command or "evaluate", _file(given.estimate), _file(given.reference)]
-    elif isinstance(given, LoopRequest):
-        words = [command or "loop", _file(given.source)]
-    else:
-        name = "whatif" if isinstance(given, WhatIfRequest) else "compare"
-        words = [command or name, _file(given.log)]
+    # what must be given are files, and everything else is an option
+    needed = [field.name for field in msgspec.structs.fields(given) if field.required]
+    files = [_file(getattr(given, name)) for name in needed]
+    words = [command or str(type(given).__struct_config__.tag or "evaluate"), *files]
     words += [word for pair in _all_options(given) for word in pair if word is not None]
     if isinstance(given, WhatIfRequest):
         for name, value in given.changes.items():

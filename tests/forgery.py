@@ -27,6 +27,7 @@ from px4fuse.verification.verification import verify
 
 Forge = Callable[[PdfWriter], Any]
 Edit = Callable[[bytes], bytes]
+Change = Callable[[dict[str, Any]], Any]
 SEAL = re.compile(rb"%px4fuse-sha256 [0-9a-f]{64}\n\Z")
 ESCAPED = {0x08: b"\\b", 0x09: b"\\t", 0x0A: b"\\n", 0x0C: b"\\f", 0x0D: b"\\r", 0x28: b"\\(",
            0x29: b"\\)", 0x5C: b"\\\\"}  # fmt: skip
@@ -37,6 +38,11 @@ def forged(pdf: bytes, *changes: Forge) -> bytes:
     writer = PdfWriter(clone_from=io.BytesIO(pdf))
     for change in changes:
         change(writer)
+    return saved(writer)
+
+
+def saved(writer: PdfWriter) -> bytes:
+    """The bytes of what was written."""
     out = io.BytesIO()
     writer.write(out)
     return out.getvalue()
@@ -123,6 +129,21 @@ def entry(key: str, value: Any) -> Callable[[Any], None]:
 
 
 # ------------------------------------------------------------------ reports that verify
+
+
+def put(value: Any, *path: Any) -> Change:
+    """Another value at a place in the results; behind the end of a list it is added."""
+
+    def change(results: dict[str, Any]) -> None:
+        part: Any = results
+        for name in path[:-1]:
+            part = part[name]
+        if isinstance(part, list) and path[-1] == len(part):
+            part.append(value)
+        else:
+            part[path[-1]] = value
+
+    return change
 
 
 def report_of(pdf: bytes) -> Report:

@@ -9,8 +9,7 @@ from px4fuse.loop.model import Closure, Correction, KnownEnd, LoopPart, Odometry
 from px4fuse.record import Unavailable
 from px4fuse.request import LoopRequest
 from px4fuse.results.contract import LoopResults, Results, to_plain
-from px4fuse.results.model import Student
-from px4fuse.results.parts import provenance, schema_of
+from px4fuse.results.model import Student, provenance, schema_of
 from px4fuse.results.reading import read_results
 from px4fuse.trajectory.alignment import Transform
 from px4fuse.trajectory.association import Association

@@ -35,10 +35,6 @@ PINNED = ((759547191, 0.109, -14.4), ("clock-jump=53ms", "ekf2-off"))
 CLASS = tuple(Person(f"s{n:02d}", f"Name {n}") for n in range(3))
 
 
-def student(name):
-    return Person(name)
-
-
 def roster(tmp_path, content):
     path = tmp_path / "roster.csv"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -58,7 +54,7 @@ def files(folder):
 
 class TestDraw:
     def test_same_secret_and_id_same_bytes(self):
-        assert fly(SECRET, student("s1"), "aisle") == fly(SECRET, student("s1"), "aisle")
+        assert fly(SECRET, Person("s1"), "aisle") == fly(SECRET, Person("s1"), "aisle")
         # as a platform may spell it in another export
         assert draw(SECRET, "S1 ", "aisle") == draw(SECRET, "s1", "aisle")
 
@@ -258,10 +254,9 @@ class TestRoster:
 class TestAssign:
     def test_logs_and_key(self, tmp_path):
         folder, key_file = tmp_path / "a" / "flights", tmp_path / "key.json"
-        made = assign(CLASS, folder, key_file, SECRET, "aisle", 1)
-        assert (made.written, made.kept) == (3, 0)
+        made, written = assign(CLASS, folder, key_file, SECRET, "aisle", 1)
         key = read_key(key_file)
-        assert key == made.key
+        assert (key, written) == (made, 3)
         assert not key.secret
         assert SECRET.decode() not in key_file.read_text(encoding="utf-8")
         logs = files(folder)
@@ -279,18 +274,16 @@ class TestAssign:
 
     def test_second_run_changes_nothing_and_may_add_students(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
-        first = assign(CLASS[:2], folder, key_file, None, "aisle")
-        assert first.key.secret
+        assert assign(CLASS[:2], folder, key_file, None, "aisle")[0].secret
         before = files(folder) | {"key": key_file.read_bytes()}
-        again = assign(CLASS[:2], folder, key_file, None, "aisle")
-        assert (again.written, again.kept) == (0, 2)
+        assert assign(CLASS[:2], folder, key_file, None, "aisle")[1] == 0
         assert files(folder) | {"key": key_file.read_bytes()} == before
-        more = assign(CLASS, folder, key_file, None, "aisle")
-        assert (more.written, more.kept) == (1, 2)
+        key, written = assign(CLASS, folder, key_file, None, "aisle")
+        assert written == 1
         assert files(folder).items() >= {k: v for k, v in before.items() if k != "key"}.items()
         # the secret that was made up serves as one that is given
-        assign(CLASS, folder, key_file, more.key.secret.encode(), "aisle")
-        assert read_key(key_file).secret == more.key.secret
+        assign(CLASS, folder, key_file, key.secret.encode(), "aisle")
+        assert read_key(key_file).secret == key.secret
 
     def test_other_flights_and_keys_are_not_replaced(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
@@ -320,9 +313,7 @@ class TestAssign:
             assign(CLASS, folder, key_file, None, "aisle")
         monkeypatch.undo()
         assert len(read_key(key_file).answers) == 2
-        made = assign(CLASS, folder, key_file, None, "aisle")
-        assert (made.written, made.kept) == (1, 2)
-        assert read_key(key_file) == made.key
+        assert assign(CLASS, folder, key_file, None, "aisle") == (read_key(key_file), 1)
 
     def test_what_cannot_be_written_leaves_nothing(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +16,7 @@ import pytest
 from click.testing import CliRunner
 from conftest import page_of
 from exchange import replace
-from forgery import Base, base, forged, on_page, read_again, report_of
+from forgery import Base, Change, base, forged, on_page, put, read_again, report_of
 from results_tools import LOOP, SHA256, changed, decoded
 
 from px4fuse.answers import form_text
@@ -161,18 +160,6 @@ def test_no_sentence_earns_anything(
 
 
 # ------------------------------------------------------------------ files
-
-Change = Callable[[dict[str, Any]], object]
-
-
-def put(value: Any, *path: str) -> Change:
-    def change(results: dict[str, Any]) -> None:
-        place = results
-        for part in path[:-1]:
-            place = place[part]
-        place[path[-1]] = value
-
-    return change
 
 
 def position(results: dict[str, Any]) -> None:

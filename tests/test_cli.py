@@ -9,25 +9,13 @@ from pathlib import Path
 import jsonschema
 import pypdf
 import pytest
-from click.testing import CliRunner, Result
+from cli_tools import run, run_main
+from click.testing import Result
 
-from px4fuse.cli import cli, main
+from px4fuse.cli import COMMANDS
 from px4fuse.results.contract import schema
 
 pytestmark = pytest.mark.usefixtures("analysed_once")
-
-
-def run(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(cli, [str(argument) for argument in arguments])
-
-
-def run_main(monkeypatch, capsys, *arguments: str | Path) -> tuple[int, str, str]:
-    """The real entry point: exit code, standard output, standard error."""
-    monkeypatch.setattr(sys, "argv", ["px4fuse", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    out, err = capsys.readouterr()
-    return int(stopped.value.code or 0), out, err
 
 
 def test_linear_algebra_has_one_thread_unless_said(monkeypatch, capsys):
@@ -59,36 +47,25 @@ def made(tmp_path_factory, sample_log) -> tuple[Path, Result]:
     return folder, result
 
 
-def test_compare_writes_report_and_results(made):
+def test_report_and_results_say_the_same_and_name_no_folder_and_no_person(made):
     folder, result = made
     assert result.exit_code == 0, result.output
     assert sorted(p.name for p in folder.iterdir()) == ["notes.md", "report.json", "report.pdf"]
     assert "vehicle_visual_odometry" in result.output
     assert len(result.output.splitlines()) <= 42, "the summary must stay short"
-
-
-def test_results_validate_and_are_attached_in_the_pdf(made):
-    folder, _ = made
     text = (folder / "report.json").read_bytes()
-    attached = pypdf.PdfReader(folder / "report.pdf").attachments["results.json"]
-    assert attached == [text]
-    jsonschema.validate(json.loads(text), schema())
+    assert pypdf.PdfReader(folder / "report.pdf").attachments["results.json"] == [text]
+    results = json.loads(text)
+    jsonschema.validate(results, schema())
+    assert results["provenance"]["command"] == "px4fuse compare aisle_uwb.ulg --sigma-z 0.12"
+    assert results["settings"]["sigma_z_m"] == 0.12
 
 
 def test_awkward_text_reaches_the_pages_as_it_is(made):
-    folder, _ = made
-    pages = [page.extract_text() for page in pypdf.PdfReader(folder / "report.pdf").pages]
+    pages = [page.extract_text() for page in pypdf.PdfReader(made[0] / "report.pdf").pages]
     assert "Ana $x$ Müller" in pages[0]
-    whole = "\n".join(pages)
-    assert "Costs $5 and x² or \\frac{1}{2}; bold, under, tag." in whole
+    assert "Costs $5 and x² or \\frac{1}{2}; bold, under, tag." in "\n".join(pages)
     assert sum("line line line" in page for page in pages) > 1  # long notes run on
-
-
-def test_command_line_in_the_report_names_no_folder_and_no_person(made):
-    folder, _ = made
-    results = json.loads((folder / "report.json").read_text(encoding="utf-8"))
-    assert results["provenance"]["command"] == "px4fuse compare aisle_uwb.ulg --sigma-z 0.12"
-    assert results["settings"]["sigma_z_m"] == 0.12
 
 
 @pytest.mark.usefixtures("analysed_anew")
@@ -99,14 +76,6 @@ def test_same_input_gives_the_same_bytes_and_fail_on_another_exit_code(tmp_path,
     for suffix in ("pdf", "json"):
         first, second = ((tmp_path / f"{name}.{suffix}").read_bytes() for name in ("a", "b"))
         assert first == second
-
-
-@pytest.mark.usefixtures("no_drawing")
-def test_json_to_standard_output_is_alone_there(tmp_path, sample_log):
-    result = run("compare", sample_log, "--axis", "aisle", "--heading", "30",
-                 "-o", tmp_path / "r.pdf", "--json", "-")  # fmt: skip
-    assert json.loads(result.stdout)["axes"]["aisle"]["heading_deg"] == 30.0
-    assert (tmp_path / "r.pdf").is_file()
 
 
 @pytest.mark.parametrize(
@@ -146,26 +115,36 @@ def test_bad_settings_give_one_line_and_leave_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("content", [b"", b"not a log at all, only text", b"ULog\x01\x12\x35" * 2])
-def test_bad_logs_give_one_line_and_overwrite_nothing(tmp_path, monkeypatch, capsys, content):
+@pytest.mark.parametrize("content", [None, b"", b"no log at all", b"ULog\x01\x12\x35" * 2])
+@pytest.mark.parametrize("command", ["compare", "info", "extract -o tables", "tune", "sync"])
+def test_bad_logs_give_one_line_and_write_nothing(tmp_path, monkeypatch, capsys, command, content):
     monkeypatch.chdir(tmp_path)
-    log = tmp_path / "bad.ulg"
-    log.write_bytes(content)
-    old = tmp_path / "reports" / "bad.pdf"
+    old, log = Path("reports", "bad.pdf"), Path("bad.ulg")
     old.parent.mkdir()
     old.write_text("an older report")
-    code, _, err = run_main(monkeypatch, capsys, "compare", log)
-    assert code == 2
+    if content is not None:
+        log.write_bytes(content)
+    code, out, err = run_main(monkeypatch, capsys, *command.split(), "bad.ulg")
+    assert (code, out) == (2, "")
     assert len(err.strip().splitlines()) == 1
-    assert "bad.ulg" in err
+    assert err.startswith("px4fuse: bad.ulg: ")
+    if content is None:
+        assert err == "px4fuse: bad.ulg: cannot be read (No such file or directory).\n"
     assert old.read_text() == "an older report"
-    assert [p.name for p in old.parent.iterdir()] == ["bad.pdf"]
+    assert {path.name for path in Path().rglob("*")} - {"bad.ulg"} == {"reports", "bad.pdf"}
 
 
 def test_no_command_shows_help(monkeypatch, capsys):
     code, out, err = run_main(monkeypatch, capsys)
     assert code == 2
     assert "Usage:" in out + err
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help(command):
+    result = run(command, "--help")
+    assert result.exit_code == 0
+    assert "Usage:" in result.output
 
 
 def test_a_pipe_that_closes_early_is_no_traceback(tmp_path, sample_log):
@@ -177,12 +156,6 @@ def test_a_pipe_that_closes_early_is_no_traceback(tmp_path, sample_log):
     assert process.stderr.read() == b""
     process.stderr.close()
     assert process.wait() in (0, 1)
-
-
-def test_missing_log_gives_one_line(monkeypatch, capsys):
-    code, _, err = run_main(monkeypatch, capsys, "compare", "absent.ulg")
-    assert code == 2
-    assert err == "px4fuse: absent.ulg: cannot be read (No such file or directory).\n"
 
 
 @pytest.mark.usefixtures("no_drawing")
@@ -209,13 +182,6 @@ def test_help_imports_nothing_heavy():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "compare" in done.stdout
-
-
-def test_every_command_has_help():
-    for command in ("compare", "lesson"):
-        result = run(command, "--help")
-        assert result.exit_code == 0
-        assert "Usage:" in result.output
 
 
 def test_lesson_kalman_prints_the_lesson_digit_for_digit():

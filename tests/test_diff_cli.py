@@ -128,7 +128,7 @@ def test_the_terminal_says_what_changed_first(settings, monkeypatch, tmp_path):
     assert any(line.startswith("Numbers not shown:") and "unchanged" in line for line in lines)
     assert any(line.startswith("Setting  SIGMA_Z (m): 0.1 → 0.03") for line in lines)
     assert any(line.startswith("New") for line in lines)
-    assert lines[-1] == "Report   reports/usual_to_small.pdf"
+    assert lines[-2] == "Wrote    reports/usual_to_small.pdf"
     # the same again is written over, another pair of the same names is not
     ran("diff", *settings)
     assert sorted(path.name for path in Path("reports").iterdir()) == [

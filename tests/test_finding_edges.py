@@ -332,7 +332,7 @@ def test_topics_that_were_logged_too_slowly(
         (log(format="MAVLink tlog", has_ulog=False), "at {:g} Hz (MAV_CMD_SET"),
         (log(format="MAVLink tlog"), "-r {:g} in PX4's console)"),
     ):
-        found = list(imu.rates(analysis(flight=flight, log=info)))
+        found = list(imu.rates(analysis(flight=flight, log=info).flight))
         assert [finding.evidence["needed_hz"] * 2.0 for finding in found] == expected
         assert all(says.format(hz) in f.remedy for f, hz in zip(found, expected, strict=True))
 
@@ -356,7 +356,7 @@ def test_what_is_not_in_a_log_is_said(
     damage: tuple[str, ...], flying: bool, severity: str | None, said: str
 ) -> None:
     info = log(damage=damage, ends_in_flight=flying, bytes=100, bytes_read=91)
-    found = list(recording.loss(analysis(log=info)))
+    found = list(recording.loss(analysis(log=info).flight))
     assert [(one.severity, one.message) for one in found] == ([(severity, said)] if said else [])
     for one in found:
         assert one.evidence == {"lost_bytes": 9, "ends_in_flight": float(flying)}

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from exchange import replace
 from form_guesses import at_random
 from scipy.stats import spearmanr
 
@@ -54,16 +55,15 @@ CLEAN = FormTruth(
 )  # fmt: skip
 
 
-def changed(answers: Answers, **values: Any) -> Answers:
-    given = {name: getattr(answers, name) for name in answers.__struct_fields__}
-    return Answers(**{**given, **values})
-
-
 def with_claim(**values: Any) -> Answers:
     """The right form with another first claim."""
-    first = RIGHT.mistakes[0]
-    given = {name: getattr(first, name) for name in first.__struct_fields__}
-    return changed(RIGHT, mistakes=(Claim(**{**given, **values}), *RIGHT.mistakes[1:]))
+    first, second = RIGHT.mistakes
+    return replace(RIGHT, mistakes=(replace(first, **values), second))
+
+
+def with_false(*kinds: str) -> Answers:
+    """The right form with more claims."""
+    return replace(RIGHT, mistakes=(*RIGHT.mistakes, *map(Claim, kinds)))
 
 
 def parts(answers: Answers, truth: FormTruth = TRUTH) -> list[float]:
@@ -88,51 +88,44 @@ def test_all_right_is_everything_and_a_blank_form_nothing() -> None:
     assert form_points(RIGHT, TRUTH).named == {"clock-offset": True, "dropout": True}
 
 
-@pytest.mark.parametrize(
-    ("answers", "expected"),
-    [
-        # wrong sign: a third of its size and of its cure
-        (with_claim(size=-190.0, value=0.2), [30.0, 10.0, 10.0, 10.0, 15.0, 15.0]),
-        (with_claim(size=140.0), [30.0, 11.25, 10.0, 15.0, 15.0, 15.0]),
-        (with_claim(size=900.0, value=-0.9), [30.0, 7.5, 10.0, 11.25, 15.0, 15.0]),
-        (with_claim(panel="map"), [30.0, 15.0, 7.5, 15.0, 15.0, 15.0]),
-        (with_claim(when=""), [30.0, 15.0, 7.5, 15.0, 15.0, 15.0]),
-        (
-            with_claim(parameter="EKF2_EV_DELAY", value=200.0, value_unit="ms"),
-            [30.0, 15.0, 10.0, 15.0, 15.0, 15.0],
-        ),
-        (
-            with_claim(parameter="EKF2_EVP_GATE", value=3.0, value_unit="sd"),
-            [30.0, 15.0, 10.0, 7.5, 15.0, 15.0],
-        ),
-        # a neighbour earns 0.4 of the kind, a third of the size, half of when
-        (with_claim(kind="ekf2-delay"), [21.0, 10.0, 7.5, 15.0, 15.0, 15.0]),
-        # each false claim costs ten; three take all
-        (
-            changed(RIGHT, mistakes=(*RIGHT.mistakes, Claim("yaw"))),
-            [20.0, 15.0, 10.0, 15.0, 15.0, 15.0],
-        ),
-        (
-            changed(RIGHT, mistakes=(*RIGHT.mistakes, Claim("yaw"), Claim("nlos"), Claim("scale"))),
-            [0.0, 0.0, 0.0, 0.0, 15.0, 15.0],
-        ),
-        (changed(RIGHT, mistakes=(Claim("none"),)), [0.0, 0.0, 0.0, 0.0, 15.0, 15.0]),
-        (changed(RIGHT, verdict_ours="consistent"), [30.0, 15.0, 10.0, 15.0, 10.0, 15.0]),
-        (changed(RIGHT, verdict_ekf2="consistent"), [30.0, 15.0, 10.0, 15.0, 12.5, 15.0]),
-        (changed(RIGHT, ekf2_did=("coasted, then reset",)), [30.0, 15.0, 10.0, 15.0, 12.5, 15.0]),
-        (changed(RIGHT, quantities=(0.53, (3.0,), None)), [30.0, 15.0, 10.0, 15.0, 15.0, 5.0]),
-        (changed(RIGHT, quantities=(9.0, (), None)), [30.0, 15.0, 10.0, 15.0, 7.5, 0.0]),
-    ],
-)
-def test_what_is_half_right(answers: Answers, expected: list[float]) -> None:
-    assert parts(answers) == pytest.approx(expected, abs=0.01)
+FULL = dict(zip(PARTS, (30.0, 15.0, 10.0, 15.0, 15.0, 15.0), strict=True))
+DELAY = {"parameter": "EKF2_EV_DELAY", "value": 200.0, "value_unit": "ms"}
+GATE = {"parameter": "EKF2_EVP_GATE", "value": 3.0, "value_unit": "sd"}
+NO_MISTAKES = {"kinds": 0.0, "sizes": 0.0, "when": 0.0, "cure": 0.0}
+# A form, and the parts of which it does not get all points
+HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
+    # wrong sign: a third of its size and of its cure
+    (with_claim(size=-190.0, value=0.2), {"sizes": 10.0, "cure": 10.0}),
+    (with_claim(size=140.0), {"sizes": 11.25}),
+    (with_claim(size=900.0, value=-0.9), {"sizes": 7.5, "cure": 11.25}),
+    (with_claim(panel="map"), {"when": 7.5}),
+    (with_claim(when=""), {"when": 7.5}),
+    (with_claim(**DELAY), {}),
+    (with_claim(**GATE), {"cure": 7.5}),
+    # a neighbour earns 0.4 of the kind, a third of the size, half of when
+    (with_claim(kind="ekf2-delay"), {"kinds": 21.0, "sizes": 10.0, "when": 7.5}),
+    # each false claim costs ten; three take all
+    (with_false("yaw"), {"kinds": 20.0}),
+    (with_false("yaw", "nlos", "scale"), NO_MISTAKES),
+    (replace(RIGHT, mistakes=(Claim("none"),)), NO_MISTAKES),
+    (replace(RIGHT, verdict_ours="consistent"), {"verdicts": 10.0}),
+    (replace(RIGHT, verdict_ekf2="consistent"), {"verdicts": 12.5}),
+    (replace(RIGHT, ekf2_did=("coasted, then reset",)), {"verdicts": 12.5}),
+    (replace(RIGHT, quantities=(0.53, (3.0,), None)), {"quantities": 5.0}),
+    (replace(RIGHT, quantities=(9.0, (), None)), {"verdicts": 7.5, "quantities": 0.0}),
+]
+
+
+@pytest.mark.parametrize(("answers", "less"), HALF_RIGHT)
+def test_what_is_half_right(answers: Answers, less: dict[str, float]) -> None:
+    assert form_points(answers, TRUTH).parts == pytest.approx({**FULL, **less}, abs=0.01)
 
 
 def test_a_clean_flight() -> None:
     none = Answers(log_sha256=SHA256, mistakes=(Claim("none"),))
     assert parts(none, CLEAN) == [40.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     assert form_points(none, CLEAN).share == 0.4
-    whole = changed(
+    whole = replace(
         none, verdict_ours="consistent", verdict_ekf2="consistent", quantities=(0.5, 0.1, 0.2),
         ekf2_did=("followed the positions",),
     )  # fmt: skip
@@ -142,16 +135,11 @@ def test_a_clean_flight() -> None:
 
 def test_a_cure_that_needs_no_measurement_counts_with_the_size_alone() -> None:
     landed = Wrong("open-end", 5.0, 4.25, 5.75, 60.0, None)
-    truth = FormTruth(
-        (landed,), 0.01, CLEAN.ours, CLEAN.ekf2, CLEAN.ekf2_did, CLEAN.ekf2_did_also, ()
-    )
+    truth = replace(CLEAN, mistakes=(landed,), quantities=())
     claim = Claim("open-end", None, "", "", 60.0, None, "--open", None, "", "loop")
     guess = Answers(log_sha256=SHA256, mistakes=(claim,))
     assert parts(guess, truth) == [30.0, 0.0, 0.0, 0.0, 0.0, 0.0]
-    measured = Answers(
-        log_sha256=SHA256,
-        mistakes=(Claim("open-end", 5.1, "m", "", 60.0, None, "--open", None, "", "loop"),),
-    )
+    measured = replace(guess, mistakes=(replace(claim, size=5.1, unit="m"),))
     assert parts(measured, truth)[:4] == [30.0, 15.0, 10.0, 15.0]
 
 
@@ -231,8 +219,7 @@ def test_points_are_those_given_by_hand(shared_logs: Path) -> None:
     for form in bank["forms"]:
         known = tuple(given(one["truth"]) for one in form["quantities"])
         truth = truths[form["flight"]]
-        values = {name: getattr(truth, name) for name in truth.__struct_fields__}
-        made = form_points(answers_of(form), FormTruth(**{**values, "quantities": known}))
+        made = form_points(answers_of(form), replace(truth, quantities=known))
         ours.append(sum(made.parts.values()))
         theirs.append(form["judgement"]["points"])
     assert len(ours) >= 30
@@ -243,7 +230,6 @@ def test_points_are_those_given_by_hand(shared_logs: Path) -> None:
 def test_random_forms_earn_little() -> None:
     """Of 500 forms filled in at random, on flights with two mistakes, one and none."""
     rng = np.random.default_rng(5)
-    values = {name: getattr(TRUTH, name) for name in TRUTH.__struct_fields__}
-    truths = (TRUTH, FormTruth(**{**values, "mistakes": (LATE,)}), CLEAN)
+    truths = (TRUTH, replace(TRUTH, mistakes=(LATE,)), CLEAN)
     earned = [form_points(at_random(rng), truths[n % 3]).share for n in range(500)]
     assert np.mean(earned) <= 0.2

@@ -13,6 +13,7 @@ import zlib
 from pathlib import Path
 
 import pytest
+from forgery import saved
 from hypothesis import given
 from hypothesis import strategies as st
 from pypdf import PdfWriter
@@ -39,12 +40,6 @@ FUZZ = int(os.environ.get("PX4FUSE_FUZZ", "300"))
 DAMAGED = "damaged: it cannot be read as a PDF"
 
 
-def written(writer: PdfWriter) -> bytes:
-    out = io.BytesIO()
-    writer.write(out)
-    return out.getvalue()
-
-
 def small(attached: bytes | None = JSON, edit=lambda writer: None, name="results.json") -> bytes:
     """A PDF of one page with results attached, changed by ``edit``."""
     writer = PdfWriter()
@@ -52,7 +47,7 @@ def small(attached: bytes | None = JSON, edit=lambda writer: None, name="results
     if attached is not None:
         writer.add_attachment(name, attached)
     edit(writer)
-    return written(writer)
+    return saved(writer)
 
 
 def raw(*objects: bytes, trailer: bytes = b"/Root 1 0 R") -> bytes:
@@ -129,10 +124,10 @@ def test_other_reports(pdf, results):
 
 def test_a_report_that_was_saved_again():
     writer = PdfWriter(clone_from=io.BytesIO(REAL))
-    saved = read_report(written(writer), "r.pdf")
-    assert isinstance(saved, Report)
-    assert saved.seal == "missing"
-    assert to_json(saved.results).encode() == JSON
+    again = read_report(saved(writer), "r.pdf")
+    assert isinstance(again, Report)
+    assert again.seal == "missing"
+    assert to_json(again.results).encode() == JSON
     changed = read_report(REAL.replace(b"/Title", b"/Titlf"), "r.pdf")
     assert isinstance(changed, Report)
     assert changed.seal == "broken"
@@ -199,7 +194,7 @@ def test_too_many_pages(count):
     writer = PdfWriter()
     for _ in range(count):
         writer.add_blank_page(9, 9)
-    assert reason(written(writer)) == "r.pdf: more than 100 pages."
+    assert reason(saved(writer)) == "r.pdf: more than 100 pages."
 
 
 # ------------------------------------------------------------------ what acts

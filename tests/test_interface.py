@@ -218,7 +218,6 @@ def test_errors_name_arguments_in_python_and_options_on_the_command_line(
         ("loop {vio} --landed-at 1,1 --open", "--landed-at and --open exclude"),
         ("loop {vio} --frame ned", "--frame ned is for trajectory files"),
         ("compare {ulg} --system 1", "--system is for MAVLink"),
-        ("compare {ulg} --heading nan", "--heading nan is not"),
         ("compare {ulg} --mavlink {ulg}", "--mavlink aisle_uwb.ulg: this is a ULog"),
         ("evaluate {vio}:vio {slam} --time-offset 9e5", "give --time-offset auto"),
     ],

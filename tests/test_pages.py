@@ -8,6 +8,7 @@ import random
 import sys
 
 import pytest
+from forgery import saved
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.backends.backend_pdf import PdfPages
@@ -91,9 +92,7 @@ def nested_forms(depth: int) -> bytes:
     whole.set_data(content)
     page[NameObject("/Resources")] = inner
     page[NameObject("/Contents")] = writer._add_object(whole)
-    out = io.BytesIO()
-    writer.write(out)
-    return out.getvalue()
+    return saved(writer)
 
 
 BOX = ArrayObject([NumberObject(0), NumberObject(0), NumberObject(595), NumberObject(842)])
@@ -154,10 +153,20 @@ def test_pages_more_fewer_and_of_another_size() -> None:
     assert [one.page for one in compared(drawn("b", "a"), two)] == [1, 2]
     writer = PdfWriter(clone_from=io.BytesIO(two))
     writer.pages[1].mediabox.upper_right = (288, 250)
-    out = io.BytesIO()
-    writer.write(out)
-    (found,) = compared(out.getvalue(), two)
+    pdf = saved(writer)
+    (found,) = compared(pdf, two)
     assert (found.page, found.picture) == (2, 1.0)
+
+
+def test_a_page_that_cannot_be_drawn_says_why() -> None:
+    two = drawn("a", "b")
+    writer = PdfWriter(clone_from=io.BytesIO(two))
+    writer.pages[1].mediabox.upper_right = (20_000, 20_000)
+    huge = saved(writer)
+    for one, other in ((huge, two), (two, huge)):
+        (found,) = compared(one, other)
+        assert (found.page, found.picture) == (2, 1.0)
+        assert "its size is 20000 by 20000 points" in found.what
 
 
 def test_a_thousand_pages_are_not_all_drawn() -> None:
@@ -165,10 +174,9 @@ def test_a_thousand_pages_are_not_all_drawn() -> None:
     page = PdfReader(io.BytesIO(drawn("a"))).pages[0]
     for _ in range(300):
         many.add_page(page)
-    out = io.BytesIO()
-    many.write(out)
-    assert len(looks(out.getvalue(), 2) or ()) == 2  # type: ignore[arg-type]
-    assert [one.page for one in compared(out.getvalue(), drawn("a"))] == [2]
+    pdf = saved(many)
+    assert len(looks(pdf, 2) or ()) == 2  # type: ignore[arg-type]
+    assert [one.page for one in compared(pdf, drawn("a"))] == [2]
 
 
 def test_a_look_is_in_reading_order_and_black_on_white() -> None:

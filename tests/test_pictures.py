@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from forgery import saved
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from matplotlib import rc_context
@@ -18,9 +19,9 @@ from pypdf import PdfReader, PdfWriter
 
 from px4fuse.flight import Unavailable
 from px4fuse.grading.sheets import draw_sheets
-from px4fuse.verification.pictures import (
+from px4fuse.verification.pages import (
     COVER,
-    MAX_BYTES,
+    MAX_PICTURE_BYTES,
     MAX_PIXELS,
     page_pictures,
     picture,
@@ -36,7 +37,7 @@ def _pdfium() -> None:
 
 def opened(made: bytes | Unavailable) -> Image.Image:
     assert isinstance(made, bytes), made
-    assert len(made) <= MAX_BYTES
+    assert len(made) <= MAX_PICTURE_BYTES
     image = Image.open(io.BytesIO(made))
     image.load()
     assert image.format == "PNG"
@@ -46,9 +47,7 @@ def opened(made: bytes | Unavailable) -> Image.Image:
 def blank(width: float, height: float) -> bytes:
     writer = PdfWriter()
     writer.add_blank_page(width, height)
-    out = io.BytesIO()
-    writer.write(out)
-    return out.getvalue()
+    return saved(writer)
 
 
 def test_a_report_s_cover_is_small_and_readable() -> None:
@@ -96,9 +95,8 @@ def test_odd_pages_are_bounded(size: tuple[float, float]) -> None:
 def test_locked_and_broken_files_are_unavailable() -> None:
     writer = PdfWriter(clone_from=REPORT)
     writer.encrypt("secret", algorithm="RC4-128")
-    out = io.BytesIO()
-    writer.write(out)
-    for content in (out.getvalue(), b"", b"%PDF-1.7", b"\0" * 1000, REPORT.read_bytes()[:3000]):
+    pdf = saved(writer)
+    for content in (pdf, b"", b"%PDF-1.7", b"\0" * 1000, REPORT.read_bytes()[:3000]):
         made = picture(content, 0)
         assert isinstance(made, Unavailable)
         assert made.remedy == "Open the PDF itself."

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 
-import click
 import msgspec
 import pytest
 from hypothesis import given, settings
@@ -14,6 +13,8 @@ from px4fuse.cli.compare import compare
 from px4fuse.cli.inputs import comparison_request
 from px4fuse.cli.loop import loop, loop_request
 from px4fuse.request import (
+    LOOP_OPTIONS,
+    OPTIONS,
     ComparisonRequest,
     GivenClosure,
     Landing,
@@ -135,22 +136,17 @@ def test_what_px4fuse_cannot_have_recorded_is_refused(recorded: object, says: st
         msgspec.convert(recorded, Request)
 
 
-@pytest.mark.parametrize("command", [compare, loop])
-def test_every_option_of_an_analysis_is_in_the_request(command: click.Command) -> None:
+@pytest.mark.parametrize(
+    ("command", "declared", "kinds"),
+    [
+        (compare, OPTIONS, (ComparisonRequest, PositionFile)),
+        (loop, LOOP_OPTIONS, (LoopRequest,)),
+    ],
+)
+def test_every_option_of_an_analysis_is_in_the_request(command, declared, kinds) -> None:
     """An option that the request forgets would be missing from every record."""
     about_outputs = {"-o", "--json", "--student", "--id", "--notes", "--answers", "--fail-on",
                      "--tum", "--g2o", "--closures", "--robust", "--max-size"}  # fmt: skip
-    request = ComparisonRequest(
-        log="a", mavlink="b", system=1, sigma_a_m_s2=1.0, sigma_z_m=1.0, dt_s=0.2, input="zero",
-        axes=("down",), heading_deg=1.0, start_s=1.0, end_s=2.0, clock_offset_s=0.1,
-        position_source="g",
-        position=PositionFile(path="c", frame="enu", yaw_deg=1.0, columns=("t",), time_unit="s",
-                              length_unit="m"),
-    ) if command is compare else LoopRequest(
-        source="a", frame="NED", system=1, reference="b", start_s=1.0, end_s=2.0,
-        landed_at=Landing(1.0, 2.0), came_back=False, closures=(GivenClosure(1.0, 2.0, 0.1),),
-        position_drift_m=2.0, heading_drift_deg=2.0, key_frames_m=0.1,
-    )  # fmt: skip
-    words = set(shlex.split(command_line(request)))
     options = {parameter.opts[0] for parameter in command.params if parameter.opts[0][0] == "-"}
-    assert options - about_outputs <= words
+    assert options - about_outputs == {option.name for option in declared.values()}
+    assert set(declared) <= {field for kind in kinds for field in kind.__struct_fields__}

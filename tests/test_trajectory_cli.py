@@ -398,7 +398,7 @@ REFUSED = {
     "no drift": ("loop s.tum --drift 0", "--drift 0 is outside"),
     "no heading drift": ("loop s.tum --heading-drift 0", "--heading-drift 0 is outside"),
     "from after to": ("loop s.tum --from 50 --to 40", "Change --from or --to"),
-    "from NaN": ("loop s.tum --from nan", "--from nan is not a finite number"),
+    "from NaN": ("loop s.tum --from nan", "nan is not a finite number"),
     "no key frames": ("loop s.tum --key-frames 0", "--key-frames 0 is outside"),
     "no such part": ("loop l.ulg:slam", "'slam' is not a part of a flight"),
     "part of a trajectory": ("loop s.tum:vio", "s.tum: a trajectory file has no part 'vio'"),
@@ -424,8 +424,8 @@ REFUSED = {
     "evaluate another flight": ("evaluate s.tum still.tum", "no poses match in time"),
     "evaluate apart": ("evaluate s.tum l.ulg --time-offset 0", "no poses match in time"),
     "evaluate a line": ("evaluate line.tum line.tum", "--alignment yaw"),
-    "gap of NaN": ("evaluate s.tum s.tum --max-gap nan", "--max-gap nan is not a finite"),
-    "offset of NaN": ("evaluate s.tum s.tum --time-offset nan", "--time-offset nan is not"),
+    "gap of NaN": ("evaluate s.tum s.tum --max-gap nan", "nan is not a finite number"),
+    "offset of NaN": ("evaluate s.tum s.tum --time-offset nan", "nan is not a finite number"),
     "offset of words": ("evaluate s.tum s.tum --time-offset abc", "give seconds, as 0.1, or auto"),
     "RPE over nothing": ("evaluate s.tum s.tum --rpe 0m", "'0m' is not a distance"),
     "RPE over half a frame": ("evaluate s.tum s.tum --rpe 1.5f", "frames come whole"),
@@ -433,7 +433,10 @@ REFUSED = {
     "page as text": ("evaluate s.tum s.tum -o page.txt", "ends in .pdf"),
     "picture as JPEG": ("evaluate s.tum s.tum --picture p.jpg", "ends in .png"),
     "picture to print": ("evaluate s.tum s.tum --picture -", "ends in .png"),
-    "picture for results": ("evaluate s.tum s.tum --picture p.png --json p.png", "Give two names"),
+    "picture for results": (
+        "evaluate s.tum s.tum --picture p.png --json p.png",
+        "two outputs name the same file",
+    ),
     "picture into a file": ("evaluate s.tum s.tum --picture n.md/e.png", "cannot be written"),
 }
 

@@ -14,8 +14,8 @@ import time
 from pathlib import Path
 
 import pytest
+from cli_tools import run_main
 from conftest import REPOSITORY
-from test_cli import run_main
 from ulog_tools import make_log
 
 from px4fuse.errors import OutputError
@@ -232,27 +232,21 @@ def test_who_is_stopped_after_writing_says_what_is_there(desk, monkeypatch, caps
 
 
 @full
-def test_results_that_cannot_be_printed_leave_no_files(desk) -> None:
+@pytest.mark.parametrize(
+    ("json_path", "left", "there"),
+    [("-", "", []), ("c.json", ", c.tum, c.json written before.", ["c.json", "c.tum"])],
+)
+def test_what_cannot_be_printed_is_one_line_that_says_what_is_written(
+    desk, json_path, left, there
+) -> None:
     with Path("/dev/full").open("wb") as device:
-        process = start(desk, *LOOP, "--json", "-", stdout=device)
+        process = start(desk, *LOOP, "--json", json_path, stdout=device)
         err = process.communicate()[1].decode()
     assert process.returncode == 2
-    assert err.startswith("px4fuse: standard output: cannot be written (No space left on device)")
+    said = "px4fuse: standard output: cannot be written (No space left on device)"
+    assert err.startswith(f"{said}{left}")
     assert len(err.splitlines()) == 1
-    assert names(desk) == ["l.ulg", "s.tum"]
-
-
-@full
-def test_a_summary_that_cannot_be_printed_says_what_is_written(desk) -> None:
-    with Path("/dev/full").open("wb") as device:
-        process = start(desk, *LOOP, "--json", "c.json", stdout=device)
-        err = process.communicate()[1].decode()
-    assert process.returncode == 2
-    assert err == (
-        "px4fuse: standard output: cannot be written (No space left on device), c.tum, c.json "
-        "written before.\n"
-    )
-    assert names(desk) == ["c.json", "c.tum", "l.ulg", "s.tum"]
+    assert names(desk) == [*there, "l.ulg", "s.tum"]
 
 
 def test_a_reader_of_the_results_that_leaves_is_no_reason_to_keep_the_files(desk) -> None:

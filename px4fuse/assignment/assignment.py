@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import secrets
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 from px4fuse.answers import form_name, form_text
@@ -47,15 +47,6 @@ def fly(
     )
 
 
-@dataclass(frozen=True)
-class Assigned:
-    """What :func:`assign` did: the key, and how many logs it wrote or found as they should be."""
-
-    key: AnswerKey
-    written: int
-    kept: int
-
-
 def key_path(folder: Path, given: Path | None) -> Path:
     """Where the answer key goes: beside the students' folder, never into it.
 
@@ -88,7 +79,7 @@ def assign(
     count: int | None = None,
     truth: bool = True,
     step: Callable[[int, int], None] = lambda done, of: None,
-) -> Assigned:
+) -> tuple[AnswerKey, int]:
     """Write everyone's log and form into a folder, and the answer key.
 
     Each student's log, form and answer are put in their places together, so that a run that is
@@ -105,6 +96,12 @@ def assign(
         Whether logs of an aisle hold the truth.
     step : callable
         Told after every flight how many are made, and of how many.
+
+    Returns
+    -------
+    AnswerKey
+    int
+        How many logs were written; the others were there, as they should be.
 
     Raises
     ------
@@ -139,7 +136,7 @@ def assign(
         key_file.chmod(0o600)
         written += folder / student.file in new
         step(done, len(students))
-    return Assigned(key, written, len(students) - written)
+    return key, written
 
 
 def preview(

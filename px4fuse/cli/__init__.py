@@ -16,24 +16,24 @@ from px4fuse.errors import OutputError, Px4FuseError, on_one_line
 from px4fuse.threads import ONE_THREAD
 from px4fuse.writing import STOPPING
 
-# Command name to module and one-line help: --help must not import what the commands need.
+# Commands, each in a module of its name, and their help: --help must not import what they need
 COMMANDS = {
-    "compare": ("px4fuse.cli.compare", "Compare a flight's EKF2 with a two-state Kalman filter."),
-    "batch": ("px4fuse.cli.batch", "Compare many logs, on this computer or a cluster."),
-    "diff": ("px4fuse.cli.diff", "Say what changed between two flights or two settings."),
-    "answers": ("px4fuse.cli.answers", "Write the form about a flight, to be filled in."),
-    "explore": ("px4fuse.cli.explore", "Turn the filter's knobs on a flight, in a web page."),
-    "info": ("px4fuse.cli.info", "Say what is in a log and what can be done with it."),
-    "extract": ("px4fuse.cli.extract", "Write a log's data as tidy tables, CSV or Parquet."),
-    "tune": ("px4fuse.cli.tune", "Find the noises that the data ask for, with intervals."),
-    "sync": ("px4fuse.cli.sync", "Estimate the position source's clock offset."),
-    "whatif": ("px4fuse.cli.whatif", "Say what EKF2 would have done with other parameters."),
-    "loop": ("px4fuse.cli.loop", "Measure and correct the closure error of a loop."),
-    "evaluate": ("px4fuse.cli.evaluate", "Score a trajectory: ATE and RPE against a reference."),
-    "simulate": ("px4fuse.cli.simulate", "Simulate a flight with chosen mistakes, as ULog."),
-    "verify": ("px4fuse.cli.verify", "Check a report against its log, number by number."),
-    "grade": ("px4fuse.cli.grade", "Verify and score a class's reports."),
-    "lesson": ("px4fuse.cli.lesson", "Run the lesson's worked examples through this engine."),
+    "compare": "Compare a flight's EKF2 with a two-state Kalman filter.",
+    "batch": "Compare many logs, on this computer or a cluster.",
+    "diff": "Say what changed between two flights or two settings.",
+    "answers": "Write the form about a flight, to be filled in.",
+    "explore": "Turn the filter's knobs on a flight, in a web page.",
+    "info": "Say what is in a log and what can be done with it.",
+    "extract": "Write a log's data as tidy tables, CSV or Parquet.",
+    "tune": "Find the noises that the data ask for, with intervals.",
+    "sync": "Estimate the position source's clock offset.",
+    "whatif": "Say what EKF2 would have done with other parameters.",
+    "loop": "Measure and correct the closure error of a loop.",
+    "evaluate": "Score a trajectory: ATE and RPE against a reference.",
+    "simulate": "Simulate a flight with chosen mistakes, as ULog.",
+    "verify": "Check a report against its log, number by number.",
+    "grade": "Verify and score a class's reports.",
+    "lesson": "Run the lesson's worked examples through this engine.",
 }
 
 
@@ -50,7 +50,7 @@ class LazyGroup(click.Group):
         del ctx
         if cmd_name not in COMMANDS:
             return None
-        module = importlib.import_module(COMMANDS[cmd_name][0])
+        module = importlib.import_module(f"px4fuse.cli.{cmd_name}")
         command: click.Command = getattr(module, cmd_name)
         return command
 
@@ -93,7 +93,7 @@ class LazyGroup(click.Group):
         """List the commands from the table above, without importing them."""
         del ctx
         with formatter.section("Commands"):
-            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+            formatter.write_dl(list(COMMANDS.items()))
 
 
 @click.group(

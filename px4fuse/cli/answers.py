@@ -8,8 +8,7 @@ from pathlib import Path
 import click
 
 from px4fuse.cli.inputs import Named, path_option
-from px4fuse.cli.outputs import write_outputs
-from px4fuse.errors import OutputError
+from px4fuse.cli.outputs import write_new
 
 
 @click.command()
@@ -26,9 +25,5 @@ def answers(log: Path, output: Path | None) -> None:
     from px4fuse.reading import read_log_bytes
 
     target = output or log.with_name(form_name(log.name))
-    if target.exists():
-        raise OutputError(f"{target}: exists already; it was not overwritten. Give another -o.")
-    write_outputs(
-        {target: form_text(log.name, hashlib.sha256(read_log_bytes(log)).hexdigest()).encode()}
-    )
-    click.echo(f"Wrote    {target}")
+    sha256 = hashlib.sha256(read_log_bytes(log)).hexdigest()
+    write_new(target, form_text(log.name, sha256).encode())

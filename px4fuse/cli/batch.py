@@ -17,8 +17,8 @@ from px4fuse.cli.inputs import path_option, settings_options
 from px4fuse.cli.outputs import (
     Interrupted,
     ShowStep,
+    check_targets,
     progress,
-    spare_inputs,
     terminal,
     write_outputs,
 )
@@ -108,7 +108,7 @@ def batch(
             "--workers and --memory are of a cluster that px4fuse starts; with --scheduler they "
             "are given to dask worker."
         )
-    spare_inputs([] if junit_path is None else [junit_path])  # before the work, not after it
+    check_targets([] if junit_path is None else [junit_path])  # before the work, not after it
     if fail_on == WORSE and baseline is None:
         raise SettingsError("--fail-on worse requires --baseline: worse than what?")
     from px4fuse.fleet.junit import junit

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -16,14 +16,13 @@ from px4fuse.cli.inputs import (
     read_person,
     report_options,
 )
-from px4fuse.cli.outputs import (
-    default_report,
-    progress,
-    report_paths,
-    terminal,
-    write_outputs,
-)
+from px4fuse.cli.outputs import finish, free_report, progress, report_paths, result_files
+from px4fuse.request import command_line, settings_name
 from px4fuse.writing import STANDARD_OUTPUT
+
+if TYPE_CHECKING:
+    from px4fuse.request import ComparisonRequest
+    from px4fuse.results.contract import ComparisonResults
 
 STEPS = (
     "reading", "filtering", "tuning", "clock offset", "changes of the clock", "replaying EKF2",
@@ -58,34 +57,36 @@ def compare(
     from px4fuse.analysis import run
     from px4fuse.findings import find
     from px4fuse.report.document import Document
-    from px4fuse.report.pdf import render
-    from px4fuse.request import command_line
+    from px4fuse.report.terminal import print_summary
     from px4fuse.results.build import results
-    from px4fuse.results.contract import to_json
 
     person = read_person(given)
     request = comparison_request(log, given)
     alone = json_path == STANDARD_OUTPUT
     report_paths(output or Path("reports/LOG.pdf"), json_path)  # before the work, not after it
-    contents: dict[Path, bytes] = {}
-    target = None
     with progress(alone, STEPS) as step:
         analysis = run(request, step)
         document = Document(analysis, find(analysis), person, command_line(request))
         found = results(request, analysis, document.findings, person, document.command)
-        text = to_json(found)
-        if output is not None or not alone:
-            step("drawing the report")
-            target, beside = report_paths(output or default_report(request, found), json_path)
-            contents |= {target: render(document, text), beside: text.encode()}
-    if alone:
-        contents[STANDARD_OUTPUT] = text.encode()
-    write_outputs(contents)
-    if not alone:
-        from px4fuse.report.terminal import print_summary
-
-        print_summary(terminal(), document, request, target)
+        if output is None and not alone:
+            output = default_report(request, found)
+        contents = result_files(found, json_path, output, document, step)
+    finish(contents, lambda console: print_summary(console, document, request, output))
     if fail_on is not None:
         worst = SEVERITIES[: SEVERITIES.index(fail_on) + 1]
         if any(one.severity in worst and one.caused_by is None for one in document.findings):
             sys.exit(1)
+
+
+def default_report(request: ComparisonRequest, results: ComparisonResults) -> Path:
+    """Where a report goes that was given no name: that of the same flight, settings and student."""
+    return free_report(Path(request.log).stem, settings_name(request), results, _same)
+
+
+def _same(old: ComparisonResults, mine: ComparisonResults) -> bool:
+    first, second = (
+        (one.request, one.log.sha256, [file.sha256 for file in one.log.joined])
+        for one in (old, mine)
+    )
+    names = [(one.student.name, one.student.id) for one in (old, mine)]
+    return first == second and names[0] in (("", ""), names[1])

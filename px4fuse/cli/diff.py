@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from px4fuse.cli.inputs import Named, max_size_option, path_option, results_option
-from px4fuse.cli.outputs import free_report, progress, report_paths, terminal, write_outputs
+from px4fuse.cli.outputs import finish, free_report, progress, report_paths, result_files
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
@@ -20,8 +19,6 @@ STEPS = (
     "reading", "filtering", "tuning", "clock offset", "replaying EKF2", "heading",
     "looking for a loop", "comparing", "drawing",
 )  # fmt: skip
-# Of each of the two names in the default name of the report: with both it stays below 255
-MAX_NAME_BYTES = 90
 
 
 @click.command()
@@ -50,41 +47,24 @@ def diff(
     from px4fuse.fleet.changes import diff as compared
     from px4fuse.report.changes_terminal import print_changes
     from px4fuse.report.document import ChangesDocument
-    from px4fuse.results.contract import to_json
 
     alone = json_path == STANDARD_OUTPUT
     report_paths(output or Path("reports/LOG.pdf"), json_path)  # before the work, not after it
-    contents: dict[Path, bytes] = {}
-    target = None
     with progress(alone, STEPS) as step:
         found = compared(a, b, progress=step)
-        text = to_json(found.results)
-        if output is not None or not alone:
-            from px4fuse.report.pdf import render
-
-            step("drawing the report")
-            target, beside = report_paths(output or _default(a, b, found.results), json_path)
-            document = ChangesDocument(found.results, found.a.analysis, found.b.analysis)
-            contents |= {target: render(document, text), beside: text.encode()}
-    if alone:
-        contents[STANDARD_OUTPUT] = text.encode()
-    write_outputs(contents)
-    if not alone:
-        print_changes(terminal(), found.results, target)
+        results = found.results
+        if output is None and not alone:
+            output = free_report(f"{a.stem}_to_{b.stem}", "", results, _same)
+        document = ChangesDocument(results, found.a.analysis, found.b.analysis)
+        contents = result_files(results, json_path, output, document, step)
+    finish(contents, lambda console: print_changes(console, results, output))
     if fail_on is not None and found.is_worse:
         sys.exit(1)
 
 
-def _default(a: Path, b: Path, mine: ChangeResults) -> Path:
-    """Where a report goes that was given no name: an earlier one of the same two is replaced."""
-    from px4fuse.results.contract import ChangeResults, Results
-
-    def is_same(old: Results) -> bool:
-        return isinstance(old, ChangeResults) and [
-            (side.given, side.log_sha256) for side in (old.a, old.b)
-        ] == [(side.given, side.log_sha256) for side in (mine.a, mine.b)]
-
+def _same(old: ChangeResults, mine: ChangeResults) -> bool:
+    """Whether an earlier report is of the same two."""
     first, second = (
-        os.fsencode(path.stem)[:MAX_NAME_BYTES].decode(errors="ignore") for path in (a, b)
+        [(side.given, side.log_sha256) for side in (one.a, one.b)] for one in (old, mine)
     )
-    return free_report(f"{first}_to_{second}", "", is_same)
+    return first == second

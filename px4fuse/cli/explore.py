@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from px4fuse.cli.inputs import Named, analysis_options, comparison_request, path_option
-from px4fuse.cli.outputs import progress, spare_inputs, terminal, write_outputs
+from px4fuse.cli.outputs import check_targets, finish, progress
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.request import settings_name
 from px4fuse.writing import STANDARD_OUTPUT
@@ -44,7 +44,7 @@ def explore(logs: tuple[Path, ...], output: Path | None, show: bool, **given: An
     requests = [comparison_request(log, dict(given)) for log in logs]
     stems = "_".join(log.stem for log in logs)
     target = output or Path("reports", f"{stems}{settings_name(requests[0])}.html")
-    spare_inputs([target])  # before the work, not after it
+    check_targets([target])  # before the work, not after it
     with progress(target == STANDARD_OUTPUT, STEPS) as step:
         found = []
         for request in requests:
@@ -55,13 +55,8 @@ def explore(logs: tuple[Path, ...], output: Path | None, show: bool, **given: An
         from px4fuse.explore.page import html_text
 
         content = html_text(found).encode()
-    write_outputs({target: content})
-    if target == STANDARD_OUTPUT:
-        return
-    from px4fuse.report.screen import print_file
-
-    print_file(terminal(), "Page", target)
-    if show:
+    finish({target: content}, lambda _: None)
+    if show and target != STANDARD_OUTPUT:
         import webbrowser
 
         webbrowser.open(target.resolve().as_uri())

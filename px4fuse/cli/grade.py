@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from px4fuse.cli.inputs import Named, max_size_option, path_option
-from px4fuse.cli.outputs import Interrupted, progress, terminal, write_outputs
+from px4fuse.cli.outputs import Interrupted, progress, terminal, write_new
 from px4fuse.errors import OutputError, SettingsError
 
 if TYPE_CHECKING:
@@ -91,19 +91,12 @@ def grade(
     rubric: Path | None,
     key: Path | None,
     output: Path | None,
-    title: str,
-    roster: Path | None,
-    attempt: Literal["latest", "best", "first"],
     due: str | None,
     late: str | None,
-    include_pending: bool,
-    worksheet: tuple[Path, ...],
-    column: str | None,
-    anonymous: bool,
-    jobs: int | None,
     write_rubric: Path | None,
     write_autograder: Path | None,
     gradescope: Path | None,
+    **given: Any,
 ) -> None:
     """Verify and score reports: PDFs, folders of them, and zip files of learning platforms.
 
@@ -121,7 +114,7 @@ def grade(
     from px4fuse.grading.rubric import read_rubric, rubric_text
 
     if write_rubric is not None:
-        _write_new(write_rubric, rubric_text().encode())
+        write_new(write_rubric, rubric_text().encode())
         return
     rule = late_rule(late) if late else None
     if gradescope is not None:
@@ -132,7 +125,7 @@ def grade(
     if write_autograder is not None:
         from px4fuse.grading.gradescope import autograder_zip
 
-        _write_new(write_autograder, autograder_zip(logs, rubric, key, rule))
+        write_new(write_autograder, autograder_zip(logs, rubric, key, rule))
         return
     if rule is not None and due is None:
         raise SettingsError("--late: say with --due when it was due.")
@@ -148,14 +141,14 @@ def grade(
         answers = read_key(key)
     chosen = read_rubric(rubric)
     course = Course(
-        None if roster is None else read_people(roster),
-        tuple(map(read_sheet, worksheet)),
-        column or "",
-        attempt,
-        due_time(due) if due else None,
-        rule,
-        include_pending,
-        anonymous,
+        roster=None if given["roster"] is None else read_people(given["roster"]),
+        worksheets=tuple(map(read_sheet, given["worksheet"])),
+        column=given["column"] or "",
+        attempt=given["attempt"],
+        due=due_time(due) if due else None,
+        late=rule,
+        include_pending=given["include_pending"],
+        anonymous=given["anonymous"],
     )
     try:
         with progress() as step:
@@ -166,8 +159,8 @@ def grade(
                 output,
                 key=answers,
                 course=course,
-                title=title,
-                processes=jobs,
+                title=given["title"],
+                processes=given["jobs"],
                 progress=partial(step, "grading"),
             )
     except KeyboardInterrupt as stopped:
@@ -193,51 +186,41 @@ def _check_places(output: Path, given: tuple[Path, ...]) -> None:
             )
 
 
-def _write_new(path: Path, content: bytes) -> None:
-    if path.exists():
-        raise OutputError(f"{path}: exists already; it was not overwritten.")
-    write_outputs({path: content})
-    click.echo(f"Wrote    {path}")
-
-
 def _print(outcome: GradeOutcome) -> None:
     from collections import Counter
 
-    from rich.text import Text
-
-    from px4fuse.report.screen import plain_table, print_file, say
+    from px4fuse.report.page import Page
+    from px4fuse.report.screen import print_file, show
+    from px4fuse.report.style import GOOD, MUTED, SEVERITY_COLOURS
     from px4fuse.results.reading import one_line
 
-    console = terminal()
-    table = plain_table(
-        ("student", "left"), ("submission", "left"), ("status", "left"), ("points", "right"),
-        ("flags", "right"),
-    )  # fmt: skip
+    page, rows = Page(), []
     for entry in outcome.entries:
         one = entry.counting
         status = one.status if one else "missing"
         if one and entry.total is None:
             status += ", pending"
-        style = "green" if status == "verified" else "yellow"
         total = "–" if entry.total is None else f"{entry.total:g}"
-        flags = len(entry.flags)
-        table.add_row(
-            Text(one_line(entry.student or entry.student_id, 60)),
-            Text(one.submission if one else ""),
-            Text(status, style),
-            f"{total} / {entry.of:g}",
-            f"{flags}" if flags else "",
+        rows.append(
+            (
+                one_line(entry.student or entry.student_id, 60),
+                one.submission if one else "",
+                (status, GOOD if status == "verified" else SEVERITY_COLOURS["warning"]),
+                f"{total} / {entry.of:g}",
+                f"{len(entry.flags) or ''}",
+            )
         )
-    console.print(table)
+    page.table(("student", "submission", "status", "points", "flags"), rows, right=(3, 4))
     counts = Counter(one.status for one in outcome.graded)
     said = ", ".join(f"{count} {status}" for status, count in counts.most_common())
     missing = sum(entry.counting is None for entry in outcome.entries)
-    say(
-        console,
+    page.write(
         f"{len(outcome.graded)} submissions: {said or 'none'}; {missing} of "
-        f"{len(outcome.entries)} students handed in nothing; {outcome.reused} as verified before",
+        f"{len(outcome.entries)} students handed in nothing; {outcome.reused} as verified before"
     )
     for note in outcome.notes:
-        say(console, Text(note, "dim"))
+        page.write(note, colour=MUTED)
+    console = terminal()
+    show(console, page.blocks)
     for path in outcome.written:
         print_file(console, "Wrote", path)

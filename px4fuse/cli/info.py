@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from px4fuse.cli.inputs import Named, comparison_request, json_option, recording_options
-from px4fuse.cli.outputs import progress, terminal, write_json
+from px4fuse.cli.outputs import finish, progress, result_files
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.table import Table
 
     from px4fuse.inspect.inventory import Inventory, Source
+    from px4fuse.report.page import Cell
     from px4fuse.request import ComparisonRequest
 
 # No clock drifts by more: the recording was replayed at another speed
 REPLAY_PPM = 10_000.0
+SOURCES_HEAD = ("", "source", "samples", "Hz", "gaps", "span (s)")
 
 
 @click.command()
@@ -36,48 +38,40 @@ def info(log: Path, json_path: Path | None, **given: Any) -> None:
         flight = read_flight(request, step)
         step("looking at what is in it")
         inventory = take_inventory(flight)
-    if write_json(to_plain(inventory), json_path):
-        return
-    _print(terminal(), inventory, request)
+    contents = result_files(to_plain(inventory), json_path)
+    finish(contents, lambda console: _print(console, inventory, request))
 
 
 def _print(console: Console, inventory: Inventory, request: ComparisonRequest) -> None:
-    from rich.text import Text
-
-    from px4fuse.report.screen import print_command, print_list
+    from px4fuse.report.page import Page
+    from px4fuse.report.screen import print_command, show
+    from px4fuse.report.style import GOOD, SEVERITY_COLOURS
     from px4fuse.request import command_line
 
-    log = inventory.log
-    console.print(log.name, style="bold", markup=False)
-    _list(console, "", _facts(inventory))
-    if log.senders:
-        console.print()
-        console.print(_senders(inventory))
-    console.print()
-    console.print(_sources(inventory))
-    _list(console, "Clocks", _clocks(inventory))
-    console.print()
-    console.print("What px4fuse can do with it", style="bold")
-    print_list(
-        console,
-        (
-            (Text(*(("yes", "green") if a.possible else ("no", "yellow"))), a.name, a.reason)
-            for a in inventory.abilities
-        ),
-    )
+    page = Page()
+    page.write(inventory.log.name, bold=True)
+    for label, text in _facts(inventory):
+        page.labelled(label, text)
+    if inventory.log.senders:
+        page.table(("sender", "what it is", "messages", "lost"), _senders(inventory), right=(2, 3))
+    page.table(SOURCES_HEAD, list(_sources(inventory)), right=(2, 3, 4, 5))
+    looks = {True: ("yes", GOOD), False: ("no", SEVERITY_COLOURS["warning"])}
+    rows = [(looks[can.possible], can.name, can.reason) for can in inventory.abilities]
+    page.table(("", "", "What px4fuse can do with it"), rows)
+    show(console, page.blocks)
     if next(ability.possible for ability in inventory.abilities if ability.name == "compare"):
         print_command(console, command_line(request, "compare", typed=True), "Compare")
-    _list(
-        console,
-        "Next time",
-        [
-            (f"{number}.", f"{advice.remedy} ({', '.join(advice.improves)})")
-            for number, advice in enumerate(inventory.advice, start=1)
-        ],
-    )
-    unused = [(part.name, f"{part.count} messages: {part.reason}") for part in inventory.unused]
-    _list(console, "Not used", unused)
-    _list(console, "Notes", [("-", note) for note in inventory.notes])
+    lists = {
+        "Next": [f"{one.remedy} ({'; '.join(one.improves)})" for one in inventory.advice],
+        "Clocks": _clocks(inventory),
+        "Not used": [f"{one.name}, {one.count} messages: {one.reason}" for one in inventory.unused],
+        "Notes": inventory.notes,
+    }
+    page = Page()
+    for label, texts in lists.items():
+        if texts:
+            page.labelled(label, *texts)
+    show(console, page.blocks)
 
 
 def _facts(inventory: Inventory) -> list[tuple[str, str]]:
@@ -90,7 +84,7 @@ def _facts(inventory: Inventory) -> list[tuple[str, str]]:
         ("Log", f"{log.format}, {size}, SHA-256 {log.sha256[:12]}"),
         ("Vehicle", f"{version}{git}, {hardware}"),
         ("Data", f"{_duration(log.duration_s)}, {_start(inventory)}"),
-        ("In flight", _flying(inventory)),
+        ("Flying", _flying(inventory)),
     ]
     if log.dropouts:
         lost_s = sum(dropout.duration_s for dropout in log.dropouts)
@@ -98,7 +92,10 @@ def _facts(inventory: Inventory) -> list[tuple[str, str]]:
         count = len(log.dropouts)
         words = f"{count} of the logger, {lost_s:.2f} s in all, the longest {longest_s:.2f} s"
         facts.append(("Dropouts", words))
-    facts += [(file.role, f"{file.name}, SHA-256 {file.sha256[:12]}") for file in inventory.inputs]
+    facts += [
+        (file.role.capitalize(), f"{file.name}, SHA-256 {file.sha256[:12]}")
+        for file in inventory.inputs
+    ]
     return facts
 
 
@@ -123,47 +120,36 @@ def _flying(inventory: Inventory) -> str:
     return ", ".join(spans[:most]) + more
 
 
-def _senders(inventory: Inventory) -> Table:
-    from px4fuse.report.screen import plain_table
-
-    table = plain_table(
-        ("sender", "left"), ("what it is", "left"), ("messages", "right"), ("lost", "right")
-    )
-    for sender in inventory.log.senders:
-        table.add_row(
+def _senders(inventory: Inventory) -> list[tuple[str, ...]]:
+    return [
+        (
             f"{sender.system}/{sender.component}",
             sender.description + (" (this flight)" if sender.chosen else ""),
             f"{sender.messages}",
             "unknown" if sender.lost_share is None else f"{sender.lost_share:.1%}",
         )
-    return table
+        for sender in inventory.log.senders
+    ]
 
 
-def _sources(inventory: Inventory) -> Table:
-    from rich.text import Text
+def _sources(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
+    from px4fuse.report.style import MUTED
 
-    from px4fuse.report.screen import plain_table
-
-    table = plain_table(
-        ("", "left"), ("source", "left"), ("samples", "right"), ("Hz", "right"),
-        ("gaps", "right"), ("span (s)", "right"),
-    )  # fmt: skip
     previous = ""
     for source in inventory.sources:
         part = source.part if source.part != previous else ""
         previous = source.part
         if source.unavailable:
-            table.add_row(part, Text("none", "dim"))  # why not stands below
+            yield part, ("none", MUTED), "", "", "", ""  # why not stands below
             continue
-        table.add_row(
+        yield (
             f"{part:9}->" if source.chosen else part,
-            Text(source.name, "bold" if source.chosen else ""),
+            source.name,
             "" if source.samples is None else f"{source.samples}",
             "" if source.rate_hz is None else _short(source.rate_hz),
             _gaps(source),
             _span(source),
         )
-    return table
 
 
 def _gaps(source: Source) -> str:
@@ -188,21 +174,20 @@ def _span(source: Source) -> str:
     return f"{start:.{digits}f}..{end:.{digits}f}"
 
 
-def _clocks(inventory: Inventory) -> list[tuple[str, str]]:
+def _clocks(inventory: Inventory) -> list[str]:
     on: dict[str, dict[str, None]] = {}
     for source in inventory.sources:
         if source.clock:
             name = source.name if source.part == "position" else source.part
             on.setdefault(source.clock, {})[name] = None
-    lines = [("-", f"{clock}: {', '.join(parts)}") for clock, parts in on.items()]
+    lines = [f"{clock}: {', '.join(parts)}" for clock, parts in on.items()]
     for clock in inventory.clocks:
         note = f"; {clock.note}" if clock.note else ""
-        words = (
+        lines.append(
             f"{clock.clock}, mapped by {clock.method} ({clock.pairs} pairs): offset "
             f"{clock.offset_s:.4f} s, {_speed(clock.drift_ppm)}, jitter "
             f"{clock.jitter_s * 1e3:.1f} ms{note}"
         )
-        lines.append(("-", words))
     return lines
 
 
@@ -211,15 +196,3 @@ def _speed(drift_ppm: float) -> str:
     if abs(drift_ppm) < REPLAY_PPM:
         return f"drift {drift_ppm:+.1f} ppm"
     return f"{1.0 + drift_ppm * 1e-6:.3g} times its speed"
-
-
-def _list(console: Console, title: str, lines: list[tuple[str, str]]) -> None:
-    """A titled list with hanging indents; nothing where there is nothing to say."""
-    from px4fuse.report.screen import print_list
-
-    if not lines:
-        return
-    if title:
-        console.print()
-        console.print(title, style="bold")
-    print_list(console, lines)

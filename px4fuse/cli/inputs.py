@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import click
+from click.core import ParameterSource
 from msgspec import NODEFAULT, Struct
 from msgspec.structs import fields
 
@@ -31,16 +32,9 @@ if TYPE_CHECKING:
     from px4fuse.results.model import Student
 
 
-class ColumnNames(click.ParamType["tuple[str, ...]"]):
-    """Names or numbers of columns, with commas between them."""
-
-    name = "columns"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, ...]:
-        """Convert what was typed."""
-        return tuple(value.split(",")) if isinstance(value, str) else value
+def column_names(text: str) -> tuple[str, ...]:
+    """Read names or numbers of columns, with commas between them."""
+    return tuple(text.split(","))
 
 
 Option = Callable[[Callable[..., None]], Callable[..., None]]
@@ -57,19 +51,11 @@ def _together(*options: Option) -> Option:
     return add
 
 
-class AnyCase(click.Choice[str]):
-    """One of some words, in any case, given as the field writes it."""
-
-    def normalize_choice(self, choice: Any, ctx: click.Context | None) -> str:
-        """Compare in small letters."""
-        return str(choice).lower()
-
-
 class Named(click.Path):
     """A file or folder; an empty name, which would be the current folder, is a slip."""
 
-    def __init__(self) -> None:
-        super().__init__(path_type=Path)
+    def __init__(self, path_type: type[Path | str] = Path) -> None:
+        super().__init__(path_type=path_type)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Convert what was typed."""
@@ -104,7 +90,7 @@ def _option(field: str, declared: Declared, hint: Any, default: Any) -> Option:
     if default is not NODEFAULT:
         details["default"] = default or None
     if field in ("path", "mavlink", "reference"):
-        details["type"] = Named()
+        details["type"] = Named(str)
     elif declared.unit:
         details["type"] = TypedQuantity(declared.unit, declared.example, auto=len(parts) > 2)
     elif inner is bool:
@@ -113,10 +99,10 @@ def _option(field: str, declared: Declared, hint: Any, default: Any) -> Option:
         details["type"] = click.IntRange(0, 255)
     elif get_origin(inner) is tuple:
         choices = get_args(get_args(inner)[0])
-        details["type"] = click.Choice(choices) if choices else ColumnNames()
+        details["type"] = click.Choice(choices) if choices else column_names
         details["multiple"] = bool(choices)
     elif get_origin(inner) is Literal:
-        details["type"] = AnyCase(get_args(inner))
+        details["type"] = click.Choice(get_args(inner), case_sensitive=False)
     return click.option(declared.name, name, **details)
 
 
@@ -199,25 +185,26 @@ def comparison_request(log: Path, given: dict[str, Any]) -> ComparisonRequest:
     SettingsError
         An option is about a position file, and none is given.
     """
-    return ComparisonRequest(
-        log=str(log), mavlink=text_of(given.pop("mavlink")), position=_position(given), **given
-    )
+    return ComparisonRequest(log=str(log), position=_position(given), **given)
 
 
 def _position(given: dict[str, Any]) -> PositionFile | None:
     typed = {field: option.name for field, option in POSITION_OPTIONS.items()}
     how = {field: given.pop(name[2:].replace("-", "_")) for field, name in typed.items()}
     if how["path"] is not None:
-        return PositionFile(**how | {"path": str(how["path"])})
+        return PositionFile(**how)
     for field, value in how.items():
         if value is not None:
             raise SettingsError(f"{typed[field]} requires --position.")
     return None
 
 
-def text_of(path: Path | None) -> str | None:
-    """A path as a request has it."""
-    return None if path is None else str(path)
+def typed_parameters() -> Iterator[click.Parameter]:
+    """What was typed of the running command, and not left at its default."""
+    context = click.get_current_context()
+    for parameter in context.command.params:
+        if context.get_parameter_source(parameter.name or "") == ParameterSource.COMMANDLINE:
+            yield parameter
 
 
 def read_person(given: dict[str, Any]) -> Student:
@@ -231,10 +218,12 @@ def read_person(given: dict[str, Any]) -> Student:
     from msgspec import UNSET
 
     from px4fuse.answers import read_answers
-    from px4fuse.results.model import Student
+    from px4fuse.results.model import MAX_NOTES_BYTES, Student
 
     name, number = given.pop("student") or "", given.pop("student_id") or ""
-    notes, form = _read_notes(given.pop("notes")), given.pop("answers")
+    path, form, notes = given.pop("notes"), given.pop("answers"), ""
+    if path is not None:
+        notes = read_text(path, SettingsError, MAX_NOTES_BYTES, name=f"--notes {path}")
     answers = UNSET if form is None else read_answers(form)
     person = Student(encodable(name), encodable(number), notes, answers)
     _tell_fonts(person.name + person.id + person.notes)
@@ -249,14 +238,6 @@ def _tell_fonts(text: str) -> None:
 
     if lacking := missing(text):
         click.echo(f"px4fuse: {advice(lacking)}", err=True)
-
-
-def _read_notes(path: Path | None) -> str:
-    from px4fuse.results.model import MAX_NOTES_BYTES
-
-    if path is None:
-        return ""
-    return read_text(path, SettingsError, MAX_NOTES_BYTES, name=f"--notes {path}")
 
 
 def encodable(text: str) -> str:

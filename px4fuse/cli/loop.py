@@ -6,18 +6,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from click.core import ParameterSource
 
 from px4fuse.cli.inputs import (
     Named,
+    json_option,
     max_size_option,
     path_option,
     person_options,
     read_person,
     request_options,
-    text_of,
+    typed_parameters,
 )
-from px4fuse.cli.outputs import finish, progress, report_paths, spare_inputs
+from px4fuse.cli.outputs import check_targets, finish, progress, report_paths, result_files
 from px4fuse.errors import SettingsError
 from px4fuse.reading import shown
 from px4fuse.request import LOOP_OPTIONS, Landing, LoopRequest, command_line
@@ -36,31 +36,22 @@ MAX_LANDED_AT = 10_000.0
 FOR_GRAPHS = ("source", "json_path", "g2o", "robust")
 
 
-class LandingType(click.ParamType[Landing]):
-    """``FORWARD,RIGHT`` or ``FORWARD,RIGHT,DEG``."""
-
-    name = "landing"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> Landing:
-        """Convert what was typed."""
-        if isinstance(value, Landing):
-            return value
-        try:
-            numbers = [float(part) for part in value.split(",")]
-        except ValueError:
-            numbers = []
-        if len(numbers) not in (2, 3) or not all(abs(n) <= MAX_LANDED_AT for n in numbers):
-            self.fail(f"{value!r} is not FORWARD,RIGHT in m, or FORWARD,RIGHT,DEG.", param, ctx)
-        return Landing(*numbers)
+def landing(text: str) -> Landing:
+    """Read ``FORWARD,RIGHT`` or ``FORWARD,RIGHT,DEG``."""
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (2, 3) or not all(abs(n) <= MAX_LANDED_AT for n in numbers):
+        raise click.BadParameter(f"{text!r} is not FORWARD,RIGHT in m, or FORWARD,RIGHT,DEG.")
+    return Landing(*numbers)
 
 
 @click.command()
 @click.argument("source", type=Named())
 @click.option(
     "--landed-at",
-    type=LandingType(),
+    type=landing,
     metavar="FORWARD,RIGHT[,DEG]",
     help="Where it really landed, by tape from the place of take-off: m along its nose there, m to "
     "the right, and degrees it was turned clockwise.  [default: the log's ground truth, else 0,0]",
@@ -80,7 +71,7 @@ class LandingType(click.ParamType[Landing]):
 @max_size_option
 @person_options
 @path_option("-o", "--output", metavar="FILE.pdf", help="A report, and its results beside it.")
-@path_option("--json", "json_path", metavar="FILE", help="The results; - prints them alone.")
+@json_option
 @path_option(
     "--tum", metavar="FILE", help="Write the corrected path as a TUM file, in the axes of SOURCE."
 )
@@ -104,7 +95,6 @@ def loop(
     from px4fuse.report.document import LoopDocument
     from px4fuse.report.loop import print_loop
     from px4fuse.results.build_trajectories import loop_results
-    from px4fuse.results.contract import to_json
 
     person = read_person(given)
     for option, path in (("--tum", tum), ("--g2o", g2o)):
@@ -114,25 +104,16 @@ def loop(
         _solve(source, json_path, g2o, True if given["robust"] else None)
         return
     request = loop_request(source, given)
-    _spare(tum, g2o, *((json_path,) if output is None else report_paths(output, json_path)))
-    alone = json_path == STANDARD_OUTPUT
-    with progress(alone, STEPS) as step:
+    results = (json_path,) if output is None else report_paths(output, json_path)
+    check_targets([tum, g2o, *results])
+    with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
         found = run_loop(request, step)
         findings = find_loop(found)
-        command = command_line(request)
-        results = loop_results(request, found, findings, person, command)
+        document = LoopDocument(found, findings, person, command_line(request))
+        made = loop_results(request, found, findings, person, document.command)
         contents = _files(found, tum, g2o)
-        if output is not None:
-            from px4fuse.report.pdf import render
-
-            step("drawing the report")
-            pdf, beside = report_paths(output, json_path)
-            text = to_json(results)
-            document = LoopDocument(found, findings, person, command)
-            contents |= {pdf: render(document, text), beside: text.encode()}
-    if json_path is not None and (alone or output is None):
-        contents[json_path] = to_json(results).encode()
-    finish(contents, lambda console: print_loop(console, found, findings, request), alone=alone)
+        contents |= result_files(made, json_path, output, document, step)
+    finish(contents, lambda console: print_loop(console, found, findings, request))
 
 
 def loop_request(source: Path, given: dict[str, Any]) -> LoopRequest:
@@ -144,19 +125,10 @@ def loop_request(source: Path, given: dict[str, Any]) -> LoopRequest:
     del given["robust"]
     return LoopRequest(
         source=str(source),
-        reference=text_of(given.pop("reference")),
         closures=closures if file is None else closures + read_closures(file),
         came_back=not given.pop("opened"),
         **given,
     )
-
-
-def _spare(*targets: Path | None) -> None:
-    """Refuse outputs that name the same file, or one that this command reads."""
-    files = [path for path in targets if path not in (None, STANDARD_OUTPUT)]
-    if len({path.resolve() for path in files}) < len(files):
-        raise SettingsError("two outputs name the same file. Give each a name of its own.")
-    spare_inputs(files)
 
 
 def _files(found: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]:
@@ -185,28 +157,22 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
     from px4fuse.readers.g2o import g2o_text, read_g2o
     from px4fuse.report.loop import print_graph
     from px4fuse.results.build_trajectories import graph_results
-    from px4fuse.results.contract import to_json
     from px4fuse.trajectory.graph.analysis import analyse_graph
 
     path, part = split_part(str(source))
     if part is not None:
         raise SettingsError(f"{shown(source)}: a pose graph has no part {part!r}. Leave it out.")
-    context = click.get_current_context()
-    for parameter in context.command.params:
-        chosen = context.get_parameter_source(parameter.name or "") == ParameterSource.COMMANDLINE
-        if chosen and parameter.name not in FOR_GRAPHS:
+    for parameter in typed_parameters():
+        if parameter.name not in FOR_GRAPHS:
             raise SettingsError(
                 f"{shown(source)}: {parameter.opts[-1]} is for flights and trajectories, not for a "
                 "pose graph. With one, give only --g2o FILE and --json FILE."
             )
-    _spare(json_path, g2o)
-    alone = json_path == STANDARD_OUTPUT
-    with progress(alone) as step:
+    check_targets([json_path, g2o])
+    with progress(json_path == STANDARD_OUTPUT) as step:
         step(f"reading {shown(source)}")
         solved = analyse_graph(shown(source), read_g2o(path), step, robust=robust)
     command = command_line(LoopRequest(source=str(source))) + (" --robust" if robust else "")
-    results = graph_results(solved, command)
     contents = {} if g2o is None else {g2o: g2o_text(solved.graph).encode()}
-    if json_path is not None:
-        contents[json_path] = to_json(results).encode()
-    finish(contents, lambda to: print_graph(to, solved), alone=alone)
+    contents |= result_files(graph_results(solved, command), json_path)
+    finish(contents, lambda to: print_graph(to, solved))

@@ -12,18 +12,17 @@ from typing import IO, TYPE_CHECKING, Any, Protocol
 import click
 
 from px4fuse.errors import OutputError, ResultsError
-from px4fuse.request import settings_name
 from px4fuse.writing import STANDARD_OUTPUT, write_all
 
 if TYPE_CHECKING:
     from msgspec import Struct
     from rich.console import Console
 
-    from px4fuse.request import ComparisonRequest
-    from px4fuse.results.contract import ComparisonResults, Results
+    from px4fuse.report.pdf import Report
+    from px4fuse.results.contract import Results
 
-# Of a report that is named by its settings: file systems take 255 bytes
-LONGEST_NAME = 200
+# Of a report with and without the settings in its name: file systems take 255 bytes
+LONGEST_NAME, LONGEST_STEM = 200, 240
 # Columns of a line that no paragraph fills
 UNWRAPPED = 10_000
 # Parameters that name files to read; some name a part of a log after a colon
@@ -63,6 +62,11 @@ class ShowStep(Protocol):
         """Show it."""
 
 
+def silent(what: str, done: int = 0, of: int | None = None) -> None:
+    """Show nothing."""
+    del what, done, of
+
+
 @contextmanager
 def progress(quiet: bool = False, steps: Sequence[str] = ()) -> Iterator[ShowStep]:
     """A bar on a terminal about what is being done and what remains; nothing in a pipe.
@@ -77,29 +81,19 @@ def progress(quiet: bool = False, steps: Sequence[str] = ()) -> Iterator[ShowSte
     """
     from rich.console import Console
 
-    def silent(what: str, done: int = 0, of: int | None = None) -> None:
-        del what, done, of
-
     console = Console(stderr=True)
     if not console.is_terminal or quiet:  # an older rich ends a disabled bar with an empty line
         yield silent
         return
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        SpinnerColumn,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich import progress as bars
 
     columns = (
-        SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(),
-        TextColumn("{task.fields[count]}"), TimeElapsedColumn(),
+        bars.SpinnerColumn(), bars.TextColumn("{task.description}", markup=False), bars.BarColumn(),
+        bars.TextColumn("{task.fields[count]}"), bars.TimeElapsedColumn(),
         # of work that is counted; steps are not equally long
-        *(() if steps else (TextColumn("of which left"), TimeRemainingColumn())),
+        *(() if steps else (bars.TextColumn("of which left"), bars.TimeRemainingColumn())),
     )  # fmt: skip
-    with Progress(*columns, console=console, transient=True) as bar:
+    with bars.Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("starting", total=len(steps) or None, count="")
         at = 0
 
@@ -115,31 +109,19 @@ def progress(quiet: bool = False, steps: Sequence[str] = ()) -> Iterator[ShowSte
         yield show
 
 
-def default_report(request: ComparisonRequest, results: ComparisonResults) -> Path:
+def free_report(stem: str, settings: str, mine: Results, same: Callable[[Any, Any], bool]) -> Path:
     """Where a report goes that was given no name: what is not at its default is in its name.
 
-    What an earlier run of the same wrote is written over. Where another file has the name (of
-    another log or another student, or no report), a number is added.
+    What an earlier run of the ``same`` wrote is written over: results of this kind of which that is
+    true. Where another file has the name, a number is added.
     """
-    from px4fuse.results.contract import ComparisonResults
 
     def is_same(old: Results) -> bool:
-        return (
-            isinstance(old, ComparisonResults)
-            and old.request == results.request
-            and [old.log.sha256, *(file.sha256 for file in old.log.joined)]
-            == [results.log.sha256, *(file.sha256 for file in results.log.joined)]
-            and (old.student.name, old.student.id)
-            in (("", ""), (results.student.name, results.student.id))
-        )
+        return type(old) is type(mine) and same(old, mine)
 
-    return free_report(Path(request.log).stem, settings_name(request), is_same)
-
-
-def free_report(stem: str, settings: str, is_same: Callable[[Results], bool]) -> Path:
-    """A name in ``reports`` that is free, or that of an earlier report of the same."""
     name = f"{stem}{settings}"
-    name = name if len(os.fsencode(name)) <= LONGEST_NAME else stem
+    if len(os.fsencode(name)) > LONGEST_NAME:
+        name = os.fsencode(stem)[:LONGEST_STEM].decode(errors="ignore")
     number, path = 1, Path("reports", f"{name}.pdf")
     while not all(_is_ours(file, is_same) for file in (path, path.with_suffix(".json"))):
         number += 1
@@ -171,24 +153,46 @@ def report_paths(output: Path, json_path: Path | None) -> tuple[Path, Path]:
     Raises
     ------
     OutputError
-        The report is no PDF, both are the same file, or one of them is read by this command.
+        The report is no PDF, or as :func:`check_targets` says.
     """
     if output.suffix.lower() != ".pdf":
         raise OutputError(f"{output}: the report is a PDF. Give a name that ends in .pdf with -o.")
     beside = output.with_suffix(".json") if json_path in (None, STANDARD_OUTPUT) else json_path
-    if beside.resolve() == output.resolve():
-        raise OutputError(f"{beside}: --json and -o name the same file. Give two names.")
-    spare_inputs([output, beside])
+    check_targets([output, beside])
     return output, beside
 
 
-def write_json(results: Struct | dict[str, Any], json_path: Path | None) -> bool:
-    """Write results where --json says; true where they have standard output to themselves."""
+def result_files(
+    results: Struct | dict[str, Any],
+    json_path: Path | None,
+    output: Path | None = None,
+    document: Report | None = None,
+    step: ShowStep = silent,
+) -> dict[Path, bytes]:
+    """Results where --json says, and a document as a PDF that holds them and has them beside it.
+
+    Parameters
+    ----------
+    results : Struct or dict
+    json_path, output : Path or None
+        As given with --json and -o.
+    document : Report, optional
+        What is drawn.
+    step : callable
+        Told what is being done.
+    """
     from px4fuse.results.contract import to_json
 
+    text, contents = to_json(results), dict[Path, bytes]()
+    if output is not None and document is not None:
+        from px4fuse.report.pdf import render
+
+        step("drawing the report")
+        output, beside = report_paths(output, json_path)
+        contents |= {output: render(document, text), beside: text.encode()}
     if json_path is not None:
-        write_outputs({json_path: to_json(results).encode()})
-    return json_path == STANDARD_OUTPUT
+        contents[json_path] = text.encode()
+    return contents
 
 
 def write_outputs(contents: Mapping[Path, bytes]) -> None:
@@ -199,7 +203,7 @@ def write_outputs(contents: Mapping[Path, bytes]) -> None:
     OutputError
         A target is one of the inputs, or cannot be written.
     """
-    spare_inputs(contents)
+    check_targets(contents)
     written: list[Path] = click.get_current_context().meta.setdefault(WRITTEN, [])
     write_all(contents, written.append)
 
@@ -210,20 +214,37 @@ def written_so_far(context: click.Context) -> str:
     return f"{', '.join(map(str, written))} written before." if written else "nothing was written."
 
 
-def spare_inputs(targets: Iterable[Path]) -> None:
-    """Refuse to write over a file that this command reads.
+def write_new(path: Path, content: bytes) -> None:
+    """Write a file that is not there yet, and say so.
 
     Raises
     ------
     OutputError
-        A target is one of the inputs.
+        It is there.
     """
+    if path.exists():
+        raise OutputError(f"{path}: exists already; it was not overwritten. Give another name.")
+    write_outputs({path: content})
+    click.echo(f"Wrote    {path}")
+
+
+def check_targets(targets: Iterable[Path | None]) -> None:
+    """Refuse outputs that name the same file, or one that this command reads.
+
+    Raises
+    ------
+    OutputError
+        Two targets are the same file, or a target is one of the inputs.
+    """
+    files = [target for target in targets if target not in (None, STANDARD_OUTPUT)]
+    if len({file.resolve() for file in files}) < len(files):
+        raise OutputError("two outputs name the same file. Give each a name of its own.")
     params = click.get_current_context().params
     given = [params[name] for name in INPUTS if params.get(name) is not None]
     several = [one if isinstance(one, tuple) else (one,) for one in given]
     paths = [Path(path) for some in several for path in some]  # URLs are texts
     read = [path if path.exists() else Path(str(path).rpartition(":")[0]) for path in paths]
-    for target in targets:
+    for target in files:
         try:
             there = target.exists()
         except OSError as error:  # a name that is too long
@@ -238,16 +259,15 @@ def spare_inputs(targets: Iterable[Path]) -> None:
                 )
 
 
-def finish(contents: Mapping[Path, bytes], show: Callable[[Console], None], *, alone: bool) -> None:
+def finish(contents: Mapping[Path, bytes], show: Callable[[Console], None]) -> None:
     """Write all outputs or none; then tell people what was found and written.
 
-    Nothing is told where the results have standard output ``alone``.
+    Nothing is told where the results have standard output to themselves.
     """
     from px4fuse.report.screen import print_file
 
-    if contents:
-        write_outputs(contents)
-    if not alone:
+    write_outputs(contents)
+    if STANDARD_OUTPUT not in contents:
         console = terminal()
         show(console)
         for path in contents:

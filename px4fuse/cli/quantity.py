@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Any
 
@@ -93,6 +94,8 @@ class TypedQuantity(click.ParamType["float | str"]):
             self.fail(
                 f"{value!r}: give {name}, as {shown}{', or auto' if self.auto else ''}.", param, ctx
             )
+        if not math.isfinite(number):
+            self.fail(f"{value} is not a finite number.", param, ctx)
         if self.between is not None and not self.between[0] <= number <= self.between[1]:
             low, high = self.between
             self.fail(f"{value} is not between {low:g} and {high:g} {name}.", param, ctx)

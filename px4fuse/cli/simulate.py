@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
-from click.core import ParameterSource
 
-from px4fuse.cli.inputs import path_option
-from px4fuse.cli.outputs import progress, terminal, write_outputs
+from px4fuse.cli.inputs import path_option, typed_parameters
+from px4fuse.cli.outputs import check_targets, progress, terminal, write_outputs
 from px4fuse.cli.quantity import TypedQuantity
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.reading import read_text
@@ -21,7 +20,6 @@ from px4fuse.simulation.scenario import KINDS, YAWS, Scenario
 
 if TYPE_CHECKING:
     from px4fuse.assignment.drawing import Kinds
-    from px4fuse.assignment.roster import Person
     from px4fuse.simulation.flights import Simulation
 
 _DEFAULT = Scenario()
@@ -187,18 +185,13 @@ def simulate(
     _check_options(assignment)
     if assignment is not None:
         drawn_from = _read_secret(secret, secret_file), scenario["kind"], count
-        students, key_file = _class(assignment, output, answer_path)
-        if preview:
-            _preview(students, key_file, *drawn_from)
-        else:
-            _assign(students, output, key_file, *drawn_from, not no_truth)
+        _assign(assignment, output, answer_path, *drawn_from, truth=not no_truth, preview=preview)
         return
     if scenario["kind"] == MIXED:
         raise SettingsError(f"--kind {MIXED} requires --assignment ROSTER.csv.")
     if output.suffix.lower() != ".ulg":
         raise OutputError(f"{output}: the log is a ULog. Give a name that ends in .ulg with -o.")
-    if answer_path is not None and answer_path.resolve() == output.resolve():
-        raise OutputError(f"{output}: --answer and -o name the same file. Give two names.")
+    check_targets([output, answer_path])
     parsed = parse(mistakes)
     chosen = Scenario(
         passes=passes if passes is not None else PASSES[scenario["kind"]],
@@ -226,17 +219,13 @@ def simulate(
 
 def _check_options(assignment: Path | None) -> None:
     """Refuse options that do not go together."""
-    context = click.get_current_context()
-    for parameter in context.command.params:
-        name = parameter.name or ""
-        if context.get_parameter_source(name) != ParameterSource.COMMANDLINE:
-            continue
-        if assignment is not None and name not in OF_ASSIGNMENTS:
+    for parameter in typed_parameters():
+        if assignment is not None and parameter.name not in OF_ASSIGNMENTS:
             raise SettingsError(
                 f"{parameter.opts[0]} is for a single flight: --assignment draws it for every "
                 "student. Leave it out."
             )
-        if assignment is None and name in ONLY_ASSIGNMENTS:
+        if assignment is None and parameter.name in ONLY_ASSIGNMENTS:
             raise SettingsError(f"{parameter.opts[0]} requires --assignment ROSTER.csv.")
 
 
@@ -256,88 +245,73 @@ def _read_secret(secret: str | None, file: Path | None) -> bytes | None:
     return secret_of(text, name)
 
 
-def _class(roster: Path, folder: Path, answer_path: Path | None) -> tuple[tuple[Person, ...], Path]:
-    """The students, and where their answer key goes."""
-    from px4fuse.assignment.assignment import key_path
+def _assign(
+    roster: Path,
+    folder: Path,
+    answer_path: Path | None,
+    secret: bytes | None,
+    kind: Kinds,
+    count: int | None,
+    *,
+    truth: bool,
+    preview: bool,
+) -> None:
+    """Write a flight for everyone and the answer key, or only say what would be drawn."""
+    from px4fuse.assignment import assignment
     from px4fuse.assignment.roster import read_roster
+    from px4fuse.report.page import Page
+    from px4fuse.report.screen import show
 
     students = read_roster(roster)
-    key_file = key_path(folder, answer_path)
+    key_file = assignment.key_path(folder, answer_path)
     if key_file.exists() and key_file.samefile(roster):
         raise OutputError(f"{key_file}: is the roster. Give another name with --answer.")
-    return students, key_file
-
-
-def _assign(
-    students: tuple[Person, ...],
-    folder: Path,
-    key_file: Path,
-    secret: bytes | None,
-    kind: Kinds,
-    count: int | None,
-    truth: bool,
-) -> None:
-    """Write a flight for everyone, and the answer key."""
-    from px4fuse.assignment.assignment import assign
-
-    with progress() as step:
-        made = assign(
-            students, folder, key_file, secret, kind, count, truth, partial(step, "simulating")
-        )
-    answers = made.key.answers
-    for line in _class_summary(
-        kind,
-        [answer.mistakes for answer in answers],
-        [answer.difficulty for answer in answers if answer.difficulty is not None],
-    ):
+    drawn: list[tuple[tuple[str, ...], float | None]]
+    if preview:
+        found = assignment.preview(students, key_file, secret, kind, count)
+        drawn = [(one.typed, one.difficulty) for one in found]
+        rows = [
+            (
+                student.student_id,
+                student.name,
+                one.scenario.kind,
+                " ".join(one.typed) or "none",
+                f"{one.difficulty:.2f}",
+            )
+            for student, one in zip(students, found, strict=True)
+        ]
+        page = Page()
+        page.table(("student", "name", "flight", "mistakes", "difficulty"), rows, right=(4,))
+        show(terminal(), page.blocks)
+        end = ["Nothing was written. Not for students: this says what is wrong in every flight."]
+    else:
+        with progress() as step:
+            told = partial(step, "simulating")
+            key, written = assignment.assign(
+                students, folder, key_file, secret, kind, count, truth, told
+            )
+        drawn = [(answer.mistakes, answer.difficulty) for answer in key.answers]
+        end = [
+            f"Flights   {folder} ({written} written, {len(drawn) - written} were there already)",
+            f"Answers   {key_file} (not for students: it says what is wrong in every flight)",
+        ]
+        if key.secret:
+            end.append(
+                "Secret    made up, and kept in the answers: the same flights can be made again, "
+                "and later students added, while that file is there"
+            )
+    for line in (*_class_summary(kind, drawn), *end):
         click.echo(line)
-    click.echo(f"Flights   {folder} ({made.written} written, {made.kept} were there already)")
-    click.echo(f"Answers   {key_file} (not for students: it says what is wrong in every flight)")
-    if made.key.secret:
-        click.echo(
-            "Secret    made up, and kept in the answers: the same flights can be made again, and "
-            "later students added, while that file is there"
-        )
 
 
-def _preview(
-    students: tuple[Person, ...],
-    key_file: Path,
-    secret: bytes | None,
-    kind: Kinds,
-    count: int | None,
-) -> None:
-    """Print what everyone would be given."""
-    from rich.text import Text
-
-    from px4fuse.assignment.assignment import preview
-    from px4fuse.report.screen import plain_table
-
-    drawn = preview(students, key_file, secret, kind, count)
-    table = plain_table(
-        ("student", "left"), ("name", "left"), ("flight", "left"), ("mistakes", "left"),
-        ("difficulty", "right"),
-    )  # fmt: skip
-    for student, one in zip(students, drawn, strict=True):
-        cells = (student.student_id, student.name, one.scenario.kind, " ".join(one.typed) or "none")
-        table.add_row(*map(Text, cells), f"{one.difficulty:.2f}")
-    terminal().print(table)
-    for line in _class_summary(
-        kind, [one.typed for one in drawn], [one.difficulty for one in drawn]
-    ):
-        click.echo(line)
-    click.echo("Nothing was written. Not for students: this says what is wrong in every flight.")
-
-
-def _class_summary(
-    kind: str, mistakes: Sequence[tuple[str, ...]], difficulties: Sequence[float]
-) -> list[str]:
-    """What the class was given, one line each."""
+def _class_summary(kind: str, drawn: list[tuple[tuple[str, ...], float | None]]) -> list[str]:
+    """What the class was given, one line each, of everyone's mistakes and difficulty."""
     from px4fuse.assignment.drawing import EASIEST, HARDEST
 
-    counts = Counter(one.partition("=")[0] for each in mistakes for one in each or ("none",))
+    counts = Counter(one.partition("=")[0] for typed, _ in drawn for one in typed or ("none",))
+    difficulties = [difficulty for _, difficulty in drawn if difficulty is not None]
     return [
-        f"Class     {len(mistakes)} student{'s' * (len(mistakes) != 1)}, {kind}",
+        f"Class     {len(drawn)} student{'s' * (len(drawn) != 1)}, {kind}",
         f"Mistakes  {', '.join(f'{name} {number}' for name, number in sorted(counts.items()))}",
         f"Difficult {min(difficulties):.2f} to {max(difficulties):.2f}, drawn between "
         f"{EASIEST:g} and {HARDEST:g} for everyone: the smallest size that px4fuse finds in 19 of "

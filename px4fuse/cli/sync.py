@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from px4fuse.cli.inputs import Named, analysis_options, comparison_request, json_option
-from px4fuse.cli.outputs import progress, terminal, write_json
+from px4fuse.cli.outputs import finish, progress, result_files
 from px4fuse.writing import STANDARD_OUTPUT
 
 STEPS = ("reading", "tuning", "clock offset", "changes of the clock")
@@ -38,7 +38,7 @@ def sync(log: Path, json_path: Path | None, **given: Any) -> None:
         compared = run_preparation(request, step)
         _, found = noises_and_clock(compared, step)
     results = sync_results(request, compared, found, command_line(request, "sync"))
-    if not write_json(results, json_path):
-        print_advice(terminal(), clock_advice(compared, found), request)
+    advice = clock_advice(compared, found)
+    finish(result_files(results, json_path), lambda to: print_advice(to, advice, request))
     if isinstance(found, Unavailable) or not found.determinable:
         raise MissingDataError(f"{compared.flight.log.name}: no clock offset could be determined.")

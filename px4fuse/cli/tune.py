@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from px4fuse.cli.inputs import Named, analysis_options, comparison_request, json_option
-from px4fuse.cli.outputs import progress, terminal, write_json
+from px4fuse.cli.outputs import finish, progress, result_files
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
@@ -23,6 +23,14 @@ STEPS = (
     "reading",
     *(f"tuning {name}" for name in ("north", "east", "down", "aisle", "horizontal")),
 )  # fmt: skip
+HEAD = (
+    "axis", "SIGMA_A (m/s²)\nvalue, 95 %", "SIGMA_Z (m)\nvalue, 95 %", "\ngain", "held\nout",
+    "lag 1\nbefore after",
+)  # fmt: skip
+NOTE = (
+    "gain: log-likelihood per measurement above the chosen settings; held out: the same on "
+    "the second half, tuned on the first; lag 1: autocorrelation of the innovations."
+)
 
 
 @click.command()
@@ -47,8 +55,7 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
         compared = run_preparation(request, step)
         tuned = tuned_noises(compared, progress=step)
     results = tuning_results(request, compared, tuned, command_line(request, "tune"))
-    if not write_json(results, json_path):
-        _print(terminal(), compared, tuned, request)
+    finish(result_files(results, json_path), lambda to: _print(to, compared, tuned, request))
     if all(isinstance(found, Unavailable) for found in tuned.values()):
         raise MissingDataError(f"{compared.flight.log.name}: no noise could be determined.")
 
@@ -59,42 +66,34 @@ def _print(
     tuned: dict[str, AxisTuning | Unavailable],
     request: ComparisonRequest,
 ) -> None:
-    from rich.text import Text
-
     from px4fuse.flight import Unavailable
-    from px4fuse.report.screen import plain_table, print_line, print_list, say
+    from px4fuse.report.page import Page
+    from px4fuse.report.screen import show
+    from px4fuse.report.style import MUTED
     from px4fuse.report.terminal import print_advice
     from px4fuse.report.words import settings_words, tuning_advice
 
-    print_line(console, "Chosen", settings_words(compared.settings))
-    table = plain_table(
-        ("axis", "left"), ("SIGMA_A (m/s²)\nvalue, 95 %", "right"),
-        ("SIGMA_Z (m)\nvalue, 95 %", "right"), ("\ngain", "right"), ("held\nout", "right"),
-        ("lag 1\nbefore after", "right"),
-    )  # fmt: skip
-    reasons = []
+    page, rows, page_below = Page(), [], Page()
+    page.labelled("Chosen", settings_words(compared.settings))
     for name, found in tuned.items():
         if isinstance(found, Unavailable):
-            reasons.append((name, Text(f"{found.reason}. {found.remedy}", "dim")))
+            page_below.write(f"{name}: {found.reason}. {found.remedy}", colour=MUTED)
             continue
         held = found.held_out
-        table.add_row(
-            name,
-            _noise(found.filter_sigma_a),
-            _noise(found.sigma_z),
-            f"{found.gain_nats:.3f}",
-            "" if isinstance(held, Unavailable) else f"{held.gain_nats:+.3f}",
-            _whiteness(found),
+        rows.append(
+            (
+                name,
+                _noise(found.filter_sigma_a),
+                _noise(found.sigma_z),
+                f"{found.gain_nats:.3f}",
+                "" if isinstance(held, Unavailable) else f"{held.gain_nats:+.3f}",
+                _whiteness(found),
+            )
         )
-    if table.row_count:
-        console.print(table)
-    print_list(console, [(f"{name}:", missing) for name, missing in reasons])
-    if table.row_count:
-        note = (
-            "gain: log-likelihood per measurement above the chosen settings; held out: the same on "
-            "the second half, tuned on the first; lag 1: autocorrelation of the innovations."
-        )
-        say(console, Text(note, "dim"))
+    if rows:
+        page.table(HEAD, rows, right=(1, 2, 3, 4, 5))
+        page_below.write(NOTE, colour=MUTED)
+    show(console, page.blocks + page_below.blocks)
     print_advice(console, tuning_advice(compared, tuned), request)
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from px4fuse.cli.inputs import Named, json_option, max_size_option, path_option
-from px4fuse.cli.outputs import progress, spare_inputs, terminal, write_json, write_outputs
+from px4fuse.cli.outputs import check_targets, finish, progress, result_files
 from px4fuse.errors import LogError
 from px4fuse.reading import files_by_sha256, read_whole, shown
 from px4fuse.writing import STANDARD_OUTPUT
@@ -50,33 +50,28 @@ def verify(
     Exit code 0: verified; 1: numbers differ, page differs, other log, or cannot verify; 2: bad
     input.
     """
-    from px4fuse.grading.grade import MEMORY_BYTES
     from px4fuse.verification.intake import MAX_BYTES, read_report
     from px4fuse.verification.model import Refused
     from px4fuse.verification.verification import verify as verify_report
-    from px4fuse.verification.workers import Failed, run_bounded
+    from px4fuse.verification.workers import Failed, bounded
 
     content = read_whole(report, LogError, MAX_BYTES, smaller="Reports are below 2 MB")
     read = read_report(content, shown(report))
     if isinstance(read, Refused):
         raise LogError(read.reason)
-    spare_inputs([path for path in (json_path, output) if path not in (None, STANDARD_OUTPUT)])
+    check_targets([json_path, output])
     with progress(json_path == STANDARD_OUTPUT, ("hashing", "running")) as step:
         step("hashing the logs")
         files = files_by_sha256(logs)
         if logs and not files:
             raise LogError("there is no file in what was given as LOG.")
         step("running the analysis again")
-        work = partial(verify_report, logs=files)
-        ((_, verdict),) = run_bounded(
-            work, [read], processes=1, timeout_s=TIMEOUT_S, memory_bytes=MEMORY_BYTES
-        )
+        verdict = bounded(partial(verify_report, logs=files), read, TIMEOUT_S)
     if isinstance(verdict, Failed):
         raise LogError(f"{shown(report)}: cannot be verified: {verdict.reason}")
-    if output is not None and verdict.redrawn:
-        write_outputs({output: verdict.redrawn})
-    if not write_json(_plain(read, verdict), json_path):
-        _print(terminal(), shown(report), verdict, output)
+    redrawn = {} if output is None or not verdict.redrawn else {output: verdict.redrawn}
+    contents = redrawn | result_files(_plain(read, verdict), json_path)
+    finish(contents, lambda console: _print(console, shown(report), verdict, output))
     sys.exit(0 if verdict.outcome == "verified" else 1)
 
 
@@ -99,7 +94,7 @@ def _plain(report: Report, verdict: Verdict) -> dict[str, object]:
 def _print(console: Console, name: str, verdict: Verdict, output: Path | None) -> None:
     from rich.text import Text
 
-    from px4fuse.report.screen import print_file, say
+    from px4fuse.report.screen import say
     from px4fuse.results.reading import one_line
     from px4fuse.verification.verification import LIMIT
 
@@ -110,10 +105,8 @@ def _print(console: Console, name: str, verdict: Verdict, output: Path | None) -
             say(console, one_line(reason, 400), "  ", 2)
     for one in verdict.differences:
         say(console, f"{one.path}: {one.recorded}, recomputed {one.recomputed}", "  ", 2)
-    if output is not None and verdict.redrawn:
-        print_file(console, "Wrote", output)
-    elif output is not None:
+    if output is not None and not verdict.redrawn:
         say(console, "Nothing was redrawn, since the analysis was not run again.")
-    elif verdict.pages:
+    elif output is None and verdict.pages:
         say(console, "Read the redrawn report instead: -o writes it.")
     say(console, Text(LIMIT, "dim"))

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import Named, flight_options, json_option, path_option, text_of
-from px4fuse.cli.outputs import progress, terminal, write_outputs
+from px4fuse.cli.inputs import Named, flight_options, json_option, path_option
+from px4fuse.cli.outputs import finish, progress, report_paths, result_files
 from px4fuse.cli.quantity import NAMES, in_unit
-from px4fuse.errors import OutputError, SettingsError
+from px4fuse.errors import SettingsError
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
@@ -35,16 +35,15 @@ STEPS = (
     "--sweep", metavar="NAME=LOW:HIGH[:COUNT]", help="Parameter to change over several values."
 )
 @flight_options
-@path_option("-o", "--output", metavar="FILE.pdf", help="Write it as a PDF page.")
+@path_option("-o", "--output", metavar="FILE.pdf", help="A page, and its results beside it.")
 @json_option
 def whatif(
     log: Path,
     changes: tuple[str, ...],
     sweep: str | None,
-    mavlink: Path | None,
-    system: int | None,
     output: Path | None,
     json_path: Path | None,
+    **given: Any,
 ) -> None:
     """Replay EKF2 from LOG as flown and with other parameters, side by side.
 
@@ -53,44 +52,25 @@ def whatif(
     with the measurement noise and the delay that the data ask for (see tune and sync).
     """
     from px4fuse.analysis import run_what_if
+    from px4fuse.report.document import WhatIfDocument
+    from px4fuse.report.whatif import print_what_if
     from px4fuse.request import WhatIfRequest, command_line
     from px4fuse.results.build import whatif_results
-    from px4fuse.results.contract import to_json
 
-    if output is not None and output.suffix.lower() != ".pdf":
-        raise OutputError(f"{output}: the page is a PDF. Give a name that ends in .pdf with -o.")
+    if output is not None:
+        report_paths(output, json_path)  # before the work, not after it
     request = WhatIfRequest(
         log=str(log),
-        mavlink=text_of(mavlink),
-        system=system,
         changes=_changes(changes),
         sweep=None if sweep is None else _sweep(sweep),
+        **given,
     )
-    contents: dict[Path, bytes] = {}
     with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
         found = run_what_if(request, step)
-        command = command_line(request)
-        text = to_json(whatif_results(request, found, command))
-        if output is not None:
-            from px4fuse.report.document import WhatIfDocument
-            from px4fuse.report.pdf import render
-
-            step("drawing the page")
-            contents[output] = render(WhatIfDocument(found, command), text)
-    if json_path is not None:
-        if json_path == output:
-            raise OutputError(f"{output}: --json and -o name the same file. Give two names.")
-        contents[json_path] = text.encode()
-    write_outputs(contents)
-    if json_path == STANDARD_OUTPUT:
-        return
-    from px4fuse.report.screen import print_file
-    from px4fuse.report.whatif import print_what_if
-
-    console = terminal()
-    print_what_if(console, found)
-    if output is not None:
-        print_file(console, "Page", output)
+        document = WhatIfDocument(found, command_line(request))
+        results = whatif_results(request, found, document.command)
+        contents = result_files(results, json_path, output, document, step)
+    finish(contents, lambda console: print_what_if(console, found))
 
 
 def _changes(given: tuple[str, ...]) -> dict[str, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from px4fuse.analysis import Analysis
+from px4fuse.comparison.model import Comparison
 from px4fuse.findings.model import Found, error, share_on, spans_at, warning
 from px4fuse.flight import Ekf2, FusionRecord, Unavailable
 
@@ -13,7 +13,7 @@ EV_STOP_INTERVAL_S = 0.4  # two times EV_MAX_INTERVAL, ev_pos_control.cpp
 MAX_LATE_S = 0.1  # older than that by the horizon, no sample is fused: RingBuffer.h
 
 
-def detect(analysis: Analysis) -> Found:
+def detect(analysis: Comparison) -> Found:
     """Fused in too small a share of the segment."""
     ekf2, segment, source = analysis.flight.ekf2, analysis.segment, analysis.source
     if not isinstance(ekf2, Ekf2) or isinstance(ekf2.fusing, Unavailable):
@@ -53,7 +53,7 @@ def detect(analysis: Analysis) -> Found:
         )
 
 
-def _cause(analysis: Analysis, ekf2: Ekf2) -> tuple[str, str]:
+def _cause(analysis: Comparison, ekf2: Ekf2) -> tuple[str, str]:
     """Why EKF2 does not fuse the source, and the remedy."""
     parameters, interval_s = analysis.flight.log.parameters, 1.0 / analysis.source.rate_hz
     control = parameters.get("EKF2_EV_CTRL")
@@ -86,7 +86,7 @@ def _cause(analysis: Analysis, ekf2: Ekf2) -> tuple[str, str]:
     return "the log does not show why", "Check EKF2_EV_CTRL (EKF2_AID_MASK before v1.14)."
 
 
-def _age_s(analysis: Analysis, ekf2: Ekf2) -> float:
+def _age_s(analysis: Comparison, ekf2: Ekf2) -> float:
     """Time (s) from a sample's stamp to its arrival, less what EKF2 takes off; NaN if unknown."""
     if not isinstance(ekf2.record, FusionRecord):
         return float("nan")

@@ -9,7 +9,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.filter.causes import Explained
 from px4fuse.filter.signals import Segment, imu_gaps, within
 from px4fuse.findings.model import MOMENT_S, Found, finding, warning
-from px4fuse.flight import SPECIFIC_FORCE_COLUMNS, Ekf2, sample_rate
+from px4fuse.flight import SPECIFIC_FORCE_COLUMNS, Ekf2, Flight, sample_rate
 from px4fuse.record import Span
 from px4fuse.recording import LogInfo
 
@@ -27,7 +27,7 @@ def detect(analysis: Analysis) -> Found:
     """All of them."""
     yield from bias(analysis)
     yield from gaps(analysis)
-    yield from rates(analysis)
+    yield from rates(analysis.flight)
 
 
 def bias(analysis: Analysis) -> Found:
@@ -116,9 +116,8 @@ def too_slow(samples: pd.DataFrame, needed_hz: float) -> bool:
     return sample_rate(samples) < RATE_MARGIN * needed_hz
 
 
-def rates(analysis: Analysis) -> Found:
+def rates(flight: Flight) -> Found:
     """IMU or attitude, below the rate that the acceleration needs."""
-    flight = analysis.flight
     for part, name, default, needed_hz in (
         (flight.imu, "imu", "sensor_combined", MIN_IMU_RATE_HZ),
         (flight.attitude, "attitude", "vehicle_attitude", MIN_ATTITUDE_RATE_HZ),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pandas as pd
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.model import Comparison
 from px4fuse.findings.model import Found, info, warning
 from px4fuse.flight import Ekf2, Unavailable
 from px4fuse.origin import RECEIVED
@@ -46,7 +47,7 @@ def unavailable(analysis: Analysis) -> Found:
             return
 
 
-def source_as_sent(analysis: Analysis) -> Found:
+def source_as_sent(analysis: Comparison) -> Found:
     """The position as it arrived is not in the log: what stands in, and whether that is thinned."""
     source, received = analysis.source, RECEIVED.preference
     logged = any(track.origin.preference == received for track in analysis.flight.positions)
@@ -76,7 +77,7 @@ def source_as_sent(analysis: Analysis) -> Found:
             )
 
 
-def innovations(analysis: Analysis) -> Found:
+def innovations(analysis: Comparison) -> Found:
     """Too few innovations of EKF2 for the measurements, which are not made of them."""
     ekf2, axes = analysis.flight.ekf2, analysis.axes.values()
     frames = (result.ekf2_innovations for result in axes)

@@ -5,21 +5,22 @@ from __future__ import annotations
 import pandas as pd
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.model import MODEL_NOTE
 from px4fuse.findings.model import Found, finding, info, times, warning
-from px4fuse.flight import Ekf2
+from px4fuse.flight import Ekf2, Flight
 from px4fuse.plain import capital
 
 
 def detect(analysis: Analysis) -> Found:
     """All of them; what was lost first."""
     yield from dropouts(analysis)
-    yield from loss(analysis)
-    yield from clocks_set_back(analysis)
+    yield from loss(analysis.flight)
+    yield from clocks_set_back(analysis.flight)
     yield from estimators(analysis)
 
 
-def dropouts(analysis: Analysis) -> Found:
+def dropouts(analysis: Comparison) -> Found:
     """The logger stopped for a while."""
     segment = analysis.segment
     lost = [
@@ -39,9 +40,9 @@ def dropouts(analysis: Analysis) -> Found:
         )
 
 
-def loss(analysis: Analysis) -> Found:
+def loss(flight: Flight) -> Found:
     """Bytes that the reader had to pass over, a flight that goes on, single samples."""
-    log = analysis.flight.log
+    log = flight.log
     if log.damage or log.ends_in_flight:
         first, *others = map(_sentence, log.damage or (
             f"the log ends in flight, after {log.duration_s:.1f} s: the landing is not in it",
@@ -71,9 +72,9 @@ def loss(analysis: Analysis) -> Found:
         )
 
 
-def clocks_set_back(analysis: Analysis) -> Found:
+def clocks_set_back(flight: Flight) -> Found:
     """The boot clock began again, or the recording computer's clock was set back."""
-    log = analysis.flight.log
+    log = flight.log
     if log.restarts:
         yield warning(
             "autopilot_restarted",

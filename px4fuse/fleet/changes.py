@@ -27,7 +27,7 @@ from px4fuse.fleet.significance import (
 from px4fuse.report.changes_words import change_line
 from px4fuse.results.changes import Compared, Judgement, NumberChange, Status
 from px4fuse.results.contract import CHANGES, ChangeResults
-from px4fuse.results.parts import provenance, schema_of
+from px4fuse.results.model import provenance, schema_of
 
 # What stands first of the significant changes; and of these, causes before what they bring
 _ORDER: tuple[Judgement, ...] = ("worse", "better", "changed", "")

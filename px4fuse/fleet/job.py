@@ -127,10 +127,9 @@ def _compared(job: Job, path: Path, sha256: str) -> Outcome:
     # only workers need all of it
     from px4fuse.analysis import read_flight, run  # noqa: PLC0415
     from px4fuse.findings import find  # noqa: PLC0415
-    from px4fuse.results.build import results  # noqa: PLC0415
+    from px4fuse.results.build import log_part, results  # noqa: PLC0415
     from px4fuse.results.contract import to_json  # noqa: PLC0415
     from px4fuse.results.model import Student  # noqa: PLC0415
-    from px4fuse.results.parts import log_part  # noqa: PLC0415
 
     request = msgspec.structs.replace(job.request, log=str(path))
     known: Row = {"name": path.name, "log_sha256": sha256}

@@ -24,16 +24,15 @@ class Veil:
 
     def __init__(self, entries: Sequence[Entry]) -> None:
         veiled = [entry for entry in entries if entry.pseudonym]
-        self._instead: dict[str, str] = {}
-        for entry in veiled:
-            for word in _words(entry):
-                self._instead[_key(word)] = NAME
-        for entry in veiled:
-            for text in _identities(entry):
-                self._instead[_key(text)] = entry.pseudonym
-        self._every = _pattern(self._instead)
-        long = (text for text in self._instead if len(text) >= SHORTEST_ID or not _is_id(text))
-        self._without_short_ids = _pattern(list(long))
+        self._instead = {_key(word): NAME for entry in veiled for word in _words(entry)}
+        self._instead |= {
+            _key(text): entry.pseudonym for entry in veiled for text in _identities(entry)
+        }
+        self._every = _pattern([*self._instead])
+        self._without_short_ids = _pattern(
+            [text for text in self._instead
+             if len(text) >= SHORTEST_ID or not any(map(str.isdigit, text))]
+        )  # fmt: skip
 
     def hide(self, text: str, *, own_words: bool = False) -> str:
         """A text without names; ``own_words`` are a student's, in which short ids are numbers."""
@@ -53,7 +52,7 @@ def hidden_words(entry: Entry, one: Graded) -> tuple[str, ...]:
 def _identities(entry: Entry) -> Iterator[str]:
     """What says who it is, as a whole."""
     yield from (text for text in (entry.student, entry.student_id, entry.email) if text.strip())
-    for one in (*([entry.counting] if entry.counting else []), *entry.others):
+    for one in entry.files:
         yield from (text for text in (one.student, one.student_id) if text.strip())
         name = one.submission
         yield name
@@ -65,7 +64,7 @@ def _identities(entry: Entry) -> Iterator[str]:
 
 
 def _words(entry: Entry) -> Iterator[str]:
-    for name in {entry.student, *(one.student for one in (entry.counting, *entry.others) if one)}:
+    for name in {entry.student, *(one.student for one in entry.files)}:
         words = re.findall(r"[^\W\d_]+", unicodedata.normalize("NFC", name))
         # scripts that do not part words have short ones
         yield from (word for word in words if len(word) >= SHORTEST_WORD or ord(word[0]) > 0x2E80)
@@ -75,11 +74,7 @@ def _key(text: str) -> str:
     return unicodedata.normalize("NFC", text).casefold()
 
 
-def _is_id(text: str) -> bool:
-    return any(character.isdigit() for character in text)
-
-
-def _pattern(texts: Sequence[str] | dict[str, str]) -> re.Pattern[str] | None:
+def _pattern(texts: Sequence[str]) -> re.Pattern[str] | None:
     if not texts:
         return None
     longest_first = sorted(texts, key=lambda text: (-len(text), text))

@@ -416,15 +416,12 @@ USUAL_DRIFT_M, USUAL_HEADING_DEG = 1.0, 3.0
 TOO_GOOD = 0.001
 
 
-def contradictions(evidence: Evidence) -> tuple[str, ...]:
+def contradictions(evidence: Evidence) -> Iterator[str]:
     """Options of a loop that its log or the answer key contradict: sentences."""
     results = evidence.results
     if not isinstance(results, LoopResults):
-        return ()
-    return tuple(_contradictions(evidence, results.request, results.loop))
-
-
-def _contradictions(evidence: Evidence, request: LoopRequest, loop: LoopPart) -> Iterator[str]:
+        return
+    request, loop = results.request, results.loop
     landed, at = _landed_m(evidence), request.landed_at
     if landed is not None and at is not None:
         said = math.hypot(at.forward_m, at.right_m)
@@ -502,7 +499,7 @@ class LoopItem(RubricItem, frozen=True, kw_only=True, tag="loop"):
         measured = f"You measured a closure error of {loop.closure_error_m or 0.0:.3g} m"
         if opened:
             measured = f"You left the end open (--open) and gave {len(loop.closures)} closures"
-        wrong = contradictions(evidence)
+        wrong = [*contradictions(evidence)]
         if not wrong and loop.closures and not any(one.accepted for one in loop.closures):
             return (1.0 + 2.0 * share) / 3.0, (
                 f"{measured}; the closure was rejected as false, which leaves the path as it is, "
@@ -511,9 +508,9 @@ class LoopItem(RubricItem, frozen=True, kw_only=True, tag="loop"):
         landed = _landed_m(evidence)
         assumed = request is not None and request.landed_at is None and not opened
         if landed is not None and landed > TAPE_M and assumed:
-            wrong += (
+            wrong.append(
                 "It did not land at the place of take-off: say where it did (--landed-at) or leave "
-                "the end open (--open).",
+                "the end open (--open)."
             )
         if wrong:
             return 1 / 3, f"{measured}, but {_begun_small(wrong[0])}"
@@ -575,8 +572,8 @@ class ClosureItem(RubricItem, frozen=True, kw_only=True, tag="closure"):
         results, loop = evidence.results, evidence.results.loop
         if not isinstance(loop, LoopPart) or not isinstance(results, LoopResults):
             return 0.0, f"Your report measures no loop{absence(loop)}."
-        if wrong := contradictions(evidence):
-            return 0.0, f"No points, since {_begun_small(wrong[0])}"
+        for wrong in contradictions(evidence):
+            return 0.0, f"No points, since {_begun_small(wrong)}"
         accepted = [one for one in loop.closures if one.accepted]
         if not results.request.came_back or not accepted:
             share, why = _open_end(evidence)

@@ -17,7 +17,7 @@ from px4fuse.answers import form_rows
 from px4fuse.grading.anonymous import Veil
 from px4fuse.grading.class_table import number
 from px4fuse.grading.flags import copied_notes
-from px4fuse.grading.model import Entry, Graded, Item, Override
+from px4fuse.grading.model import Entry, Graded, Item, Override, columns
 from px4fuse.grading.overrides import TOTAL
 from px4fuse.webpage.charts import bins, histogram
 from px4fuse.webpage.frame import (
@@ -195,8 +195,7 @@ class _Page:
         self.timed = any(entry.handed_in or entry.late_s for entry in entries)
         places = [at for at, entry in enumerate(entries) if entry.counting]
         graded = [one for entry in entries if (one := entry.counting)]
-        self.items = tuple(dict.fromkeys(name for one in graded for name in one.by_title))
-        self.numbers = tuple(dict.fromkeys(name for one in graded for name in one.numbers))
+        self.items, self.numbers = columns(entries)
         self.copied = {
             places[at]: [(share, places[to]) for share, to in others]
             for at, others in copied_notes(graded).items()

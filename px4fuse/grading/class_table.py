@@ -7,7 +7,7 @@ import io
 import math
 from collections.abc import Sequence
 
-from px4fuse.grading.model import Entry
+from px4fuse.grading.model import Entry, columns
 from px4fuse.spreadsheet import neutral, neutral_id
 
 FIRST = ("file", "student", "id", "status", "points", "pending points", "of", "deducted", "total")
@@ -29,9 +29,7 @@ def csv_text(entries: Sequence[Entry]) -> str:
         Begins with the byte order mark by which Excel knows UTF-8; lines end with CRLF. Write it
         without translating line ends.
     """
-    handed_in = [one for entry in entries if (one := entry.counting)]
-    items = tuple(dict.fromkeys(title for one in handed_in for title in one.by_title))
-    numbers = tuple(dict.fromkeys(title for one in handed_in for title in one.numbers))
+    items, numbers = columns(entries)
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\r\n")
     writer.writerow(neutral(title) for title in (*FIRST, *items, *numbers, *LAST))

@@ -124,15 +124,9 @@ def _named(graded: Sequence[Graded], submissions: Sequence[Submission]) -> list[
                 continue
             # two students may not hand in under one id: the second is known by the platform alone
             student_id = origin.student_id or ("" if claimed is not None else one.student_id)
-            register.people.append(
-                Person(
-                    student_id or origin.login or origin.number,
-                    one_line(one.student if student_id else origin.name, 200) or origin.name,
-                    origin.email,
-                    origin.login,
-                    {origin.platform: origin.number} if origin.number else {},
-                )
-            )
+            name = one_line(one.student if student_id else origin.name, 200) or origin.name
+            known_by = student_id or origin.login or origin.number
+            register.people.append(replace(origin.person, student_id=known_by, name=name))
         elif one.student_id and claimed is None:
             register.people.append(Person(one.student_id, one_line(one.student, 200)))
     return register.people

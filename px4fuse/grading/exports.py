@@ -71,11 +71,9 @@ def grade_column(sheet: Sheet, wanted: str) -> int:
     titles = {
         at: title.rpartition(" (")[0] if kind == "canvas" else title
         for at, title in enumerate(sheet.head)
-        if kind != "canvas" or CANVAS.match(title)
+        if (kind != "canvas" or CANVAS.match(title))
+        and not any(READ_ONLY in row[at] for row in sheet.rows[:3])
     }
-    for at in [*titles]:
-        if any(READ_ONLY in row[at] for row in sheet.rows[:3]):
-            del titles[at]
     named = [at for at, title in titles.items()
              if folded(wanted) in (folded(title), folded(sheet.head[at]))]  # fmt: skip
     usual = sheet.column(GRADE)

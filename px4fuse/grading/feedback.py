@@ -14,6 +14,7 @@ NEXT = (
     "Your instructor has these points as a proposal and decides; ask if you think that something "
     "was overlooked."
 )
+AGAIN = " Make it again with px4fuse and hand in the PDF as it was written."
 # What verification found, and what to do about it
 FOUND = {
     "verified": (
@@ -23,16 +24,13 @@ FOUND = {
     "numbers differ": (
         "Numbers in your report are not those that px4fuse computes from the log with your "
         "settings",
-        " Make it again with px4fuse and hand in the PDF as it was written.",
+        AGAIN,
     ),
     "other log": (
         "The log of your report is not one of those that your instructor has",
         " Make the report of the log that you were given, or hand in your log too.",
     ),
-    "cannot verify": (
-        "Your report could not be verified",
-        " Make it again with px4fuse and hand in the PDF as it was written.",
-    ),
+    "cannot verify": ("Your report could not be verified", AGAIN),
 }
 
 

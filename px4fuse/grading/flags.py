@@ -7,17 +7,18 @@ leads everyone to the same number.
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from decimal import Decimal
+from itertools import combinations
 from operator import attrgetter
 
 from px4fuse.assignment.key import AnswerKey, folded
 from px4fuse.filter.settings import Settings
 from px4fuse.grading.model import Graded
-from px4fuse.grading.text import copies
 from px4fuse.plain import few_words
-from px4fuse.results.contract import LoopResults, Reported
+from px4fuse.results.contract import LoopResults, Reported, to_plain
 from px4fuse.results.reading import one_line
 from px4fuse.simulation import flights
 
@@ -31,6 +32,24 @@ HAND_PICKED = 0.5
 # What a student chooses; the rest of the settings follows from the log
 CHOSEN = ("sigma_a_m_s2", "sigma_z_m", "dt_s", "input", "clock_offset_s")
 SHOWN = 4
+# Words in a row by which two texts are compared: of two written apart a few per cent are the same,
+# of a copy with an error in every fifth word two in five
+RUN = 3
+COPIED = 0.25
+# Shorter texts are the same by chance
+MIN_RUNS = 25
+# Of longer texts only the beginning is compared
+MAX_WORDS = 3000
+# What more than half of the class has is the instructor's template, from a class of this size on
+TEMPLATE_SHARE, TEMPLATE_CLASS = 0.5, 5
+# From this share on a text is the report's own words, or has too few of the course's language
+QUOTED, OF_THE_LANGUAGE = 0.5, 0.10
+JUDGED_FROM = 40
+# What a text says to who, or what, grades it
+TO_A_GRADER = re.compile(
+    r"full points|ignore (the|all|any|previous)|rubric|language model|system prompt|grader",
+    re.IGNORECASE,
+)
 
 Flags = Iterator[tuple[int, str]]
 
@@ -142,15 +161,12 @@ def _common(graded: Sequence[Graded]) -> Flags:
 
 
 def _other_version(graded: Sequence[Graded]) -> Flags:
-    usual = next(iter(Counter(one.version for one in graded if one.version).most_common(1)), [""])[
-        0
-    ]
-    for index, one in enumerate(graded):
-        if one.version not in ("", usual):
-            yield (
-                index,
-                (f"Made with px4fuse {_line(one.version)}, most of the class with {_line(usual)}."),
-            )
+    versions = Counter(one.version for one in graded if one.version)
+    for usual, _ in versions.most_common(1):
+        said = f"Made with px4fuse {{}}, most of the class with {_line(usual)}."
+        for index, one in enumerate(graded):
+            if one.version not in ("", usual):
+                yield index, said.format(_line(one.version))
 
 
 def copied_notes(graded: Sequence[Graded]) -> dict[int, list[tuple[float, int]]]:
@@ -214,3 +230,80 @@ def _line(text: str) -> str:
 def _digits(number: float) -> int:
     """Significant digits of a number as typed."""
     return len(Decimal(repr(abs(number))).normalize().as_tuple().digits) if number else 0
+
+
+# ------------------------------------------------------------------ texts
+
+
+def words_of(text: str) -> list[str]:
+    """Words as they are compared: one spelling per character, no case, no accents, no signs.
+
+    >>> words_of("Naïve, ｎaïve: SIGMA_Z")
+    ['naive', 'naive', 'sigma', 'z']
+    """
+    plain = unicodedata.normalize("NFKD", text[: 12 * MAX_WORDS]).casefold()
+    seen = "".join(part for part in plain if unicodedata.category(part) not in ("Mn", "Cf"))
+    return re.findall(r"[^\W_]+", seen)[:MAX_WORDS]
+
+
+def runs(words: Sequence[str]) -> frozenset[tuple[str, ...]]:
+    """Every few words in a row."""
+    return frozenset(tuple(words[at : at + RUN]) for at in range(len(words) - RUN + 1))
+
+
+def text_flags(results: Reported, min_words: int, common_words: Sequence[str]) -> Iterator[str]:
+    """What stands out in one text by itself: sentences for the instructor."""
+    text = results.student.notes
+    words = words_of(text)
+    if not text.strip():
+        return
+    if len(words) < min_words:
+        yield f"The text has {len(words)} words; {min_words} were asked for."
+    if len(words) >= JUDGED_FROM and common_words:
+        known = sum(word in set(common_words) for word in words) / len(words)
+        if known < OF_THE_LANGUAGE:
+            yield f"The text is in another language than the course's ({known:.0%} of its words)."
+    own = runs(words)
+    if len(own) >= MIN_RUNS:
+        told = to_plain(results)
+        told.pop("student", None)
+        printed = runs_of_all(told)
+        share = len(own & printed) / len(own)
+        if share >= QUOTED:
+            yield f"The text is px4fuse's own: {share:.0%} of it is in the report."
+    if said := TO_A_GRADER.search(text):
+        yield f"The text speaks to who grades it (\u201c{said[0]}\u201d): it is not followed."
+
+
+def runs_of_all(value: object) -> frozenset[tuple[str, ...]]:
+    """Runs of words of every text in plain results."""
+    if isinstance(value, str):
+        return runs(words_of(value))
+    parts = list(value.values()) if isinstance(value, dict) else value
+    if not isinstance(parts, list | tuple):
+        return frozenset()
+    return frozenset[tuple[str, ...]]().union(*map(runs_of_all, parts))
+
+
+def copies(texts: Sequence[str], authors: Sequence[str]) -> list[tuple[float, int, int]]:
+    """Pairs of texts that share passages: which share of the shorter one, and their places.
+
+    Parameters
+    ----------
+    authors : sequence of str
+        Texts of one author are not compared.
+    """
+    each = [runs(words_of(text)) for text in texts]
+    if len(texts) >= TEMPLATE_CLASS:
+        counted = Counter(part for parts in each for part in parts)
+        common = {part for part, count in counted.items() if count > TEMPLATE_SHARE * len(texts)}
+        each = [parts - common for parts in each]
+    long = [at for at, parts in enumerate(each) if len(parts) >= MIN_RUNS]
+    pairs = []
+    for first, second in combinations(long, 2):
+        if authors[first] == authors[second]:
+            continue
+        share = len(each[first] & each[second]) / min(len(each[first]), len(each[second]))
+        if share >= COPIED:
+            pairs.append((share, first, second))
+    return pairs

@@ -239,50 +239,54 @@ def cures(wrong: Wrong, truth: FormTruth) -> tuple[Cure, ...]:
     until_s = from_s if wrong.until_s is None else wrong.until_s
     noise = 0.8 * truth.sigma_z_m, 1.25 * truth.sigma_z_m
     back = -high, -low
-    delay = (1e3 * low, 1e3 * high), 1.0 if size > 0.0 else 0.0
     factors = 100.0 / (100.0 + high), 100.0 / (100.0 + low)
-    after = "--start", (until_s - 1.0, until_s + 15.0), 1.0
-    before = "--end", (from_s - 15.0, from_s + 1.0), 1.0
-    survey = "survey the anchors", ANY, 1.0
-    synchronise = "synchronise the clocks before take-off", ANY, 1.0
-    all_of: Mapping[str, tuple[Cure, ...]] = {
-        "clock-offset": (
-            ("--clock-offset", back, 1.0),
-            ("correct the stamps at the sender", back, 1.0),
-            ("EKF2_EV_DELAY", *delay),
-        ),
-        "clock-drift": (synchronise, ("--clock-offset", ANY, 0.5)),
-        "clock-jump": (synchronise, after),
-        "nlos": (("line of sight and link", ANY, 1.0), ("EKF2_EVP_GATE", ANY, 0.5)),
-        "dropout": (("line of sight and link", ANY, 1.0), after, before),
-        "imu-dropout": (("log at a higher rate", ANY, 0.5), after, before),
-        "decimate": (
-            ("send positions more often", (5.0, math.inf), 1.0),
-            ("line of sight and link", ANY, 0.5),
-        ),
-        "r-scale": (("EKF2_EVP_NOISE", noise, 1.0), ("report the true variance", noise, 1.0)),
-        "yaw": (
-            ("--position-yaw", back, 1.0), ("turn the positions at the sender", back, 1.0), survey,
-        ),
-        "scale": (("multiply the positions at the sender", factors, 1.0), survey),
-        "jump": (("one set of anchors", ANY, 1.0), after, before),
-        "smoothed": (
-            ("switch the smoothing off", ANY, 1.0), ("--clock-offset", back, 1.0 / 3.0),
-        ),
-        "accel-bias": (("calibrate the accelerometer", ANY, 1.0),),
-        "vibration": (("balance the propellers", ANY, 1.0), ("--sigma-a", ANY, 0.5)),
-        "imu-rate": (
-            ("log at a higher rate", (2.0 * size, math.inf), 1.0), ("SDLOG_PROFILE", ANY, 0.5),
-        ),
-        "no-motion": (("fly several passes", ANY, 1.0),),
-        "open-end": (("--open", ANY, 1.0), ("--landed-at", (low, high), 1.0)),
-        "no-vvo": (("SDLOG_PROFILE", (129.0, 255.0), 1.0),),
-        "ekf2-noise": (("EKF2_EVP_NOISE", noise, 1.0),),
-        "ekf2-delay": (("EKF2_EV_DELAY", (0.0, 20.0), 1.0),),
-        "ekf2-gate": (("EKF2_EVP_GATE", (3.0, 10.0), 1.0), ("EKF2_EVP_NOISE", ANY, 1.0 / 3.0)),
-        "ekf2-off": (("EKF2_EV_CTRL", (1.0, 15.0), 1.0),),
-    }  # fmt: skip
-    return all_of.get(wrong.kind, ())
+    after, before = (until_s - 1.0, until_s + 15.0), (from_s - 15.0, from_s + 1.0)
+    rows: tuple[tuple[str, str, tuple[float, float], float], ...] = (
+        ("clock-offset", "--clock-offset", back, 1.0),
+        ("clock-offset", "correct the stamps at the sender", back, 1.0),
+        ("clock-offset", "EKF2_EV_DELAY", (1e3 * low, 1e3 * high), float(size > 0.0)),
+        ("clock-drift", "synchronise the clocks before take-off", ANY, 1.0),
+        ("clock-drift", "--clock-offset", ANY, 0.5),
+        ("clock-jump", "synchronise the clocks before take-off", ANY, 1.0),
+        ("clock-jump", "--start", after, 1.0),
+        ("nlos", "line of sight and link", ANY, 1.0),
+        ("nlos", "EKF2_EVP_GATE", ANY, 0.5),
+        ("dropout", "line of sight and link", ANY, 1.0),
+        ("dropout", "--start", after, 1.0),
+        ("dropout", "--end", before, 1.0),
+        ("imu-dropout", "log at a higher rate", ANY, 0.5),
+        ("imu-dropout", "--start", after, 1.0),
+        ("imu-dropout", "--end", before, 1.0),
+        ("decimate", "send positions more often", (5.0, math.inf), 1.0),
+        ("decimate", "line of sight and link", ANY, 0.5),
+        ("r-scale", "EKF2_EVP_NOISE", noise, 1.0),
+        ("r-scale", "report the true variance", noise, 1.0),
+        ("yaw", "--position-yaw", back, 1.0),
+        ("yaw", "turn the positions at the sender", back, 1.0),
+        ("yaw", "survey the anchors", ANY, 1.0),
+        ("scale", "multiply the positions at the sender", factors, 1.0),
+        ("scale", "survey the anchors", ANY, 1.0),
+        ("jump", "one set of anchors", ANY, 1.0),
+        ("jump", "--start", after, 1.0),
+        ("jump", "--end", before, 1.0),
+        ("smoothed", "switch the smoothing off", ANY, 1.0),
+        ("smoothed", "--clock-offset", back, 1.0 / 3.0),
+        ("accel-bias", "calibrate the accelerometer", ANY, 1.0),
+        ("vibration", "balance the propellers", ANY, 1.0),
+        ("vibration", "--sigma-a", ANY, 0.5),
+        ("imu-rate", "log at a higher rate", (2.0 * size, math.inf), 1.0),
+        ("imu-rate", "SDLOG_PROFILE", ANY, 0.5),
+        ("no-motion", "fly several passes", ANY, 1.0),
+        ("open-end", "--open", ANY, 1.0),
+        ("open-end", "--landed-at", (low, high), 1.0),
+        ("no-vvo", "SDLOG_PROFILE", (129.0, 255.0), 1.0),
+        ("ekf2-noise", "EKF2_EVP_NOISE", noise, 1.0),
+        ("ekf2-delay", "EKF2_EV_DELAY", (0.0, 20.0), 1.0),
+        ("ekf2-gate", "EKF2_EVP_GATE", (3.0, 10.0), 1.0),
+        ("ekf2-gate", "EKF2_EVP_NOISE", ANY, 1.0 / 3.0),
+        ("ekf2-off", "EKF2_EV_CTRL", (1.0, 15.0), 1.0),
+    )
+    return tuple(row[1:] for row in rows if row[0] == wrong.kind)
 
 
 def _verdicts(answers: Answers, truth: FormTruth) -> float:

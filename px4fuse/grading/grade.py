@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -32,9 +31,6 @@ from px4fuse.verification.model import Refused, Verdict
 from px4fuse.verification.workers import Failed, run_bounded
 
 RECORDS = "records"
-# Of one report: a flight of ten minutes takes about one; what takes longer is not a report
-TIMEOUT_S = 120.0
-MEMORY_BYTES = 4_000_000_000
 FAILED = "Do not open it: ask for the report as px4fuse wrote it."
 # For the class table: column title, and where in the results
 NUMBERS = (
@@ -162,14 +158,13 @@ def register_of(
 
 def _flagged(entries: Sequence[Entry], key: AnswerKey | None) -> tuple[Entry, ...]:
     """With what stands out between the reports that count."""
+    places = [place for place, entry in enumerate(entries) if entry.counting]
     flags = class_flags([one for entry in entries if (one := entry.counting)], key)
-    made, index = [], 0
-    for entry in entries:
+    made = list(entries)
+    for index, said in flags.items():
+        entry = made[places[index]]
         one = entry.counting
-        if one is not None:
-            one = replace(one, flags=(*one.flags, *flags.get(index, ())))
-            index += 1
-        made.append(replace(entry, counting=one))
+        made[places[index]] = replace(entry, counting=one and replace(one, flags=one.flags + said))
     return tuple(made)
 
 
@@ -202,20 +197,14 @@ def grade_all(
             largest_log_bytes=max_log_bytes.get(),
         ),
         jobs,
-        processes=min(processes or os.cpu_count() or 1, len(jobs)),
-        timeout_s=TIMEOUT_S,
-        memory_bytes=MEMORY_BYTES,
+        processes=processes,
     )
     with closing(work):
         for index, result in work:
-            one, recalled = (
-                (
-                    refused(rubric, key, Refused(f"Grading it failed: {result.reason}", FAILED)),
-                    False,
-                )
-                if isinstance(result, Failed)
-                else result
-            )
+            if isinstance(result, Failed):
+                why = Refused(f"Grading it failed: {result.reason}", FAILED)
+                result = refused(rubric, key, why), False  # noqa: PLW2901
+            one, recalled = result
             submission = found[index]
             nameless = not one.student and not one.student_id
             graded[index] = replace(

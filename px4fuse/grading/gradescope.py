@@ -75,27 +75,32 @@ def results(entry: Entry, text: str, seconds: float) -> dict[str, Any]:
         That grading took.
     """
     graded = entry.counting
-    tests = [
-        _test(
-            number,
-            one_line(item.title, 200),
-            item.comment,
-            VISIBLE,
-            score=item.points,
-            max_score=item.of,
-            status="passed" if item.points >= item.of else "failed",
-            tags=["px4fuse", graded.status if graded else "missing"],
-        )
-        for number, item in enumerate(graded.items if graded else (), start=1)
+    tests: list[dict[str, Any]] = [
+        {
+            "name": one_line(item.title, 200),
+            "output": item.comment,
+            "visibility": VISIBLE,
+            "score": item.points,
+            "max_score": item.of,
+            "status": "passed" if item.points >= item.of else "failed",
+            "tags": ["px4fuse", graded.status if graded else "missing"],
+        }
+        for item in (graded.items if graded else ())
     ]
     said = [f"Pending: {graded.pending}"] if graded and graded.pending else []
     if said := [*said, *entry.flags]:
-        output = "\n".join(map(cleaned, said))
-        tags = ["px4fuse", "instructor"]
-        last = len(tests) + 1
         tests.append(
-            _test(last, "For the instructor", output, "hidden", score=0.0, max_score=0.0, tags=tags)
+            {
+                "name": "For the instructor",
+                "output": "\n".join(map(cleaned, said)),
+                "visibility": "hidden",
+                "score": 0.0,
+                "max_score": 0.0,
+                "tags": ["px4fuse", "instructor"],
+            }
         )
+    for number, test in enumerate(tests, start=1):
+        test.update(number=str(number), name_format="text", output_format="text")
     return {
         "score": entry.total or 0.0,
         "output": text,
@@ -106,18 +111,6 @@ def results(entry: Entry, text: str, seconds: float) -> dict[str, Any]:
         "stdout_visibility": "hidden",
         "tests": tests,
         "execution_time": round(seconds, 2),
-    }
-
-
-def _test(number: int, name: str, output: str, visibility: str, **more: object) -> dict[str, Any]:
-    return {
-        "name": name,
-        "name_format": "text",
-        "output": output,
-        "output_format": "text",
-        "number": str(number),
-        "visibility": visibility,
-        **more,
     }
 
 

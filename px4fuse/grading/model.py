@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -221,3 +221,10 @@ class Entry:
     def flags(self) -> tuple[str, ...]:
         """All that an instructor should look at."""
         return (*self.remarks, *(self.counting.flags if self.counting else ()))
+
+
+def columns(entries: Sequence[Entry]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Titles of the items and of the numbers that the class has, each once."""
+    graded = [one for entry in entries if (one := entry.counting)]
+    items = dict.fromkeys(title for one in graded for title in one.by_title)
+    return tuple(items), tuple(dict.fromkeys(title for one in graded for title in one.numbers))

@@ -27,6 +27,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+from px4fuse.assignment.roster import Person
+
 METADATA = "submission_metadata.yml"
 # By platform: how its exports name files
 PLATFORMS = {
@@ -79,6 +81,12 @@ class ExportOrigin:
     email: str = ""
     time: datetime | None = None
     late: bool = False
+
+    @property
+    def person(self) -> Person:
+        """Who it is, for a look at a class list."""
+        numbers = {self.platform: self.number} if self.number else {}
+        return Person(self.student_id, self.name, self.email, self.login, numbers)
 
 
 NOBODY = ExportOrigin()
@@ -163,14 +171,12 @@ def gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
     for number, block in _SUBMISSION.findall(text[:_MAX_METADATA].replace("\r\n", "\n")):
         people = _SUBMITTERS.search(block)
         name, student_id, email = (
-            _value(people[1] if people else "", rf"  (?:- |  ):{key}") for key in _KEYS
+            _value(people[1] if people else "", rf"  (?:- |  ):{key}")
+            for key in ("name", "sid", "email")
         )
         time = _time(_value(block, "  :created_at"))
         found[number] = ExportOrigin("gradescope", number, name, "", student_id, email, time)
     return found
-
-
-_KEYS = ("name", "sid", "email")
 
 
 def _value(block: str, key: str) -> str:

@@ -57,12 +57,7 @@ class Register:
 
     def by_platform(self, origin: ExportOrigin) -> int | None:
         """Whose file it is by what the platform says, which no student can change."""
-        if not origin.platform:
-            return None
-        numbers = {origin.platform: origin.number} if origin.number else {}
-        return self.place(
-            Person(origin.student_id, origin.name, origin.email, origin.login, numbers)
-        )
+        return self.place(origin.person) if origin.platform else None
 
 
 def only_place(those: Sequence[T], looks: Iterable[Callable[[T], bool]]) -> int | None:

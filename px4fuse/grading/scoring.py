@@ -10,9 +10,9 @@ from px4fuse.answers import Answers
 from px4fuse.assignment.key import AnswerKey
 from px4fuse.grading.checks import contradictions
 from px4fuse.grading.evidence import Evidence, reason_of, text_of
+from px4fuse.grading.flags import text_flags
 from px4fuse.grading.model import Graded, Item
 from px4fuse.grading.rubric import Doubtful, Rubric
-from px4fuse.grading.text import text_flags
 from px4fuse.plain import capital
 from px4fuse.results.contract import Reported
 from px4fuse.verification.model import Refused, Verdict

@@ -8,43 +8,28 @@ drawn twice and none says whose it is.
 from __future__ import annotations
 
 import hashlib
-import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from px4fuse.flight import Unavailable
-from px4fuse.verification.pictures import page_pictures
+from px4fuse.verification.pages import page_pictures
 from px4fuse.verification.workers import run_bounded
 from px4fuse.writing import write_all
 
-TIMEOUT_S = 120.0
-MEMORY_BYTES = 4_000_000_000
 # What a picture looks like besides its report; a change draws all anew
 DRAWN_AS = "700 px, 16 colours"
 # What the pictures are called; nothing else in their folder is ever deleted
 NAMED = re.compile(r"([0-9a-f]{16})-\d{3}-of-\d{3}\.png")
 
 
-@dataclass(frozen=True)
-class SheetJob:
-    """A redrawn report, the words that its pictures must not show, and where they go."""
-
-    pdf: Path
-    hide: tuple[str, ...]
-    folder: Path
-
-    @property
-    def stem(self) -> str:
-        """By which its pictures are known."""
-        made = hashlib.sha256(self.pdf.read_bytes())
-        made.update("\0".join((DRAWN_AS, *self.hide)).encode("utf-8", "replace"))
-        return made.hexdigest()[:16]
+# A redrawn report, and the words that its pictures must not show
+Redrawn = tuple[Path, Sequence[str]]
 
 
 def draw_sheets(
-    reports: Mapping[str, tuple[Path, Sequence[str]]], folder: Path, processes: int | None = None
+    reports: Mapping[str, Redrawn], folder: Path, processes: int | None = None
 ) -> dict[str, tuple[str, ...]]:
     """Draw the pages of reports that are not drawn yet, in processes of their own.
 
@@ -67,16 +52,9 @@ def draw_sheets(
     OutputError
         The folder cannot be written.
     """
-    jobs = {key: SheetJob(pdf, tuple(hide), folder) for key, (pdf, hide) in reports.items()}
-    stems = {key: job.stem for key, job in jobs.items()}
-    missing = [jobs[key] for key, stem in stems.items() if not _drawn(folder, stem)]
-    for _ in run_bounded(
-        draw,
-        missing,
-        processes=min(processes or os.cpu_count() or 1, len(missing)),
-        timeout_s=TIMEOUT_S,
-        memory_bytes=MEMORY_BYTES,
-    ):
+    stems = {key: _stem(report) for key, report in reports.items()}
+    missing = [reports[key] for key, stem in stems.items() if not _drawn(folder, stem)]
+    for _ in run_bounded(partial(draw, folder=folder), missing, processes=processes):
         pass
     for path in folder.glob("*.png"):
         named = NAMED.fullmatch(path.name)
@@ -85,13 +63,21 @@ def draw_sheets(
     return {key: _drawn(folder, stem) for key, stem in stems.items()}
 
 
-def draw(job: SheetJob) -> None:
+def draw(report: Redrawn, folder: Path) -> None:
     """Write the pictures of one report, if it can be drawn."""
-    drawn = page_pictures(job.pdf.read_bytes(), job.hide)
+    pdf, hide = report
+    drawn = page_pictures(pdf.read_bytes(), hide)
     if not isinstance(drawn, Unavailable):
-        ends = (f"-{number:03}-of-{len(drawn):03}.png" for number in range(1, len(drawn) + 1))
-        named = zip((job.folder / f"{job.stem}{end}" for end in ends), drawn, strict=True)
-        write_all(dict(named))
+        names = f"{_stem(report)}-{{:03}}-of-{len(drawn):03}.png"
+        write_all({folder / names.format(at): made for at, made in enumerate(drawn, start=1)})
+
+
+def _stem(report: Redrawn) -> str:
+    """By which the pictures of a report are known."""
+    pdf, hide = report
+    made = hashlib.sha256(pdf.read_bytes())
+    made.update("\0".join((DRAWN_AS, *hide)).encode("utf-8", "replace"))
+    return made.hexdigest()[:16]
 
 
 def _drawn(folder: Path, stem: str) -> tuple[str, ...]:

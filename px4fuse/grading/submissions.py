@@ -135,17 +135,13 @@ def read(submission: Submission) -> bytes | Refused:
     try:
         if submission.file.is_file():
             with submission.file.open("rb") as file:
-                if not submission.entry:
-                    content = file.read(MAX_BYTES + 1)
-                    if len(content) > MAX_BYTES:
-                        raise _EntryError(_TOO_LARGE)
-                    return content
-                outer, _, inner = submission.entry.partition(_INSIDE)
-                with _archive(file) as archive:
-                    content = _unpacked(archive, outer)
-            if inner:
-                with _archive(io.BytesIO(content)) as archive:
-                    content = _unpacked(archive, inner)
+                stream: IO[bytes] = file
+                for entry in filter(None, submission.entry.split(_INSIDE)):
+                    with _archive(stream) as archive:
+                        stream = io.BytesIO(_unpacked(archive, entry))
+                content = stream.read(MAX_BYTES + 1)
+            if len(content) > MAX_BYTES:
+                raise _EntryError(_TOO_LARGE)
             return content
     except _EntryError as error:
         reason = str(error)
@@ -250,51 +246,38 @@ def _search_zip(
         what is in it.
     """
     shown, left = _shown(name), MAX_INNER_BYTES
+    with _damage_noted(shown, search), _archive(stream) as archive:
+        for entry, label in _listed(archive, shown, search.notes):
+            where = entry.filename if outer is None else f"{outer[0]}{_INSIDE}{entry.filename}"
+            time = _time(entry) if outer is None else outer[1]
+            end, whole = label.lower()[-4:], prefix + label
+            about = outer is None and _is_metadata(label)
+            if end == ".pdf":
+                search.found.setdefault((file, where), (whole, time))
+            elif not about and end != ".zip":
+                search.others[_kind(label)] += 1
+            elif outer is not None:
+                search.notes.append(f"{shown}: a zip file in it was passed over: too deep.")
+            elif (left := left - entry.file_size) < 0:
+                raise _EntryError("it holds too many zip files.")
+            else:
+                with _damage_noted(_shown(whole), search):
+                    content = _unpacked(archive, entry.filename)
+                    if about:
+                        search.people |= _people(content)
+                        continue
+                    inside = io.BytesIO(content)
+                    _search_zip(inside, whole, f"{whole}/", file, search, (where, time))
+
+
+@contextmanager
+def _damage_noted(shown: str, search: _Search) -> Iterator[None]:
+    """Whatever is wrong with a zip file, or with an entry of it, is a note and ends no search."""
     try:
-        with _archive(stream) as archive:
-            for entry, label in _listed(archive, shown, search.notes):
-                where = entry.filename if outer is None else f"{outer[0]}{_INSIDE}{entry.filename}"
-                time = _time(entry) if outer is None else outer[1]
-                end = label.lower()[-4:]
-                about = outer is None and _is_metadata(label)
-                if end == ".pdf":
-                    search.found.setdefault((file, where), (prefix + label, time))
-                elif not about and end != ".zip":
-                    search.others[_kind(label)] += 1
-                elif outer is not None:
-                    search.notes.append(f"{shown}: a zip file in it was passed over: too deep.")
-                elif (left := left - entry.file_size) < 0:
-                    raise _EntryError("it holds too many zip files.")
-                else:
-                    _search_inside(archive, entry, about, prefix + label, file, search, time)
+        yield
     except (_EntryError, *_DAMAGED) as error:
-        search.notes.append(f"{shown}: passed over: {_why(error)}")
-
-
-def _search_inside(
-    archive: zipfile.ZipFile,
-    entry: zipfile.ZipInfo,
-    about: bool,
-    name: str,
-    file: Path,
-    search: _Search,
-    time: datetime | None,
-) -> None:
-    """Look into a zip file in a zip file, or into what is written ``about`` the submissions."""
-    try:
-        content = _unpacked(archive, entry.filename)
-    except (_EntryError, *_DAMAGED) as error:
-        search.notes.append(f"{_shown(name)}: passed over: {_why(error)}")
-        return
-    if about:
-        search.people |= _people(content)
-    else:
-        outer = (entry.filename, time)
-        _search_zip(io.BytesIO(content), name, f"{name}/", file, search, outer)
-
-
-def _why(error: BaseException) -> str:
-    return str(error) if isinstance(error, _EntryError) else "not a zip file, or damaged."
+        why = str(error) if isinstance(error, _EntryError) else "not a zip file, or damaged."
+        search.notes.append(f"{shown}: passed over: {why}")
 
 
 def _listed(

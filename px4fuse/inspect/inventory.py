@@ -10,26 +10,66 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from px4fuse.comparison.preparation import choose_segment, choose_source
+from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.model import Comparison
 from px4fuse.errors import MissingDataError, Px4FuseError
-from px4fuse.filter.signals import IMU_GAP_INTERVALS, IMU_GAP_S, Segment, make_axes
+from px4fuse.filter.signals import IMU_GAP_INTERVALS, IMU_GAP_S, Segment, ned_acceleration, within
+from px4fuse.findings import ekf2_not_fusing, imu, missing, named, recording
 from px4fuse.findings.source_intervals import longest_s
-from px4fuse.flight import Ekf2, Flight, Unavailable, sample_rate
-from px4fuse.inspect.outlook import (
-    PART_NAMES,
-    Ability,
-    Advice,
-    Plan,
-    abilities,
-    advice,
-    most_innovations,
+from px4fuse.flight import (
+    VELOCITY_COLUMNS,
+    Ekf2,
+    Flight,
+    PositionTrack,
+    Truth,
+    Unavailable,
+    sample_rate,
 )
-from px4fuse.plain import plain
-from px4fuse.recording import ClockMap, InputFile, LogInfo, Unused
+from px4fuse.inspect.tables import NO_POSITION, absent
+from px4fuse.plain import capital, plain
+from px4fuse.recording import ClockMap, InputFile, LogInfo, Stream, Unused
 from px4fuse.request import with_options
 
 SCHEMA_NAME = "px4fuse-info"
 SCHEMA_VERSION = "1.0"
+# How a part is named for a person, by its name in Flight.streams
+PARTS = {
+    "imu": "IMU",
+    "attitude": "attitude",
+    "position": "position",
+    "ekf2_state": "EKF2 state",
+    "ekf2_variance": "EKF2 variance",
+    "ekf2_innovations": "innovations",
+    "ekf2_fusing": "fusion flags",
+    "truth": "truth",
+    "airborne": "land detector",
+}
+# What compare does with EKF2 and the truth, and the part that each needs
+OF_PARTS = {
+    "EKF2 states": "ekf2_state",
+    "EKF2 variances": "ekf2_variance",
+    "EKF2 innovations": "ekf2_innovations",
+    "truth": "truth",
+}
+NO_AXIS = Unavailable("comparison", "no position to compare on", "")
+Spans = tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
+class Ability:
+    """One thing that px4fuse can or cannot do with the log, and with what or why not."""
+
+    name: str
+    possible: bool
+    reason: str
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What to do before the next flight, and for what."""
+
+    remedy: str
+    improves: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -59,7 +99,7 @@ class Source:
     Attributes
     ----------
     part : str
-        "IMU", "attitude", "position", "EKF2 state", ..., see :data:`PART_NAMES`.
+        "IMU", "attitude", "position", "EKF2 state", ..., see :data:`PARTS`.
     name : str
         The name of a position track, else the first topic; empty where unavailable.
     topics : tuple of str
@@ -147,25 +187,36 @@ def take_inventory(flight: Flight) -> Inventory:
     flight : Flight
         Any: also one of which every part is unavailable.
     """
-    plan = _plan(flight)
+    compared, reason, remedy = None, "", ""
+    try:
+        compared = compare(flight)
+        reason = compared.source_reason
+    except Px4FuseError as error:
+        text = with_options(str(error)).removeprefix(f"{flight.log.name}: ")
+        first, _, remedy = text.partition(". ")
+        reason = first.removesuffix(".")
+        if not isinstance(error, MissingDataError):
+            remedy = "Record more of the flight: the logger from arming on (SDLOG_MODE 0)."
+    log = flight.log
+    cut = log.ends_in_flight and not log.damage
     return Inventory(
-        log=flight.log,
-        start_utc=_utc(flight.log.start_unix_s),
+        log=log,
+        start_utc=_utc(log.start_unix_s),
         airborne=None if isinstance(flight.airborne, Unavailable) else flight.airborne,
-        sources=tuple(_sources(flight, plan)),
-        source_reason=plan.reason,
-        segment=plan.segment,
+        sources=tuple(_sources(flight, compared, reason)),
+        source_reason=reason,
+        segment=None if compared is None else compared.segment,
         clocks=flight.clocks,
-        abilities=tuple(abilities(flight, plan)),
-        advice=advice(flight, plan),
+        abilities=tuple(_abilities(flight, compared, reason)),
+        advice=_advice(flight, compared, remedy),
         missing=flight.missing,
         unused=flight.unused,
         inputs=flight.inputs,
         notes=(
-            *flight.log.damage,
-            *_end(flight.log),
-            *flight.log.notes,
-            *(plan.track.notes if plan.track is not None else ()),
+            *log.damage,
+            *(("the log ends in flight: the landing is not in it",) if cut else ()),
+            *log.notes,
+            *(() if compared is None else compared.source.notes),
             *(flight.ekf2.notes if isinstance(flight.ekf2, Ekf2) else ()),
         ),
     )
@@ -177,11 +228,6 @@ def to_plain(inventory: Inventory) -> dict[str, Any]:
     return {"schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION}, **data}
 
 
-def _end(log: LogInfo) -> tuple[str, ...]:
-    flying = log.ends_in_flight and not log.damage
-    return ("the log ends in flight: the landing is not in it",) if flying else ()
-
-
 def _utc(unix_s: float | None) -> str | None:
     if unix_s is None:
         return None
@@ -191,90 +237,145 @@ def _utc(unix_s: float | None) -> str | None:
         return None
 
 
-def _plan(flight: Flight) -> Plan:
-    track = segment = None
-    reason = remedy = ""
-    try:
-        track, reason = choose_source(flight)
-        segment = choose_segment(flight, track)
-        return Plan(track, segment, make_axes(flight, track, segment), reason, "")
-    except Px4FuseError as error:
-        text = with_options(str(error)).removeprefix(f"{flight.log.name}: ")
-        reason, _, remedy = text.partition(". ")
-        if not isinstance(error, MissingDataError):
-            remedy = "Record more of the flight: the logger from arming on (SDLOG_MODE 0)."
-    return Plan(track, None, (), reason.removesuffix("."), remedy)
+def _parts(flight: Flight) -> dict[str, pd.DataFrame | Spans | Unavailable]:
+    """All but the positions, by their names in Flight.streams; of EKF2 that is missing the state.
 
-
-def _sources(flight: Flight, plan: Plan) -> Iterator[Source]:
-    ekf2 = flight.ekf2
-    yield _part(flight, "imu", flight.imu)
-    yield _part(flight, "attitude", flight.attitude)
-    for track in flight.positions:
-        yield Source(
-            part="position",
-            name=track.name,
-            topics=track.topics,
-            clock=track.clock,
-            log=track.log,
-            chosen=plan.track is not None and track.name == plan.track.name,
-            description=track.description,
-            **_counted(track.samples, _gap_limit(track.samples)),
-        )
-    if not flight.positions:
-        yield Source("position", unavailable=plan.reason)
-    yield _part(flight, "ekf2_state", ekf2 if isinstance(ekf2, Unavailable) else ekf2.state)
-    if isinstance(ekf2, Ekf2):
-        yield _part(flight, "ekf2_variance", ekf2.variance)
-        yield _part(flight, "ekf2_innovations", most_innovations(ekf2))
-        yield _part(flight, "ekf2_fusing", ekf2.fusing)
-    truth = flight.truth
-    yield _part(flight, "truth", truth if isinstance(truth, Unavailable) else truth.samples)
-    yield _part(flight, "airborne", flight.airborne)
-
-
-def _part(
-    flight: Flight, key: str, data: pd.DataFrame | tuple[tuple[float, float], ...] | Unavailable
-) -> Source:
-    if isinstance(data, Unavailable):
-        return Source(PART_NAMES[key], unavailable=data.reason)
-    stream = flight.streams.get(key)
-    topics = () if stream is None else stream.topics
-    if isinstance(data, pd.DataFrame):
-        counted = _counted(data, _gap_limit(data, of_imu=key == "imu"))
+    Innovations are those of the axis that has most of them.
+    """
+    ekf2, truth = flight.ekf2, flight.truth
+    parts = {"imu": flight.imu, "attitude": flight.attitude}
+    if isinstance(ekf2, Unavailable):
+        parts["ekf2_state"] = ekf2
     else:
-        counted = {"start_s": data[0][0], "end_s": data[-1][1]} if data else {}
-    return Source(
-        part=PART_NAMES[key],
-        name=topics[0] if topics else "",
-        topics=topics,
-        clock="" if stream is None else stream.clock,
-        log="" if stream is None else stream.log,
-        **counted,
+        axes = ekf2.innovations.values()
+        frames = [frame for frame in axes if isinstance(frame, pd.DataFrame)]
+        most = max(frames, key=len) if frames else next(iter(axes))
+        parts |= {"ekf2_state": ekf2.state, "ekf2_variance": ekf2.variance}
+        parts |= {"ekf2_innovations": most, "ekf2_fusing": ekf2.fusing}
+    samples = truth if isinstance(truth, Unavailable) else truth.samples
+    return {**parts, "truth": samples, "airborne": flight.airborne}
+
+
+def _sources(flight: Flight, compared: Comparison | None, reason: str) -> Iterator[Source]:
+    parts = _parts(flight)
+    for key, name in PARTS.items():
+        if key in parts:
+            yield _source(name, parts[key], flight.streams.get(key))
+        for track in flight.positions if key == "position" else ():
+            chosen = compared is not None and track.name == compared.source.name
+            about = {"name": track.name, "description": track.description, "chosen": chosen}
+            yield _source(name, track.samples, track, **about)
+        if key == "position" and not flight.positions:
+            yield Source(name, unavailable=reason)
+
+
+def _source(
+    part: str,
+    data: pd.DataFrame | Spans | Unavailable,
+    stream: Stream | PositionTrack | None,
+    **about: Any,
+) -> Source:
+    """A part, what is said of it, and the streams that it was read from."""
+    if isinstance(data, Unavailable):
+        return Source(part, unavailable=data.reason)
+    if stream is not None:
+        about = {"name": stream.topics[0] if stream.topics else "", **about}
+        about |= {"topics": stream.topics, "clock": stream.clock, "log": stream.log}
+    if isinstance(data, pd.DataFrame):
+        about["samples"] = len(data)
+        times_s = data.index.tolist()
+    else:
+        times_s = [time_s for span in data for time_s in span]
+    if times_s:
+        about |= {"start_s": times_s[0], "end_s": times_s[-1]}
+    if isinstance(data, pd.DataFrame) and len(data) > 1:
+        about |= {"rate_hz": sample_rate(data), "gaps": _gaps(data, of_imu=part == PARTS["imu"])}
+    return Source(part, **about)
+
+
+def _gaps(frame: pd.DataFrame, *, of_imu: bool) -> Gaps:
+    intervals = np.diff(frame.index.to_numpy())
+    limit_s = (
+        max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(intervals)))
+        if of_imu
+        else float(longest_s(1.0 / sample_rate(frame)))
     )
+    long = intervals[intervals > limit_s]
+    return Gaps(len(long), float(long.sum()), float(long.max(initial=0.0)), limit_s)
 
 
-def _counted(frame: pd.DataFrame, limit_s: float | None) -> dict[str, Any]:
-    if frame.empty:
-        return {"samples": 0}
-    counted: dict[str, Any] = {
-        "samples": len(frame),
-        "start_s": float(frame.index[0]),
-        "end_s": float(frame.index[-1]),
+def _abilities(flight: Flight, compared: Comparison | None, reason: str) -> Iterator[Ability]:
+    """What compare does, with what, or why not."""
+    given: object
+    if compared is None:
+        yield Ability("compare", False, reason)
+        given = ned_acceleration(flight)
+    else:
+        source, segment = compared.source, compared.segment
+        count, span = len(within(source.samples, segment)), (segment.start_s, segment.end_s)
+        said = "our filter on {}, {} samples, {:.1f} s to {:.1f} s"
+        yield Ability("compare", True, said.format(source.name, count, *span))
+        given = compared.lines[0].acceleration
+    slow = " ".join(found.message for found in imu.rates(flight))
+    if isinstance(given, Unavailable):
+        slow = f"{given.reason}; velocity is held constant"
+    turned = "IMU turned into NED by the attitude, gravity removed"
+    yield Ability("acceleration", not slow, slow or turned)
+    parts = _parts(flight)
+    done: dict[str, str | Unavailable] = {} if compared is None else _done(compared)
+    for name, key in OF_PARTS.items():
+        part = parts.get(key, flight.ekf2)
+        found = part if isinstance(part, Unavailable) else done.get(name, NO_AXIS)
+        if isinstance(found, Unavailable):
+            yield Ability(name, False, found.reason)
+        else:
+            yield Ability(name, True, found)
+
+
+def _done(compared: Comparison) -> dict[str, str | Unavailable]:
+    """What compare did with EKF2 and the truth along its first axis, or why it did not."""
+    first, truth = next(iter(compared.axes.values())), compared.flight.truth
+    innovations = {name: axis.ekf2_innovations for name, axis in compared.axes.items()}
+    counts = [f"{n} {len(f)}" for n, f in innovations.items() if isinstance(f, pd.DataFrame)]
+    judged = [axis.filters["ekf2"] for axis in compared.axes.values()]
+    what = "position only"
+    if isinstance(truth, Truth) and truth.samples[VELOCITY_COLUMNS].notna().any(axis=None):
+        what = "position and velocity"
+    rows = {
+        "EKF2 states": (first.difference, f"{_count(first.ekf2_state)} of position and velocity"),
+        "EKF2 variances": (first.ekf2_variance, _count(first.ekf2_variance)),
+        "EKF2 innovations": (
+            next((one for one in judged if not isinstance(one, Unavailable)), judged[0]),
+            f"two-sided consistency: {', '.join(counts)}",
+        ),
+        "truth": (first.truth, f"RMSE and NEES of {what} against {getattr(truth, 'name', '')}"),
     }
-    if limit_s is not None:
-        intervals = np.diff(frame.index.to_numpy())
-        long = intervals[intervals > limit_s]
-        counted["rate_hz"] = sample_rate(frame)
-        counted["gaps"] = Gaps(
-            len(long), float(long.sum()), float(long.max(initial=0.0)), float(limit_s)
-        )
-    return counted
+    return {
+        name: part if isinstance(part, Unavailable) else said for name, (part, said) in rows.items()
+    }
 
 
-def _gap_limit(frame: pd.DataFrame, *, of_imu: bool = False) -> float | None:
-    if len(frame) < 2:
-        return None
-    if of_imu:
-        return max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(np.diff(frame.index.to_numpy()))))
-    return longest_s(1.0 / sample_rate(frame))
+def _count(part: pd.DataFrame | Unavailable) -> str:
+    return "" if isinstance(part, Unavailable) else f"{len(part)} samples"
+
+
+def _advice(flight: Flight, compared: Comparison | None, remedy: str) -> tuple[Advice, ...]:
+    """Remedies of what compare finds about the recording and of all that is missing, each once."""
+    found = [*recording.loss(flight), *recording.clocks_set_back(flight)]
+    lacking = [(remedy, "position")] if remedy else []
+    if compared is not None:
+        found += [*missing.source_as_sent(compared), *ekf2_not_fusing.detect(compared)]
+        found += [*missing.innovations(compared), *recording.dropouts(compared)]
+    found += imu.rates(flight)
+    lacking += [(one.remedy, named(one.id)) for one in found]
+    # no other autopilot than PX4 could have recorded more of its estimator
+    of_all = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
+    lacking += [
+        (part.remedy, part.what)
+        for part in absent(flight)
+        if part is not NO_POSITION and (flight.log.has_ulog or any(part is one for one in of_all))
+    ]
+    improves: dict[str, dict[str, None]] = {}
+    for said, what in lacking:
+        improves.setdefault(capital(said), {})[what] = None
+    return tuple(Advice(said, tuple(parts)) for said, parts in improves.items())

@@ -67,11 +67,12 @@ def data_dictionary(flight: Flight) -> pd.DataFrame:
 def absent(flight: Flight) -> tuple[Unavailable, ...]:
     """Parts of the flight that have no table, and why."""
     ekf2 = flight.ekf2
-    parts: list[object] = [flight.imu, flight.attitude, ekf2, flight.truth, flight.airborne]
+    parts: list[object] = [flight.imu, flight.attitude, ekf2]
     if isinstance(ekf2, Ekf2):
-        parts += [ekf2.variance, *ekf2.innovations.values(), ekf2.fusing]
+        parts += [*ekf2.innovations.values(), ekf2.variance, ekf2.fusing]
     if not any(isinstance(part, Unavailable) for part in (flight.imu, flight.attitude)):
         parts.append(ned_acceleration(flight))
+    parts += [flight.airborne, flight.truth]
     found = [part for part in parts if isinstance(part, Unavailable)]
     if not flight.positions:
         found.append(NO_POSITION)

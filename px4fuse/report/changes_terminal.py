@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.text import Text
 
 from px4fuse.report.changes_words import cells, folded_words, other_lines, printed
-from px4fuse.report.screen import STYLES, plain_table, print_file, print_line, say
+from px4fuse.report.screen import STYLES, plain_table, print_line, say
 from px4fuse.report.style import SEVERITY_COLOURS
 from px4fuse.results.contract import ChangeResults
 
@@ -48,5 +48,3 @@ def print_changes(console: Console, results: ChangeResults, report: object = Non
         print_line(console, head, Text(text, style))
     for note in results.notes[:2]:
         say(console, Text(note, "dim"))
-    if report is not None:
-        print_file(console, "Report", report)

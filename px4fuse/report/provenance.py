@@ -10,7 +10,7 @@ from px4fuse.report.document import Document, LoopDocument
 from px4fuse.report.page import Page
 from px4fuse.report.style import MUTED
 from px4fuse.report.words import alignment_words, clock_words
-from px4fuse.results.parts import provenance
+from px4fuse.results.model import provenance
 
 INDENT, SIZE = 140.0, 7.5
 

@@ -119,19 +119,6 @@ def print_file(console: Console, label: str, path: object) -> None:
     console.print(Text(f"{label:{INDENT}}{path}", "bold"), soft_wrap=True)
 
 
-def print_list(console: Console, rows: Iterable[tuple[str | Text, ...]]) -> None:
-    """Print rows of short columns and a last one whose words wrap."""
-    cells = [tuple(Text(c) if isinstance(c, str) else c for c in row) for row in rows]
-    widths = [max(cell.cell_len for cell in column) + 1 for column in zip(*cells, strict=True)]
-    for row in cells:
-        head = Text()
-        for cell, width in zip(row[:-1], widths, strict=False):
-            padded = cell.copy()
-            padded.pad_right(width - cell.cell_len)
-            head.append_text(padded)
-        say(console, row[-1], head, head.cell_len)
-
-
 def plain_table(*heads: tuple[str, str]) -> Table:
     """A table without lines.
 

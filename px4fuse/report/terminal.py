@@ -12,7 +12,7 @@ from px4fuse.flight import Unavailable
 from px4fuse.report.cover import facts, write_axes, write_finding
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page
-from px4fuse.report.screen import print_file, show
+from px4fuse.report.screen import show
 from px4fuse.report.style import MUTED
 from px4fuse.report.why import write_why
 from px4fuse.report.words import verdict_notes
@@ -64,8 +64,6 @@ def print_summary(
     if (more := len(groups) - MOST_FINDINGS) > 0:
         page.write(f"and {more} more in the report" if report else f"and {more} more")
     show(console, page.blocks, request)
-    if report is not None:
-        print_file(console, "Report", report)
 
 
 def _told(why: Why | Unavailable, story: tuple[str, ...]) -> bool:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import cast
+from dataclasses import asdict
+from typing import Any, cast
+
+import msgspec
 
 from px4fuse.analysis import Analysis, Counterfactual
 from px4fuse.comparison.model import Comparison
@@ -11,10 +14,10 @@ from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import Finding
 from px4fuse.findings.story import story
-from px4fuse.flight import Unavailable
+from px4fuse.flight import Flight, PositionTrack, Unavailable
 from px4fuse.record import written
 from px4fuse.request import AxisName, ComparisonRequest, WhatIfRequest
-from px4fuse.results.comparison import AvailableTrack, ChosenSettings, PositionSource
+from px4fuse.results.comparison import AvailableTrack, ChosenSettings, Log, PositionSource
 from px4fuse.results.contract import (
     COMPARISON,
     WHATIF,
@@ -23,8 +26,7 @@ from px4fuse.results.contract import (
     TuningResults,
     WhatIfResults,
 )
-from px4fuse.results.model import Student
-from px4fuse.results.parts import copied, log_part, provenance, schema_of
+from px4fuse.results.model import Student, provenance, schema_of
 
 
 def results(
@@ -36,11 +38,7 @@ def results(
 ) -> ComparisonResults:
     """Everything that the report says."""
     return ComparisonResults(
-        schema=schema_of(COMPARISON),
-        request=request.recorded(),
-        log=log_part(analysis.flight),
-        source=_source(analysis),
-        settings=_settings(analysis),
+        **_of_flight(COMPARISON, request, analysis, command),
         axes={cast(AxisName, name): written(axis) for name, axis in analysis.axes.items()},
         horizontal=dict(analysis.horizontal),
         tuning=written(analysis.tuning),
@@ -54,7 +52,6 @@ def results(
         notes=analysis.notes,
         missing=analysis.missing,
         student=student,
-        provenance=provenance(command),
     )
 
 
@@ -65,15 +62,8 @@ def tuning_results(
     command: str,
 ) -> TuningResults:
     """What ``px4fuse tune`` found."""
-    return TuningResults(
-        schema=schema_of("px4fuse-tuning"),
-        request=request.recorded(),
-        log=log_part(comparison.flight),
-        source=_source(comparison),
-        settings=_settings(comparison),
-        tuning=written(tuned),
-        provenance=provenance(command),
-    )
+    begun = _of_flight("px4fuse-tuning", request, comparison, command)
+    return TuningResults(**begun, tuning=written(tuned))
 
 
 def sync_results(
@@ -83,15 +73,8 @@ def sync_results(
     command: str,
 ) -> SyncResults:
     """What ``px4fuse sync`` found."""
-    return SyncResults(
-        schema=schema_of("px4fuse-sync"),
-        request=request.recorded(),
-        log=log_part(comparison.flight),
-        source=_source(comparison),
-        settings=_settings(comparison),
-        clock=written(clock),
-        provenance=provenance(command),
-    )
+    begun = _of_flight("px4fuse-sync", request, comparison, command)
+    return SyncResults(**begun, clock=written(clock))
 
 
 def whatif_results(request: WhatIfRequest, made_of: Counterfactual, command: str) -> WhatIfResults:
@@ -114,40 +97,53 @@ def whatif_results(request: WhatIfRequest, made_of: Counterfactual, command: str
     )
 
 
-def _source(comparison: Comparison) -> PositionSource:
-    track = comparison.source
+def log_part(flight: Flight) -> Log:
+    """The log of a flight and what was joined with it."""
+    return Log(**msgspec.structs.asdict(flight.log), joined=flight.inputs, clocks=flight.clocks)
+
+
+def _of_flight(
+    name: str, request: ComparisonRequest, comparison: Comparison, command: str
+) -> dict[str, Any]:
+    """What the results of every command on one flight's comparison have in common."""
+    track, segment, settings = comparison.source, comparison.segment, comparison.settings
     origin, parameters = track.origin, comparison.flight.log.parameters
-    return copied(
-        PositionSource,
-        track,
+    placed_s = 0.0 if track.alignment is None else track.alignment.clock_offset_s
+    source = PositionSource(
+        name=track.name,
         kind=origin.kind,
         passage=origin.passage,
-        reconstructed=origin.reconstructed,
         ekf2_parameters={} if origin.aid is None else origin.aid.in_log(parameters),
+        description=track.description,
         reason=comparison.source_reason,
-        available=tuple(
-            copied(
-                AvailableTrack,
-                known,
-                kind=known.origin.kind,
-                passage=known.origin.passage,
-                samples=len(known.samples),
-            )
-            for known in comparison.flight.positions
-        ),
+        rate_hz=track.rate_hz,
+        frame=cast(Any, track.frame),
+        clock=track.clock,
+        reconstructed=origin.reconstructed,
+        topics=track.topics,
+        available=tuple(map(_available, comparison.flight.positions)),
         not_in_log=tuple(part for part in comparison.missing if part.source),
+        log=track.log,
+        alignment=track.alignment,
     )
+    used: dict[str, Any] = asdict(settings) | {"clock_offset_s": settings.clock_offset_s + placed_s}
+    return {
+        "schema": schema_of(name),
+        "request": request.recorded(),
+        "log": log_part(comparison.flight),
+        "source": source,
+        "settings": ChosenSettings(
+            **used,
+            start_s=segment.start_s,
+            end_s=segment.end_s,
+            segment_reason=segment.reason,
+        ),
+        "provenance": provenance(command),
+    }
 
 
-def _settings(comparison: Comparison) -> ChosenSettings:
-    settings = comparison.settings
-    alignment = comparison.source.alignment
-    placed_s = 0.0 if alignment is None else alignment.clock_offset_s
-    return copied(
-        ChosenSettings,
-        settings,
-        start_s=comparison.segment.start_s,
-        end_s=comparison.segment.end_s,
-        segment_reason=comparison.segment.reason,
-        clock_offset_s=settings.clock_offset_s + placed_s,
+def _available(track: PositionTrack) -> AvailableTrack:
+    origin = track.origin
+    return AvailableTrack(
+        track.name, origin.kind, origin.passage, len(track.samples), track.rate_hz
     )

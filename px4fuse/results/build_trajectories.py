@@ -9,8 +9,7 @@ from px4fuse.loop.loop import Loop
 from px4fuse.record import written
 from px4fuse.request import LoopRequest
 from px4fuse.results.contract import LOOP, EvaluationResults, GraphResults, LoopResults
-from px4fuse.results.model import Student
-from px4fuse.results.parts import provenance, schema_of
+from px4fuse.results.model import Student, provenance, schema_of
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import SolvedGraph
 

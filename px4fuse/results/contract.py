@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
@@ -32,12 +32,11 @@ from px4fuse.results.changes import (
     TextChange,
 )
 from px4fuse.results.comparison import ChosenSettings, Log, PositionSource
-from px4fuse.results.model import Provenance, Schema, Student
+from px4fuse.results.model import VERSION, Provenance, Schema, Student
 from px4fuse.trajectory.evaluation import Score
 from px4fuse.trajectory.graph.analysis import Graph
 from px4fuse.trajectory.model import Track
 
-VERSION: Literal["3.0"] = "3.0"
 COMPARISON = "px4fuse-results"
 LOOP = "px4fuse-loop"
 WHATIF = "px4fuse-whatif"

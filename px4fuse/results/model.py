@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import platform
+from importlib import metadata
 from typing import Annotated, Literal
 
 import msgspec
@@ -10,6 +12,9 @@ from msgspec import Meta
 from px4fuse.answers import Answers
 from px4fuse.record import Record
 
+VERSION: Literal["3.0"] = "3.0"
+# The libraries on whose arithmetic the numbers rest
+LIBRARIES = ("numpy", "scipy", "pandas", "pyulog", "pymavlink", "filterpy", "matplotlib", "pypdf")
 MAX_NOTES_BYTES = 200_000
 MAX_PERSON = 10_000
 
@@ -57,3 +62,18 @@ class Provenance(Record, frozen=True):
     python: Version
     libraries: dict[str, Version]
     command: str
+
+
+def schema_of(name: str) -> Schema:
+    """Name and version of what is written."""
+    return Schema(name, VERSION)
+
+
+def provenance(command: str) -> Provenance:
+    """Versions of this installation, and the command line."""
+    return Provenance(
+        px4fuse=metadata.version("px4fuse"),
+        python=platform.python_version(),
+        libraries={name: metadata.version(name) for name in LIBRARIES},
+        command=command,
+    )

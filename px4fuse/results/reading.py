@@ -12,7 +12,8 @@ import msgspec
 
 from px4fuse.errors import ResultsError
 from px4fuse.record import choose
-from px4fuse.results.contract import KINDS, VERSION, Results
+from px4fuse.results.contract import KINDS, Results
+from px4fuse.results.model import VERSION
 
 MAX_BYTES = 5_000_000
 MAX_DEPTH = 64

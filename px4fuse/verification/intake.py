@@ -42,7 +42,6 @@ MAX_VALUES = 1_000_000
 # Objects that are referred to and not there: pypdf searches the whole file for each of them
 MAX_MISSING = 100
 
-_INSTALL = 'reading reports needs more packages: pip install "px4fuse[grade]".'
 _DAMAGED = "damaged: it cannot be read as a PDF. Hand in the file that px4fuse wrote."
 _LOCKED = "encrypted, or damaged. Hand in the file px4fuse wrote."
 _COSTLY = "it takes more memory or work to open than a report can need."
@@ -139,8 +138,7 @@ def read_report(pdf: bytes, name: str) -> Report | Refused:
         reason = _COSTLY
     # pypdf names no closed set of exceptions for what is broken in a file
     except Exception:  # noqa: BLE001
-        old = not hasattr(pypdf, "apply_configuration")
-        reason = _INSTALL if old else _LOCKED if b"/Encrypt" in pdf else _DAMAGED
+        reason = _LOCKED if b"/Encrypt" in pdf else _DAMAGED
     return Refused(f"{one_line(name, 200)}: {reason}", remedy)
 
 
@@ -259,6 +257,9 @@ def _look_at(value: DictionaryObject, contents: _Contents) -> None:
         contents.found.add(_ACTIONS[action])
     if "/EF" in value:
         contents.files.append(value)
+        versions = _resolved(value.get("/EF"))
+        parts = map(_resolved, versions.values() if isinstance(versions, DictionaryObject) else ())
+        contents.embedded += [part for part in parts if isinstance(part, StreamObject)]
     elif _name(value.get("/Type")) in {"/Filespec", "/F"}:
         contents.found.add("a reference to another file")
     if isinstance(value, StreamObject):
@@ -290,9 +291,7 @@ def _attachment(contents: _Contents) -> bytes:
             f"no {RESULTS_NAME} is attached: not a report of px4fuse, or one that was printed to "
             "PDF, which leaves the results out. Hand in the original file that px4fuse wrote."
         )
-    streams = {id(stream): stream for found in contents.files for stream in _streams_of(found)} | {
-        id(stream): stream for stream in contents.embedded
-    }
+    streams = {id(stream): stream for stream in contents.embedded}
     if len(contents.files) != 1 or len(streams) != 1:
         raise ResultsError(
             "more than one file is attached, or none that can be read: hand in one report per PDF."
@@ -312,9 +311,3 @@ def _attachment(contents: _Contents) -> bytes:
         limit = MAX_ATTACHMENT_BYTES // 1_000_000
         raise ResultsError(f"{RESULTS_NAME} in it is larger than {limit} MB.")
     return data
-
-
-def _streams_of(file: DictionaryObject) -> list[StreamObject]:
-    versions = _resolved(file.get("/EF"))
-    parts = versions.values() if isinstance(versions, DictionaryObject) else ()
-    return [part for each in parts if isinstance(part := _resolved(each), StreamObject)]

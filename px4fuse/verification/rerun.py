@@ -21,7 +21,7 @@ from px4fuse.errors import Px4FuseError, ResultsError, SettingsError
 from px4fuse.report.document import Document, LoopDocument
 from px4fuse.request import command_line
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json
-from px4fuse.results.model import Provenance
+from px4fuse.results.model import LIBRARIES, Provenance
 from px4fuse.results.reading import one_line
 from px4fuse.verification.model import Refused
 
@@ -82,16 +82,13 @@ def recompute(results: Reported, logs: Mapping[str, Path]) -> Recomputed | Refus
         Refused where the command is not px4fuse's, a file is missing, or the analysis fails.
     """
     try:
-        from px4fuse.results.parts import LIBRARIES  # noqa: PLC0415
-
-        versions = results.provenance
-        if tuple(versions.libraries) != LIBRARIES:
+        if tuple(results.provenance.libraries) != LIBRARIES:
             raise ResultsError("the results do not say which libraries they were made with", ASK)
         with tempfile.TemporaryDirectory(prefix="px4fuse-") as folder:
             place = partial(_place, logs, Path(folder))
             if isinstance(results, LoopResults):
-                return _looped(results, place, versions)
-            return _compared(results, place, versions)
+                return _looped(results, place)
+            return _compared(results, place)
     except SettingsError as error:  # no run with these settings can have made a report
         return Refused(f"{NOT_OURS}: {error}", ASK)
     except ResultsError as error:
@@ -136,7 +133,7 @@ def split_part(source: str) -> tuple[str, str]:
     return (name, f":{tail}") if colon and tail in PARTS else (source, "")
 
 
-def _compared(handed_in: ComparisonResults, place: _Place, versions: Provenance) -> Recomputed:
+def _compared(handed_in: ComparisonResults, place: _Place) -> Recomputed:
     from px4fuse.analysis import run  # noqa: PLC0415
     from px4fuse.findings import find  # noqa: PLC0415
     from px4fuse.results.build import results  # noqa: PLC0415
@@ -153,10 +150,10 @@ def _compared(handed_in: ComparisonResults, place: _Place, versions: Provenance)
     analysis = run(request)
     document = Document(analysis, find(analysis), person, command_line(recorded))
     found = results(recorded, analysis, document.findings, person, document.command)
-    return Recomputed(found, partial(_drawn, document, to_json(found), versions))
+    return Recomputed(found, partial(_drawn, document, to_json(found), handed_in.provenance))
 
 
-def _looped(handed_in: LoopResults, place: _Place, versions: Provenance) -> Recomputed:
+def _looped(handed_in: LoopResults, place: _Place) -> Recomputed:
     from px4fuse.analysis import run_loop  # noqa: PLC0415
     from px4fuse.findings import find_loop  # noqa: PLC0415
     from px4fuse.results.build_trajectories import loop_results  # noqa: PLC0415
@@ -173,7 +170,7 @@ def _looped(handed_in: LoopResults, place: _Place, versions: Provenance) -> Reco
     found = run_loop(request)
     document = LoopDocument(found, find_loop(found), person, command_line(recorded))
     made = loop_results(recorded, found, document.findings, person, document.command)
-    return Recomputed(made, partial(_drawn, document, to_json(made), versions))
+    return Recomputed(made, partial(_drawn, document, to_json(made), handed_in.provenance))
 
 
 def _drawn(document: Document | LoopDocument, text: str, versions: Provenance) -> bytes:

@@ -28,6 +28,9 @@ Result = TypeVar("Result")
 # is done in less than this fills no cache, and a new process takes two seconds to import
 JOBS_PER_WORKER = 40
 QUICK_S = 0.5
+# Of one report: a flight of ten minutes takes about one minute; what takes longer is not a report
+TIMEOUT_S = 120.0
+MEMORY_BYTES = 4_000_000_000
 # Until a new process has imported what the function needs, on a slow and busy machine
 START_S = 180.0
 # Read by an interpreter as it starts, before any code of ours runs
@@ -74,9 +77,9 @@ def run_bounded(
     function: Callable[[Job], Result],
     jobs: Sequence[Job],
     *,
-    processes: int,
-    timeout_s: float,
-    memory_bytes: int | None,
+    processes: int | None = None,
+    timeout_s: float = TIMEOUT_S,
+    memory_bytes: int | None = MEMORY_BYTES,
 ) -> Generator[tuple[int, Result | Failed]]:
     """Call a function on every job, in processes of their own, each within bounds.
 
@@ -87,8 +90,8 @@ def run_bounded(
     ----------
     function : callable
         At the top level of a module; pickled, as are jobs and results.
-    processes : int
-        At once.
+    processes : int, optional
+        At once; by default as many as there are cores.
     timeout_s : float
         For one job, once its process is ready.
     memory_bytes : int or None
@@ -111,7 +114,7 @@ def run_bounded(
 
     try:
         while waiting or workers:
-            while waiting and len(workers) < max(1, processes):
+            while waiting and len(workers) < (processes or os.cpu_count() or 1):
                 # given now, sent when the process is ready: a start that fails costs one job
                 workers.append(_Worker(function, memory_bytes, waiting.pop()))
             # the latest when somebody's time is up
@@ -143,10 +146,13 @@ def run_bounded(
 
 
 def bounded(
-    function: Callable[[Job], Result], job: Job, timeout_s: float, memory_bytes: int
+    function: Callable[[Job], Result],
+    job: Job,
+    timeout_s: float,
+    memory_bytes: int = MEMORY_BYTES,
 ) -> Result | Failed:
     """One call in a process of its own, within bounds: see :func:`run_bounded`."""
-    work = run_bounded(function, [job], processes=1, timeout_s=timeout_s, memory_bytes=memory_bytes)
+    work = run_bounded(function, [job], timeout_s=timeout_s, memory_bytes=memory_bytes)
     with closing(work):
         return next(work)[1]
 
