@@ -30,6 +30,8 @@ class Aid:
         Standard deviation of the measurement, its gate in standard deviations, its age in ms.
     noise_mode : str
         1: variances of the sender are not used; empty where there is no such choice.
+    place : tuple of str
+        Where the sensor is in the body (m, FRD).
     """
 
     name: str
@@ -38,6 +40,7 @@ class Aid:
     gate: str
     delay: str
     noise_mode: str = ""
+    place: tuple[str, ...] = ()
 
     def in_log(self, logged: Mapping[str, float]) -> dict[str, float]:
         """Its parameters among those of a log, and what switches it."""
@@ -47,8 +50,9 @@ class Aid:
 
 AID_MASK = "EKF2_AID_MASK"
 EV_POS = Aid(
-    "ev_pos", "EKF2_EV_CTRL", "EKF2_EVP_NOISE", "EKF2_EVP_GATE", "EKF2_EV_DELAY", "EKF2_EV_NOISE_MD"
-)
+    "ev_pos", "EKF2_EV_CTRL", "EKF2_EVP_NOISE", "EKF2_EVP_GATE", "EKF2_EV_DELAY",
+    "EKF2_EV_NOISE_MD", ("EKF2_EV_POS_X", "EKF2_EV_POS_Y", "EKF2_EV_POS_Z"),
+)  # fmt: skip
 GNSS_POS = Aid("gnss_pos", "EKF2_GPS_CTRL", "EKF2_GPS_P_NOISE", "EKF2_GPS_P_GATE", "EKF2_GPS_DELAY")
 
 
@@ -63,31 +67,27 @@ class Parameter:
         PX4's, from v1.14 on.
     minimum, maximum : float
         PX4's range, both ends included.
-    meaning : str
     """
 
     unit: str
     default: float
     minimum: float
     maximum: float
-    meaning: str
 
 
 PARAMETERS: Mapping[str, Parameter] = {
-    EV_POS.noise: Parameter("m", 0.1, 0.01, 1e3, "standard deviation of vision position"),
-    EV_POS.noise_mode: Parameter("", 0.0, 0.0, 1.0, "1: variances of the sender are not used"),
-    EV_POS.gate: Parameter("SD", 5.0, 1.0, 1e3, "gate of the vision position innovation"),
-    EV_POS.delay: Parameter("ms", 0.0, 0.0, 300.0, "age of vision at its stamp"),
-    "EKF2_DELAY_MAX": Parameter("ms", 200.0, 0.0, 1e3, "how far fusion may run behind (v1.15)"),
-    "EKF2_EV_POS_X": Parameter("m", 0.0, -math.inf, math.inf, "vision sensor forward of the body"),
-    "EKF2_EV_POS_Y": Parameter("m", 0.0, -math.inf, math.inf, "vision sensor right of the body"),
-    "EKF2_EV_POS_Z": Parameter("m", 0.0, -math.inf, math.inf, "vision sensor below the body"),
-    "EKF2_ACC_NOISE": Parameter("m/s^2", 0.35, 0.01, 1.0, "noise of the accelerometer"),
-    "EKF2_GYR_NOISE": Parameter("rad/s", 0.015, 0.0001, 0.1, "noise of the gyro"),
-    "EKF2_ACC_B_NOISE": Parameter("m/s^3", 0.003, 0.0, 0.01, "drift of the accelerometer's bias"),
-    "EKF2_GYR_B_NOISE": Parameter("rad/s^2", 0.001, 0.0, 0.01, "drift of the gyro's bias"),
-    "EKF2_TAU_POS": Parameter("s", 0.25, 0.1, 1.0, "output predictor, position"),
-    "EKF2_TAU_VEL": Parameter("s", 0.25, 0.0, 1.0, "output predictor, velocity"),
+    EV_POS.noise: Parameter("m", 0.1, 0.01, 1e3),
+    EV_POS.noise_mode: Parameter("", 0.0, 0.0, 1.0),
+    EV_POS.gate: Parameter("SD", 5.0, 1.0, 1e3),
+    EV_POS.delay: Parameter("ms", 0.0, 0.0, 300.0),
+    "EKF2_DELAY_MAX": Parameter("ms", 200.0, 0.0, 1e3),
+    **dict.fromkeys(EV_POS.place, Parameter("m", 0.0, -math.inf, math.inf)),
+    "EKF2_ACC_NOISE": Parameter("m/s^2", 0.35, 0.01, 1.0),
+    "EKF2_GYR_NOISE": Parameter("rad/s", 0.015, 0.0001, 0.1),
+    "EKF2_ACC_B_NOISE": Parameter("m/s^3", 0.003, 0.0, 0.01),
+    "EKF2_GYR_B_NOISE": Parameter("rad/s^2", 0.001, 0.0, 0.01),
+    "EKF2_TAU_POS": Parameter("s", 0.25, 0.1, 1.0),
+    "EKF2_TAU_VEL": Parameter("s", 0.25, 0.0, 1.0),
 }
 # Up to v1.13, ekf2_params.c
 OLD_DEFAULTS: Mapping[str, float] = {EV_POS.delay: 175.0}

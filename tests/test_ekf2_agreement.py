@@ -100,7 +100,7 @@ def test_a_replay_that_rejects_what_ekf2_rejected_must_agree(
         rejected_share_replayed=0.2, decisions_same=0.9, published_rms_difference_m=0.0,
         good=True, reason="so far",
     )  # fmt: skip
-    again = replace(one, north=agreeing(), east=agreeing(correlation))
+    again = replace(one, ev_pos={"north": agreeing(), "east": agreeing(correlation)})
     found = with_obedient(one, again)
     assert found.good is good
     assert f"the innovations correlate by {correlation:.3f}" in found.reason

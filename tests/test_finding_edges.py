@@ -31,7 +31,6 @@ from findings_tools import (
 )
 
 from px4fuse.comparison import remedy as remedies
-from px4fuse.comparison.remedy import Effect
 from px4fuse.ekf2.model import Model
 from px4fuse.filter.heading import HeadingError, HeadingPart
 from px4fuse.filter.heading import turned as together
@@ -220,10 +219,10 @@ def test_rejections(count: int, of: int, expected: str | None) -> None:
         # by name, noise first, then the delay, then both; the wider gate always last
         ({"EKF2_EVP_NOISE": 0.3, "EKF2_EV_DELAY": 90.0}, "EKF2_EV_DELAY",
          [["EKF2_EVP_NOISE"], ["EKF2_EV_DELAY"], ["EKF2_EVP_NOISE", "EKF2_EV_DELAY"],
-          ["EKF2_EVP_GATE"]], "Set EKF2_EV_DELAY to 90 ms: effect."),
+          ["EKF2_EVP_GATE"]], "Set EKF2_EV_DELAY to 90 ms: effect on flown."),
         ({"EKF2_EVP_NOISE": 0.3, "EKF2_EV_DELAY": 0.0}, "nothing",
          [["EKF2_EVP_NOISE"], ["EKF2_EVP_GATE"]],
-         "With what the data ask for (EKF2_EVP_NOISE to 0.3 m) the rejections remain: effect."),
+         "With what the data ask for (EKF2_EVP_NOISE to 0.3 m) the rejections remain: effect on"),
         ({"EKF2_EVP_NOISE": 0.1}, "nothing", [["EKF2_EVP_GATE"]],
          "EKF2's parameters are what the data ask for."),
         ({}, "nothing", [["EKF2_EVP_GATE"]], "What EKF2 fused does not tell its noise here."),
@@ -234,24 +233,22 @@ def test_what_ends_rejections_is_tried_in_order(
 ) -> None:
     seen: list[dict[str, float]] = []
 
-    def replayed(_model: Model, *candidates: dict[str, float]) -> list[Effect]:
+    def replayed(_model: Model, candidates: list[dict[str, float]]) -> SimpleNamespace:
         seen.extend(candidates)
-        return [Effect(each, SimpleNamespace(position_rmse_to_truth_m=list(each)),
-                       SimpleNamespace(position_rmse_to_truth_m=0.1)) for each in candidates]  # type: ignore[arg-type]  # fmt: skip
+        tried = [SimpleNamespace(changed=each, position_rmse_to_truth_m=0.1) for each in candidates]
+        return SimpleNamespace(replayed="flown", whatif=tried)
 
     monkeypatch.setattr(remedies, "asked_of_ekf2", lambda *_: wanted)
-    monkeypatch.setattr(remedies, "replayed", replayed)
-    monkeypatch.setattr(Effect, "words", lambda _: "effect")
-    monkeypatch.setattr(
-        remedies, "rejects_less", lambda before, _: before.position_rmse_to_truth_m == [ends]
-    )
+    monkeypatch.setattr(ekf2_rejecting, "what_if", replayed)
+    monkeypatch.setattr(remedies, "effect_words", lambda before, _: f"effect on {before}")
+    monkeypatch.setattr(remedies, "rejects_less", lambda _, after: [*after.changed] == [ends])
     flown = {"EKF2_EVP_NOISE": 0.1, "EKF2_EV_DELAY": 0.0, "EKF2_EVP_GATE": 5.0}
     model = made(Model, inputs=SimpleNamespace(settings=flown))
     frame = axis("north", ekf2_innovations=rejected(5, 10))
     one = analysis(ekf2={"gate": 5.0}, axes=(frame,), ekf2_model=model)
     remedy = only(ekf2_rejecting.detect, one).remedy
     if ends == "nothing":
-        assert remedy.endswith("A wider EKF2_EVP_GATE is no remedy; at 10: effect.")
+        assert remedy.endswith("A wider EKF2_EVP_GATE is no remedy; at 10: effect on flown.")
     assert said in remedy
     assert [list(changes) for changes in seen] == tried
     assert seen[-1] == {"EKF2_EVP_GATE": 10.0}

@@ -14,10 +14,10 @@ from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import AgainstTruth, Comparison
 from px4fuse.comparison.remedy import (
-    Effect,
     asked_of_ekf2,
     delay_change,
     delay_helps,
+    effect_words,
     filter_words,
     noise_change,
     noise_helps,
@@ -255,13 +255,12 @@ def axis_error(of: Summary) -> float | Unavailable:
 
 def test_the_effect_in_words() -> None:
     before, after = summary(11.0, 0.27, 0.0707), summary(1.0, 0.0, 0.0424)
-    effect = Effect({"EKF2_EVP_NOISE": 0.1}, before, after)
-    assert effect.words() == (
+    assert effect_words(before, after) == (
         "rejected 27% → 0%, mean NIS 11 → 1.0, position error 0.10 → 0.06 m (replayed)"
     )
-    blind = Effect({}, summary(0.04, 0.0, NO_TRUTH, 0.2), summary(1.0, 0.0, NO_TRUTH))
-    assert (
-        blind.words() == "mean NIS 0.04 → 1.0, innovations 0.200 → 0.100 m rms, no truth (replayed)"
+    blind = summary(0.04, 0.0, NO_TRUTH, 0.2), summary(1.0, 0.0, NO_TRUTH)
+    assert effect_words(*blind) == (
+        "mean NIS 0.04 → 1.0, innovations 0.200 → 0.100 m rms, no truth (replayed)"
     )
 
 

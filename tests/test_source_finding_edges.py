@@ -31,6 +31,7 @@ from findings_tools import (
 
 from px4fuse.comparison import remedy as remedies
 from px4fuse.ekf2.model import Model
+from px4fuse.ekf2.whatif import WhatIf
 from px4fuse.filter.causes import Explained
 from px4fuse.filter.hypotheses import Estimate
 from px4fuse.filter.settings import Settings
@@ -356,11 +357,12 @@ def test_a_clock_offset_that_the_truth_contradicts_is_not_told(
 
 def test_what_a_clock_offset_asks_of_ekf2(monkeypatch: pytest.MonkeyPatch) -> None:
     """The delay is what the stamps are late by, with what was applied: 150 ms."""
-    effect = SimpleNamespace(before=1.0, after=2.0, words=lambda: "it helps")
+    found = made(WhatIf, replayed=1.0, whatif=(2.0,))
     monkeypatch.setattr(
         remedies, "delay_change", lambda _, late_ms: {"EKF2_EV_DELAY": round(late_ms)}
     )
-    monkeypatch.setattr(remedies, "replayed", lambda *_: [effect])
+    monkeypatch.setattr(source_clock, "what_if", lambda *_: found)
+    monkeypatch.setattr(remedies, "effect_words", lambda *both: f"it helps {both}")
     for fed, helps, there in (("uwb", True, True), ("another", True, False), ("uwb", False, False)):
         monkeypatch.setattr(
             remedies, "delay_helps", lambda *both, h=helps: both == (1.0, 2.0) and h
@@ -369,7 +371,7 @@ def test_what_a_clock_offset_asks_of_ekf2(monkeypatch: pytest.MonkeyPatch) -> No
         clock = late(-0.1, applied_s=-0.05)
         one = analysis(clock=clock, settings=APPLIED, ekf2_model=model)
         remedy = only(source_clock.detect, one).remedy
-        assert ("; for EKF2 set EKF2_EV_DELAY to 150 ms: it helps." in remedy) is there
+        assert ("; for EKF2 set EKF2_EV_DELAY to 150 ms: it helps (1.0, 2.0)." in remedy) is there
         assert ("EKF2" in remedy) is there
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array
+from px4fuse.ekf2_parameters import EV_POS
 from px4fuse.filter.signals import AISLE, Axis, Segment, along, within
 from px4fuse.flight import (
     POSITION_COLUMNS,
@@ -183,11 +184,11 @@ def observation_variance(
     (EKF2.cpp, ev_pos_control.cpp).
     """
     parameters = flight.log.parameters
-    if "EKF2_EVP_NOISE" not in parameters:
+    if EV_POS.noise not in parameters:
         return float("nan")
-    r = max(parameters["EKF2_EVP_NOISE"], EKF2_MIN_NOISE_M) ** 2
+    r = max(parameters[EV_POS.noise], EKF2_MIN_NOISE_M) ** 2
     # what a file of its own reports is not what EKF2 was sent
-    if parameters.get("EKF2_EV_NOISE_MD") == 1.0 or track.alignment is not None:
+    if parameters.get(EV_POS.noise_mode) == 1.0 or track.alignment is not None:
         return r
     reported = within(track.samples, segment)[POSITION_VARIANCE_COLUMNS].median()
     reported_along = float(np.nansum(reported.to_numpy() * axis.direction**2))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import AgainstTruth, Comparison
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.whatif import Summary, what_if
-from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.ekf2_parameters import EV_POS, PARAMETERS
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE
@@ -76,7 +75,7 @@ def asked_of_ekf2(
     if noise_m is not None and not (trusted and source.origin.may_drift):
         changes |= noise_change(model, noise_m)
     if isinstance(clock, ClockOffset) and clock.determinable:
-        flown = model.inputs.settings["EKF2_EV_DELAY"]
+        flown = model.inputs.settings[EV_POS.delay]
         high, low = (-1e3 * end for end in clock.interval_s)
         if not low - UPDATE_MS <= flown <= high + UPDATE_MS:
             changes |= delay_change(model, -1e3 * clock.offset_s)
@@ -95,11 +94,11 @@ def noise_change(model: Model, noise_m: float) -> dict[str, float]:
     Two digits, within PX4's range.
     """
     settings = model.inputs.settings
-    least = PARAMETERS["EKF2_EVP_NOISE"].minimum
-    changes = {"EKF2_EVP_NOISE": max(float(f"{noise_m:.2g}"), least)}
-    reported = noise_used_m(model) > REPORTED_TIMES * settings["EKF2_EVP_NOISE"]
-    if reported and noise_m < noise_used_m(model) and settings["EKF2_EV_NOISE_MD"] == 0.0:
-        changes["EKF2_EV_NOISE_MD"] = 1.0
+    least = PARAMETERS[EV_POS.noise].minimum
+    changes = {EV_POS.noise: max(float(f"{noise_m:.2g}"), least)}
+    reported = noise_used_m(model) > REPORTED_TIMES * settings[EV_POS.noise]
+    if reported and noise_m < noise_used_m(model) and settings[EV_POS.noise_mode] == 0.0:
+        changes[EV_POS.noise_mode] = 1.0
     return changes
 
 
@@ -108,11 +107,11 @@ def delay_change(model: Model, delay_ms: float) -> dict[str, float]:
 
     Nothing where PX4's range ends before; 0 for stamps that are early.
     """
-    known = PARAMETERS["EKF2_EV_DELAY"]
+    known = PARAMETERS[EV_POS.delay]
     if delay_ms > known.maximum:
         return {}
-    changes = {"EKF2_EV_DELAY": max(float(round(delay_ms)), known.minimum)}
-    needed, flown = changes["EKF2_EV_DELAY"] + ARRIVAL_MS, model.inputs.settings
+    changes = {EV_POS.delay: max(float(round(delay_ms)), known.minimum)}
+    needed, flown = changes[EV_POS.delay] + ARRIVAL_MS, model.inputs.settings
     if not model.inputs.rules.horizon_by_delay and needed > flown["EKF2_DELAY_MAX"]:
         changes["EKF2_DELAY_MAX"] = DELAY_STEP_MS * math.ceil(needed / DELAY_STEP_MS)
     return {name: value for name, value in changes.items() if value != flown[name]}
@@ -125,66 +124,24 @@ def noise_used_m(model: Model) -> float:
     return float(np.sqrt(np.median(updates[columns].to_numpy())))
 
 
-@dataclass(frozen=True)
-class Effect:
-    """EKF2 replayed as flown and with a change.
-
-    Attributes
-    ----------
-    changes : mapping
-        By PX4 name and in PX4's units.
-    before, after : Summary
-    """
-
-    changes: Mapping[str, float]
-    before: Summary
-    after: Summary
-
-    def words(self) -> str:
-        """What the change does, in numbers."""
-        before, after = self.before, self.after
-        parts = []
-        if max(before.rejected_share, after.rejected_share) >= REJECTED_SHOWN:
-            parts.append(f"rejected {before.rejected_share:.0%} → {after.rejected_share:.0%}")
-        parts.append(f"mean NIS {_short(before.nis_mean)} → {_short(after.nis_mean)}")
-        flown, changed = before.position_rmse_to_truth_m, after.position_rmse_to_truth_m
-        if isinstance(flown, Unavailable):
-            parts.append(f"innovations {_std(before):.3f} → {_std(after):.3f} m rms, no truth")
-        else:
-            parts.append(f"position error {flown:.2f} → {changed:.2f} m")
-        return f"{', '.join(parts)} (replayed)"
-
-
-Judge = Callable[[Summary, Summary], bool]
-
-
-def replayed(
-    model: Model | Unavailable, *candidates: Mapping[str, float]
-) -> list[Effect] | Unavailable:
-    """What each of some changes would do.
-
-    Parameters
-    ----------
-    model : Model or Unavailable
-        Of the flight.
-    *candidates : mapping
-        Changes by PX4 name and in PX4's units.
-    """
-    if isinstance(model, Unavailable):
-        return model
-    found = what_if(model, candidates)
-    if isinstance(found, Unavailable):
-        return found
-    return [
-        Effect(changes, found.replayed, after)
-        for changes, after in zip(candidates, found.whatif, strict=True)
-    ]
+def effect_words(before: Summary, after: Summary) -> str:
+    """What a change of EKF2's parameters does, in numbers, by replays without it and with it."""
+    parts = []
+    if max(before.rejected_share, after.rejected_share) >= REJECTED_SHOWN:
+        parts.append(f"rejected {before.rejected_share:.0%} → {after.rejected_share:.0%}")
+    parts.append(f"mean NIS {_short(before.nis_mean)} → {_short(after.nis_mean)}")
+    flown, changed = before.position_rmse_to_truth_m, after.position_rmse_to_truth_m
+    if isinstance(flown, Unavailable):
+        parts.append(f"innovations {_std(before):.3f} → {_std(after):.3f} m rms, no truth")
+    else:
+        parts.append(f"position error {flown:.2f} → {changed:.2f} m")
+    return f"{', '.join(parts)} (replayed)"
 
 
 def remedy_words(
     model: Model | Unavailable,
     changes: Mapping[str, float],
-    helps: Judge,
+    helps: Callable[[Summary, Summary], bool],
     *,
     why: str = "",
     otherwise: str,
@@ -204,14 +161,15 @@ def remedy_words(
         What to do where the replay says that it is none.
     """
     setting = f"{why}set {settings_words(changes)}"
-    found = replayed(model, changes)
+    found = model if isinstance(model, Unavailable) else what_if(model, [changes])
     if isinstance(found, Unavailable):
         return f"{capital(setting)}. {not_replayed(found)}", True
-    (effect,) = found
-    if helps(effect.before, effect.after):
-        return f"{capital(setting)}: {effect.words()}.", True
+    before, (after,) = found.replayed, found.whatif
+    effect = effect_words(before, after)
+    if helps(before, after):
+        return f"{capital(setting)}: {effect}.", True
     said = ", ".join(f"{name} {value:.3g}" for name, value in changes.items())
-    return f"{otherwise} {said} is no remedy: {effect.words()}.", False
+    return f"{otherwise} {said} is no remedy: {effect}.", False
 
 
 def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, float] | None:

@@ -33,6 +33,7 @@ from px4fuse.ekf2.walk import (
     Why,
     walk,
 )
+from px4fuse.ekf2_parameters import EV_POS
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.signals import AISLE
@@ -133,7 +134,7 @@ def with_words(
     because = _reasons(why, comparison, model, clock)
     if too_sure:
         cause = (
-            f"EKF2_EVP_NOISE is too small: EKF2 takes the source's noise to be {used_m:.2g} m, the "
+            f"{EV_POS.noise} is too small: EKF2 takes the source's noise to be {used_m:.2g} m, the "
             f"data ask for {asked_m:.2g} m, so its gate rejects {rejected:.0%} of the samples"
             f"{_coasted(why)}"
         )
@@ -230,12 +231,12 @@ def _reasons(
     return {
         SAMPLES: samples,
         STAMPS: (
-            f"EKF2 takes a position to be {flown['EKF2_EV_DELAY']:g} ms older than its stamp "
-            f"(EKF2_EV_DELAY), ours {0.0 - settings.clock_offset_s * 1e3:.0f} ms{data}"
+            f"EKF2 takes a position to be {flown[EV_POS.delay]:g} ms older than its stamp "
+            f"({EV_POS.delay}), ours {0.0 - settings.clock_offset_s * 1e3:.0f} ms{data}"
         ),
         NOISE: (
             f"EKF2 takes the source's noise to be {noise_used_m(model):.2g} m "
-            f"(EKF2_EVP_NOISE), ours {settings.sigma_z_m:.2g} m"
+            f"({EV_POS.noise}), ours {settings.sigma_z_m:.2g} m"
         ),
         BIASES: "EKF2 estimates the accelerometer's bias in flight, ours knows none",
         PROCESS: (
@@ -290,7 +291,7 @@ def _wrong_stamps(comparison: Comparison, model: Model, clock: ClockOffset | Non
     """That the source's stamps are wrong for both filters alike, where they are."""
     if clock is None:
         return []
-    delay_s, late_s = model.inputs.settings["EKF2_EV_DELAY"] * 1e-3, clock.offset_s
+    delay_s, late_s = model.inputs.settings[EV_POS.delay] * 1e-3, clock.offset_s
     wrong_s = min(abs(clock.remaining_s), abs(late_s + delay_s))
     apart_s = abs(comparison.settings.clock_offset_s + delay_s)
     if wrong_s < max(CLOCK_S, clock.chance_s) or apart_s > CLOCK_S:

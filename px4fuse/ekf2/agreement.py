@@ -57,14 +57,15 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
             "Record a flight with motion and measured positions.",
         )
     north, east = (_axis(axis, log, model, ekf2, replay) for axis in HORIZONTAL)
+    axes = {"north": north, "east": east}
     by_log, by_model = (frame["rejected"].to_numpy() > 0 for frame in (log, model))
     shares = float(by_log.mean()), float(by_model.mean())
-    good, reason = _verdict({"north": north, "east": east}, *shares)
+    good, reason = _verdict(axes, *shares)
     apart_m = np.hypot(north.position_rms_difference_m, east.position_rms_difference_m)
     return Agreement(
         north=north,
         east=east,
-        ev_pos={"north": north, "east": east},
+        ev_pos=axes,
         samples=len(log),
         rejected_share_logged=shares[0],
         rejected_share_replayed=shares[1],
@@ -152,7 +153,7 @@ def rms_to_truth(flight: Flight, position: Array, direction: Array, times: Array
     """Error of a horizontal position (m, RMS) in the truth's span; None where there is no truth."""
     if not isinstance(flight.truth, Truth):
         return None
-    truth = flight.truth.samples
+    truth = flight.truth.samples.dropna(subset=POSITION_COLUMNS[:2])
     inside = (times >= truth.index[0]) & (times <= truth.index[-1])
     error = (position - along(truth, POSITION_COLUMNS, direction, times))[inside]
     return rms(error) if len(error) else None
@@ -199,7 +200,7 @@ def with_obedient(agreement: Agreement, obedient: Agreement) -> Agreement:
     agreement, obedient : Agreement
         Of the replay by its own gate, and of the other.
     """
-    worst = min(axis.innovation_correlation for axis in obedient.axes.values())
+    worst = min(axis.innovation_correlation for axis in obedient.ev_pos.values())
     with_them = f"with EKF2's own rejections the innovations correlate by {worst:.3f}"
     if worst >= MIN_CORRELATION:
         return replace(agreement, reason=f"{agreement.reason}; {with_them} or better")

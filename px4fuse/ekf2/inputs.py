@@ -14,7 +14,7 @@ import pandas as pd
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
 from px4fuse.ekf2.stretches import MIN_STRETCH_S, Stretch, find_stretches, predict_s
-from px4fuse.ekf2_parameters import fuses_by_mask, settings_in_force
+from px4fuse.ekf2_parameters import AID_MASK, EV_POS, fuses_by_mask, settings_in_force
 from px4fuse.flight import (
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
@@ -190,9 +190,8 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
         )
     floor = 5e-8 / ekf2.step_s**2 if record.per_step_biases else None
     # EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h
-    limits = (
-        (np.inf, 7.0, 7.0, NO_LIMIT) if fuses_by_mask(record.parameters) else (0.2, 0.4, 1.0, 5)
-    )
+    old = fuses_by_mask(record.parameters)
+    limits = (np.inf, 7.0, 7.0, NO_LIMIT) if old else (0.2, 0.4, 1.0, 5)
     fusing = ekf2.fusing
     return Inputs(
         settings=settings_in_force(record.parameters),
@@ -229,7 +228,7 @@ def read_vision(
     variance = samples[POSITION_VARIANCE_COLUMNS].fillna(0.0).to_numpy(copy=True)
     rotated = not isinstance(ekf2.fusing, pd.DataFrame) or not ekf2.fusing["yaw"].any()
     if fuses_by_mask(record.parameters):
-        rotated = bool(int(record.parameters["EKF2_AID_MASK"]) & ROTATE_VISION_BIT)
+        rotated = bool(int(record.parameters[AID_MASK]) & ROTATE_VISION_BIT)
     if track.frame == "FRD" and rotated:
         if track.orientation is None:
             return Unavailable(
@@ -260,7 +259,7 @@ def _decisions(ekf2: Ekf2, record: FusionRecord, stamp: Array) -> tuple[Array, B
     known = AID_SOURCE in ekf2.innovation_topics
     if isinstance(innovations, Unavailable) or isinstance(horizon_s, Unavailable) or not known:
         return rejected, reset
-    delay_s = settings_in_force(record.parameters)["EKF2_EV_DELAY"] * 1e-3
+    delay_s = settings_in_force(record.parameters)[EV_POS.delay] * 1e-3
     taken = stamp - delay_s - 0.5 * ekf2.step_s
     row = same_sample(innovations.index.to_numpy(), taken)
     rejected[row >= 0] = innovations["rejected"].to_numpy()[row[row >= 0]]

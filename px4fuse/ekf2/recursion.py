@@ -30,6 +30,7 @@ from px4fuse.ekf2.intervals import (
     Timing,
 )
 from px4fuse.ekf2.stretches import Stretch
+from px4fuse.ekf2_parameters import EV_POS
 
 # How long the first pass runs that gives the correlations at the start
 CORRELATING_S = 8.0
@@ -82,7 +83,7 @@ class Variant:
         """What is taken off the stamps, half a step besides, and how far fusion runs behind."""
         if self.stamp_offset_s is not None:
             return Timing(-self.stamp_offset_s - 0.5 * inputs.step_s, np.inf)
-        delay_s = self.settings["EKF2_EV_DELAY"] * 1e-3
+        delay_s = self.settings[EV_POS.delay] * 1e-3
         if inputs.rules.horizon_by_delay:  # the longest of the delays makes the buffer
             length = math.ceil(delay_s / inputs.predict_s)
             return Timing(delay_s, max(inputs.horizon_s, (length - 1) * inputs.step_s))
@@ -164,7 +165,7 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
         [stretch.heading_variance_rad2[end], stretch.down_variance_m2[end]], axis=-1
     )
     heading = np.where(attitude, own[:, :, 0], 0.0)
-    gate2 = (np.maximum(knob["EKF2_EVP_GATE"], MIN_GATE) ** 2)[:, None]
+    gate2 = (np.maximum(knob[EV_POS.gate], MIN_GATE) ** 2)[:, None]
     gyro2 = np.where(attitude, knob["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
     force2 = (knob["EKF2_ACC_NOISE"] ** 2)[:, None, None]
     drift, drift_limit = _drift(inputs, knob, biases, attitude)
@@ -362,13 +363,12 @@ def _measurements(
     inputs: Inputs, stretch: Stretch, sample: IntArray, end: IntArray, knob: dict[str, Array]
 ) -> tuple[Array, Array]:
     """Measured position and its variance, both of shape (E, S, 3)."""
-    vision, size = inputs.vision, len(knob["EKF2_EVP_NOISE"])
-    offset = np.stack([knob[f"EKF2_EV_POS_{axis}"] for axis in "XYZ"], -1) - inputs.imu_offset_m
+    vision, size = inputs.vision, len(knob[EV_POS.noise])
+    offset = np.stack([knob[name] for name in EV_POS.place], -1) - inputs.imu_offset_m
     position = np.repeat(vision.position_m[sample][:, None], size, axis=1)
     if offset.any():
         position = position - (stretch.rotation[end] @ offset[:, :, None])[:, :, :, 0]
-    least = np.maximum(knob["EKF2_EVP_NOISE"], MIN_POSITION_SD_M)[:, None] ** 2
-    reported = np.where(
-        knob["EKF2_EV_NOISE_MD"][:, None] == 1.0, 0.0, vision.variance_m2[sample][:, None]
-    )
+    least = np.maximum(knob[EV_POS.noise], MIN_POSITION_SD_M)[:, None] ** 2
+    unused = knob[EV_POS.noise_mode][:, None] == 1.0
+    reported = np.where(unused, 0.0, vision.variance_m2[sample][:, None])
     return position, np.maximum(reported, least)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import pandas as pd
 
 from px4fuse.display import brief
-from px4fuse.flight import AxisName
+from px4fuse.flight import AxisName, Unavailable
 from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
 
 Spans = tuple[Span, ...]
@@ -81,10 +81,13 @@ class Agreement(Record, frozen=True, kw_only=True):
     good: bool
     reason: str
 
-    @property
-    def axes(self) -> dict[str, AxisAgreement]:
-        """By axis."""
-        return {"north": self.north, "east": self.east}
+    def doubted(self, what: str) -> Unavailable:
+        """What stands in for a conclusion where the replay is not good."""
+        return Unavailable(
+            what,
+            f"the model does not reproduce what EKF2 logged: {self.reason}",
+            "Record without dropouts, with SDLOG_PROFILE 129 (default and vision).",
+        )
 
 
 class Replayed(Record, frozen=True, kw_only=True, omit_defaults=False):

@@ -27,6 +27,7 @@ from px4fuse.ekf2.agreement import along, at_times, judged_from, rms_to_truth, s
 from px4fuse.ekf2.model import Model, delayed_variants
 from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import Ekf2Replay, Spans
+from px4fuse.ekf2_parameters import EV_POS
 from px4fuse.filter.kalman import Replay, state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Ekf2, Truth, Unavailable
@@ -188,11 +189,7 @@ def walk(
         Unavailable where the model does not reproduce what was logged.
     """
     if not model.agreement.good:
-        return Unavailable(
-            WHAT,
-            f"the model does not reproduce what EKF2 logged: {model.agreement.reason}",
-            "Record without dropouts, with SDLOG_PROFILE 129 (default and vision).",
-        )
+        return model.agreement.doubted(WHAT)
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
     variants = _variants(model, settings or Settings())
@@ -239,8 +236,8 @@ def _variants(model: Model, ours: Settings) -> dict[str, Variant]:
     """The filter after each step but the last; from one to the next, one thing changes."""
     flown = model.inputs.settings
     spread = {"EKF2_ACC_NOISE": float(ours.sigma_a_m_s2 * np.sqrt(ours.dt_s / model.inputs.step_s))}
-    own = {**flown, **spread, "EKF2_EVP_NOISE": ours.sigma_z_m, "EKF2_EV_NOISE_MD": 1.0}
-    unmoved = {**own, **{f"EKF2_EV_POS_{axis}": 0.0 for axis in "XYZ"}}
+    own = {**flown, **spread, EV_POS.noise: ours.sigma_z_m, EV_POS.noise_mode: 1.0}
+    unmoved = {**own, **dict.fromkeys(EV_POS.place, 0.0)}
     bare = Variant(own, biases=False, attitude=False, gated=False)
     return {
         SAMPLES: replace(bare, settings=unmoved, stamp_offset_s=ours.clock_offset_s),

@@ -154,11 +154,7 @@ def what_if(model: Model, settings: Sequence[Mapping[str, float]]) -> WhatIf | U
     """
     checked = [check(change) for change in settings]
     if not model.agreement.good:
-        return Unavailable(
-            WHAT,
-            f"the model does not reproduce what EKF2 logged: {model.agreement.reason}",
-            "Record without dropouts, with SDLOG_PROFILE 129 (default and vision).",
-        )
+        return model.agreement.doubted(WHAT)
     replays = replay_settings(model, checked)
     flight, judged = model.flight, judged_from(model.flown)
     return WhatIf(

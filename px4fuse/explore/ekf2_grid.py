@@ -14,15 +14,15 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.arrays import Array, BoolArray
-from px4fuse.ekf2.agreement import at_times, judged_from, settled
+from px4fuse.arrays import Array
+from px4fuse.ekf2.agreement import along, judged_from, rms_to_truth, settled
 from px4fuse.ekf2.model import Model, replay_settings
 from px4fuse.ekf2.replay import HORIZONTAL, Ekf2Replay
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.explore.packing import Packer
 from px4fuse.filter.consistency import Consistency, assess
 from px4fuse.filter.signals import within
-from px4fuse.flight import POSITION_COLUMNS, Ekf2, Truth, Unavailable
+from px4fuse.flight import POSITION_COLUMNS, Ekf2, Unavailable
 
 # As multiples of the noise as flown, and beside the delay (ms) and the gate as flown
 NOISES = (0.25, 0.5, 1.0, 2.0, 4.0)
@@ -39,7 +39,7 @@ def grid_data(analysis: Analysis, packer: Packer) -> dict[str, Any] | str:
     if isinstance(model, Unavailable):
         return model.reason
     if not model.agreement.good:
-        return f"the model does not reproduce what EKF2 logged: {model.agreement.reason}"
+        return model.agreement.doubted("EKF2").reason
     stops = _stops(model.inputs.settings)
     settings = [
         dict(zip(stops, values, strict=True)) for values in itertools.product(*stops.values())
@@ -160,19 +160,11 @@ def _numbers(
     """EKF2's column of the table at this stop."""
     flight = analysis.flight
     made = judged_numbers(assess(*_along(used, direction)))
-    if isinstance(flight.truth, Truth) and isinstance(flight.ekf2, Ekf2):
-        truth = flight.truth.samples.dropna(subset=POSITION_COLUMNS[:2])
-        times = flight.ekf2.state.index.to_numpy()
-        known: BoolArray = settled(times, judged)
-        known &= (times >= truth.index[0]) & (times <= truth.index[-1])
-        if np.any(known):
-            error = sum(
-                weight
-                * (
-                    at_times(replay.published, column, times[known])
-                    - at_times(truth, column, times[known])
-                )
-                for weight, column in zip(direction[:2], POSITION_COLUMNS[:2], strict=True)
-            )
-            made["truthP"] = float(np.sqrt(np.mean(np.square(error))))
+    assert isinstance(flight.ekf2, Ekf2)
+    times = flight.ekf2.state.index.to_numpy()
+    times = times[settled(times, judged)]
+    position = along(replay.published, POSITION_COLUMNS, direction, times)
+    error = rms_to_truth(flight, position, direction, times)
+    if error is not None:
+        made["truthP"] = error
     return made

@@ -198,10 +198,8 @@ def assess_horizontal(
 
     Returns
     -------
-    HorizontalNis, or None below ten innovations or where the two differ in length.
+    HorizontalNis, or None below ten innovations.
     """
-    if len(north[0]) != len(east[0]):
-        return None
     usable = (north[1] > 0) & (east[1] > 0) & np.isfinite(north[0]) & np.isfinite(east[0])
     nis = np.sum([nu[usable] ** 2 / s[usable] for nu, s in (north, east)], axis=0)
     if len(nis) < MIN_INNOVATIONS or not nis.any():

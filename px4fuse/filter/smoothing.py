@@ -103,21 +103,20 @@ def smoothing(
     plain = score(0.0)[0]
     if clock_offset_s:
         plain = min(plain, score(0.0, clock_offset_s)[0])
-    best, at, noise = plain, 0.0, sigma_z_m
+    found = plain, 0.0, sigma_z_m
     # from none on, for as long as more of it makes the positions more likely
     for correlation in CORRELATIONS[1:].tolist():
         here, sigma = score(correlation)
-        if here < best:
-            best, at, noise = here, correlation, sigma
-        elif at > 0.0 or correlation > FIRST_CORRELATIONS:
+        if here >= found[0] and (found[1] > 0.0 or correlation > FIRST_CORRELATIONS):
             break
+        found = min(found, (here, correlation, sigma))
     # then between that and its neighbours
-    place = int(np.searchsorted(CORRELATIONS, at))
-    around = CORRELATIONS[place - 1 : place + 2] if at else np.zeros(0)
+    place = int(np.searchsorted(CORRELATIONS, found[1]))
+    around = CORRELATIONS[place - 1 : place + 2] if place else np.zeros(0)
     for correlation in ((around[:-1] + around[1:]) / 2.0).tolist():
         here, sigma = score(correlation)
-        if here < best:
-            best, at, noise = here, correlation, sigma
+        found = min(found, (here, correlation, sigma))
+    best, at, noise = found
     lag = -float(np.median(np.diff(time)) / np.log(at)) if at else 0.0
     return Smoothing(at, lag, plain - best, noise)
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
-from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.ekf2.whatif import what_if
+from px4fuse.ekf2_parameters import EV_POS, PARAMETERS
 from px4fuse.findings.model import Found, finding, moments
 from px4fuse.flight import Ekf2, Unavailable
 
@@ -52,24 +53,26 @@ def _remedy(analysis: Analysis) -> str:
     noise = {name: value for name, value in asked.items() if name not in delay}
     both = asked if noise and delay else {}
     candidates = [changes for changes in (noise, delay, both) if changes]
-    gate = min(2.0 * flown["EKF2_EVP_GATE"], PARAMETERS["EKF2_EVP_GATE"].maximum)
-    found = remedy.replayed(model, *candidates, {"EKF2_EVP_GATE": gate})
+    gate = min(2.0 * flown[EV_POS.gate], PARAMETERS[EV_POS.gate].maximum)
+    found = what_if(model, [*candidates, {EV_POS.gate: gate}])
     if isinstance(found, Unavailable):
         return f"{IN_ORDER} {remedy.not_replayed(found)}"
-    *effects, wider = found
-    for effect in effects:
-        if remedy.rejects_less(effect.before, effect.after):
-            return f"Set {remedy.settings_words(effect.changes)}: {effect.words()}."
+    before, (*tried, wider) = found.replayed, found.whatif
+    for after in tried:
+        if remedy.rejects_less(before, after):
+            effect = remedy.effect_words(before, after)
+            return f"Set {remedy.settings_words(after.changed)}: {effect}."
     said = f"{OUTLIERS} What EKF2 fused does not tell its noise here."
-    if effects:
-        asked_for, remain = remedy.settings_words(effects[-1].changes), effects[-1].words()
+    if tried:
+        asked_for = remedy.settings_words(tried[-1].changed)
+        remain = remedy.effect_words(before, tried[-1])
         said = (
             f"With what the data ask for ({asked_for}) the rejections remain: {remain}. {OUTLIERS}"
         )
     elif wanted:
         said = f"{OUTLIERS} EKF2's parameters are what the data ask for."
-    if isinstance(wider.after.position_rmse_to_truth_m, Unavailable):
+    if isinstance(wider.position_rmse_to_truth_m, Unavailable):
         return said
-    helps = remedy.rejects_less(wider.before, wider.after)
+    helps = remedy.rejects_less(before, wider)
     verdict = "Widen EKF2_EVP_GATE" if helps else "A wider EKF2_EVP_GATE is no remedy"
-    return f"{said} {verdict}; at {gate:g}: {wider.words()}."
+    return f"{said} {verdict}; at {gate:g}: {remedy.effect_words(before, wider)}."

@@ -7,6 +7,7 @@ from dataclasses import replace
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
 from px4fuse.comparison.model import Comparison
+from px4fuse.ekf2.whatif import WhatIf, what_if
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
 from px4fuse.findings.model import Found, error, finding, warning
@@ -77,11 +78,11 @@ def _for_ekf2(analysis: Analysis, clock: ClockOffset) -> str:
     if isinstance(model, Unavailable) or analysis.source.name != model.inputs.vision.source:
         return ""
     changes = remedy.delay_change(model, -1e3 * clock.offset_s)
-    found = remedy.replayed(model, changes) if changes else []
-    for effect in [] if isinstance(found, Unavailable) else found:
-        if remedy.delay_helps(effect.before, effect.after):
-            return f"; for EKF2 set {remedy.settings_words(changes)}: {effect.words()}"
-    return ""
+    found = what_if(model, [changes]) if changes else None
+    if not isinstance(found, WhatIf) or not remedy.delay_helps(found.replayed, *found.whatif):
+        return ""
+    effect = remedy.effect_words(found.replayed, *found.whatif)
+    return f"; for EKF2 set {remedy.settings_words(changes)}: {effect}"
 
 
 def typed_offset_s(comparison: Comparison, clock: ClockOffset) -> float:
