@@ -61,5 +61,5 @@ def test_a_real_flight_with_dropouts_does_not_agree(shared_logs: Path) -> None:
     assert isinstance(found, Model)
     assert not found.agreement.good
     assert "correlate by" in found.agreement.reason
-    for axis in found.agreement.axes.values():
+    for axis in found.agreement.ev_pos.values():
         assert axis.s_ratio_median == pytest.approx(1.0, abs=0.05)

@@ -132,7 +132,7 @@ def test_the_sample_flight_agrees_with_its_log(model: Model) -> None:
     assert agreement.good
     assert agreement.samples > 200
     assert agreement.rejected_share_logged == agreement.rejected_share_replayed == 0.0
-    for axis in agreement.axes.values():
+    for axis in agreement.ev_pos.values():
         assert axis.innovation_correlation > 0.999
         assert axis.innovation_rms_difference < 0.005
         assert axis.s_ratio_median == pytest.approx(1.0, abs=0.005)
@@ -218,7 +218,7 @@ def test_a_mavlink_recording_gives_the_samples_that_the_log_lacks(sample_flight:
     made = opened(join(log, recording))
     assert made.flown.source == "VISION_POSITION_ESTIMATE"
     assert made.agreement.good
-    assert made.agreement.axes["north"].innovation_correlation > 0.999
+    assert made.agreement.ev_pos["north"].innovation_correlation > 0.999
 
 
 def test_the_published_attitude_follows_the_replayed_one(model: Model) -> None:

@@ -86,7 +86,7 @@ def test_a_clean_flight_agrees_with_its_replay_from_the_log(clean: Flight) -> No
     found = agreement(clean)
     assert found.good
     assert found.decisions_same == 1.0
-    for axis in found.axes.values():
+    for axis in found.ev_pos.values():
         assert axis.innovation_correlation > 0.999
         assert axis.s_ratio_median == pytest.approx(1.0, abs=0.01)
         assert (axis.s_ratio_p5, axis.s_ratio_p95) == pytest.approx((1.0, 1.0), abs=0.01)
@@ -108,7 +108,7 @@ def test_flights_with_mistakes_agree_too(texts: tuple[str, ...], scenario: Scena
     found = agreement(flown(*texts, scenario=scenario))
     assert found.good
     assert found.decisions_same > 0.99
-    for axis in found.axes.values():
+    for axis in found.ev_pos.values():
         assert axis.innovation_correlation > 0.99
         assert axis.s_ratio_median == pytest.approx(1.0, abs=0.01)
 

@@ -47,7 +47,7 @@ def agreement_table(paths: list[Path]) -> dict[str, Model]:
             print(f"{path.stem} | {model.reason}")
             continue
         models[path.stem] = model
-        a, (north, east) = model.agreement, model.agreement.axes.values()
+        a, (north, east) = model.agreement, model.agreement.ev_pos.values()
         print(
             f"{path.stem} | {a.samples} | {north.innovation_correlation:.4f}, "
             f"{east.innovation_correlation:.4f} | {north.innovation_rms_difference:.4f}, "
@@ -60,7 +60,7 @@ def agreement_table(paths: list[Path]) -> dict[str, Model]:
         judge_agreement(path.stem, model)
     print("\npublished, model - log, rms: position m, velocity m/s (north, east)")
     for name, model in models.items():
-        north, east = model.agreement.axes.values()
+        north, east = model.agreement.ev_pos.values()
         print(
             f"{name} | {north.position_rms_difference_m:.4f}, "
             f"{east.position_rms_difference_m:.4f} | {north.velocity_rms_difference_m_s:.4f}, "
@@ -72,7 +72,7 @@ def agreement_table(paths: list[Path]) -> dict[str, Model]:
 def judge_agreement(name: str, model: Model) -> None:
     agreement = model.agreement
     assert agreement.good, (name, agreement.reason)
-    for axis in agreement.axes.values():
+    for axis in agreement.ev_pos.values():
         if OVERCONFIDENT in name:
             off = agreement.rejected_share_replayed - agreement.rejected_share_logged
             assert abs(off) < 0.03, name
@@ -123,7 +123,7 @@ def readme_table(models: dict[str, Model], left: dict[str, float]) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for name, model in models.items():
-        a, (north, east) = model.agreement, model.agreement.axes.values()
+        a, (north, east) = model.agreement, model.agreement.ev_pos.values()
         lines.append(
             f"| {name} | {a.samples} | {north.innovation_correlation:.4f} / "
             f"{east.innovation_correlation:.4f} | {min(north.s_ratio_p5, east.s_ratio_p5):.3f} to "
