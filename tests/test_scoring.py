@@ -403,9 +403,6 @@ class TestWhatStudentsRead:
 # ------------------------------------------------------------------ flags
 
 
-REASON = "chosen with --start and --end"
-
-
 WRITTEN = (
     "I compared my filter with EKF2 on four passes of the aisle. The innovations leave their band "
     "several times for half a second: these positions are outliers, metres beside the track and "
@@ -438,8 +435,8 @@ class TestTextFlags:
     ("values", "said"),
     [
         ({}, ()),
-        ({"settings__segment_reason": REASON, "settings__end_s": 50.0}, ("37%",)),
-        ({"settings__segment_reason": REASON}, ()),
+        ({"request__end_s": 50.0, "settings__end_s": 50.0}, ("37%",)),
+        ({"request__start_s": 1.0}, ()),
         ({"settings__end_s": 50.0}, ()),
         ({"settings__input": "zero"}, ("IMU",)),
         ({"axes": {"down": EXAMPLE["axes"]["down"]}}, ("vertical",)),

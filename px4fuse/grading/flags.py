@@ -63,7 +63,8 @@ def own_flags(results: Reported, handed_out: bool = False) -> Iterator[str]:
         return
     settings, whole_s = results.settings, results.log.duration_s
     share = (settings.end_s - settings.start_s) / whole_s if whole_s else 1.0
-    if settings.segment_reason.startswith("chosen with") and share < HAND_PICKED:
+    chosen = (results.request.start_s, results.request.end_s) != (None, None)
+    if chosen and share < HAND_PICKED:
         yield (
             f"The analysed part was chosen by hand and is {share:.0%} of the log "
             f"({settings.start_s:.1f} to {settings.end_s:.1f} s of {whole_s:.1f} s): ask why the "
