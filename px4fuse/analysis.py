@@ -172,7 +172,8 @@ def read_flight(request: ComparisonRequest, progress: Progress = silent) -> Flig
         if not other.log.format.startswith("MAVLink"):
             raise LogError(
                 f"`mavlink` {other.log.name}: this is a {other.log.format}, not a MAVLink "
-                "recording. Give the ULog as LOG, and the recording (.tlog) with `mavlink`."
+                "recording",
+                "Give the ULog as LOG, and the recording (.tlog) with `mavlink`.",
             )
         flight = join(flight, other)
     position, offset = request.position, request.clock_offset_s
@@ -232,8 +233,8 @@ def run_preparation(
     _, clock = noises_and_clock(prepared, progress)
     if isinstance(clock, Unavailable) or not clock.determinable:
         raise MissingDataError(
-            f"{flight.log.name}: `clock_offset_s` auto: not determinable: {clock.reason}. "
-            "Give the seconds to add, or leave it out."
+            f"{flight.log.name}: `clock_offset_s` auto: not determinable: {clock.reason}",
+            "Give the seconds to add, or leave it out.",
         )
     settings = replace(settings, clock_offset_s=clock.offset_s)
     return prepare(flight, settings, input_required=required, **choices)
@@ -320,13 +321,13 @@ def run_what_if(
     if swept is not None:
         values = sweep_values(swept.parameter, swept.low, swept.high, swept.count)
         if swept.parameter in changes:
-            raise SettingsError(f"{swept.parameter}: set and swept. Give one of the two.")
+            raise SettingsError(f"{swept.parameter}: set and swept", "Give one of the two.")
     recordings = ComparisonRequest(log=request.log, mavlink=request.mavlink, system=request.system)
     flight = flight or read_flight(recordings, progress)
     progress("replaying EKF2")
     model = open_model(flight)
     if isinstance(model, Unavailable):
-        raise MissingDataError(f"{flight.log.name}: {model}")
+        raise MissingDataError(f"{flight.log.name}: {model.what}: {model.reason}", model.remedy)
     asked = not changes and swept is None
     why: Mapping[str, Why | Unavailable] = {}
     compared = None
@@ -348,7 +349,7 @@ def run_what_if(
     progress("replaying with other parameters")
     found = what_if(model, settings)
     if isinstance(found, Unavailable):
-        raise MissingDataError(f"{flight.log.name}: {found}")
+        raise MissingDataError(f"{flight.log.name}: {found.what}: {found.reason}", found.remedy)
     return Counterfactual(flight, found, changes, asked, why)
 
 

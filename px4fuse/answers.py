@@ -261,7 +261,7 @@ def read_answers(path: Path) -> Answers:
         answers = msgspec.convert(_as_record(tomllib.loads(text)), Answers)
         check(answers)
     except (tomllib.TOMLDecodeError, RecursionError, msgspec.ValidationError, ValueError) as error:
-        raise SettingsError(f"{path}: {error}. Correct it there.") from error
+        raise SettingsError(f"{path}: {error}", "Correct it there.") from error
     return answers
 
 

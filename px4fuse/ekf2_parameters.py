@@ -136,8 +136,8 @@ def check(chosen: Mapping[str, float]) -> dict[str, float]:
         known = PARAMETERS.get(name)
         if known is None:
             raise SettingsError(
-                f"{name}: the model of EKF2 does not have this parameter. It knows "
-                f"{', '.join(PARAMETERS)}."
+                f"{name}: the model of EKF2 does not have this parameter",
+                f"It knows {', '.join(PARAMETERS)}.",
             )
         if not known.minimum <= value <= known.maximum or not math.isfinite(value):
             unit = f" {known.unit}" if known.unit else ""

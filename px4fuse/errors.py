@@ -30,16 +30,19 @@ def on_one_line(text: str) -> str:
 
 
 class Px4FuseError(Exception):
-    """Base of all errors that px4fuse raises on purpose.
+    """Base of all errors that px4fuse raises on purpose; all is put on one line.
 
     Parameters
     ----------
-    text : str
-        Put on one line.
+    reason : str
+        What is wrong, and where.
+    remedy : str
+        What to do, a sentence; empty where the reason says it.
     """
 
-    def __init__(self, text: str) -> None:
-        super().__init__(on_one_line(text))
+    def __init__(self, reason: str, remedy: str = "") -> None:
+        self.reason, self.remedy = on_one_line(reason).removesuffix("."), on_one_line(remedy)
+        super().__init__(f"{self.reason}. {self.remedy}" if remedy else on_one_line(reason))
 
 
 class LogError(Px4FuseError):
@@ -59,14 +62,7 @@ class SettingsError(Px4FuseError):
 
 
 class ResultsError(Px4FuseError):
-    """A file holds no results of px4fuse, or none that this version reads.
-
-    ``remedy`` is what helps; "" where nothing but another file does.
-    """
-
-    def __init__(self, reason: str, remedy: str = "") -> None:
-        super().__init__(reason)
-        self.remedy = remedy
+    """A file holds no results of px4fuse, or none that this version reads."""
 
 
 class OutputError(Px4FuseError):

@@ -52,10 +52,10 @@ def size_of(path: Path, refuse: type[Px4FuseError], name: str = "") -> int:
     except (OSError, ValueError) as error:  # ValueError: a path with a NUL in it
         raise _unreadable(name, error, refuse) from error
     if stat.S_ISDIR(status.st_mode):
-        raise refuse(f"{name}: is a folder. Give a file.")
+        raise refuse(f"{name}: is a folder", "Give a file.")
     if not stat.S_ISREG(status.st_mode):
         raise refuse(
-            f"{name}: not a regular file (a device, pipe or socket). Save it to a file first."
+            f"{name}: not a regular file (a device, pipe or socket)", "Save it to a file first."
         )
     return status.st_size
 
@@ -107,10 +107,11 @@ def read_whole(
     if max(size, len(content)) > limit_bytes:
         raise refuse(
             f"{name}: {_megabytes(max(size, len(content)))} MB, more than the limit of "
-            f"{_megabytes(limit_bytes)} MB. {smaller}."
+            f"{_megabytes(limit_bytes)} MB",
+            f"{smaller}.",
         )
     if again is not None and not content:
-        raise refuse(f"{name}: the file is empty. {again}.")
+        raise refuse(f"{name}: the file is empty", f"{again}.")
     return content
 
 
@@ -158,7 +159,7 @@ def read_text(
         return content.decode("utf-16" if is_utf16 else "utf-8-sig")
     except UnicodeDecodeError as error:
         raise refuse(
-            f"{name}: not a text file in UTF-8 (byte {error.start}). Save it as UTF-8."
+            f"{name}: not a text file in UTF-8 (byte {error.start})", "Save it as UTF-8."
         ) from error
 
 
@@ -182,7 +183,8 @@ def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
         elif (size := size_of(path, LogError)) > limit:
             raise LogError(
                 f"{shown(path)}: {_megabytes(size)} MB, more than the limit of "
-                f"{_megabytes(limit)} MB. {_LARGER_LOGS}."
+                f"{_megabytes(limit)} MB",
+                f"{_LARGER_LOGS}.",
             )
         else:
             files = [path]

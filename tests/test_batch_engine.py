@@ -43,7 +43,7 @@ def test_each_bad_job_is_lost_alone_and_its_worker_begins_again(subtests, monkey
         with subtests.test(work=work):
             result = found.pop(work)
             if isinstance(result, WorkerFailed):
-                assert expected in result.line
+                assert expected in str(result.error)
             else:
                 assert result == expected
     assert set(found) == {("process", 0)}

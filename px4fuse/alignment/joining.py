@@ -50,14 +50,15 @@ def join(flight: Flight, other: Flight) -> Flight:
     """
     if other.log.sha256 == flight.log.sha256:
         raise MissingDataError(
-            f"{other.log.name}: the same recording twice. Give the other recording of the flight."
+            f"{other.log.name}: the same recording twice", "Give the other recording of the flight."
         )
     shift_s = other.log.boot_time_s - flight.log.boot_time_s
     low, high = max(0.0, shift_s), min(flight.log.duration_s, shift_s + other.log.duration_s)
     if high - low < MIN_OVERLAP_S:
         raise MissingDataError(
             f"{flight.log.name} and {other.log.name} do not overlap in time: {_span(flight)} and "
-            f"{_span(other)} on the autopilot's boot clock. Give the recordings of one flight."
+            f"{_span(other)} on the autopilot's boot clock",
+            "Give the recordings of one flight.",
         )
     moved = _shifted(other, shift_s)
     agreement = _agreement(flight, moved)

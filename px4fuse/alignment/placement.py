@@ -84,13 +84,14 @@ def place(
     if lag_s is not None and not start_s - end_s <= lag_s <= flight.log.duration_s:
         raise MissingDataError(
             f"{file.name}: with `clock_offset_s` {clock_offset_s:.3f} it does not overlap the log; "
-            f"{spans}. Correct the offset, or leave it out to have it found."
+            f"{spans}",
+            "Correct the offset, or leave it out to have it found.",
         )
     yaw_rad = None if yaw_deg == "auto" else float(np.radians(yaw_deg or 0.0))
     try:
         match = find_match(flight, Question(samples, frame or file.frame, yaw_rad, lag_s))
     except NoMatchError as error:
-        raise MissingDataError(f"{file.name}: {error}; {spans}. {error.remedy}.") from None
+        raise MissingDataError(f"{file.name}: {error}; {spans}", f"{error.remedy}.") from None
     alignment, placed = describe(flight, file, samples, match, frame, yaw_deg, clock_offset_s)
     how = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
     turned = f" turned by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
@@ -124,7 +125,9 @@ def _check_options(
     frame: str | None, yaw_deg: float | str | None, clock_offset_s: float | None
 ) -> None:
     if frame is not None and frame not in FRAMES:
-        raise SettingsError(f"`frame` {frame}: not a known frame. Choose from {', '.join(FRAMES)}.")
+        raise SettingsError(
+            f"`frame` {frame}: not a known frame", f"Choose from {', '.join(FRAMES)}."
+        )
     if isinstance(yaw_deg, str) and yaw_deg != "auto":
         raise SettingsError(f"`yaw_deg` {yaw_deg}: give degrees, or auto.")
     for name, value in (("yaw_deg", yaw_deg), ("clock_offset_s", clock_offset_s)):

@@ -238,7 +238,7 @@ def secret_of(text: str, where: str) -> bytes:
     stripped = text.strip()
     if len(stripped) < MIN_SECRET:
         raise SettingsError(
-            f"{where}: a secret of {len(stripped)} characters can be guessed. Give "
-            f"{MIN_SECRET} or more, or leave it out: one is made up and kept in the answer key."
+            f"{where}: a secret of {len(stripped)} characters can be guessed",
+            f"Give {MIN_SECRET} or more, or leave it out: one is made up, and kept in the answers.",
         )
     return stripped.encode(errors="replace")

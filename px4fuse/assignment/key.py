@@ -135,7 +135,7 @@ def read_key(path: Path) -> AnswerKey:
             raise ValueError("two students have the same id")
     except (msgspec.MsgspecError, RecursionError, ValueError) as error:
         raise SettingsError(
-            f"{path}: not an answer key that this px4fuse reads ({error}). Give it as px4fuse "
-            "simulate --assignment wrote it."
+            f"{path}: not an answer key that this px4fuse reads ({error})",
+            "Give it as px4fuse simulate --assignment wrote it.",
         ) from error
     return key

@@ -84,8 +84,8 @@ def people_of_sheet(sheet: Sheet) -> tuple[Person, ...]:
     known = (_ids(sheet), LOGIN_COLUMNS, EMAIL_COLUMNS, NAME_COLUMNS, LAST_NAME_COLUMNS)
     if not any(sheet.column(titles) is not None for titles in known):
         raise SettingsError(
-            f"{sheet.path}: no column tells who a student is. Give one a title such as id, email "
-            "or name."
+            f"{sheet.path}: no column tells who a student is",
+            "Give one a title such as id, email or name.",
         )
     rows: dict[str, int] = {}
     people = []
@@ -97,7 +97,8 @@ def people_of_sheet(sheet: Sheet) -> tuple[Person, ...]:
         if wanted and rows.setdefault(wanted, number) != number:
             raise SettingsError(
                 f"{sheet.path}: rows {rows[wanted]} and {number} have the same id "
-                f"{one_line(person.student_id, 40)!r}. Give every student one of its own."
+                f"{one_line(person.student_id, 40)!r}",
+                "Give every student one of its own.",
             )
         people.append(person)
     return tuple(people)
@@ -113,7 +114,7 @@ def read_roster(path: Path) -> tuple[Person, ...]:
     """
     people = read_people(path)
     if not people or len(people) > MAX_STUDENTS:
-        raise SettingsError(f"{path}: {len(people)} students. Give 1 to {MAX_STUDENTS}.")
+        raise SettingsError(f"{path}: {len(people)} students", f"Give 1 to {MAX_STUDENTS}.")
     stems: dict[str, Person] = {}
     for person in people:
         who = one_line(person.student_id or person.name, 40)
@@ -121,12 +122,14 @@ def read_roster(path: Path) -> tuple[Person, ...]:
         if stem is None:
             raise SettingsError(
                 f"{path}: {who!r} has no id with letters or digits, after which a file can be "
-                "named. Give every student one."
+                "named",
+                "Give every student one.",
             )
         if stems.setdefault(stem.casefold(), person) is not person:
             raise SettingsError(
                 f"{path}: {one_line(stems[stem.casefold()].student_id, 40)!r} and {who!r} give the "
-                "same file name. Give every student an id of its own."
+                "same file name",
+                "Give every student an id of its own.",
             )
     return people
 

@@ -100,7 +100,7 @@ def read_sheet(path: Path) -> Sheet:
         path, SettingsError, MAX_BYTES, name=str(path), smaller="Give a CSV file of one class"
     )
     if content.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")):
-        raise SettingsError(f"{path}: a spreadsheet. Save it as CSV.")
+        raise SettingsError(f"{path}: a spreadsheet", "Save it as CSV.")
     mark, encoding = next(
         ((mark, name) for mark, name in _MARKS if content.startswith(mark)), (b"", "utf-8")
     )
@@ -110,7 +110,7 @@ def read_sheet(path: Path) -> Sheet:
         encoding = "cp1252"
         text = content.decode(encoding, errors="replace")
     if "\0" in text:
-        raise SettingsError(f"{path}: not text. Give a CSV file with a header.")
+        raise SettingsError(f"{path}: not text", "Give a CSV file with a header.")
     header = next((line for line in text.splitlines() if line.strip()), "")
     # quoted cells may hold any of them
     separator = max(SEPARATORS, key=re.sub(r'"[^"]*"', "", header).count)
@@ -121,7 +121,7 @@ def read_sheet(path: Path) -> Sheet:
         raise SettingsError(f"{path}: not a CSV file ({error}).") from error
     lines = [(number, cells) for number, cells in lines if any(map(str.strip, cells))]
     if not lines:
-        raise SettingsError(f"{path}: empty. Give a CSV file with a header.")
+        raise SettingsError(f"{path}: empty", "Give a CSV file with a header.")
     (_, head), *rows = lines
     return Sheet(
         path,

@@ -177,7 +177,7 @@ def _check_places(output: Path, given: tuple[Path, ...]) -> None:
             raise SettingsError(f"{path}: no such file or folder.")
         if not path.is_file() and not path.is_dir():
             raise SettingsError(
-                f"{path}: not a regular file (a device, pipe or socket). Give a file or folder."
+                f"{path}: not a regular file (a device, pipe or socket)", "Give a file or folder."
             )
         if path.is_dir() and output.resolve().is_relative_to(path.resolve()):
             raise OutputError(

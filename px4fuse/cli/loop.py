@@ -99,7 +99,7 @@ def loop(
     person = read_person(given)
     for option, path in (("--tum", tum), ("--g2o", g2o)):
         if path == STANDARD_OUTPUT:
-            raise SettingsError(f"{option} -: only --json can print. Give a file name.")
+            raise SettingsError(f"{option} -: only --json can print", "Give a file name.")
     if is_g2o(split_part(str(source))[0]):
         _solve(source, json_path, g2o, True if given["robust"] else None)
         return
@@ -161,12 +161,13 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
 
     path, part = split_part(str(source))
     if part is not None:
-        raise SettingsError(f"{shown(source)}: a pose graph has no part {part!r}. Leave it out.")
+        raise SettingsError(f"{shown(source)}: a pose graph has no part {part!r}", "Leave it out.")
     for parameter in typed_parameters():
         if parameter.name not in FOR_GRAPHS:
             raise SettingsError(
                 f"{shown(source)}: {parameter.opts[-1]} is for flights and trajectories, not for a "
-                "pose graph. With one, give only --g2o FILE and --json FILE."
+                "pose graph",
+                "With one, give only --g2o FILE and --json FILE.",
             )
     check_targets([json_path, g2o])
     with progress(json_path == STANDARD_OUTPUT) as step:

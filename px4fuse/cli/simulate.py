@@ -223,7 +223,8 @@ def _check_options(assignment: Path | None) -> None:
         if assignment is not None and parameter.name not in OF_ASSIGNMENTS:
             raise SettingsError(
                 f"{parameter.opts[0]} is for a single flight: --assignment draws it for every "
-                "student. Leave it out."
+                "student",
+                "Leave it out.",
             )
         if assignment is None and parameter.name in ONLY_ASSIGNMENTS:
             raise SettingsError(f"{parameter.opts[0]} requires --assignment ROSTER.csv.")

@@ -120,8 +120,8 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
     have = ", ".join(track.name for track in flight.positions) or "none"
     reasons = {missing.source: missing.reason for missing in flight.missing}
     raise MissingDataError(
-        f"{flight.log.name}: position source {name}: {reasons.get(name, 'no such source')}. "
-        f"This log has: {have}."
+        f"{flight.log.name}: position source {name}: {reasons.get(name, 'no such source')}",
+        f"This log has: {have}.",
     )
 
 

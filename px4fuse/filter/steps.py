@@ -68,7 +68,7 @@ def timeline(axis: Axis, settings: Settings, initial: InitialState | None = None
     if settings.input == "zero":
         return Timeline(time, measurement, np.zeros(steps), np.zeros(steps), 0.0)
     if isinstance(axis.acceleration, Unavailable):
-        raise SettingsError(f"`input` imu needs an acceleration. {axis.acceleration}")
+        raise SettingsError("`input` imu needs an acceleration", f"{axis.acceleration}")
     mean, gap = step_means(axis.acceleration, time)
     gap_s = gap * np.diff(time)
     # Unknown acceleration persists through a gap: after T seconds it has moved the velocity by

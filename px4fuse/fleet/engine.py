@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from importlib import metadata
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from px4fuse.errors import Px4FuseError, SettingsError
+from px4fuse.errors import LogError, Px4FuseError, SettingsError
 from px4fuse.results.reading import one_line
 
 if TYPE_CHECKING:
@@ -54,17 +54,20 @@ class WorkerFailed:
 
     Attributes
     ----------
-    line : str
+    error : Px4FuseError
         Why, and what to do.
     """
 
-    line: str
+    error: Px4FuseError
 
 
 # What stands for a job whose worker ended each time
 _ENDED = WorkerFailed(
-    f"the process that read it ended {ENDS} times: it crashed, or needed more memory than it may "
-    "take. Give each more with --memory, or look at this log with px4fuse compare."
+    LogError(
+        f"the process that read it ended {ENDS} times: it crashed, or needed more memory than it "
+        "may take",
+        "Give each more with --memory, or look at this log with px4fuse compare.",
+    )
 )
 
 
@@ -95,11 +98,13 @@ def connected(
         from dask.utils import parse_bytes  # noqa: PLC0415
         from distributed import Client, LocalCluster, default_client  # noqa: PLC0415
     except ImportError as error:
-        raise SettingsError('many logs require Dask. Run pip install "px4fuse[batch]".') from error
+        raise SettingsError(
+            "many logs require Dask", 'Run pip install "px4fuse[batch]".'
+        ) from error
     try:
         limit = memory if memory == "auto" else parse_bytes(memory)
     except ValueError as error:
-        raise SettingsError(f"`memory` {memory}: not a size. Give one like 2GB.") from error
+        raise SettingsError(f"`memory` {memory}: not a size", "Give one like 2GB.") from error
     if scheduler is not None:
         try:
             # one that fails must not become the session's own
@@ -107,7 +112,8 @@ def connected(
         except (OSError, ValueError) as error:
             raise SettingsError(
                 f"`scheduler` {scheduler}: no Dask scheduler answers there "
-                f"({one_line(str(error), 120)}). Start one with: dask scheduler"
+                f"({one_line(str(error), 120)})",
+                "Start one with: dask scheduler",
             ) from error
         with client, client.as_current():
             _check(client, scheduler)
@@ -143,21 +149,22 @@ def _check(client: Client, address: str) -> None:
     try:
         client.wait_for_workers(1, timeout=CONNECT_S)
     except TimeoutError as error:
-        raise SettingsError(f"{address}: has no workers. {_START.format(address)}") from error
+        raise SettingsError(f"{address}: has no workers", f"{_START.format(address)}") from error
     for name, worker in client.scheduler_info(n_workers=-1)["workers"].items():
         # matplotlib draws in one thread only, and what hangs must be ended alone
         if worker["nthreads"] != 1 or worker["nanny"] is None:
             lacks = "no nanny" if worker["nanny"] is None else f"{worker['nthreads']} threads"
             raise SettingsError(
                 f"worker {name} has {lacks}; each log requires a process of its own, which can be "
-                f"ended. {_START.format(address)}"
+                f"ended",
+                f"{_START.format(address)}",
             )
     here = metadata.version("px4fuse")
     for name, there in client.run(metadata.version, "px4fuse", on_error="return").items():
         if there != here:
             other = f"px4fuse {there}" if isinstance(there, str) else "no px4fuse"
             raise SettingsError(
-                f"worker {name} has {other}, and this is {here}. Install the same on both."
+                f"worker {name} has {other}, and this is {here}", "Install the same on both."
             )
 
 
@@ -242,9 +249,8 @@ def _finished(
         elif run.address not in workers:
             result = _ENDED
         elif now_s > run.deadline_s:
-            result = WorkerFailed(
-                f"it took longer than {timeout_s:g} s and was ended. Allow more with --timeout."
-            )
+            said = f"it took longer than {timeout_s:g} s and was ended"
+            result = WorkerFailed(LogError(said, "Allow more with --timeout."))
             client.restart_workers([run.address], timeout=RESTART_S, raise_for_error=False)
         else:
             continue
@@ -271,12 +277,11 @@ def _result(future: Future[Any]) -> Any:
     if isinstance(error, KilledWorker):
         return _ENDED
     if isinstance(error, MemoryError):
-        return WorkerFailed("it needs more memory than there is. Use fewer --workers.")
-    if isinstance(error, Px4FuseError):
-        return WorkerFailed(str(error))
-    return WorkerFailed(
-        f"{type(error).__name__}: {one_line(str(error), 300)}. Look at it with px4fuse compare."
-    )
+        error = LogError("it needs more memory than there is", "Use fewer --workers.")
+    if not isinstance(error, Px4FuseError):
+        said = f"{type(error).__name__}: {one_line(str(error), 300)}"
+        error = LogError(said, "Look at it with px4fuse compare.")
+    return WorkerFailed(error)
 
 
 def _failed(future: Future[Any]) -> bool:

@@ -97,13 +97,13 @@ def analyse(job: Job) -> Outcome:
         with _opened(job) as path:
             sha256 = _sha256(path)
             if job.sha256 not in ("", sha256):
-                raise LogError(CHANGED)
+                raise LogError(*CHANGED)
             outcome = _compared(job, path, sha256)
             if _sha256(path) != sha256:
-                raise LogError(CHANGED)
+                raise LogError(*CHANGED)
             return outcome
     except Px4FuseError as error:
-        return Outcome((refused(str(error), FAILED) | {"log_sha256": sha256},))
+        return Outcome((refused(error, FAILED) | {"log_sha256": sha256},))
 
 
 @contextmanager
@@ -117,10 +117,10 @@ def _opened(job: Job) -> Iterator[Path]:
         max_log_bytes.reset(before)
 
 
-def refused(text: str, status: str) -> Row:
-    """The row of a log from the line of an error: what is wrong, and then what to do."""
-    reason, _, remedy = with_options(text).partition(". ")
-    return {"status": status, "reason": reason.removesuffix("."), "remedy": remedy}
+def refused(error: Px4FuseError, status: str, name: str = "") -> Row:
+    """The row of a log that could not be compared: what is wrong, and what to do."""
+    reason = with_options(error.reason).removeprefix(f"{name}: ")
+    return {"status": status, "reason": reason, "remedy": with_options(error.remedy)}
 
 
 def _compared(job: Job, path: Path, sha256: str) -> Outcome:
@@ -147,8 +147,7 @@ def _compared(job: Job, path: Path, sha256: str) -> Outcome:
             report = render(Document(analysis, findings, Student(), command), text)
     except Px4FuseError as error:
         status = NOT_JUDGED if isinstance(error, MissingDataError) else FAILED
-        text = str(error).removeprefix(f"{path.name}: ")
-        return Outcome((known | refused(text, status),))
+        return Outcome((known | refused(error, status, path.name),))
     return Outcome(tuple(rows_of(found)), text.encode(), report)
 
 

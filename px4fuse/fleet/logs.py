@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 #: What is taken from a folder; a file that is named itself may be called anything
 SUFFIXES = (".ulg", ".tlog", ".bin")
-CHANGED = "it changed while it was read. Run the same command again when it is complete."
+CHANGED = ("it changed while it was read", "Run the same command again when it is complete.")
 # By these, as far as a file system has them, a file is the same as before
 _SAME = (
     "size", "mtime", "ETag", "etag", "LastModified", "last_modified", "updated", "md5Hash",
@@ -69,7 +69,7 @@ def find_logs(given: Iterable[str]) -> list[FoundLog]:
 
 def _logs_in(given: str) -> list[FoundLog]:
     if not given:
-        raise SettingsError("the name of a log is empty. Give files, folders or URLs.")
+        raise SettingsError("the name of a log is empty", "Give files, folders or URLs.")
     files, root = _file_system(given)
     try:
         if files.isdir(root):
@@ -87,8 +87,8 @@ def _logs_in(given: str) -> list[FoundLog]:
         ) from error
     if not infos:
         raise SettingsError(
-            f"{given}: no logs there ({', '.join(SUFFIXES)}). Give a file, or a folder that holds "
-            "some."
+            f"{given}: no logs there ({', '.join(SUFFIXES)})",
+            "Give a file, or a folder that holds some.",
         )
     return [_found(given, files, path, info) for path, info in infos.items()]
 
@@ -124,15 +124,15 @@ def local_file(address: str) -> Iterator[Path]:
     size, limit = before.get("size"), max_log_bytes.get()
     if size is not None and size > limit:
         raise LogError(
-            f"{size / 1e6:,.0f} MB, more than the limit of {limit / 1e6:,.0f} MB. Allow more with "
-            "--max-size MB."
+            f"{size / 1e6:,.0f} MB, more than the limit of {limit / 1e6:,.0f} MB",
+            "Allow more with --max-size MB.",
         )
     with TemporaryDirectory(prefix="px4fuse-") as folder:
         local = Path(folder, _name(path))
         files.get_file(path, str(local))
         files.invalidate_cache()
         if _identity(files, path) != before:
-            raise LogError(CHANGED)
+            raise LogError(*CHANGED)
         yield local
 
 
@@ -149,10 +149,10 @@ def _file_system(address: str) -> tuple[AbstractFileSystem, str]:
     except ImportError as error:  # its cause names the module, which is the package's name
         package = getattr(error.__cause__, "name", None) or "the package that it names"
         raise SettingsError(
-            f'{address}: this kind of URL requires a package. Run pip install "{package}".'
+            f"{address}: this kind of URL requires a package", f'Run pip install "{package}".'
         ) from error
     except ValueError as error:  # of a protocol that nobody knows
-        raise SettingsError(f"{address}: {error}. Give a path or another URL.") from error
+        raise SettingsError(f"{address}: {error}", "Give a path or another URL.") from error
     return files, path
 
 

@@ -58,7 +58,7 @@ def read_baseline(path: Path) -> pd.DataFrame:
     needed = {"log", "log_sha256", "settings", "status", "vehicle", "axis", *_MEASURES}
     if lacking := sorted(needed - set(found.columns)):
         raise SettingsError(
-            f"{path.name}: has no column {lacking[0]}. Give the fleet.parquet of px4fuse batch."
+            f"{path.name}: has no column {lacking[0]}", "Give the fleet.parquet of px4fuse batch."
         )
     return found.fillna(dict.fromkeys(texts.keys() & set(found.columns), ""))
 

@@ -210,7 +210,7 @@ def _worked(
     with closing(outcomes(client, function, jobs, timeout_s=timeout_s)) as found:
         for number, (job, outcome) in enumerate(found, 1):
             if isinstance(outcome, WorkerFailed):
-                row = refused(outcome.line, FAILED) | {"log_sha256": job.sha256}
+                row = refused(outcome.error, FAILED) | {"log_sha256": job.sha256}
                 outcome = Outcome((row,))  # noqa: PLW2901
             failed += isinstance(outcome, Outcome) and outcome.rows[0]["status"] == FAILED
             yield job, outcome

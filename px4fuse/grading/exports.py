@@ -87,7 +87,7 @@ def grade_column(sheet: Sheet, wanted: str) -> int:
     several = "several columns for the grade" if found else "no column for the grade"
     others = ", ".join(one_line(title, 40) for title in titles.values())
     raise SettingsError(
-        f"{sheet.path}: {several}. Name one with --column: {one_line(others, 300)}."
+        f"{sheet.path}: {several}", f"Name one with --column: {one_line(others, 300)}."
     )
 
 

@@ -42,7 +42,7 @@ def read_overrides(path: Path) -> Overrides:
     missing = [title for title in TITLES if sheet.column((title,)) is None]
     if missing:
         raise SettingsError(
-            f"{path}: no column {', '.join(missing)}. Its columns are {', '.join(TITLES)}."
+            f"{path}: no column {', '.join(missing)}", f"Its columns are {', '.join(TITLES)}."
         )
     found: dict[str, dict[str, Override]] = defaultdict(dict)
     for number, row in zip(sheet.numbers, sheet.rows, strict=True):
@@ -52,7 +52,8 @@ def read_overrides(path: Path) -> Overrides:
         if item in found[student]:
             raise SettingsError(
                 f"{path}: row {number}: {one_line(student, 40)}, {one_line(item, 40) or 'all'} "
-                "stands there twice. Keep one of them."
+                "stands there twice",
+                "Keep one of them.",
             )
         value = _points(points)
         if (points and value is None) or (value is not None and not item):

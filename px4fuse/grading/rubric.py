@@ -103,4 +103,4 @@ def parse_rubric(text: str, where: str) -> Rubric:
         return msgspec.convert(given, Rubric)
     # ValueError: not TOML, or an integer of a million digits
     except (msgspec.ValidationError, ValueError, RecursionError) as error:
-        raise SettingsError(f"{place}: {one_line(str(error), 300)}. {HELP}") from error
+        raise SettingsError(f"{place}: {one_line(str(error), 300)}", f"{HELP}") from error

@@ -192,9 +192,8 @@ def take_inventory(flight: Flight) -> Inventory:
         compared = compare(flight)
         reason = compared.source_reason
     except Px4FuseError as error:
-        text = with_options(str(error)).removeprefix(f"{flight.log.name}: ")
-        first, _, remedy = text.partition(". ")
-        reason = first.removesuffix(".")
+        reason = with_options(error.reason).removeprefix(f"{flight.log.name}: ")
+        remedy = with_options(error.remedy)
         if not isinstance(error, MissingDataError):
             remedy = "Record more of the flight: the logger from arming on (SDLOG_MODE 0)."
     log = flight.log

@@ -159,7 +159,7 @@ def _known_end(
     """Where it really ended: as measured, else by the truth in the log, else where it began."""
     if landed_at is not None:
         if not came_back:
-            raise SettingsError("`landed_at` and `came_back` exclude each other. Leave one out.")
+            raise SettingsError("`landed_at` and `came_back` exclude each other", "Leave one out.")
         return measured_end(path, *landed_at)
     if not came_back:
         return Unavailable(
@@ -184,7 +184,8 @@ def _key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
     if not along[-1] >= max(MIN_PATH_M * min(1.0, spacing_m / 0.5), 1e-6):
         raise TrajectoryError(
             f"{path.name}: the path is {along[-1]:.2f} m long on key frames {spacing_m:g} m apart, "
-            "too short for a loop. Give the part with `start_s` and `end_s`, or `key_frames_m`."
+            "too short for a loop",
+            "Give the part with `start_s` and `end_s`, or `key_frames_m`.",
         )
     return frames, np.interp(path.time_s, path.time_s[frames], along)
 

@@ -91,7 +91,8 @@ def chosen_part(
     if not low < high:
         raise SettingsError(
             f"the part from {low:.12g} s to {high:.12g} s is empty; the track runs from "
-            f"{span[0]:.2f} s to {span[1]:.2f} s. Change `start_s` or `end_s`."
+            f"{span[0]:.2f} s to {span[1]:.2f} s",
+            "Change `start_s` or `end_s`.",
         )
     if given:
         reason = f"chosen with {' and '.join(given)}"

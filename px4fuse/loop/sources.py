@@ -42,8 +42,8 @@ def split_part(argument: str) -> tuple[Path, Part | None]:
         return Path(path), part
     if Path(path).is_file():
         raise TrajectoryError(
-            f"{shown(Path(path))}:{part}: {part!r} is not a part of a flight. Choose from "
-            f"{', '.join(PARTS)}."
+            f"{shown(Path(path))}:{part}: {part!r} is not a part of a flight",
+            f"Choose from {', '.join(PARTS)}.",
         )
     return whole, None
 
@@ -102,23 +102,24 @@ def read_source(
     """
     path, part = split_part(argument)
     if not head_of(path):
-        raise TrajectoryError(f"{shown(path)}: the file is empty. Copy or export it again.")
+        raise TrajectoryError(f"{shown(path)}: the file is empty", "Copy or export it again.")
     if is_g2o(path):
         raise TrajectoryError(
-            f"{shown(path)}: a pose graph, not a trajectory. Solve it with px4fuse loop "
-            f"{shown(path)}."
+            f"{shown(path)}: a pose graph, not a trajectory",
+            f"Solve it with px4fuse loop {shown(path)}.",
         )
     if is_text(path):
         if part is not None:
             raise TrajectoryError(
-                f"{shown(path)}: a trajectory file has no part {part!r}. Leave it out."
+                f"{shown(path)}: a trajectory file has no part {part!r}", "Leave it out."
             )
         trajectory = read_trajectory(path)
         return LoopSource(trajectory if frame is None else replace(trajectory, frame=frame), None)
     if frame is not None:
         raise SettingsError(
             f"`frame` {frame.lower()} is for trajectory files; {shown(path)} is a flight log, "
-            "which states its frame. Leave `frame` out."
+            "which states its frame",
+            "Leave `frame` out.",
         )
     flight = read_log(path, system=system)
     chosen = part or default
@@ -127,5 +128,7 @@ def read_source(
         if isinstance(odometry, Unavailable):
             chosen = "ekf2"
             if isinstance(flight.ekf2, Unavailable):
-                raise MissingDataError(f"{flight.log.name}: {odometry.reason}. {odometry.remedy}")
+                raise MissingDataError(
+                    f"{flight.log.name}: {odometry.reason}", f"{odometry.remedy}"
+                )
     return LoopSource(trajectory_of(flight, chosen), flight)

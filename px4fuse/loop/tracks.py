@@ -73,7 +73,7 @@ def trajectory_of(flight: Flight, part: Part) -> Trajectory:
     if isinstance(found, Truth):
         return _trajectory(flight, part, found.samples, found.attitude, (found.name,))
     if not isinstance(found, Ekf2):
-        raise MissingDataError(f"{flight.log.name}:{part}: {found.reason}. {found.remedy}")
+        raise MissingDataError(f"{flight.log.name}:{part}: {found.reason}", f"{found.remedy}")
     state, notes = found.state, ["EKF2's position as published"]
     source = next((t for t in flight.positions if t.origin.is_vision), None)
     if source is not None:

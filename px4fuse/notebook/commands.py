@@ -101,7 +101,8 @@ def compare(
     if isinstance(log, Flight) and (position, mavlink, system) != (None, None, None):
         raise SettingsError(
             "`position`, `mavlink` and `system` say what is read beside a log, and this flight has "
-            "been read. Give the path of its log."
+            "been read",
+            "Give the path of its log.",
         )
     if isinstance(clock_offset_s, str) and clock_offset_s != AUTO:
         raise SettingsError(f"`clock_offset_s` {clock_offset_s!r}: give seconds, or 'auto'.")
@@ -248,8 +249,8 @@ def what_if(
         return run_what_if(WhatIfRequest(log=flight.log.name), flight=flight).whatif
     model = log if isinstance(log, Model) else open_model(flight)
     if isinstance(model, Unavailable):
-        raise MissingDataError(str(model))
+        raise MissingDataError(f"{model.what}: {model.reason}", model.remedy)
     found = whatif.what_if(model, [changes] if isinstance(changes, Mapping) else changes)
     if isinstance(found, Unavailable):
-        raise MissingDataError(str(found))
+        raise MissingDataError(f"{found.what}: {found.reason}", found.remedy)
     return found

@@ -44,8 +44,8 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
         return read_ulog(path)
     if head.startswith(DATAFLASH_MAGIC):
         raise LogError(
-            f"{name}: not a PX4 ULog but an ArduPilot DataFlash log, which px4fuse does not "
-            "read. Give the .tlog that the ground station wrote."
+            f"{name}: not a PX4 ULog but an ArduPilot DataFlash log, which px4fuse does not read",
+            "Give the .tlog that the ground station wrote.",
         )
     from px4fuse.readers.mavlink import read_mavlink  # noqa: PLC0415
 

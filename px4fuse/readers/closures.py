@@ -46,7 +46,7 @@ def read_closures(path: Path) -> tuple[GivenClosure, ...]:
     name = shown(path)
     text = text_of(read_whole(path, TrajectoryError, MAX_FILE_BYTES))
     if text is None:
-        raise TrajectoryError(f"{name}: not a text file. Give one T1,T2[,SIGMA] a line.")
+        raise TrajectoryError(f"{name}: not a text file", "Give one T1,T2[,SIGMA] a line.")
     found: list[GivenClosure] = []
     for number, line in enumerate(text.split("\n"), start=1):
         content = line.split("#", 1)[0].strip()

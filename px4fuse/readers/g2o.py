@@ -67,7 +67,7 @@ def read_g2o(path: str | Path) -> PoseGraph:
     text = text_of(read_whole(file, TrajectoryError, MAX_FILE_BYTES))
     if text is None:
         raise TrajectoryError(
-            f"{shown(file)}: not a text file. Give a g2o file: VERTEX and EDGE lines."
+            f"{shown(file)}: not a text file", "Give a g2o file: VERTEX and EDGE lines."
         )
     return parse_g2o(text, shown(file))
 
@@ -97,7 +97,7 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
     vertices, edges = found[f"VERTEX_{kind}"], found[f"EDGE_{kind}"]
     if not edges.line:
         raise TrajectoryError(
-            f"{name}: no edges. Give a g2o file with EDGE_SE2 or EDGE_SE3:QUAT lines."
+            f"{name}: no edges", "Give a g2o file with EDGE_SE2 or EDGE_SE3:QUAT lines."
         )
     width = 3 if is_plane else 7
     numbers, ends = _finite(edges), np.array(edges.ids, dtype=np.intp)

@@ -200,8 +200,8 @@ def read_frames(path: Path) -> Frames:
     if good < MIN_GOOD_SHARE * len(content) or not len(start):
         raise LogError(
             f"{name}: not a PX4 ULog, and not a MAVLink recording ({len(start)} frames with a "
-            f"good checksum in {len(content)} bytes). Give the .ulg from the vehicle, or a .tlog "
-            "or raw MAVLink stream."
+            f"good checksum in {len(content)} bytes)",
+            "Give the .ulg from the vehicle, or a .tlog or raw MAVLink stream.",
         )
     source = np.frombuffer(content, dtype=np.uint8)
     second = source[start] == MAGIC_2

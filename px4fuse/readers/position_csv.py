@@ -139,7 +139,9 @@ class _Table:
                 quoting=csv.QUOTE_NONE,
             )
         except ValueError as error:
-            raise LogError(f"{self.file}: no table of numbers. Export it as CSV again.") from error
+            raise LogError(
+                f"{self.file}: no table of numbers", "Export it as CSV again."
+            ) from error
         texts = texts.apply(lambda column: column.str.strip())
         made: pd.DataFrame = texts.mask(
             texts.apply(lambda column: column.str.lower().isin(_MISSING)), None
@@ -217,8 +219,8 @@ def read_position_csv(
     if len(keep) < MIN_ROWS:
         raise LogError(
             f"{table.file}: usable rows: {len(keep)}, at least {MIN_ROWS} are needed"
-            f"{''.join('; ' + note for note in notes)}. Copy the file again, or say where time and "
-            f"position are with {_COLUMNS}."
+            f"{''.join('; ' + note for note in notes)}",
+            f"Copy the file again, or say where time and position are with {_COLUMNS}.",
         )
     numbers = numbers.iloc[keep].set_index(pd.Index(seconds[keep], name="time_s"))
     step = float(np.median(np.diff(numbers.index)))
@@ -297,8 +299,8 @@ def _find_table(
     text = text_of(content)
     if text is None:
         raise LogError(
-            f"{file}: a binary file, not a text table. Give the CSV file of the UWB system; a "
-            "flight log is read without `position`."
+            f"{file}: a binary file, not a text table",
+            "Give the CSV file of the UWB system; a flight log is read without `position`.",
         )
     notes = []
     whole, _, last = text.replace('"', "").rpartition("\n")
@@ -320,16 +322,16 @@ def _find_table(
         told = ", ".join(map(quote, sorted(wanted))) or "time, x, y, z"
         raise LogError(
             f"{file}: no header with the columns {told} in its first {len(lines)} lines, of which "
-            f"the first is {quote(lines[0])}. Give a CSV file with a header, or name its columns "
-            f"with {_COLUMNS}."
+            f"the first is {quote(lines[0])}",
+            f"Give a CSV file with a header, or name its columns with {_COLUMNS}.",
         )
     body = re.sub(r"(?m)^[ \t]*[#%].*", "", text.split("\n", start)[start])
     head = body[:HEAD_CHARS].lstrip("\n").partition("\n")[0].rstrip(f"{separator} ")
     width = len(_split(head, separator))
     if width > len(names):
         raise LogError(
-            f"{file}: the header names {len(names)} columns, but rows have {width}. Export it with "
-            "decimal points, and with a name for every column."
+            f"{file}: the header names {len(names)} columns, but rows have {width}",
+            "Export it with decimal points, and with a name for every column.",
         )
     return _Table(file, separator, names, body, start + 1), notes
 
@@ -376,7 +378,8 @@ def _resolve(table: _Table, columns: tuple[str, ...]) -> list[int]:
         if wanted not in names and not (wanted.isdecimal() and 1 <= float(wanted) <= len(names)):
             raise SettingsError(
                 f"{table.file}: no column {quote(column)} found (the columns are "
-                f"{table.label(*range(len(names)))}). Name them with {_COLUMNS}."
+                f"{table.label(*range(len(names)))})",
+                f"Name them with {_COLUMNS}.",
             )
         found.append(names.index(wanted) if wanted in names else int(wanted) - 1)
     if len({*found}) < len(found):

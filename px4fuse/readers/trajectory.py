@@ -118,8 +118,8 @@ def read_trajectory(path: str | Path) -> Trajectory:
         rows.pop()
     if len(rows) < MIN_POSES:
         raise TrajectoryError(
-            f"{name}: poses: {len(rows)}, at least {MIN_POSES} are needed. Export the trajectory "
-            "again; where SLAM lost track at once, its file is almost empty."
+            f"{name}: poses: {len(rows)}, at least {MIN_POSES} are needed",
+            "Export the trajectory again; where SLAM lost track at once, its file is almost empty.",
         )
     stamps, values = _parse(file, layout, rows)
     time, time_words = _seconds(file, stamps)
@@ -163,8 +163,8 @@ def tum_text(trajectory: Trajectory) -> str:
     """
     if trajectory.rotation is None:
         raise TrajectoryError(
-            f"{trajectory.name}: a TUM file needs orientations, and here are only positions. "
-            "Choose a part with orientation."
+            f"{trajectory.name}: a TUM file needs orientations, and here are only positions",
+            "Choose a part with orientation.",
         )
     time = trajectory.time_s + (trajectory.unix_offset_s or 0.0)
     table = np.column_stack((time, trajectory.position_m, trajectory.rotation.as_quat()))
@@ -179,7 +179,7 @@ def _text(name: str, content: bytes) -> str:
         is_ulog = content.startswith(b"ULog")
         what = "a PX4 log" if is_ulog else "a binary file"
         remedy = f"Name a part of the log: {name}:vio or {name}:ekf2." if is_ulog else _REMEDY
-        raise TrajectoryError(f"{name}: {what}, not a trajectory file. {remedy}")
+        raise TrajectoryError(f"{name}: {what}, not a trajectory file", f"{remedy}")
     return text
 
 
@@ -209,16 +209,16 @@ def _recognise(file: _File) -> _Layout:
         header.append(",".join(rows.pop(0)))
     if not rows:
         what = "nothing but comments" if header else "nothing but blank lines"
-        raise TrajectoryError(f"{file.name}: {what} in the first {HEAD_LINES} lines. {_REMEDY}")
+        raise TrajectoryError(f"{file.name}: {what} in the first {HEAD_LINES} lines", f"{_REMEDY}")
     first = rows[0]
     if re.match(r"(VERTEX|EDGE|FIX|PARAMS)[_ ]?", first[0]):
         raise TrajectoryError(
-            f"{file.name}: a pose graph (g2o), not a trajectory: it has no times. {_REMEDY}"
+            f"{file.name}: a pose graph (g2o), not a trajectory: it has no times", f"{_REMEDY}"
         )
     if not _numeric(first):
         raise TrajectoryError(
-            f"{file.name}: not a trajectory file: its first line is "
-            f"{quote(' '.join(first))}. {_REMEDY}"
+            f"{file.name}: not a trajectory file: its first line is {quote(' '.join(first))}",
+            f"{_REMEDY}",
         )
     separator = "," if any("," in line for line in head if _is_row(line)) else None
     if len(first) in ((COLUMNS,) if separator is None else EUROC_COLUMNS):
@@ -226,7 +226,8 @@ def _recognise(file: _File) -> _Layout:
     kitti = ": a KITTI file, which has no times" if not separator and len(first) == 12 else ""
     raise TrajectoryError(
         f"{file.name}: {len(first)} columns{kitti}; TUM has {COLUMNS} between blanks, EuRoC "
-        f"{EUROC_COLUMNS[0]} or {EUROC_COLUMNS[1]} between commas. {_REMEDY}"
+        f"{EUROC_COLUMNS[0]} or {EUROC_COLUMNS[1]} between commas",
+        f"{_REMEDY}",
     )
 
 
@@ -257,14 +258,16 @@ def _layout(file: _File, first: list[str], separator: str | None, header: list[s
     if names:
         raise TrajectoryError(
             f"{file.name}: its columns are {quote(', '.join(names))}, not time, position x y z and "
-            f"quaternion w x y z. {_REMEDY}"
+            f"quaternion w x y z",
+            f"{_REMEDY}",
         )
     if abs(float(first[0])) * 1e-9 >= UNIX_START_S:
         return _Layout(separator, len(first), True, euroc + ", by its nanoseconds")
     raise TrajectoryError(
         f"{file.name}: {len(first)} columns between commas without a header, so the place of the "
-        "quaternion's w is not known. Add the line "
-        "'#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z' with the columns in their order."
+        "quaternion's w is not known",
+        "Add the line "
+        "'#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z' with the columns in their order.",
     )
 
 
@@ -336,7 +339,8 @@ def _seconds(file: _File, stamps: list[str]) -> tuple[Array, str]:
             ), f"Its stamps are {unit} and were divided by {per_second:.0e}."
     raise TrajectoryError(
         f"{file.name}: its stamps are {step:.3g} apart (median), which is not an interval of "
-        "frames in seconds or nanoseconds. Give stamps in seconds."
+        "frames in seconds or nanoseconds",
+        "Give stamps in seconds.",
     )
 
 

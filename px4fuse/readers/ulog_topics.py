@@ -284,14 +284,14 @@ def read_topics(path: Path) -> Topics:
             placed = tables or _tables(ULog(io.BytesIO(whole)))
     except _PARSE_ERRORS as error:
         raise LogError(
-            f"{name}: not a readable ULog ({str(error) or type(error).__name__}). "
-            "Copy the .ulg from the vehicle again."
+            f"{name}: not a readable ULog ({str(error) or type(error).__name__})",
+            "Copy the .ulg from the vehicle again.",
         ) from error
     notes: tuple[str, ...] = ()
     if not placed:
         raise LogError(
-            f"{name}: a ULog without any data (no IMU, no position, no EKF2). If it is cut "
-            "short, copy it again; else record with SDLOG_PROFILE 129."
+            f"{name}: a ULog without any data (no IMU, no position, no EKF2)",
+            "If it is cut short, copy it again; else record with SDLOG_PROFILE 129.",
         )
     if not tables:
         names = sorted({topic for topic, _ in placed})
@@ -364,8 +364,8 @@ def _data_span(
             stretch = max(np.split(kept, breaks), key=len)
             return int(stretch[0]), int(stretch[-1])
     raise LogError(
-        f"{name}: every time stamp in it is zero, so nothing can be placed in time. "
-        "The logger ran before the clock did; record again."
+        f"{name}: every time stamp in it is zero, so nothing can be placed in time",
+        "The logger ran before the clock did; record again.",
     )
 
 

@@ -293,7 +293,7 @@ def parse(texts: Iterable[str]) -> Mistakes:
         name, equals, values = text.strip().partition("=")
         if name not in MISTAKES:
             raise SettingsError(
-                f"--mistake {text}: not a known mistake. Choose from {', '.join(MISTAKES)}."
+                f"--mistake {text}: not a known mistake", f"Choose from {', '.join(MISTAKES)}."
             )
         mistake = MISTAKES[name]
         given = values.split(",") if equals else []

@@ -84,8 +84,8 @@ def fit(estimate_m: Array, reference_m: Array, kind: AlignmentKind) -> Transform
     """
     if len(estimate_m) < MIN_POSES:
         raise TrajectoryError(
-            f"Only {len(estimate_m)} poses match in time: an alignment needs {MIN_POSES}. Check "
-            "that both are of the same flight, and their clocks (`time_offset_s` auto)."
+            f"Only {len(estimate_m)} poses match in time: an alignment needs {MIN_POSES}",
+            "Check that both are of the same flight, and their clocks (`time_offset_s` auto).",
         )
     if kind == "none":
         return Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 0)
@@ -151,8 +151,9 @@ def _check_yaw(transform: Transform, estimate_m: Array, reference_m: Array) -> N
     if moved < max(MIN_SPREAD_M, MIN_SHARE * extent) or left > MAX_PLANE_RATIO * moved:
         raise TrajectoryError(
             f"The horizontal motion is {moved:.2g} m (RMS) and what an alignment leaves is "
-            f"{left:.2g} m: a yaw cannot be found from it. The vehicle did not move, or the "
-            f"estimate does not follow; `alignment` none compares without turning."
+            f"{left:.2g} m: a yaw cannot be found from it",
+            "The vehicle did not move, or the "
+            "estimate does not follow; `alignment` none compares without turning.",
         )
 
 
@@ -168,12 +169,13 @@ def _check_turn(
     left = rms_m(reference_m - transform.apply(estimate_m))
     if min(length, spread[0]) < MIN_SPREAD_M:
         raise TrajectoryError(
-            f"One of the two does not move, so {kind} cannot be found from it. `alignment` none "
-            "compares without turning."
+            f"One of the two does not move, so {kind} cannot be found from it",
+            "`alignment` none compares without turning.",
         )
     if width < MIN_SHARE * length or left > MAX_LINE_RATIO * width:
         raise TrajectoryError(
             f"The motion is along a line: {length:.2g} m (RMS) by {width:.2g} m across it, where "
             f"an alignment leaves {left:.2g} m, so the turn about that line and with it {kind} "
-            f"cannot be found. Use `alignment` yaw if z is vertical in both, or `alignment` none."
+            f"cannot be found",
+            "Use `alignment` yaw if z is vertical in both, or `alignment` none.",
         )

@@ -91,8 +91,9 @@ def associate(
         added = f" (with the offset of {time_offset_s:.12g} s)" if time_offset_s else ""
         raise TrajectoryError(
             f"{estimate.name}: {what} in time: it spans {time[0]:.3f} to {time[-1]:.3f} s{added}, "
-            f"the reference {reference.name} {first:.3f} to {last:.3f} s. Check that both are of "
-            "the same flight; if their clocks differ, give `time_offset_s` auto."
+            f"the reference {reference.name} {first:.3f} to {last:.3f} s",
+            "Check that both are of "
+            "the same flight; if their clocks differ, give `time_offset_s` auto.",
         )
     outside = int(((time < first - slack) | (time > last + slack)).sum())
     steps = np.diff(time[chosen])

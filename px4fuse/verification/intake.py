@@ -133,7 +133,7 @@ def read_report(pdf: bytes, name: str) -> Report | Refused:
             results = _results(pdf)
         return Report(hashlib.sha256(pdf).hexdigest(), seal_of(pdf), results, pdf)
     except ResultsError as refusal:
-        reason, remedy = str(refusal), refusal.remedy
+        reason, remedy = f"{refusal.reason}.", refusal.remedy
     except (LimitReachedError, RecursionError, MemoryError):
         reason = _COSTLY
     # pypdf names no closed set of exceptions for what is broken in a file

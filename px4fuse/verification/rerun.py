@@ -92,7 +92,7 @@ def recompute(results: Reported, logs: Mapping[str, Path]) -> Recomputed | Refus
     except SettingsError as error:  # no run with these settings can have made a report
         return Refused(f"{NOT_OURS}: {error}", ASK)
     except ResultsError as error:
-        return Refused(str(error), error.remedy, getattr(error, "missing", ""))
+        return Refused(error.reason, error.remedy, getattr(error, "missing", ""))
     except Px4FuseError as error:
         return Refused(str(error), ASK)
     except Exception as error:  # noqa: BLE001 - settings made to fail may fail anywhere

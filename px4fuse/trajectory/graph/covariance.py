@@ -104,8 +104,8 @@ def _tested(graph: PoseGraph, edge: int, residual: Array, covariance: Array) -> 
     freedom = len(variance)
     if not freedom:
         raise TrajectoryError(
-            f"The closure from vertex {ends[0]} to {ends[1]} has no information. Give its inverse "
-            "covariance."
+            f"The closure from vertex {ends[0]} to {ends[1]} has no information",
+            "Give its inverse covariance.",
         )
     seen = directions.T @ residual
     spread = directions.T @ covariance @ directions + np.diag(variance)
@@ -113,8 +113,8 @@ def _tested(graph: PoseGraph, edge: int, residual: Array, covariance: Array) -> 
     if not is_finite or np.linalg.eigvalsh(unit_diagonal(spread)[1])[0] <= _SINGULAR:
         raise TrajectoryError(
             f"Odometry between vertices {ends[0]} and {ends[1]} is too uncertain to test the "
-            "closure with the digits that numbers have. Give its edges information that is closer "
-            "to the closure's."
+            "closure with the digits that numbers have",
+            "Give its edges information that is closer to the closure's.",
         )
     d2 = float(seen @ np.linalg.solve(spread, seen))
     p = float(chdtrc(freedom, d2))
@@ -129,7 +129,8 @@ def _dead_reckoning(graph: PoseGraph, low: int, high: int, chain: IntArray) -> t
         at = low + int(gap[0])
         raise TrajectoryError(
             f"No odometry edge joins vertices {graph.ids[at]} and {graph.ids[at + 1]}, so odometry "
-            "alone does not tell how well the closure fits. Add the edge, or test shorter closures."
+            "alone does not tell how well the closure fits",
+            "Add the edge, or test shorter closures.",
         )
     covariance = _covariances(graph, used)
     poses = lie.chain(odometry_steps(graph, used))
@@ -146,7 +147,8 @@ def _covariances(graph: PoseGraph, used: IntArray) -> Array:
         raise TrajectoryError(
             f"The odometry edge from vertex {graph.ids[graph.first[edge]]} to "
             f"{graph.ids[graph.second[edge]]} has a direction without information, so its error "
-            "has no bound. Give the information of all directions."
+            "has no bound",
+            "Give the information of all directions.",
         )
     covariance = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
     back = graph.first[used] > graph.second[used]

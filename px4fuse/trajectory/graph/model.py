@@ -175,13 +175,14 @@ def require_connected(graph: PoseGraph, used: BoolArray, what: str) -> None:
         Says how many parts there are and which vertex is apart.
     """
     if not len(graph.first):
-        raise TrajectoryError("The pose graph has no edges. Give a file with EDGE lines.")
+        raise TrajectoryError("The pose graph has no edges", "Give a file with EDGE lines.")
     parts, part = connected_components(_links(graph, used), directed=False)
     if parts > 1:
         apart = graph.ids[np.flatnonzero(part != part[0])[0]]
         raise TrajectoryError(
             f"The pose graph falls into {parts} parts: vertex {apart} is not joined to vertex "
-            f"{graph.ids[0]} by {what}. Add an edge between the parts, or solve them one by one."
+            f"{graph.ids[0]} by {what}",
+            "Add an edge between the parts, or solve them one by one.",
         )
 
 

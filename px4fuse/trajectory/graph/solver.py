@@ -147,7 +147,8 @@ def solve(
     if not np.isfinite(cost_initial):
         raise TrajectoryError(
             "The pose graph has a pose or measurement that is not a finite number, or one too "
-            "large to square. Correct it, or take the edge out."
+            "large to square",
+            "Correct it, or take the edge out.",
         )
     plain = problem.minimise(start, _least_squares(np.ones(len(doubtful))))
     weights = np.ones(len(doubtful))
