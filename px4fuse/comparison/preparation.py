@@ -113,7 +113,7 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
         for track in flight.positions:
             if track.origin.automatic:
                 return track, _why_best(flight, track)
-        raise MissingDataError(_no_source(flight))
+        raise _no_source(flight)
     for track in flight.positions:
         if track.name == name:
             return track, "chosen with --position-source"
@@ -125,23 +125,23 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
     )
 
 
-def _no_source(flight: Flight) -> str:
+def _no_source(flight: Flight) -> MissingDataError:
     name = f"{flight.log.name}: {'the file is damaged, and ' if flight.log.damage else ''}"
     if flight.log.format.startswith("MAVLink"):
-        return (
+        return MissingDataError(
             f"{name}no external position was sent to the autopilot in this "
-            "recording (no VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP). Give the "
-            "positioning system's own file with `position`"
-            f"{', or the ULog' if flight.log.has_ulog else ''}."
+            "recording (no VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP)",
+            "Give the positioning system's own file with `position`"
+            f"{', or the ULog' if flight.log.has_ulog else ''}.",
         )
     hint = "S"
     if any(not track.origin.automatic for track in flight.positions):
         hint = "Only GPS is in it: give `position_source` vehicle_gps_position to use that, or s"
-    return (
+    return MissingDataError(
         f"{name}no external position in this log (no "
-        "vehicle_visual_odometry, motion capture or EKF2 innovations of external vision). "
+        "vehicle_visual_odometry, motion capture or EKF2 innovations of external vision)",
         f"{hint}et SDLOG_PROFILE to 129 and send the UWB position to PX4 as "
-        "VISION_POSITION_ESTIMATE, or give the UWB's own file with `position`."
+        "VISION_POSITION_ESTIMATE, or give the UWB's own file with `position`.",
     )
 
 
