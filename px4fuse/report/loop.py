@@ -60,7 +60,7 @@ TITLE, LEAD = (
 )
 WARPED = SOLUTIONS["all"]  # by closures that are not true
 MAP_POINTS = 2000
-MAP, HEIGHT, LEGEND = 290.0, 105.0, 30.0  # of the axes, and of a legend, in points
+MAP, HEIGHT, LEGEND = 290.0, 105.0, 38.0  # of the axes, and of a legend, in points
 
 
 def draw(document: Document) -> Iterator[Page]:

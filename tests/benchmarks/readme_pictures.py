@@ -31,7 +31,7 @@ REPORTS = REPOSITORY / "reports"
 AISLE = "compare sample_logs/aisle_uwb.ulg"
 DPI, COLOURS, MAX_BYTES = 96, 64, 100_000
 # Head and foot of a page, as shares of its height, are left out; a margin (pixels) stays
-HEAD, FOOT, MARGIN = 0.035, 0.965, 12
+HEAD, FOOT, MARGIN = 0.045, 0.965, 12
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,11 @@ class Picture:
 
 
 PICTURES = (
-    Picture("aisle_uwb", AISLE, "Two-state Kalman filter against EKF2", 0.64),
+    Picture("aisle_uwb", AISLE, "Two-state Kalman filter against EKF2", 0.5),
     Picture("explore", "explore sample_logs/aisle_uwb.ulg"),
-    Picture("lab_1", AISLE, "The flight along the aisle", 0.64),
+    Picture("lab_1", AISLE, "The flight along the aisle", 0.585),
     Picture("lab_2", f"{AISLE} --sigma-a 0.001", "Innovations and variances"),
-    Picture("lab_3", AISLE, "Why EKF2 differs", 0.66),
+    Picture("lab_3", AISLE, "Why EKF2 differs", 0.71),
     Picture("lab_4", "loop sample_logs/loop_vio.ulg", "Loop closure"),
     Picture("lab_5", "evaluate sample_logs/loop_vio.ulg:vio sample_logs/loop_slam.tum"),
 )
