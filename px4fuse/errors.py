@@ -41,8 +41,9 @@ class Px4FuseError(Exception):
     """
 
     def __init__(self, reason: str, remedy: str = "") -> None:
-        self.reason, self.remedy = on_one_line(reason).removesuffix("."), on_one_line(remedy)
-        super().__init__(f"{self.reason}. {self.remedy}" if remedy else on_one_line(reason))
+        text, self.remedy = on_one_line(reason), on_one_line(remedy)
+        self.reason = text.removesuffix(".")
+        super().__init__(f"{self.reason}. {self.remedy}" if remedy else text)
 
 
 class LogError(Px4FuseError):

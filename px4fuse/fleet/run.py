@@ -204,7 +204,7 @@ def _worked(
     client: Client, timeout_s: float, progress: Progress, function: Callable[[Job], Any],
     jobs: Sequence[Job], what: str,
 ) -> Iterator[tuple[Job, Any]]:  # fmt: skip
-    """What comes of every job; of one that a worker was lost with the row that says why."""
+    """What comes of every job; of one whose worker gave nothing, the row that says why."""
     failed = 0
     progress(what, 0, len(jobs))
     with closing(outcomes(client, function, jobs, timeout_s=timeout_s)) as found:

@@ -15,7 +15,6 @@ from typing import Literal
 
 from msgspec.structs import replace
 from rich.console import Console
-from rich.style import StyleType
 from rich.table import Table
 from rich.text import Text
 
@@ -153,12 +152,6 @@ def say(console: Console, text: str | Text, head: str | Text = "", indent: int =
         line.rstrip()
         console.print(head.append_text(line), soft_wrap=True)
         head = Text(" " * indent)
-
-
-def print_line(console: Console, label: str, text: str | Text, style: StyleType = "") -> None:
-    """Print a label and a text whose words wrap beside it."""
-    words = Text(text, style) if isinstance(text, str) else text
-    say(console, words, Text(label.ljust(INDENT), "bold"), INDENT)
 
 
 def print_command(console: Console, command: str, label: str = "") -> None:
