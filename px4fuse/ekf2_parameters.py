@@ -32,6 +32,12 @@ class Aid:
         1: variances of the sender are not used; empty where there is no such choice.
     place : tuple of str
         Where the sensor is in the body (m, FRD).
+    label, unit : str
+        What it is for a person, and the unit of its innovations.
+    reported : str
+        What forms its variance where ``noise`` alone does not; empty where it always does.
+    default_gate : float
+        In force where a log has no ``gate``.
     """
 
     name: str
@@ -41,6 +47,10 @@ class Aid:
     delay: str
     noise_mode: str = ""
     place: tuple[str, ...] = ()
+    label: str = ""
+    unit: str = "m"
+    reported: str = ""
+    default_gate: float = 5.0
 
     def in_log(self, logged: Mapping[str, float]) -> dict[str, float]:
         """Its parameters among those of a log, and what switches it."""
@@ -49,11 +59,67 @@ class Aid:
 
 
 AID_MASK = "EKF2_AID_MASK"
+_SENDER, _RECEIVER = "the variance that the sender states", "the accuracy that the receiver states"
 EV_POS = Aid(
     "ev_pos", "EKF2_EV_CTRL", "EKF2_EVP_NOISE", "EKF2_EVP_GATE", "EKF2_EV_DELAY",
     "EKF2_EV_NOISE_MD", ("EKF2_EV_POS_X", "EKF2_EV_POS_Y", "EKF2_EV_POS_Z"),
+    "external vision, position", reported=_SENDER,
 )  # fmt: skip
-GNSS_POS = Aid("gnss_pos", "EKF2_GPS_CTRL", "EKF2_GPS_P_NOISE", "EKF2_GPS_P_GATE", "EKF2_GPS_DELAY")
+GNSS_POS = Aid(
+    "gnss_pos", "EKF2_GPS_CTRL", "EKF2_GPS_P_NOISE", "EKF2_GPS_P_GATE", "EKF2_GPS_DELAY",
+    label="GNSS position", reported=_RECEIVER,
+)  # fmt: skip
+
+
+def _gnss(name: str, label: str, noise: str, gate: str, unit: str) -> Aid:
+    return Aid(name, GNSS_POS.switch, noise, gate, GNSS_POS.delay, label=label, unit=unit,
+               reported=_RECEIVER)  # fmt: skip
+
+
+def _vision(name: str, label: str, noise: str, gate: str, unit: str) -> Aid:
+    return Aid(name, EV_POS.switch, noise, gate, EV_POS.delay, EV_POS.noise_mode,
+               label=f"external vision, {label}", unit=unit, reported=_SENDER)  # fmt: skip
+
+
+# What EKF2 can fuse, in the order in which it is told. gate, noise and what else forms R: PX4's
+# EKF/aid_sources of v1.13 to main
+AIDS: Mapping[str, Aid] = {
+    aid.name: aid
+    for aid in (
+        GNSS_POS,
+        _gnss("gnss_vel", "GNSS velocity", "EKF2_GPS_V_NOISE", "EKF2_GPS_V_GATE", "m/s"),
+        _gnss("gnss_hgt", "GNSS height", GNSS_POS.noise, GNSS_POS.gate, "m"),
+        _gnss("gnss_yaw", "GNSS yaw", "", "EKF2_HDG_GATE", "rad"),
+        EV_POS,
+        _vision("ev_vel", "velocity", "EKF2_EVV_NOISE", "EKF2_EVV_GATE", "m/s"),
+        _vision("ev_hgt", "height", EV_POS.noise, EV_POS.gate, "m"),
+        _vision("ev_yaw", "yaw", "EKF2_EVA_NOISE", "EKF2_HDG_GATE", "rad"),
+        Aid("baro_hgt", "EKF2_BARO_CTRL", "EKF2_BARO_NOISE", "EKF2_BARO_GATE", "EKF2_BARO_DELAY",
+            label="barometer", reported="EKF2_BARO_NOISE and the variance of its bias"),
+        Aid("rng_hgt", "EKF2_RNG_CTRL", "EKF2_RNG_NOISE", "EKF2_RNG_GATE", "EKF2_RNG_DELAY",
+            label="range to the ground",
+            reported="EKF2_RNG_NOISE, EKF2_RNG_SFE and the height's own variance"),
+        Aid("optical_flow", "EKF2_OF_CTRL", "EKF2_OF_N_MIN", "EKF2_OF_GATE", "EKF2_OF_DELAY",
+            label="optical flow", unit="rad/s", default_gate=3.0,
+            reported="EKF2_OF_N_MIN to EKF2_OF_N_MAX, by quality"),
+        Aid("mag", "EKF2_MAG_TYPE", "EKF2_MAG_NOISE", "EKF2_MAG_GATE", "EKF2_MAG_DELAY",
+            label="magnetometer", unit="gauss", default_gate=3.0),
+        Aid("mag_heading", "EKF2_MAG_TYPE", "EKF2_HEAD_NOISE", "EKF2_HDG_GATE", "EKF2_MAG_DELAY",
+            label="magnetic heading", unit="rad", default_gate=2.6),
+        Aid("airspeed", "EKF2_ARSP_THR", "EKF2_EAS_NOISE", "EKF2_TAS_GATE", "EKF2_ASP_DELAY",
+            label="airspeed", unit="m/s"),
+        Aid("sideslip", "EKF2_FUSE_BETA", "EKF2_BETA_NOISE", "EKF2_BETA_GATE", "",
+            label="sideslip", unit="rad"),
+        Aid("drag", "EKF2_DRAG_CTRL", "EKF2_DRAG_NOISE", "", "", label="drag", unit="m/s²"),
+        Aid("gravity", "EKF2_IMU_CTRL", "EKF2_GRAV_NOISE", "", "", label="gravity", unit="",
+            default_gate=0.25),
+        Aid("aux_vel", "", "", "", "EKF2_AVEL_DELAY", label="auxiliary velocity", unit="m/s",
+            reported=_SENDER),
+        Aid("aux_global_position", "EKF2_AGP_CTRL", "EKF2_AGP_NOISE", "EKF2_AGP_GATE",
+            "EKF2_AGP_DELAY", label="auxiliary position", reported=_SENDER, default_gate=3.0),
+        Aid("fake_pos", "", "EKF2_NOAID_NOISE", "", "", label="fake position", default_gate=3.0),
+    )
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

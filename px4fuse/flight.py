@@ -16,8 +16,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
+import numpy as np
 import pandas as pd
 
+from px4fuse.arrays import Array
 from px4fuse.display import Shown, brief
 from px4fuse.origin import Origin
 from px4fuse.record import NotNegative, Record, Vector
@@ -247,6 +249,43 @@ class FusionRecord:
 
 
 @dataclass(frozen=True)
+class AidLog:
+    """What a log has of one aid of EKF2.
+
+    Attributes
+    ----------
+    topic : str
+        Where its innovations are from.
+    axes : tuple of str
+    samples : DataFrame
+        By time of measurement, for each axis: ``innovation_<axis>`` (measurement minus prediction)
+        and ``variance_<axis>`` (S); where the aid has a topic of its own also ``noise_<axis>``
+        (R), ``ratio_<axis>`` (ν²/(gate²·S)), ``fused`` and ``rejected`` (1 or 0). In the aid's
+        unit, variances in its square.
+    meant : Series or None
+        1 while EKF2 means to fuse it, 0 while it does not, a step function; None where the log
+        does not tell.
+    parameters : mapping
+        EKF2's for this aid, by PX4 name, as at the log's start.
+    """
+
+    topic: str
+    axes: tuple[str, ...]
+    samples: pd.DataFrame
+    meant: pd.Series[float] | None
+    parameters: Mapping[str, float] = field(default_factory=dict)
+
+    __repr__ = brief
+
+
+def at_times(steps: pd.Series[float], times: pd.Index[float]) -> Array:
+    """Values of a step function at some times; before its first step that of the first."""
+    at = np.clip(np.searchsorted(steps.index, times, side="right") - 1, 0, None)
+    values: Array = steps.to_numpy(np.float64)[at]
+    return values
+
+
+@dataclass(frozen=True)
 class Ekf2:
     """EKF2's output, variances and innovations, of the instance that was primary at each time.
 
@@ -280,6 +319,8 @@ class Ekf2:
         t - horizon, carried to t by the IMU.
     record : FusionRecord or Unavailable
         The inside of the filter, as far as it is logged.
+    aids : mapping from PX4's name to AidLog
+        What the log has of everything that EKF2 can fuse.
     """
 
     state: pd.DataFrame
@@ -295,6 +336,7 @@ class Ekf2:
     step_s: float = EKF2_STEP_S
     horizon_s: float | Unavailable = HORIZON_NOT_LOGGED
     record: FusionRecord | Unavailable = RECORD_NOT_LOGGED
+    aids: Mapping[str, AidLog] = field(default_factory=dict)
 
     __repr__ = brief
 

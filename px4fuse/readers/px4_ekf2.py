@@ -33,6 +33,7 @@ from px4fuse.flight import (
 )
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.layouts import Layout, elements
+from px4fuse.readers.px4_aids import read_aids
 from px4fuse.readers.px4_innovations import read_innovations
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 
@@ -83,6 +84,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         step_s=step_s,
         horizon_s=_horizon_s(topics, step_s),
         record=_read_record(topics, step_s),
+        aids=read_aids(topics),
     )
 
 

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
 import pandas as pd
 
-from px4fuse.flight import AXIS_NAMES, AxisName, Unavailable
+from px4fuse.flight import AXIS_NAMES, AxisName, Unavailable, at_times
 from px4fuse.readers.layouts import Layout
 from px4fuse.readers.px4_topics import HOW_TO_FUSE, INNOVATIONS
 from px4fuse.readers.ulog_topics import Topics
@@ -110,9 +109,7 @@ def _read(
     if {"fused", "rejected"} <= {*frame.columns}:
         frame = frame[(frame["fused"] > 0) | (frame["rejected"] > 0)]
     elif fused is not None:
-        # a step function; its first value holds before its first step too
-        at = np.clip(np.searchsorted(fused.index, frame.index, side="right") - 1, 0, None)
-        frame = frame[fused.to_numpy()[at] > 0]
+        frame = frame[at_times(fused, frame.index) > 0]
     frame = frame[frame["innovation_variance_m2"] > 0].reindex(columns=INNOVATION_COLUMNS)
     # EKF2 logs state minus measurement; everyone else says measurement minus state
     return frame.assign(innovation_m=-frame["innovation_m"])

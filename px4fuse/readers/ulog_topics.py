@@ -28,6 +28,7 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.ekf2_parameters import REPORTED
 from px4fuse.errors import LogError
 from px4fuse.readers.layouts import Layout
+from px4fuse.readers.px4_aid_sources import aid_topics
 from px4fuse.readers.px4_topics import IMU, SELECTOR, topics
 from px4fuse.readers.ulog_framing import Framing, whole_messages
 from px4fuse.reading import read_log_bytes, shown
@@ -274,11 +275,12 @@ def read_topics(path: Path) -> Topics:
     """
     name, content = shown(path), read_log_bytes(path)
     chatter = io.StringIO()
+    wanted = sorted({*topics(), *aid_topics()})
     framing = whole_messages(content)
     whole = framing.content
     try:
         with contextlib.redirect_stdout(chatter):  # pyulog prints its warnings
-            ulog = ULog(io.BytesIO(whole), message_name_filter_list=topics())
+            ulog = ULog(io.BytesIO(whole), message_name_filter_list=wanted)
             tables = _tables(ulog)
             # a log of other topics can still be placed in time, by all that it holds
             placed = tables or _tables(ULog(io.BytesIO(whole)))

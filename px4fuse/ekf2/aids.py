@@ -1,0 +1,259 @@
+"""Every aid of EKF2 judged by its own innovations: was it fused, and does S say how large they are.
+
+Definitions as in :mod:`px4fuse.filter.consistency`; what PX4 logs and where it misleads: PX4's
+``EKF/aid_sources`` and ``EKF/ekf_helper.cpp``, v1.13 to main.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+
+from px4fuse.arrays import Array, BoolArray
+from px4fuse.ekf2_parameters import AIDS, Aid
+from px4fuse.filter.consistency import assess, nis_band, verdict_of
+from px4fuse.flight import AidLog, Ekf2, Flight, Unavailable, at_times
+from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share
+
+AidVerdict = Literal[
+    "consistent", "variance overstated", "variance understated", "biased", "starved", "idle",
+    "too few samples",
+]  # fmt: skip
+# S that is wrong by less than this in σ is called consistent: R is a rule of thumb
+MATTERS = 1.25
+# An aid pulls EKF2 to one side where the mean is half of what the innovations are, root mean
+# square, and a fifth of √S: then averaging does not take it away, and EKF2 follows
+BIASED, FELT = 0.5, 0.2
+# Longest time (s) without a sample fused while EKF2 means to fuse it. EKF2 itself resets to an aid
+# after 7 s (reset_timeout_max); rates of 2 Hz are the slowest of the default profile
+STARVED_S = 5.0
+# Within this of a parameter, R is formed by it
+SAME_NOISE = 0.02
+# Height (m) below which ground effect and the landing gear's reach are not judged
+GROUND_M = 1.0
+
+
+class AidAxis(Record, frozen=True, kw_only=True):
+    """Innovations of one aid along one axis, in the aid's unit.
+
+    Attributes
+    ----------
+    samples : int
+        Innovations judged: fused, or rejected while meant to be fused.
+    innovation_mean, innovation_std : float
+    s_sqrt_median : float
+        Median of √S.
+    nis_mean, nis_band, sigma_factor
+        As :class:`~px4fuse.filter.consistency.NisVerdict` has them.
+    rejected_share : float
+        Outside the gate along this axis.
+    lag1_autocorrelation, ljung_box_p, bias_p : float
+        As :class:`~px4fuse.filter.consistency.Consistency` has them.
+    """
+
+    samples: Count
+    innovation_mean: float
+    innovation_std: NotNegative
+    s_sqrt_median: Positive
+    nis_mean: Positive
+    nis_band: tuple[NotNegative, NotNegative]
+    sigma_factor: Positive
+    rejected_share: Share
+    lag1_autocorrelation: Correlation
+    ljung_box_p: Share
+    bias_p: Share
+
+
+class AidResult(Record, frozen=True, kw_only=True):
+    """What EKF2 did with one aid in flight, and whether its variance was right.
+
+    Attributes
+    ----------
+    label, unit, topic : str
+    intended_share : float or None
+        Of the flight, meant to be fused; None where the log does not tell.
+    fused_share : float
+        Of the samples while it was meant.
+    fused_logged : bool
+        Whether the log tells of each sample if it was fused; else the gate was applied here.
+    rejected_share : float
+        Of the samples while it was meant, by any axis.
+    longest_without_s : float
+        Longest time without a fused sample that began while it was meant to be fused.
+    resets : int
+        Times that EKF2 took the aid's value as its own; these rows are not judged.
+    gate : float
+        In standard deviations.
+    noise : float or None
+        Median of √R, where R is logged.
+    noise_from : str
+        What set it: a parameter's name, or what is reported; empty where R is not logged.
+    verdict : str
+    axes : mapping from axis to AidAxis
+        Empty where there are too few samples.
+    """
+
+    label: str
+    unit: str
+    topic: str
+    intended_share: Share | None = None
+    fused_share: Share
+    fused_logged: bool
+    rejected_share: Share
+    longest_without_s: NotNegative
+    resets: Count
+    gate: Positive
+    noise: Positive | None = None
+    noise_from: str
+    verdict: AidVerdict
+    axes: dict[str, AidAxis]
+
+    @property
+    def nis_mean(self) -> float:
+        """Mean NIS of all axes (NaN without any)."""
+        return float(np.mean([axis.nis_mean for axis in self.axes.values()] or [np.nan]))
+
+
+def flown(flight: Flight) -> tuple[float, float] | Unavailable:
+    """When the vehicle flew (s), away from the ground where its height is known."""
+    if isinstance(flight.airborne, Unavailable):
+        return 0.0, flight.log.duration_s
+    if not flight.airborne:
+        return Unavailable("aids of EKF2", "the vehicle never took off", "Record a flight.")
+    start, end = flight.airborne[0][0], flight.airborne[-1][1]
+    if isinstance(flight.ekf2, Ekf2):
+        down = flight.ekf2.state["down_m"].loc[start:end]
+        high = down.index[down < down[:1].max() - GROUND_M]
+        if len(high):
+            start, end = float(high[0]), float(high[-1])
+    return start, end
+
+
+def judge_aids(flight: Flight) -> dict[str, AidResult] | Unavailable:
+    """Judge everything that EKF2 could fuse, in flight.
+
+    Returns
+    -------
+    mapping from PX4's name to AidResult, in the order of :data:`~px4fuse.ekf2_parameters.AIDS`; or
+    Unavailable without EKF2, without innovations, or without a flight.
+    """
+    if isinstance(flight.ekf2, Unavailable):
+        return flight.ekf2
+    if not flight.ekf2.aids:
+        return Unavailable(
+            "aids of EKF2",
+            "no estimator_aid_src topic, estimator_innovations or ekf2_innovations in flight",
+            "Record a ULog with SDLOG_PROFILE bit 0 (default).",
+        )
+    span = flown(flight)
+    if isinstance(span, Unavailable):
+        return span
+    logs = flight.ekf2.aids
+    return {name: _judge(aid, logs[name], *span) for name, aid in AIDS.items() if name in logs}
+
+
+def _judge(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidResult:
+    samples = log.samples.loc[start_s:end_s]
+    times = samples.index.to_numpy()
+    gate = _gate(aid, log)
+    innovation, variance = (
+        samples[[f"{what}_{axis}" for axis in log.axes]].to_numpy()
+        for what in ("innovation", "variance")
+    )
+    meant: BoolArray = np.ones(len(samples), bool)
+    intended_share = None
+    if log.meant is not None:
+        meant = at_times(log.meant, samples.index) > 0.0
+        grid = pd.Index(np.arange(start_s, end_s, 0.1))
+        intended_share = float(np.mean(at_times(log.meant, grid) > 0.0)) if len(grid) else 0.0
+    fused_logged = "fused" in samples
+    if fused_logged:
+        fused = samples["fused"].to_numpy() > 0.0
+        rejected = samples["rejected"].to_numpy() > 0.0
+        noise = samples[[f"noise_{axis}" for axis in log.axes]].to_numpy()
+        # after a reset to the aid the row says innovation 0 and S = R
+        reset = ((innovation == 0.0) & np.isclose(variance, noise)).all(axis=1)
+        noise_median = float(np.median(np.sqrt(noise[fused, 0]))) if fused.any() else None
+    else:
+        rejected = (innovation**2 > gate**2 * variance).any(axis=1)
+        fused, reset, noise_median = ~rejected, np.zeros(len(samples), bool), None
+    tried = (fused | rejected) & meant & ~reset
+    without_s = _longest_without(times, fused & meant, log, start_s, end_s)
+    axes = {}
+    for number, axis in enumerate(log.axes):
+        found = assess(innovation[tried, number], variance[tried, number], gate)
+        if not isinstance(found, Unavailable):
+            axes[axis] = AidAxis(
+                samples=found.count, innovation_mean=found.innovation_mean_m,
+                innovation_std=found.innovation_std_m, s_sqrt_median=found.sqrt_s_median_m,
+                nis_mean=found.nis_mean, nis_band=found.nis_band, sigma_factor=found.sigma_factor,
+                rejected_share=found.outside_gate, bias_p=found.bias_p,
+                lag1_autocorrelation=found.lag1_autocorrelation, ljung_box_p=found.ljung_box_p,
+            )  # fmt: skip
+    idle = not tried.any()
+    return AidResult(
+        label=aid.label, unit=aid.unit, topic=log.topic, intended_share=intended_share,
+        fused_share=_share(fused & meant, meant), fused_logged=fused_logged,
+        rejected_share=_share(rejected & meant, meant), longest_without_s=without_s,
+        resets=int(reset.sum()), gate=gate, noise=noise_median,
+        noise_from=_noise_from(aid, log, noise_median), axes=axes,
+        verdict="idle" if idle else _verdict(axes, without_s),
+    )  # fmt: skip
+
+
+def _share(some: BoolArray, of: BoolArray) -> float:
+    return float(some.sum() / max(of.sum(), 1))
+
+
+def _gate(aid: Aid, log: AidLog) -> float:
+    """The gate in force: as the log's test ratios have it, or else by its parameter."""
+    axis = log.axes[0]
+    if f"ratio_{axis}" in log.samples:
+        judged = log.samples[log.samples[f"ratio_{axis}"] > 0.0]
+        nis = judged[f"innovation_{axis}"] ** 2 / judged[f"variance_{axis}"]
+        if len(judged) and (nis > 0.0).any():
+            return float(np.sqrt(np.median(nis / judged[f"ratio_{axis}"])))
+    return max(log.parameters.get(aid.gate, aid.default_gate), 0.01)
+
+
+def _noise_from(aid: Aid, log: AidLog, noise: float | None) -> str:
+    """What set R: the parameter where they are alike (or R is its root), else what is reported."""
+    value = log.parameters.get(aid.noise)
+    if noise is None or value is None:
+        return "" if noise is None else aid.reported
+    for one in (value, 1.5 * value, np.sqrt(value)):  # the factor of GNSS heights
+        if abs(noise - one) <= SAME_NOISE * one:
+            return aid.noise
+    return aid.reported or aid.noise
+
+
+def _longest_without(
+    times: Array, fused: BoolArray, log: AidLog, start_s: float, end_s: float
+) -> float:
+    """Longest time without a fused sample, of those that begin while it was meant to be fused."""
+    ends = np.concatenate([[start_s], times[fused], [end_s]])
+    begun = ends[:-1]
+    meant = np.ones(len(begun), bool)
+    if log.meant is not None:
+        # an aid that is given up when its last sample was fused is no longer meant a second later
+        meant = at_times(log.meant, pd.Index(begun + 1.0)) > 0.0
+    return float(np.max(np.diff(ends)[meant], initial=0.0))
+
+
+def _verdict(axes: dict[str, AidAxis], longest_without_s: float) -> AidVerdict:
+    if longest_without_s > STARVED_S:
+        return "starved"
+    if not axes:
+        return "too few samples"
+    if any(_pulls(axis) for axis in axes.values()):
+        return "biased"
+    nis = float(np.mean([axis.nis_mean for axis in axes.values()]))
+    said = verdict_of(nis, nis_band(sum(axis.samples for axis in axes.values())))
+    return said if max(nis, 1.0 / nis) > MATTERS**2 else "consistent"
+
+
+def _pulls(axis: AidAxis) -> bool:
+    pull = abs(axis.innovation_mean) / axis.s_sqrt_median
+    return pull > FELT and pull > BIASED * np.sqrt(axis.nis_mean)

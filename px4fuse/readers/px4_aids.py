@@ -1,0 +1,147 @@
+"""What a ULog has of every aid that EKF2 can fuse: innovations, their variance, what was fused.
+
+Source: PX4-Autopilot ``EKF2.cpp`` (PublishInnovations, PublishAidSourceStatus), v1.8 to main; the
+topics and fields are rows of :mod:`px4fuse.readers.px4_aid_sources`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from px4fuse.ekf2_parameters import AIDS
+from px4fuse.flight import AidLog, at_times
+from px4fuse.readers.layouts import Layout
+from px4fuse.readers.px4_aid_sources import (
+    FLAG_ALWAYS_SET,
+    SOURCES,
+    STATUS,
+    STATUS_FLAGS,
+    AidSource,
+)
+from px4fuse.readers.px4_innovations import JOIN_TOLERANCE_S
+from px4fuse.readers.ulog_topics import Topics
+
+
+def read_aids(topics: Topics) -> dict[str, AidLog]:
+    """Every aid of which the log has innovations, by PX4's name.
+
+    Of several topics the aid's own is taken: it has each attempt to fuse, with its time, and what
+    came of it. The others repeat a value until the next one, which counts once.
+    """
+    meant = dict(_intentions(topics))
+    found = {}
+    for name, source in SOURCES.items():
+        told = meant.get(name)
+        log = _own_topic(topics, name, source, told)
+        # an aid that was never meant to be fused stands at its last value, or is another's
+        if log is None and told is not None and told.any():
+            log = _snapshots(topics, name, source, told)
+        if log is not None:
+            found[name] = replace(log, parameters=AIDS[name].in_log(topics.ekf2_parameters))
+    return found
+
+
+def _intentions(topics: Topics) -> Iterator[tuple[str, pd.Series[float]]]:
+    """By aid, a step function: 1 while EKF2 means to fuse it, 0 while it does not."""
+    fields = {field for table in topics.of(STATUS_FLAGS) for field in table}
+    layout = Layout(STATUS, {"bits": "control_mode_flags"})
+    for name, source in SOURCES.items():
+        group = next((group for group in source.flags if {*group} <= fields), None)
+        if group is not None:
+            flags = topics.of_primary(Layout(STATUS_FLAGS, dict(zip(group, group, strict=True))),
+                                      step=True)  # fmt: skip
+            yield name, flags.max(axis=1)
+        elif not fields and source.bit is not None and topics.find((layout,)) is not None:
+            bits = topics.of_primary(layout, step=True)["bits"].dropna()
+            on = bits.to_numpy().astype(np.int64) >> source.bit & 1
+            yield name, pd.Series(on.astype(float), index=bits.index)
+
+
+def _own_topic(
+    topics: Topics, name: str, source: AidSource, meant: pd.Series[float] | None
+) -> AidLog | None:
+    """An aid by its ``estimator_aid_src`` topic."""
+    count = len(source.axes)
+    at = [""] if count == 1 else [f"[{number}]" for number in range(count)]
+    columns = {
+        f"{ours}_{axis}": px4 + element
+        for axis, element in zip(source.axes, at, strict=True)
+        for ours, px4 in (
+            ("innovation", "innovation"), ("variance", "innovation_variance"),
+            ("noise", "observation_variance"), ("ratio", "test_ratio"),
+        )
+    }  # fmt: skip
+    layout = Layout(
+        f"estimator_aid_src_{name}", columns | {"fused": "fused", "rejected": "innovation_rejected"}
+    )
+    if topics.find((layout,)) is None:
+        return None
+    frame = topics.of_primary(layout).dropna()
+    if meant is not None and name in FLAG_ALWAYS_SET:
+        frame["fused"] = at_times(meant, frame.index)
+    frame = frame[(frame[[f"variance_{axis}" for axis in source.axes]] > 0.0).all(axis=1)]
+    return _log(layout.topic, source, frame, meant) if len(frame) else None
+
+
+def _snapshots(
+    topics: Topics, name: str, source: AidSource, meant: pd.Series[float]
+) -> AidLog | None:
+    """An aid by the topics that hold the last value of every aid."""
+    gauss = name == "mag_heading" and any("cs_mag" in one for one in topics.of(STATUS_FLAGS))
+    layouts = [] if gauss or not source.fields else [
+        (Layout("estimator_innovations", _columns("innovation", source, source.fields)),
+         Layout("estimator_innovation_variances", _columns("variance", source, source.fields)))
+    ]  # fmt: skip
+    if source.before:
+        both = _columns("innovation", source, source.before) | _columns(
+            "variance", source, [_variance(field) for field in source.before]
+        )
+        layouts.append((Layout("ekf2_innovations", both),) * 2)
+    for values, variances in layouts:
+        if topics.find((values,)) is None or topics.find((variances,)) is None:
+            continue
+        frame = topics.of_primary(values, select=_fresh)
+        if variances is not values:
+            # each topic is thinned by itself; S changes slowly
+            frame = pd.merge_asof(
+                frame, topics.of_primary(variances).dropna(), left_index=True, right_index=True,
+                direction="nearest", tolerance=JOIN_TOLERANCE_S,  # type: ignore[arg-type]
+            )  # fmt: skip
+        frame = frame.dropna()
+        frame = frame[(frame[[f"variance_{axis}" for axis in source.axes]] > 0.0).all(axis=1)]
+        frame = frame[at_times(meant, frame.index) > 0.0]
+        if len(frame):
+            return _log(values.topic, source, frame, meant)
+    return None
+
+
+def _fresh(frame: pd.DataFrame) -> pd.DataFrame:
+    """Without repeats and without zeros, the value before any fusion."""
+    first = frame.iloc[:, 0]
+    return frame[first.ne(first.shift()) & (first != 0.0)]
+
+
+def _columns(name: str, source: AidSource, fields: tuple[str, ...] | list[str]) -> dict[str, str]:
+    return {f"{name}_{axis}": field for axis, field in zip(source.axes, fields, strict=True)}
+
+
+def _variance(field: str) -> str:
+    """Field of ``ekf2_innovations`` with the variance of another.
+
+    >>> _variance("flow_innov[1]"), _variance("heading_innov")
+    ('flow_innov_var[1]', 'heading_innov_var')
+    """
+    return field.replace("innov", "innov_var")
+
+
+def _log(
+    topic: str, source: AidSource, frame: pd.DataFrame, meant: pd.Series[float] | None
+) -> AidLog:
+    """The record, with the sign that everyone else gives an innovation."""
+    innovations = [f"innovation_{axis}" for axis in source.axes]
+    return AidLog(topic, source.axes, frame.assign(**{one: -frame[one] for one in innovations}),
+                  meant)  # fmt: skip
