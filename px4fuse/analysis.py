@@ -25,10 +25,11 @@ from px4fuse.comparison.estimates import (
     turned_frame,
 )
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.preparation import Choices, prepare
+from px4fuse.comparison.preparation import Choices, no_source, prepare
 from px4fuse.comparison.remedy import asked_of_ekf2
 from px4fuse.comparison.why import why_ekf2_differs
 from px4fuse.display import brief
+from px4fuse.ekf2.aids import AidResult, judge_aids
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.replay import Ekf2Replay
 from px4fuse.ekf2.walk import Why
@@ -111,6 +112,11 @@ class Analysis(Comparison):
             left_out = np.union1d(left_out, time_s[near])
         return smoothing(axes, self.settings, outlier_time_s=left_out, **noises)
 
+    @cached_property
+    def aids(self) -> Mapping[str, AidResult] | Unavailable:
+        """Every aid that EKF2 can fuse, judged by its own innovations."""
+        return judge_aids(self.flight)
+
     def _horizontally(self) -> tuple[tuple[Axis, ...], Array, dict[str, float]] | Unavailable:
         """The horizontal axes, times of outliers, noises and a clock offset beyond doubt."""
         clock, offset_s, settings = self.clock, 0.0, self.settings
@@ -130,6 +136,46 @@ class Analysis(Comparison):
             "the noises of the horizontal axes are not known",
             "Analyse north and east, or the aisle (--axis).",
         )
+
+
+@dataclass(frozen=True)
+class AidsAlone:
+    """A flight without a position for our filter: what EKF2 fused is judged all the same.
+
+    Attributes
+    ----------
+    flight : Flight
+    aids : mapping from PX4's name to AidResult
+    lacking : Unavailable
+        Why there is no comparison, and what would make one.
+    """
+
+    flight: Flight
+    aids: Mapping[str, AidResult]
+    lacking: Unavailable
+
+    __repr__ = brief
+
+
+def run_or_judge_aids(
+    request: ComparisonRequest, progress: Progress = silent
+) -> Analysis | AidsAlone:
+    """As :func:`run`; without a position source the aids of EKF2 alone.
+
+    Raises
+    ------
+    LogError, MissingDataError, SettingsError
+        As of :func:`run`; the flight has neither a position nor aids that can be judged.
+    """
+    flight = read_flight(request, progress)
+    given = request.position_source is not None
+    if given or any(track.origin.automatic for track in flight.positions):
+        return run(request, progress, flight)
+    lacking, aids = no_source(flight), judge_aids(flight)
+    if isinstance(aids, Unavailable):
+        neither = f"{lacking.reason}, and the aids of EKF2 cannot be judged: {aids.reason}"
+        raise MissingDataError(f"{flight.log.name}: {neither}", lacking.remedy)
+    return AidsAlone(flight, aids, lacking)
 
 
 def run(

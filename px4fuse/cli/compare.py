@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,8 +22,9 @@ from px4fuse.request import command_line, settings_name
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
+    from px4fuse.report.document import AidsDocument, Document
     from px4fuse.request import ComparisonRequest
-    from px4fuse.results.contract import ComparisonResults
+    from px4fuse.results.contract import AidsResults, ComparisonResults
 
 STEPS = (
     "reading", "filtering", "tuning", "clock offset", "changes of the clock", "replaying EKF2",
@@ -54,36 +56,45 @@ def compare(
     LOG is a PX4 ULog or a MAVLink recording (.tlog or raw stream). Writes a PDF report and its
     results as JSON, for example reports/LOG_sigma-z-0.05.pdf and .json.
     """
-    from px4fuse.analysis import run
-    from px4fuse.findings import find
-    from px4fuse.report.document import Document
-    from px4fuse.report.terminal import print_summary
-    from px4fuse.results.build import results
+    from px4fuse.analysis import AidsAlone, run_or_judge_aids
+    from px4fuse.findings import find, find_aids
+    from px4fuse.report.document import AidsDocument, Document
+    from px4fuse.report.terminal import print_aids, print_summary
+    from px4fuse.results.build import aids_results, results
 
     person = read_person(given)
     request = comparison_request(log, given)
     alone = json_path == STANDARD_OUTPUT
     report_paths(output or Path("reports/LOG.pdf"), json_path)  # before the work, not after it
     with progress(alone, STEPS) as step:
-        analysis = run(request, step)
-        document = Document(analysis, find(analysis), person, command_line(request))
-        found = results(request, analysis, document.findings, person, document.command)
+        analysis, typed = run_or_judge_aids(request, step), command_line(request)
+        document: AidsDocument | Document
+        found: AidsResults | ComparisonResults
+        if isinstance(analysis, AidsAlone):
+            document = AidsDocument(analysis, find_aids(analysis.aids), person, typed)
+            found = aids_results(request, analysis, document.findings, person, typed)
+        else:
+            document = Document(analysis, find(analysis), person, typed)
+            found = results(request, analysis, document.findings, person, typed)
         if output is None and not alone:
             output = default_report(request, found)
         contents = result_files(found, json_path, output, document, step)
-    finish(contents, lambda console: print_summary(console, document, request, output))
+    if isinstance(document, AidsDocument):
+        finish(contents, partial(print_aids, document=document))
+    else:
+        finish(contents, partial(print_summary, document=document, request=request, report=output))
     if fail_on is not None:
         worst = SEVERITIES[: SEVERITIES.index(fail_on) + 1]
         if any(one.severity in worst and one.caused_by is None for one in document.findings):
             sys.exit(1)
 
 
-def default_report(request: ComparisonRequest, results: ComparisonResults) -> Path:
+def default_report(request: ComparisonRequest, results: AidsResults | ComparisonResults) -> Path:
     """Where a report goes that was given no name: that of the same flight, settings and student."""
     return free_report(Path(request.log).stem, settings_name(request), results, _same)
 
 
-def _same(old: ComparisonResults, mine: ComparisonResults) -> bool:
+def _same(old: AidsResults | ComparisonResults, mine: AidsResults | ComparisonResults) -> bool:
     first, second = (
         (one.request, one.log.sha256, [file.sha256 for file in one.log.joined])
         for one in (old, mine)

@@ -113,7 +113,8 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
         for track in flight.positions:
             if track.origin.automatic:
                 return track, _why_best(flight, track)
-        raise _no_source(flight)
+        lacking = no_source(flight)
+        raise MissingDataError(f"{flight.log.name}: {lacking.reason}", lacking.remedy)
     for track in flight.positions:
         if track.name == name:
             return track, "chosen with --position-source"
@@ -125,11 +126,13 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
     )
 
 
-def _no_source(flight: Flight) -> MissingDataError:
-    name = f"{flight.log.name}: {'the file is damaged, and ' if flight.log.damage else ''}"
+def no_source(flight: Flight) -> Unavailable:
+    """Why no track of a flight is a position source by itself, and what would be one."""
+    damaged = "the file is damaged, and " if flight.log.damage else ""
     if flight.log.format.startswith("MAVLink"):
-        return MissingDataError(
-            f"{name}no external position was sent to the autopilot in this "
+        return Unavailable(
+            "position source",
+            f"{damaged}no external position was sent to the autopilot in this "
             "recording (no VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP)",
             "Give the positioning system's own file with `position`"
             f"{', or the ULog' if flight.log.has_ulog else ''}.",
@@ -137,8 +140,9 @@ def _no_source(flight: Flight) -> MissingDataError:
     hint = "S"
     if any(not track.origin.automatic for track in flight.positions):
         hint = "Only GPS is in it: give `position_source` vehicle_gps_position to use that, or s"
-    return MissingDataError(
-        f"{name}no external position in this log (no "
+    return Unavailable(
+        "position source",
+        f"{damaged}no external position in this log (no "
         "vehicle_visual_odometry, motion capture or EKF2 innovations of external vision)",
         f"{hint}et SDLOG_PROFILE to 129 and send the UWB position to PX4 as "
         "VISION_POSITION_ESTIMATE, or give the UWB's own file with `position`.",

@@ -15,7 +15,7 @@ from px4fuse.arrays import Array, BoolArray
 from px4fuse.ekf2_parameters import AIDS, Aid
 from px4fuse.filter.consistency import assess, nis_band, verdict_of
 from px4fuse.flight import AidLog, Ekf2, Flight, Unavailable, at_times
-from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share
+from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
 
 AidVerdict = Literal[
     "consistent", "variance overstated", "variance understated", "biased", "starved", "idle",
@@ -80,8 +80,9 @@ class AidResult(Record, frozen=True, kw_only=True):
         Whether the log tells of each sample if it was fused; else the gate was applied here.
     rejected_share : float
         Of the samples while it was meant, by any axis.
-    longest_without_s : float
-        Longest time without a fused sample that began while it was meant to be fused.
+    longest_without_s : (float, float)
+        From when to when was the longest time without a fused sample that began while it was
+        meant to be fused.
     resets : int
         Times that EKF2 took the aid's value as its own; these rows are not judged.
     gate : float
@@ -102,13 +103,18 @@ class AidResult(Record, frozen=True, kw_only=True):
     fused_share: Share
     fused_logged: bool
     rejected_share: Share
-    longest_without_s: NotNegative
+    longest_without_s: Span
     resets: Count
     gate: Positive
     noise: Positive | None = None
     noise_from: str
     verdict: AidVerdict
     axes: dict[str, AidAxis]
+
+    @property
+    def longest_without(self) -> float:
+        """How long (s) the longest time without a fused sample was."""
+        return self.longest_without_s[1] - self.longest_without_s[0]
 
     @property
     def nis_mean(self) -> float:
@@ -162,22 +168,23 @@ def _judge(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidResult:
         samples[[f"{what}_{axis}" for axis in log.axes]].to_numpy()
         for what in ("innovation", "variance")
     )
-    meant: BoolArray = np.ones(len(samples), bool)
+    meant = np.ones(len(samples), bool)
     intended_share = None
     if log.meant is not None:
-        meant = at_times(log.meant, samples.index) > 0.0
+        meant = np.asarray(at_times(log.meant, samples.index) > 0.0)
         grid = pd.Index(np.arange(start_s, end_s, 0.1))
         intended_share = float(np.mean(at_times(log.meant, grid) > 0.0)) if len(grid) else 0.0
     fused_logged = "fused" in samples
+    fused: BoolArray
+    rejected: BoolArray
     if fused_logged:
-        fused = samples["fused"].to_numpy() > 0.0
-        rejected = samples["rejected"].to_numpy() > 0.0
+        fused, rejected = (samples[flag].to_numpy() > 0.0 for flag in ("fused", "rejected"))
         noise = samples[[f"noise_{axis}" for axis in log.axes]].to_numpy()
         # after a reset to the aid the row says innovation 0 and S = R
         reset = ((innovation == 0.0) & np.isclose(variance, noise)).all(axis=1)
         noise_median = float(np.median(np.sqrt(noise[fused, 0]))) if fused.any() else None
     else:
-        rejected = (innovation**2 > gate**2 * variance).any(axis=1)
+        rejected = np.max(innovation**2 / variance, axis=1, initial=0.0) > gate**2
         fused, reset, noise_median = ~rejected, np.zeros(len(samples), bool), None
     tried = (fused | rejected) & meant & ~reset
     without_s = _longest_without(times, fused & meant, log, start_s, end_s)
@@ -199,7 +206,7 @@ def _judge(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidResult:
         rejected_share=_share(rejected & meant, meant), longest_without_s=without_s,
         resets=int(reset.sum()), gate=gate, noise=noise_median,
         noise_from=_noise_from(aid, log, noise_median), axes=axes,
-        verdict="idle" if idle else _verdict(axes, without_s),
+        verdict="idle" if idle else _verdict(axes, without_s[1] - without_s[0]),
     )  # fmt: skip
 
 
@@ -231,7 +238,7 @@ def _noise_from(aid: Aid, log: AidLog, noise: float | None) -> str:
 
 def _longest_without(
     times: Array, fused: BoolArray, log: AidLog, start_s: float, end_s: float
-) -> float:
+) -> Span:
     """Longest time without a fused sample, of those that begin while it was meant to be fused."""
     ends = np.concatenate([[start_s], times[fused], [end_s]])
     begun = ends[:-1]
@@ -239,11 +246,14 @@ def _longest_without(
     if log.meant is not None:
         # an aid that is given up when its last sample was fused is no longer meant a second later
         meant = at_times(log.meant, pd.Index(begun + 1.0)) > 0.0
-    return float(np.max(np.diff(ends)[meant], initial=0.0))
+    longest = int(np.argmax(np.diff(ends) * meant))
+    if not meant[longest]:
+        return start_s, start_s
+    return float(ends[longest]), float(ends[longest + 1])
 
 
-def _verdict(axes: dict[str, AidAxis], longest_without_s: float) -> AidVerdict:
-    if longest_without_s > STARVED_S:
+def _verdict(axes: dict[str, AidAxis], longest_without: float) -> AidVerdict:
+    if longest_without > STARVED_S:
         return "starved"
     if not axes:
         return "too few samples"

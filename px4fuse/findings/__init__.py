@@ -10,19 +10,24 @@ on which its rate is measured in ``tests/studies/rates.csv``.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
 from importlib import import_module
 from pkgutil import iter_modules
 
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.model import Comparison
+from px4fuse.ekf2.aids import AidResult
+from px4fuse.findings.aids import find_in as find_in_aids
 from px4fuse.findings.causes import NAMES, by_cause
 from px4fuse.findings.loops import find_in
 from px4fuse.findings.model import SEVERITIES, Finding, Found, Severity, by_root
 from px4fuse.loop.loop import Loop
 
-__all__ = ["NAMES", "SEVERITIES", "Finding", "Severity", "by_root", "find", "find_loop", "named"]
+__all__ = [
+    "NAMES", "SEVERITIES", "Finding", "Severity", "by_root", "find", "find_aids", "find_loop",
+    "named",
+]  # fmt: skip
 
 
 @cache
@@ -49,6 +54,11 @@ def find(subject: Analysis | Comparison) -> tuple[Finding, ...]:
 def find_loop(loop: Loop) -> tuple[Finding, ...]:
     """All findings about a loop, most severe first."""
     return by_cause(find_in(loop))
+
+
+def find_aids(aids: Mapping[str, AidResult]) -> tuple[Finding, ...]:
+    """All findings about EKF2's aids alone, most severe first."""
+    return by_cause(find_in_aids(aids))
 
 
 def named(finding: str) -> str:

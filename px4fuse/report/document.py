@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from px4fuse.analysis import Analysis, Counterfactual
+from px4fuse.analysis import AidsAlone, Analysis, Counterfactual
 from px4fuse.comparison.events import Events, happened
 from px4fuse.comparison.model import AxisComparison
 from px4fuse.findings import Finding
@@ -62,6 +62,25 @@ class Document:
     def events(self) -> Events:
         """What is marked on every time axis."""
         return happened(self.analysis)
+
+
+@dataclass(frozen=True)
+class AidsDocument:
+    """A report on the aids of EKF2 alone.
+
+    Attributes
+    ----------
+    alone : AidsAlone
+    findings : tuple of Finding
+        Most severe first.
+    student : Student
+    command : str
+    """
+
+    alone: AidsAlone
+    findings: tuple[Finding, ...]
+    student: Student
+    command: str
 
 
 @dataclass(frozen=True)

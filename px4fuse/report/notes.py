@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from px4fuse.answers import Answers, form_rows
-from px4fuse.report.document import Document, LoopDocument
+from px4fuse.report.document import AidsDocument, Document, LoopDocument
 from px4fuse.report.page import Page, appendix
 from px4fuse.report.style import MUTED
 
@@ -51,7 +51,7 @@ SYMBOLS = dict(zip(GREEK.split(), "αβγδεζηθικλμνξοπρστυφχ�
 }  # fmt: skip
 
 
-def draw(document: Document | LoopDocument) -> Iterator[Page]:
+def draw(document: Document | AidsDocument | LoopDocument) -> Iterator[Page]:
     """Draw as many pages as the form and the notes need; none without both."""
     title, answers = "What the student found", document.student.answers
     page = Page(appendix(title) if isinstance(document, Document) else title)

@@ -17,6 +17,7 @@ from typing import Any
 import typst
 
 from px4fuse.report import (
+    aids,
     changes,
     clock,
     consistency,
@@ -33,6 +34,7 @@ from px4fuse.report import (
     why,
 )
 from px4fuse.report.document import (
+    AidsDocument,
     ChangesDocument,
     Document,
     LoopDocument,
@@ -44,14 +46,16 @@ from px4fuse.report.seal import sealed
 from px4fuse.report.style import report_style
 from px4fuse.trajectory.evaluation import Evaluation
 
-Report = Document | LoopDocument | WhatIfDocument | Evaluation | ChangesDocument
+Report = Document | AidsDocument | LoopDocument | WhatIfDocument | Evaluation | ChangesDocument
 RESULTS_NAME = "results.json"
 STANDARDS: list[Any] = ["a-3a", "ua-1"]
 PAGES: Mapping[type, tuple[Callable[[Any], Iterator[Page]], ...]] = {
     Document: (
         cover.draw, flight.draw, innovations.draw, why.draw, flight.draw_other_axes,
-        consistency.draw, sensitivity.draw, clock.draw, loop.draw, notes.draw, provenance.draw,
+        consistency.draw, sensitivity.draw, clock.draw, aids.draw, loop.draw, notes.draw,
+        provenance.draw,
     ),
+    AidsDocument: (aids.draw_alone, notes.draw),
     LoopDocument: (loop.draw_report, notes.draw, provenance.draw_loop),
     WhatIfDocument: (whatif.draw,),
     Evaluation: (evaluation.draw,),
@@ -64,6 +68,9 @@ def _named(document: Report) -> tuple[str, str, str]:
     match document:
         case Document(analysis):
             log = analysis.flight.log
+            return f"px4fuse compare {log.name}", log.name, log.sha256
+        case AidsDocument(alone):
+            log = alone.flight.log
             return f"px4fuse compare {log.name}", log.name, log.sha256
         case WhatIfDocument(made_of):
             log = made_of.flight.log
@@ -84,7 +91,7 @@ def render(document: Report, results_json: str) -> bytes:
 
     Parameters
     ----------
-    document : Document, LoopDocument, WhatIfDocument, Evaluation or ChangesDocument
+    document : Document, AidsDocument, LoopDocument, WhatIfDocument, Evaluation or ChangesDocument
     results_json : str
         Attached inside the PDF as ``results.json``, so that the PDF alone can be checked.
 
@@ -100,7 +107,7 @@ def render(document: Report, results_json: str) -> bytes:
     title, name, sha256 = _named(document)
     made_by = f"px4fuse {metadata.version('px4fuse')}"
     student = ""
-    if isinstance(document, Document | LoopDocument):
+    if isinstance(document, Document | AidsDocument | LoopDocument):
         student = who(document.student, " · ")
     # figures have no text of others
     words = title + name + student + json.dumps(written, ensure_ascii=False, default=repr)

@@ -8,8 +8,9 @@ from rich.console import Console
 
 from px4fuse.ekf2.walk import Why
 from px4fuse.findings import by_root
+from px4fuse.report.aids import write_alone, write_appendix
 from px4fuse.report.cover import facts, write_finding
-from px4fuse.report.document import Document
+from px4fuse.report.document import AidsDocument, Document
 from px4fuse.report.page import Page
 from px4fuse.report.screen import show
 from px4fuse.report.style import MUTED
@@ -56,6 +57,7 @@ def print_summary(
     is_told = isinstance(why, Why) and why.cause in document.story
     if why is not None and not is_told:
         write_why(page, why)
+    write_appendix(page, document)
     if not document.findings:
         page.write("No findings.")
     groups = by_root(document.findings)
@@ -64,6 +66,14 @@ def print_summary(
     if (more := len(groups) - MOST_FINDINGS) > 0:
         page.write(f"and {more} more in the report" if report else f"and {more} more")
     show(console, page.blocks, request)
+
+
+def print_aids(console: Console, document: AidsDocument) -> None:
+    """Print the summary of a flight without a position source."""
+    page, log = Page(), document.alone.flight.log
+    page.labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
+    write_alone(page, document)
+    show(console, page.blocks)
 
 
 def print_advice(console: Console, advice: Mapping[str, str], request: Request) -> None:

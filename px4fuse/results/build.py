@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import msgspec
 
-from px4fuse.analysis import Analysis, Counterfactual
+from px4fuse.analysis import AidsAlone, Analysis, Counterfactual
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
@@ -19,8 +19,10 @@ from px4fuse.record import written
 from px4fuse.request import AxisName, ComparisonRequest, WhatIfRequest
 from px4fuse.results.comparison import AvailableTrack, ChosenSettings, Log, PositionSource
 from px4fuse.results.contract import (
+    AIDS,
     COMPARISON,
     WHATIF,
+    AidsResults,
     ComparisonResults,
     SyncResults,
     TuningResults,
@@ -46,12 +48,33 @@ def results(
         heading=analysis.heading,
         ekf2_replay=written(analysis.ekf2_replay),
         why=written(analysis.why),
+        aids={} if isinstance(analysis.aids, Unavailable) else dict(analysis.aids),
         loop=written(analysis.loop),
         story=story(analysis, findings),
         findings=findings,
         notes=analysis.notes,
         missing=analysis.missing,
         student=student,
+    )
+
+
+def aids_results(
+    request: ComparisonRequest,
+    alone: AidsAlone,
+    findings: tuple[Finding, ...],
+    student: Student,
+    command: str,
+) -> AidsResults:
+    """What ``px4fuse compare`` found on a flight without a position source."""
+    return AidsResults(
+        schema=schema_of(AIDS),
+        request=request.recorded(),
+        log=log_part(alone.flight),
+        aids=dict(alone.aids),
+        findings=findings,
+        missing=(alone.lacking, *alone.flight.missing),
+        student=student,
+        provenance=provenance(command),
     )
 
 

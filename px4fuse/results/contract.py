@@ -14,6 +14,7 @@ import msgspec
 from msgspec import Meta
 
 from px4fuse.comparison.model import AxisResult, FilterName
+from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.replay import Agreement, Replayed
 from px4fuse.ekf2.walk import WhySteps
 from px4fuse.ekf2.whatif import Summary
@@ -40,6 +41,7 @@ from px4fuse.trajectory.model import Track
 COMPARISON = "px4fuse-results"
 LOOP = "px4fuse-loop"
 WHATIF = "px4fuse-whatif"
+AIDS = "px4fuse-aids"
 CHANGES = "px4fuse-changes"
 
 
@@ -72,6 +74,8 @@ class ComparisonResults(_OfFlight, frozen=True):
         EKF2 replayed from the log, and how well that agrees with what was logged.
     why : mapping of axis name to WhySteps
         Why EKF2 differs.
+    aids : mapping of PX4's name to AidResult
+        What EKF2 fused in flight, each judged by its own innovations; empty where none can be.
     loop : LoopPart
     story : tuple of str
         What happened, in up to three sentences.
@@ -92,10 +96,24 @@ class ComparisonResults(_OfFlight, frozen=True):
     heading: Maybe[HeadingError]
     ekf2_replay: Maybe[Replayed]
     why: dict[str, Maybe[WhySteps]]
+    aids: dict[str, AidResult]
     loop: Maybe[LoopPart]
     story: tuple[str, ...]
     findings: tuple[Finding, ...]
     notes: tuple[str, ...]
+    missing: tuple[Unavailable, ...]
+    student: Student
+    provenance: Provenance
+
+
+class AidsResults(Record, frozen=True):
+    """Results of ``px4fuse compare`` on a flight without a position source: EKF2's aids alone."""
+
+    schema: Schema
+    request: ComparisonRequest
+    log: Log
+    aids: Annotated[dict[str, AidResult], Meta(min_length=1)]
+    findings: tuple[Finding, ...]
     missing: tuple[Unavailable, ...]
     student: Student
     provenance: Provenance
@@ -201,6 +219,7 @@ class ChangeResults(Record, frozen=True, kw_only=True):
 Reported = ComparisonResults | LoopResults
 Results = (
     Reported
+    | AidsResults
     | TuningResults
     | SyncResults
     | GraphResults
@@ -212,6 +231,7 @@ Results = (
 KINDS: dict[str, type[Results]] = {
     COMPARISON: ComparisonResults,
     LOOP: LoopResults,
+    AIDS: AidsResults,
     "px4fuse-tuning": TuningResults,
     "px4fuse-sync": SyncResults,
     "px4fuse-graph": GraphResults,

@@ -1,0 +1,94 @@
+"""An aid of EKF2 that it did not get, does not believe, or is pulled to one side by.
+
+External vision's position is judged by the detectors of the lab, with what a replay shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from px4fuse.analysis import Analysis
+from px4fuse.ekf2.aids import STARVED_S, AidAxis, AidResult
+from px4fuse.ekf2_parameters import AIDS
+from px4fuse.findings.model import Found, info, warning
+from px4fuse.flight import Unavailable
+from px4fuse.plain import factor_words, number_words
+
+JUDGED_ELSEWHERE = ("ev_pos", "ev_hgt")
+
+
+def detect(analysis: Analysis) -> Found:
+    """Of a comparison."""
+    if not isinstance(analysis.aids, Unavailable):
+        yield from find_in(analysis.aids)
+
+
+def find_in(aids: Mapping[str, AidResult]) -> Found:
+    """One finding for each aid that has one.
+
+    What one sensor gives is missing together, and told once.
+    """
+    judged = {name: aid for name, aid in aids.items() if name not in JUDGED_ELSEWHERE}
+    starved: dict[str, list[AidResult]] = {}
+    for name, aid in judged.items():
+        if aid.verdict == "starved":
+            starved.setdefault(AIDS[name].switch or name, []).append(aid)
+    for together in starved.values():
+        longest = max(together, key=lambda aid: aid.longest_without)
+        labels = ", ".join(aid.label for aid in together)
+        yield warning(
+            "aid_starved",
+            f"EKF2 had {longest.longest_without:.0f} s without {labels} that it meant to fuse",
+            f" (more than {STARVED_S:g} s; {longest.rejected_share:.1%} of its samples were "
+            "rejected): it went on by its other aids and the IMU, whose errors grow.",
+            "See what the sensor lacked then (reception, range, light), or whether EKF2 rejected "
+            "it; what carried EKF2 meanwhile is in the table.",
+            {"aid": labels, "longest_without_s": longest.longest_without,
+             "rejected_share": longest.rejected_share},
+            (longest.longest_without_s,),
+        )  # fmt: skip
+    for name, aid in judged.items():
+        if aid.verdict == "variance understated":
+            factor = aid.nis_mean**0.5
+            yield warning(
+                "aid_understated",
+                f"EKF2 is {factor_words(factor)} times too sure of {aid.label}",
+                f" (mean NIS {number_words(aid.nis_mean)}, 1 is consistent; "
+                f"{aid.rejected_share:.1%} rejected): its errors are larger than R"
+                f"{_noise_words(aid)} says, or another aid pulls against it.",
+                _understated_remedy(name),
+                {"aid": name, "nis_mean": aid.nis_mean, "rejected_share": aid.rejected_share},
+            )
+        elif aid.verdict == "biased":
+            axis, worst = max(aid.axes.items(), key=_pull)
+            yield info(
+                "aid_biased",
+                f"Innovations of {aid.label} are not zero in the mean",
+                f" ({number_words(worst.innovation_mean)} {aid.unit}, {axis}; √S is "
+                f"{number_words(worst.s_sqrt_median)}): it and another aid contradict each other, "
+                "and EKF2 stands between them.",
+                "Find the one that is wrong (calibration, place of the sensor, interference): "
+                "noises do not cure a bias.",
+                {"aid": name, "axis": axis, "innovation_mean": worst.innovation_mean,
+                 "s_sqrt_median": worst.s_sqrt_median},
+            )  # fmt: skip
+
+
+def _pull(axis: tuple[str, AidAxis]) -> float:
+    return abs(axis[1].innovation_mean) / axis[1].s_sqrt_median
+
+
+def _noise_words(aid: AidResult) -> str:
+    if aid.noise is None:
+        return ""
+    return f" (√R {number_words(aid.noise)} {aid.unit}, from {aid.noise_from})"
+
+
+def _understated_remedy(name: str) -> str:
+    """Never a value: innovations alone do not tell noise from a wrong delay."""
+    parameter = AIDS[name].noise
+    return (
+        "Look for what is wrong first (outliers, the sensor's delay or place, another aid); where "
+        "it is the sensor's own noise, "
+        + (f"raise {parameter}." if parameter else "its reported accuracy is too small.")
+    )
