@@ -31,8 +31,9 @@ BIASED, FELT = 0.5, 0.2
 STARVED_S = 5.0
 # Within this of a parameter, R is formed by it
 SAME_NOISE = 0.02
-# Height (m) below which ground effect and the landing gear's reach are not judged
-GROUND_M = 1.0
+# Height (m) from which a flight is judged, of low ones half of the highest: below, the rotors' wash
+# moves the barometer, and motors that run on the ground count as flight for the land detector
+GROUND_M = 2.0
 
 
 class AidAxis(Record, frozen=True, kw_only=True):
@@ -131,7 +132,8 @@ def flown(flight: Flight) -> tuple[float, float] | Unavailable:
     start, end = flight.airborne[0][0], flight.airborne[-1][1]
     if isinstance(flight.ekf2, Ekf2):
         down = flight.ekf2.state["down_m"].loc[start:end]
-        high = down.index[down < down[:1].max() - GROUND_M]
+        height = (down.iloc[0] if len(down) else 0.0) - down
+        high = height.index[height > min(GROUND_M, height.max() / 2.0)]
         if len(high):
             start, end = float(high[0]), float(high[-1])
     return start, end

@@ -27,7 +27,7 @@ from pypdf.generic import ArrayObject, DictionaryObject, IndirectObject, StreamO
 from px4fuse.errors import ResultsError
 from px4fuse.report.pdf import RESULTS_NAME
 from px4fuse.report.seal import seal_of
-from px4fuse.results.contract import ComparisonResults, LoopResults, Reported
+from px4fuse.results.contract import AidsResults, ComparisonResults, LoopResults, Reported
 from px4fuse.results.reading import MAX_BYTES as MAX_ATTACHMENT_BYTES
 from px4fuse.results.reading import one_line, read_results
 from px4fuse.verification.model import Refused, Report
@@ -161,7 +161,11 @@ def _results(pdf: bytes) -> Reported:
     where = f"{RESULTS_NAME} in it"
     results = read_results(_attachment(contents), where)
     if not isinstance(results, ComparisonResults | LoopResults):
-        raise ResultsError(f"{where} holds no results of a report.")
+        alone = isinstance(results, AidsResults)
+        what = (
+            "the aids of EKF2 alone, nothing of our filter" if alone else "no results of a report"
+        )
+        raise ResultsError(f"{where} holds {what}.")
     return results
 
 

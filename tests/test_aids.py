@@ -1,0 +1,314 @@
+"""EKF2's aids: read from logs of each release, and judged by their own innovations."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from cli_tools import run
+from conftest import SHARED_LOGS
+from exchange import replace
+from flights import aisle_flight
+from ulog_tools import Log, make_log, seconds_of, stamps, topic
+
+from px4fuse.ekf2.aids import AidResult, judge_aids
+from px4fuse.ekf2_parameters import AIDS
+from px4fuse.errors import MissingDataError
+from px4fuse.findings import find_aids
+from px4fuse.flight import AidLog, Unavailable
+from px4fuse.readers import read_log
+from px4fuse.results.contract import AidsResults
+from px4fuse.results.reading import read_results
+
+# ------------------------------------------------------------------------------- judged
+
+TIMES = np.arange(0.0, 60.0, 0.1)
+
+
+def steps(*changes: tuple[float, float]) -> pd.Series:
+    at, values = zip(*changes, strict=True)
+    return pd.Series(values, index=pd.Index(at, name="time_s"))
+
+
+def aid_log(
+    *, sigma: float = 0.5, claimed: float = 0.5, mean: float = 0.0, gate: float = 5.0,
+    own: bool = True, meant: pd.Series | None = None, axes: tuple[str, ...] = ("north", "east"),
+    **parameters: float,
+) -> AidLog:  # fmt: skip
+    """White innovations of a standard deviation, of which EKF2 claims another, R half of S."""
+    rng = np.random.default_rng(7)
+    white = rng.normal(size=(len(TIMES), len(axes)))
+    white = (white - white.mean(axis=0)) / white.std(axis=0)
+    innovation = mean + sigma * white
+    beyond = (np.abs(innovation) > gate * claimed).any(axis=1).astype(float)
+    columns: dict[str, Any] = {}
+    for number, axis in enumerate(axes):
+        columns[f"innovation_{axis}"] = innovation[:, number]
+        columns[f"variance_{axis}"] = claimed**2
+        if own:
+            columns[f"noise_{axis}"] = claimed**2 / 2.0
+            columns[f"ratio_{axis}"] = innovation[:, number] ** 2 / (gate * claimed) ** 2
+    if own:
+        columns |= {"fused": 1.0 - beyond, "rejected": beyond}
+    frame = pd.DataFrame(columns, index=pd.Index(TIMES, name="time_s"))
+    return AidLog("a_topic", axes, frame, meant, parameters)
+
+
+def judged(log: AidLog, name: str = "gnss_pos") -> AidResult:
+    flight = aisle_flight(duration_s=60.0)
+    found = judge_aids(replace(flight, ekf2=replace(flight.ekf2, aids={name: log})))
+    assert not isinstance(found, Unavailable)
+    return found[name]
+
+
+@pytest.mark.parametrize(
+    ("sigma", "verdict"),
+    [(0.5, "consistent"), (0.58, "consistent"), (0.68, "variance understated"),
+     (0.43, "consistent"), (0.37, "variance overstated")],
+)  # fmt: skip
+def test_a_verdict_needs_more_than_chance_and_a_quarter_in_sigma(
+    sigma: float, verdict: str
+) -> None:
+    aid = judged(aid_log(sigma=sigma))
+    assert aid.verdict == verdict
+    assert aid.nis_mean == pytest.approx((sigma / 0.5) ** 2, rel=0.06)
+    assert aid.axes["north"].sigma_factor == pytest.approx(0.5 / sigma, rel=0.04)
+    assert len(TIMES) - 5 < aid.axes["east"].samples <= len(TIMES)
+    assert aid.axes["north"].s_sqrt_median == pytest.approx(0.5)
+
+
+def test_a_mean_that_averaging_does_not_take_away_is_a_bias() -> None:
+    assert judged(aid_log(mean=0.35)).verdict == "biased"
+    assert judged(aid_log(mean=0.2)).verdict == "consistent"
+    # small beside what EKF2 allows for: it hardly follows
+    assert judged(aid_log(sigma=0.05, mean=0.09)).verdict == "variance overstated"
+    assert judged(aid_log(sigma=0.05, mean=0.11)).verdict == "biased"
+
+
+def test_times_without_a_fused_sample_count_from_where_it_was_meant() -> None:
+    log = aid_log(meant=steps((0.0, 1.0), (26.0, 0.0), (40.0, 1.0)))
+    silent = log.samples.loc[:20.0]
+    outage = judged(replace(log, samples=pd.concat([silent, log.samples.loc[40.0:]])))
+    assert (outage.verdict, outage.longest_without_s) == ("starved", (20.0, 40.0))
+    # given up at once: nothing was waited for
+    meant = steps((0.0, 1.0), (20.05, 0.0), (40.0, 1.0))
+    given_up = judged(replace(log, samples=outage_free(log, 20.0, 40.0), meant=meant))
+    assert given_up.verdict == "consistent"
+    assert given_up.longest_without == pytest.approx(0.1, abs=0.01)
+    assert given_up.intended_share == pytest.approx(40.0 / 60.0, abs=0.02)
+
+
+def outage_free(log: AidLog, start_s: float, end_s: float) -> pd.DataFrame:
+    times = log.samples.index
+    return log.samples[(times <= start_s) | (times >= end_s)]
+
+
+def test_what_was_never_meant_is_idle_and_few_samples_are_no_verdict() -> None:
+    log = aid_log()
+    assert judged(replace(log, meant=steps((0.0, 0.0)))).verdict == "idle"
+    few = judged(replace(log, samples=log.samples.iloc[::80], meant=steps((0.0, 1.0))))
+    assert (few.verdict, few.axes) == ("starved", {})
+    three_hertz = pd.DataFrame(log.samples.iloc[:9])
+    assert judged(replace(log, samples=three_hertz, meant=steps((0.0, 1.0), (0.9, 0.0)))
+                  ).verdict == "too few samples"  # fmt: skip
+
+
+def test_a_row_of_a_reset_is_counted_and_not_judged() -> None:
+    log = aid_log()
+    samples = log.samples.copy()
+    reset = samples.index[[100, 300]]
+    for axis in log.axes:
+        samples.loc[reset, f"innovation_{axis}"] = 0.0
+        samples.loc[reset, f"variance_{axis}"] = samples[f"noise_{axis}"].iloc[0]
+    aid = judged(replace(log, samples=samples))
+    assert (aid.resets, aid.axes["north"].samples) == (2, judged(log).axes["north"].samples - 2)
+
+
+def test_the_gate_is_the_log_s_own_and_else_the_parameter() -> None:
+    assert judged(aid_log(gate=3.0)).gate == pytest.approx(3.0)
+    assert judged(aid_log(own=False, EKF2_GPS_P_GATE=4.0)).gate == 4.0
+    assert judged(aid_log(own=False)).gate == AIDS["gnss_pos"].default_gate
+    # where no flag says so, the gate tells what was rejected
+    aid = judged(aid_log(own=False, sigma=1.0, EKF2_GPS_P_GATE=2.0))
+    inside = 0.6827**2  # both axes within one σ of their own
+    assert aid.rejected_share == pytest.approx(1.0 - inside, abs=0.05)
+    assert not aid.fused_logged
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters", "set_by"),
+    [("gnss_pos", {"EKF2_GPS_P_NOISE": 0.5**0.5 * 0.5}, "EKF2_GPS_P_NOISE"),
+     ("gnss_pos", {"EKF2_GPS_P_NOISE": 0.1}, "the accuracy that the receiver states"),
+     ("gnss_hgt", {"EKF2_GPS_P_NOISE": 0.5**0.5 / 3.0}, "EKF2_GPS_P_NOISE"),
+     ("ev_yaw", {"EKF2_EVA_NOISE": 0.125}, "EKF2_EVA_NOISE"),
+     ("mag", {"EKF2_MAG_NOISE": 0.05}, "EKF2_MAG_NOISE"), ("gnss_pos", {}, "the accuracy that "
+     "the receiver states")],
+)  # fmt: skip
+def test_who_set_the_noise(name: str, parameters: dict[str, float], set_by: str) -> None:
+    aid = judged(aid_log(**parameters), name)
+    assert aid.noise == pytest.approx(0.5 * 0.5**0.5)
+    assert aid.noise_from == set_by
+    assert judged(aid_log(own=False, **parameters), name).noise_from == ""
+
+
+def test_findings_name_the_aid_its_figures_and_when() -> None:
+    log = aid_log()
+    silent = replace(log, samples=outage_free(log, 20.0, 41.0), meant=steps((0.0, 1.0)))
+    flight = aisle_flight(duration_s=60.0)
+    aids = {"gnss_pos": silent, "gnss_vel": silent, "baro_hgt": aid_log(sigma=1.5),
+            "mag": aid_log(mean=-0.4), "ev_pos": aid_log(sigma=9.0), "rng_hgt": log}  # fmt: skip
+    found = judge_aids(replace(flight, ekf2=replace(flight.ekf2, aids=aids)))
+    assert not isinstance(found, Unavailable)
+    by_id = {one.id: one for one in find_aids(found)}
+    assert set(by_id) == {"aid_starved", "aid_understated", "aid_biased"}
+    assert by_id["aid_starved"].headline == (
+        "EKF2 had 21 s without GNSS position, GNSS velocity that it meant to fuse"
+    )
+    assert by_id["aid_starved"].spans_s == ((20.0, 41.0),)
+    assert by_id["aid_understated"].headline.startswith("EKF2 is 3 times too sure of barometer")
+    assert "EKF2_BARO_NOISE" in by_id["aid_understated"].remedy
+    assert by_id["aid_biased"].evidence["aid"] == "mag"
+    assert by_id["aid_biased"].evidence["innovation_mean"] == pytest.approx(-0.4, abs=0.05)
+
+
+# --------------------------------------------------------------------------------- read
+
+
+def gnss_log(generation: str) -> Log:
+    """A log in which EKF2 fuses GNSS position at 5 Hz, and external vision never."""
+    log, number = make_log(generation, seconds=20.0), int(generation.removeprefix("v1."))
+    vision = ("visual", "aid_src_ev", "innovation", "status_flags")
+    log.drop(*(name for name in log.names() if any(part in name for part in vision)))
+    at = stamps(20.0, 5.0)
+    logged = 0.3 * np.random.default_rng(3).normal(size=(len(at), 2))
+    second = stamps(20.0, 1.0)
+    if number >= 14:
+        log.add(
+            topic("estimator_aid_src_gnss_pos", at, {
+                "innovation": logged, "innovation_variance": np.full((len(at), 2), 0.25),
+                "observation_variance": np.full((len(at), 2), 0.16),
+                "test_ratio": logged**2 / (25.0 * 0.25), "fused": np.ones(len(at), np.bool_),
+                "innovation_rejected": np.zeros(len(at), np.bool_),
+            }, sampled=True),
+            topic("estimator_status_flags", second, {
+                "cs_gps" if number < 16 else "cs_gnss_pos": np.ones(len(second), np.bool_),
+                "cs_ev_pos": np.zeros(len(second), np.bool_),
+                "cs_ev_hgt": np.zeros(len(second), np.bool_),
+                "cs_ev_yaw": np.zeros(len(second), np.bool_),
+            }),
+        )  # fmt: skip
+        return log
+    if "estimator_status" not in log.names():
+        log.add(topic("estimator_status", second, {}))
+    status = log["estimator_status"]
+    status["control_mode_flags"] = np.full(len(status["timestamp"]), 1 << 2, np.uint64)
+    if number <= 10:
+        rest = np.zeros((len(at), 3))
+        log.add(topic("ekf2_innovations", at, {
+            "vel_pos_innov": np.hstack([rest, logged, rest[:, :1]]),
+            "vel_pos_innov_var": np.full((len(at), 6), 0.25),
+        }))  # fmt: skip
+        return log
+    twice = np.repeat(np.arange(len(at)), 2)
+    late = np.tile(np.array([0, 100_000], np.uint64), len(at))
+    for name, values in (("s", logged), ("_variances", np.full((len(at), 2), 0.25))):
+        log.add(topic(f"estimator_innovation{name}", at[twice] + late, {
+            "gps_hpos": values[twice], "ev_hpos": np.zeros((2 * len(at), 2)),
+            "baro_vpos": np.ones(2 * len(at)),
+        }, sampled=number >= 12))  # fmt: skip
+    return log
+
+
+@pytest.mark.parametrize("generation", ["v1.9", "v1.12", "v1.14", "v1.16"])
+def test_each_release_s_innovations_are_read_once_and_with_everybody_s_sign(
+    generation: str, tmp_path: Path
+) -> None:
+    flight = read_log(gnss_log(generation).write(tmp_path / "a.ulg"))
+    aids = flight.ekf2.aids  # type: ignore[union-attr]
+    assert [name for name in aids if name in ("gnss_pos", "gnss_hgt", "baro_hgt")] == ["gnss_pos"]
+    log, at = aids["gnss_pos"], seconds_of(stamps(20.0, 5.0))
+    expected = -0.3 * np.random.default_rng(3).normal(size=(len(at), 2))
+    np.testing.assert_allclose(log.samples.index, at, atol=1e-6)
+    found = log.samples[["innovation_north", "innovation_east"]].to_numpy()
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    assert (log.samples["variance_north"] == 0.25).all()
+    aid = judge_aids(flight)["gnss_pos"]  # type: ignore[index]
+    assert aid.intended_share == 1.0
+    assert aid.fused_logged is (generation in ("v1.14", "v1.16"))
+    assert aid.verdict == "variance overstated"
+
+
+# ------------------------------------------------------------------------------ reported
+
+
+def test_a_log_without_position_gets_its_aids_judged(tmp_path: Path) -> None:
+    log, report = gnss_log("v1.16").write(tmp_path / "a.ulg"), tmp_path / "a.pdf"
+    done = run("compare", log, "-o", report)
+    assert done.exit_code == 0, done.output
+    assert "Our filter has nothing to compare with EKF2: no external position" in done.output
+    assert "--position-source" in done.output or "--position" in done.output
+    assert "GNSS position" in done.output
+    found = read_results(report.with_suffix(".json").read_bytes())
+    assert isinstance(found, AidsResults)
+    assert found.aids["gnss_pos"].axes["east"].samples > 80
+    assert found.missing[0].what == "position source"
+    refused = run("verify", report, log).exception
+    assert "the aids of EKF2 alone, nothing of our filter" in str(refused)
+
+
+def test_on_the_ground_there_is_nothing_to_judge(tmp_path: Path) -> None:
+    made = gnss_log("v1.16")
+    made["vehicle_land_detected"]["landed"][:] = 1
+    done = run("compare", made.write(tmp_path / "a.ulg"), "-o", tmp_path / "a.pdf")
+    assert isinstance(done.exception, MissingDataError)
+    assert "the vehicle never took off" in str(done.exception)
+    assert not (tmp_path / "a.pdf").exists()
+
+
+# --------------------------------------------------------------------- flights of the real EKF2
+
+# What the facts of each flight leave to be seen in its aids, by PX4's names
+SEEN = {
+    "main202603_gps_outage_flow": {"gnss_pos": "starved", "gnss_vel": "starved"},
+    "v1.13.3_gps_profile1": {"gnss_pos": "consistent", "gnss_vel": "consistent"},
+    "v1.14.4_gps_magdist": {"gnss_pos": "consistent", "mag": "biased"},
+    "v1.16.1_gps_delay0": {"gnss_pos": "consistent", "gnss_vel": "consistent"},
+    "v1.16.1_gps_fullrate": {"gnss_pos": "consistent", "gnss_hgt": "consistent"},
+    "v1.16.1_gps_nominal": {"gnss_pos": "consistent", "gravity": "idle"},
+    "v1.16.1_gps_overconfident": {"gnss_pos": "variance understated", "gnss_vel": "consistent"},
+    "v1.16.1_gps_stock_flow": {"gnss_pos": "variance overstated", "rng_hgt": "variance overstated"},
+}
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize("name", SEEN)
+def test_flights_of_the_real_ekf2(name: str) -> None:
+    """NIS as PX4's own figures have it (computed from the logs without px4fuse)."""
+    folder = SHARED_LOGS / "gps"
+    if not folder.exists():
+        pytest.skip("../shared is absent")
+    found = judge_aids(read_log(folder / f"{name}.ulg"))
+    assert not isinstance(found, Unavailable)
+    assert SEEN[name] == {aid: found[aid].verdict for aid in SEEN[name]}
+    truth = json.loads((folder / f"{name}.json").read_text())["truth"]
+    compared = 0
+    for aid, stated in truth["aid_sources"].items():
+        all_rows = stated["rejected_share"] > 0.0  # theirs without the rejected is another number
+        expected = stated["mean_nis" if all_rows else "mean_nis_fused"]
+        if aid in found and found[aid].axes:
+            nis = [axis.nis_mean for axis in found[aid].axes.values()]
+            # flight is from one metre up here, from take-off there
+            assert nis == pytest.approx(expected, rel=0.02, abs=0.002), aid
+            compared += 1
+    if not truth["aid_sources"]:
+        for aid, fields in (("gnss_pos", ("gps_hpos[0]", "gps_hpos[1]")),
+                            ("gnss_vel", ("gps_hvel[0]", "gps_hvel[1]", "gps_vvel"))):  # fmt: skip
+            stated = [truth["estimator_innovations"][field]["mean_nis"] for field in fields]
+            nis = [axis.nis_mean for axis in found[aid].axes.values()]
+            assert nis == pytest.approx(stated, rel=0.02)
+            compared += 1
+    assert compared >= 2
