@@ -1,10 +1,10 @@
 """How many one-operator changes of the package the suite notices.
 
 ``python tests/studies/mutants.py --map FOLDER`` runs every test file once by itself under coverage
-and keeps in FOLDER which lines it covers and how long it takes. ``python tests/studies/mutants.py
-FOLDER --number 300 --seed 1`` then draws changes from the whole package, runs for each the test
-files that cover its line (those that cover least first) until one fails, and prints killed and
-surviving changes by room, and the survivors. A change that outlives ``--seconds`` of tests counts
+and keeps in FOLDER which lines each test covers. ``python tests/studies/mutants.py FOLDER --number
+300 --seed 1`` then draws changes from the whole package, runs for each the tests that cover its
+line (those that cover least first) until one fails, and prints the survivors, and killed and
+surviving changes by room. A change that outlives ``--seconds`` of tests counts
 as a survivor, one whose line no test covers as uncovered. Nothing in the checkout is changed.
 """
 
@@ -21,7 +21,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import Queue
@@ -144,10 +144,10 @@ def copied(folder: Path) -> Path:
     return folder
 
 
-def tested(folder: Path, file: str, *before: str, seconds: float) -> bool:
-    """Whether a test file passes in a copy; one that takes too long does not."""
+def passes(folder: Path, *arguments: str, before: Sequence[str] = (), seconds: float) -> bool:
+    """Whether tests pass in a copy; those that take too long do not."""
     environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
-    command = [sys.executable, *before, "-m", "pytest", "-n", "0", "-q", "-x", f"tests/{file}"]
+    command = [sys.executable, *before, "-m", "pytest", "-n", "0", "-q", "-x", *arguments]
     try:
         run = subprocess.run(
             command, cwd=folder, env=environment, capture_output=True, timeout=seconds, check=False
@@ -158,24 +158,33 @@ def tested(folder: Path, file: str, *before: str, seconds: float) -> bool:
 
 
 def make_map(out: Path, workers: int) -> None:
-    """Run every test file under coverage and keep its lines and its time in ``out``."""
+    """Run every test file under coverage; keep in ``out`` which lines each of its tests covers.
+
+    What runs outside a test (imports, fixtures) is kept under the empty name.
+    """
     from coverage import CoverageData
 
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         tree = copied(Path(folder))
+        settings = tree / "coverage.ini"
+        settings.write_text("[run]\ndynamic_context = test_function\n")
 
         def run(path: Path) -> None:
             data = out / f"{path.stem}.coverage"
             begin = time.monotonic()
-            under = ("-m", "coverage", "run", "--source=px4fuse", f"--data-file={data}")
-            passed = tested(tree, path.name, *under, seconds=3600)
+            under = ("-m", "coverage", "run", f"--rcfile={settings}", "--source=px4fuse",
+                     f"--data-file={data}")  # fmt: skip
+            passed = passes(tree, f"tests/{path.name}", before=under, seconds=3600)
             measured = CoverageData(str(data))
             measured.read()
-            lines = {
-                Path(file).relative_to(tree.resolve()).as_posix(): measured.lines(file)
-                for file in measured.measured_files()
-            }
+            lines: dict[str, dict[str, list[int]]] = {}
+            for file in measured.measured_files():
+                name = Path(file).relative_to(tree.resolve()).as_posix()
+                for line, contexts in measured.contexts_by_lineno(file).items():
+                    for context in contexts:
+                        test = context.rpartition(".")[2]
+                        lines.setdefault(test, {}).setdefault(name, []).append(line)
             data.unlink()
             took = time.monotonic() - begin
             (out / f"{path.stem}.json").write_text(json.dumps({"seconds": took, "lines": lines}))
@@ -183,6 +192,48 @@ def make_map(out: Path, workers: int) -> None:
 
         with ThreadPoolExecutor(workers) as pool:
             list(pool.map(run, sorted((ROOT / "tests").glob("test_*.py"))))
+
+
+class Cover:
+    """Which tests cover which lines."""
+
+    def __init__(self, folder: Path) -> None:
+        self.lines: dict[str, dict[str, set[int]]] = {}
+        self.fixtures: dict[str, dict[str, set[int]]] = {}
+        for path in sorted(folder.glob("*.json")):
+            for test, lines in json.loads(path.read_text())["lines"].items():
+                file = f"tests/{path.stem}.py"
+                into = self.lines if test else self.fixtures
+                into[f"{file}::{test}" if test else file] = {
+                    name: set(some) for name, some in lines.items()
+                }
+        self.width = {test: sum(map(len, lines.values())) for test, lines in self.lines.items()}
+
+    def of(self, mutant: Mutant) -> list[str]:
+        """Tests to run for a change, those that cover least first.
+
+        A line that runs while its module is imported is tested by what covers the module most;
+        one of a fixture by the whole file.
+        """
+        path = mutant.path
+        found = [test for test, lines in self.lines.items() if mutant.line in lines.get(path, ())]
+        files = [
+            file for file, lines in self.fixtures.items() if mutant.line in lines.get(path, ())
+        ]
+        if not found and files:
+            share = {
+                test: len(lines[path]) / self.width[test]
+                for test, lines in self.lines.items()
+                if path in lines
+            }
+            return sorted(share, key=share.__getitem__, reverse=True)
+        return [*sorted(found, key=self.width.__getitem__), *(files if len(files) < FEW else ())]
+
+
+# Files whose fixtures cover a line; more than that is what all do
+FEW = 8
+# Tests that one process runs, in turn: what covers least most often fails
+PORTIONS = (4, 12, 40, 120, 10_000)
 
 
 def main() -> None:
@@ -193,26 +244,24 @@ def main() -> None:
     parser.add_argument("--number", type=int, default=300)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=300.0)
+    parser.add_argument("--only", default="", help="part of the path of the files to change")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     given = parser.parse_args()
     if given.map:
         make_map(given.folder, given.workers)
         return
-    coverage = {path.stem: json.loads(path.read_text()) for path in given.folder.glob("*.json")}
-    width = {name: sum(map(len, one["lines"].values())) for name, one in coverage.items()}
-    every = [one for path in sorted((ROOT / "px4fuse").rglob("*.py")) for one in mutants(path)]
-    drawn = random.Random(given.seed).sample(every, given.number)
+    cover = Cover(given.folder)
+    files = [path for path in sorted((ROOT / "px4fuse").rglob("*.py")) if given.only in str(path)]
+    every = [one for path in files for one in mutants(path)]
+    drawn = random.Random(given.seed).sample(every, min(given.number, len(every)))
     verdicts: Counter[tuple[str, str]] = Counter()
-    told: list[str] = []
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(given.workers) as pool:
         trees: Queue[Path] = Queue()
         for number in range(given.workers):
             trees.put(copied(Path(folder) / str(number)))
 
         def judge(mutant: Mutant) -> str:
-            names = [
-                n for n, one in coverage.items() if mutant.line in one["lines"].get(mutant.path, ())
-            ]
+            names = cover.of(mutant)
             if not names:
                 return "uncovered"
             tree = trees.get()
@@ -221,11 +270,12 @@ def main() -> None:
             file.write_text(mutant.text(source), encoding="utf-8")
             end = time.monotonic() + given.seconds
             try:
-                for name in sorted(names, key=width.__getitem__):
-                    limit = min(end - time.monotonic(), 30 + 5 * coverage[name]["seconds"])
-                    if limit <= 0:
+                for portion in PORTIONS:
+                    some, names = names[:portion], names[portion:]
+                    left = end - time.monotonic()
+                    if not some or left <= 0:
                         break
-                    if not tested(tree, f"{name}.py", seconds=limit) and time.monotonic() < end:
+                    if not passes(tree, *some, seconds=left) and time.monotonic() < end:
                         return "killed"
                 return "survived"
             finally:
@@ -236,15 +286,13 @@ def main() -> None:
             room = mutant.path.split("/")[1]
             verdicts[room, verdict] += 1
             if verdict != "killed":
-                told.append(f"{verdict:9} {mutant.told()}")
-            print(".", end="", flush=True)
+                print(f"{verdict:9} {mutant.told()}", flush=True)
     print(f"\n{'room':22}{'killed':>8}{'survived':>10}{'uncovered':>11}")
     kinds = ("killed", "survived", "uncovered")
     for room in sorted({room for room, _ in verdicts}):
         print(f"{room:22}" + "".join(f"{verdicts[room, kind]:10}" for kind in kinds))
     totals = [sum(n for (_, kind), n in verdicts.items() if kind == wanted) for wanted in kinds]
     print(f"{'all':22}" + "".join(f"{total:10}" for total in totals))
-    print("\n".join(told))
 
 
 if __name__ == "__main__":
