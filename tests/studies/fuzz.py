@@ -1,0 +1,333 @@
+"""Damaged input for whatever reads files: what comes of it is a result or px4fuse's own error.
+
+``python tests/studies/fuzz.py --inputs 1000000 --seed 1`` tries so many in all, shared out by what
+each target costs, and prints cases, how many were read and refused, and what escaped: any other
+exception, a warning, or more than :data:`SLOW_S`. ``--pipelines 1000`` takes so many damaged logs
+through all of ``compare`` instead. An escape is printed with the number that makes it again.
+
+A part of it runs in the suite: ``tests/test_fuzz.py``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import random
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+
+TESTS = Path(__file__).resolve().parents[1]
+if str(TESTS) not in sys.path:
+    sys.path.insert(0, str(TESTS))
+
+import mavlink_tools  # noqa: E402
+import ulog_tools  # noqa: E402
+from made_up_fleet import made_up  # noqa: E402
+
+from px4fuse import answers  # noqa: E402
+from px4fuse.analysis import run_or_judge_aids  # noqa: E402
+from px4fuse.assignment.key import Answer, AnswerKey, key_text, read_key  # noqa: E402
+from px4fuse.assignment.roster import read_people, read_roster  # noqa: E402
+from px4fuse.errors import Px4FuseError  # noqa: E402
+from px4fuse.fleet.regressions import read_baseline  # noqa: E402
+from px4fuse.fleet.rows import table_of  # noqa: E402
+from px4fuse.grading.overrides import read_overrides  # noqa: E402
+from px4fuse.grading.rubric import read_rubric, rubric_text  # noqa: E402
+from px4fuse.readers import read_log  # noqa: E402
+from px4fuse.readers.closures import read_closures  # noqa: E402
+from px4fuse.readers.g2o import read_g2o  # noqa: E402
+from px4fuse.readers.position_csv import read_position_csv  # noqa: E402
+from px4fuse.readers.trajectory import read_trajectory  # noqa: E402
+from px4fuse.request import ComparisonRequest  # noqa: E402
+from px4fuse.results.reading import read_results  # noqa: E402
+from px4fuse.trajectory.graph.analysis import analyse_graph  # noqa: E402
+from px4fuse.verification.intake import Refused, read_report  # noqa: E402
+
+REPOSITORY = TESTS.parent
+SLOW_S = 5.0
+# Numbers and words that parsers stumble over
+ODD = (
+    b"nan", b"-inf", b"1e999", b"-1e-400", b"1.8e308", b"0", b"-0", b"", b"9" * 400, b"0x1p3",
+    "١٢".encode(), "−1".encode(), b"1,5", b"1_0", b"\x00", b"\xff\xfe", b"\xef\xbb\xbf", b"#",
+    b'"', b"\r", b"\x1b[2J", "\u202e".encode(), b"true", b"null", b"[" * 300, b"{", b"= = =",
+)  # fmt: skip
+
+
+def mutated(content: bytes, rng: random.Random, *, words: bool) -> bytes:
+    """A few changes of a file: bits, bytes, pieces that go, come twice or swap, odd words, cuts."""
+    data = bytearray(content)
+    for _ in range(rng.choice((1, 1, 1, 2, 3, 8))):
+        size = len(data)
+        if not size:
+            break
+        at, length = rng.randrange(size), min(rng.choice((1, 2, 4, 8, 64, 512)), size)
+        match rng.randrange(9 if words else 7):
+            case 0:
+                data[at] ^= 1 << rng.randrange(8)
+            case 1:
+                data[at : at + length] = rng.randbytes(len(data[at : at + length]))
+            case 2:
+                data[at : at + length] = bytes([rng.choice((0, 255))]) * length
+            case 3:
+                del data[at : at + length]
+            case 4:
+                data[at:at] = data[at : at + length]
+            case 5:
+                del data[at:]
+            case 6:
+                other = rng.randrange(size)
+                piece = bytes(data[other : other + length])
+                data[at : at + length] = piece
+            case _:
+                # in place of a word, so that what stands around it is still right
+                ends = [i for i, byte in enumerate(data) if byte in b" ,;\t\n=:\"'"]
+                if len(ends) > 1:
+                    first = rng.randrange(len(ends) - 1)
+                    data[ends[first] + 1 : ends[first + 1]] = rng.choice(ODD)
+    return bytes(data)
+
+
+@dataclass(frozen=True)
+class Target:
+    """One thing that reads files.
+
+    Attributes
+    ----------
+    name : str
+    seeds : callable
+        Files that it reads, as bytes.
+    read : callable
+        Takes the path of a file with the bytes.
+    end : str
+        Of the file's name.
+    words : bool
+        Whether the format is text.
+    in_suite : int
+        Inputs that the suite tries.
+    weight : float
+        Share of a study's inputs: what is cheap is tried more often.
+    """
+
+    name: str
+    seeds: Callable[[], list[bytes]]
+    read: Callable[[Path], object]
+    end: str
+    words: bool
+    in_suite: int
+    weight: float
+
+
+@dataclass
+class Outcome:
+    """What came of a target's inputs."""
+
+    read: int = 0
+    refused: int = 0
+    escaped: list[str] = field(default_factory=list)
+
+
+@cache
+def _ulogs() -> list[bytes]:
+    return [
+        ulog_tools.make_log(one, 1.0, imu_hz=20.0).encode() for one in ("v1.9", "v1.12", "v1.16")
+    ]
+
+
+@cache
+def _recordings() -> list[bytes]:
+    sent = mavlink_tools.Aisle(seconds=3.0, imu_hz=20.0).record()
+    return [sent.tlog(), sent.raw()]
+
+
+def _report(path: Path) -> object:
+    found = read_report(path.read_bytes(), path.name)
+    if isinstance(found, Refused):
+        raise Px4FuseError(str(found))
+    return found
+
+
+def _graph(path: Path) -> object:
+    return analyse_graph(path.name, read_g2o(path))
+
+
+def _text(*texts: str) -> Callable[[], list[bytes]]:
+    return lambda: [text.encode() for text in texts]
+
+
+_TRACK = "\n".join(f"{i}.5 {i} {i % 3} 0.1 0 0 0.38268343 0.92387953" for i in range(12))
+_EUROC = (
+    "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], "
+    "q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []\n"
+    + "\n".join(f"{i}000000000,{i},{i % 3},0.1,1,0,0,0" for i in range(12))
+)
+_KITTI = "\n".join(f"1 0 0 {i} 0 1 0 {i % 3} 0 0 1 0.5" for i in range(12))
+_POSITIONS = (
+    "time_s,x_m,y_m,z_m,sigma_m\n" + "\n".join(f"{i / 5},{i % 7},0.5,-1,0.1" for i in range(40)),
+    "timestamp_us;north;east;down\n" + "\n".join(f"{i}00000;{i % 7};1,5;-1" for i in range(40)),
+)
+_GRAPH_2D = "\n".join(
+    [*(f"VERTEX_SE2 {i} {i} 0 0" for i in range(6)),
+     *(f"EDGE_SE2 {i} {i + 1} 1 0 0 10 0 0 10 0 10" for i in range(5)),
+     "EDGE_SE2 0 5 5 0.1 0 10 0 0 10 0 10"]
+)  # fmt: skip
+_GRAPH_3D = "\n".join(
+    [*(f"VERTEX_SE3:QUAT {i} {i} 0 0 0 0 0 1" for i in range(5)),
+     *(f"EDGE_SE3:QUAT {i} {i + 1} 1 0 0 0 0 0 1 {' '.join(['9 0 0 0 0 0', '9 0 0 0 0', '9 0 0 0', '9 0 0', '9 0', '9'])}" for i in range(4)),  # noqa: E501
+     f"EDGE_SE3:QUAT 0 4 4 0.1 0 0 0 0 1 {' '.join(['9 0 0 0 0 0', '9 0 0 0 0', '9 0 0 0', '9 0 0', '9 0', '9'])}"]  # noqa: E501
+)  # fmt: skip
+_ROSTER = "id,name,email\ns1,Ada Lovelace,ada@x.org\ns2,山田,y@x.org\n"
+_MOODLE = "Identifier,Full name,ID number,Email address,Grade\nParticipant 7,Ada L,s1,a@x,\n"
+_OVERRIDES = "id,item,points,comment\ns1,total,80,good\ns2,,,see me\n"
+
+
+def _fleet() -> list[bytes]:
+    return [table_of(made_up(3).to_dict("records")).to_csv(index=False).encode()]
+
+
+def _key() -> list[bytes]:
+    people = (Answer("s1", "Ada", "s1.ulg", "0" * 64), Answer("s2", "山田", "s2.ulg", "1" * 64))
+    return [key_text(AnswerKey("aisle", people)).encode()]
+
+
+TARGETS = (
+    Target("ULog", _ulogs, read_log, ".ulg", False, 120, 2.0),
+    Target("MAVLink", _recordings, read_log, ".tlog", False, 120, 2.0),
+    Target("trajectory", _text(_TRACK, _EUROC, _KITTI), read_trajectory, ".txt", True, 1800, 20.0),
+    Target("position file", _text(*_POSITIONS), read_position_csv, ".csv", True, 900, 14.0),
+    Target("g2o", _text(_GRAPH_2D, _GRAPH_3D), read_g2o, ".g2o", True, 1800, 20.0),
+    Target("pose graph", _text(_GRAPH_2D, _GRAPH_3D), _graph, ".g2o", True, 180, 2.0),
+    Target(
+        "closures", _text("# of the corridor\n0.5,12.25,0.1\n5,10\n"), read_closures, ".txt",
+        True, 600, 10.0,
+    ),
+    Target(
+        "answers", lambda: [answers.form_text("a.ulg", "0" * 64).encode()], answers.read_answers,
+        ".toml", True, 900, 8.0,
+    ),
+    Target(
+        "results", lambda: [(REPOSITORY / "reports/aisle_uwb.json").read_bytes()],
+        lambda path: read_results(path.read_bytes()), ".json", True, 100, 4.0,
+    ),
+    Target(
+        "report", lambda: [(REPOSITORY / "reports/aisle_uwb.pdf").read_bytes()], _report, ".pdf",
+        False, 15, 0.6,
+    ),
+    Target("rubric", lambda: [rubric_text().encode()], read_rubric, ".toml", True, 900, 8.0),
+    Target("overrides", _text(_OVERRIDES), read_overrides, ".csv", True, 900, 6.0),
+    Target("roster", _text(_ROSTER, _MOODLE), read_roster, ".csv", True, 900, 6.0),
+    Target("class list", _text(_ROSTER, _MOODLE), read_people, ".csv", True, 900, 6.0),
+    Target("answer key", _key, read_key, ".json", True, 300, 2.0),
+    Target("earlier table", _fleet, read_baseline, ".csv", True, 120, 1.0),
+)  # fmt: skip
+
+
+def attempt(target: Target, content: bytes, path: Path, outcome: Outcome, label: str) -> None:
+    """Read one input, and count what came of it."""
+    path.write_bytes(content)
+    begin = time.process_time()
+    printed = io.StringIO()
+    try:
+        with warnings.catch_warnings(), contextlib.redirect_stdout(printed):
+            warnings.simplefilter("error")
+            target.read(path)
+        outcome.read += 1
+    except Px4FuseError as error:
+        outcome.refused += 1
+        if "\n" in str(error):
+            outcome.escaped.append(f"{label}: more than one line: {error!r}")
+    except Exception as error:  # noqa: BLE001 - whatever it is, it escaped
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        own = [
+            one for one in traceback.extract_tb(error.__traceback__) if "px4fuse/" in one.filename
+        ]
+        at = (own or [last])[-1]
+        outcome.escaped.append(
+            f"{label}: {type(error).__name__}: {str(error)[:120]} "
+            f"({Path(at.filename).name}:{at.lineno} {at.name})"
+        )
+    if printed.getvalue():
+        outcome.escaped.append(f"{label}: it printed {printed.getvalue()[:80]!r}")
+    if (took := time.process_time() - begin) > SLOW_S:
+        outcome.escaped.append(f"{label}: took {took:.1f} s of CPU")
+
+
+def tried(target: Target, count: int, seed: int, folder: Path) -> Outcome:
+    """What comes of so many inputs of a target; the same for the same seed."""
+    outcome, seeds = Outcome(), target.seeds()
+    for number in range(count):
+        rng = random.Random(f"{target.name} {seed} {number}")
+        content = mutated(rng.choice(seeds), rng, words=target.words)
+        path = folder / f"input{target.end}"
+        attempt(target, content, path, outcome, f"{target.name} {seed} {number}")
+    return outcome
+
+
+def pipeline(path: Path) -> object:
+    """All of ``compare`` but the drawing: findings and results of a log."""
+    from px4fuse.analysis import AidsAlone
+    from px4fuse.findings import find, find_aids
+    from px4fuse.results.build import aids_results, results
+    from px4fuse.results.contract import to_json
+    from px4fuse.results.model import Student
+
+    request = ComparisonRequest(log=str(path))
+    found = run_or_judge_aids(request)
+    student = Student()
+    if isinstance(found, AidsAlone):
+        return to_json(aids_results(request, found, find_aids(found.aids), student, ""))
+    return to_json(results(request, found, find(found), student, ""))
+
+
+def main() -> None:
+    """Try, and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--inputs", type=int, default=1_000_000)
+    parser.add_argument("--pipelines", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", default="")
+    given = parser.parse_args()
+    targets = [one for one in TARGETS if given.only in one.name]
+    weights = sum(one.weight for one in targets)
+    jobs = [(one, round(given.inputs * one.weight / weights)) for one in targets]
+    if given.pipelines:
+        logs = Target("compare, ULog", _flights, pipeline, ".ulg", False, 0, 1.0)
+        sent = Target("compare, MAVLink", _flown, pipeline, ".tlog", False, 0, 1.0)
+        jobs = [
+            (logs, given.pipelines * 2 // 3),
+            (sent, given.pipelines - given.pipelines * 2 // 3),
+        ]
+    print(f"{'target':20}{'inputs':>10}{'read':>10}{'refused':>10}{'escaped':>10}{'s':>8}")
+    with tempfile.TemporaryDirectory() as folder:
+        for target, count in jobs:
+            begin = time.monotonic()
+            outcome = tried(target, count, given.seed, Path(folder))
+            took = time.monotonic() - begin
+            numbers = (count, outcome.read, outcome.refused, len(outcome.escaped))
+            print(f"{target.name:20}{''.join(f'{n:10}' for n in numbers)}{took:8.0f}", flush=True)
+            kinds = Counter(escape.split(": ", 1)[1] for escape in outcome.escaped)
+            first = {e.split(": ", 1)[1]: e for e in reversed(outcome.escaped)}
+            for kind, times in kinds.most_common(20):
+                print(f"    {times} times, first {first[kind]}", flush=True)
+
+
+@cache
+def _flights() -> list[bytes]:
+    return [ulog_tools.make_log(one, 10.0).encode() for one in ("v1.12", "v1.14", "v1.16")]
+
+
+@cache
+def _flown() -> list[bytes]:
+    return [mavlink_tools.Aisle(seconds=15.0).record().tlog()]
+
+
+if __name__ == "__main__":
+    main()
