@@ -16,6 +16,7 @@ from mavlink_tools import (
     AUTOPILOT,
     COMPANION,
     MESSAGES,
+    Aisle,
     Heard,
     Recorder,
     frame,
@@ -281,6 +282,17 @@ def test_frames_of_a_known_message_that_were_changed_on_the_way_are_damage(read)
     frames = read(b"".join(parts))
     assert dict(frames.passed_over) == {}
     assert frames.bad_bytes == 2 * len(parts[0])
+
+
+@pytest.mark.parametrize(("share", "said"), [(0.002, False), (0.005, True)])
+def test_half_a_hundredth_that_is_no_frame_is_damage(tmp_path, share: float, said: bool):
+    content = Aisle(seconds=40.0).record().raw()
+    junk = b"\x00" * round(share * len(content) + 2 * said * mavlink_frames.LONGEST_FRAME)
+    at = len(content) // 2
+    (tmp_path / "made.tlog").write_bytes(content[:at] + junk + content[at:])
+    log = read_log(tmp_path / "made.tlog").log
+    assert any("belong to no whole MAVLink frame" in text for text in log.damage) is said
+    assert log.bytes - log.bytes_read >= len(junk)
 
 
 @pytest.mark.parametrize("junk", [b"\x00" * 50, b"\xfd" * 50, b"\xfe" * 300, bytes(range(256))])
