@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_tools import contents, run_main
+from cli_tools import contents, run, run_main
 from click.testing import CliRunner
 from ulog_tools import ev_error, ev_stamps, make_log, position
 
@@ -79,6 +79,19 @@ def test_a_name_that_no_font_has_is_said_before_the_report(
     (before,) = told
     assert (f"No font of this machine has the Chinese characters {name}" in before) == said
     assert ("Install a font that has them" in before) == said
+
+
+@pytest.mark.usefixtures("no_drawing")
+@pytest.mark.parametrize(
+    "command",
+    ["compare l.ulg -o \x1b[31m.pdf", "extract l.ulg -o \x1b[31m", "simulate -o \x1b[31m.ulg",
+     "answers l.ulg -o \u202e.toml"],
+)  # fmt: skip
+def test_what_was_written_is_told_without_acting_on_the_terminal(desk, command: str) -> None:
+    told = run(*command.split(" "))
+    assert told.exit_code == 0
+    assert not {"\x1b", "\u202e"} & set(told.output)
+    assert any({"\x1b", "\u202e"} & set(path.name) for path in desk.iterdir())
 
 
 @pytest.mark.usefixtures("no_drawing")

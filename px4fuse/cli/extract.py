@@ -12,7 +12,7 @@ import click
 
 from px4fuse.cli.inputs import Named, comparison_request, path_option, recording_options
 from px4fuse.cli.outputs import write_outputs
-from px4fuse.errors import OutputError
+from px4fuse.errors import OutputError, on_one_line
 from px4fuse.reading import read_text
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def extract(log: Path, folder: Path, kind: str, **given: Any) -> None:
     contents[folder / "data_dictionary.csv"] = _csv(extraction.data_dictionary(flight))
     contents[folder / "flight.json"] = to_json(extraction.description(flight)).encode()
     write_outputs(contents)
-    click.echo(f"Wrote to {folder}:")
+    click.echo(f"Wrote to {on_one_line(str(folder))}:")
     for name, table in tables.items():
         click.echo(f"  {f'{name}.{kind}':44} {len(table):8} rows")
     click.echo("  data_dictionary.csv, flight.json")
@@ -74,7 +74,7 @@ def extract(log: Path, folder: Path, kind: str, **given: Any) -> None:
     others = {path for path in folder.glob(f"*.{kind}") if path not in contents}
     if others:
         names = ", ".join(sorted(path.name for path in others))
-        click.echo(f"Already there and not of this run: {names}")
+        click.echo(on_one_line(f"Already there and not of this run: {names}"))
 
 
 def _refuse_mixture(folder: Path, sha256: str) -> None:

@@ -11,7 +11,7 @@ from typing import IO, TYPE_CHECKING, Any, Protocol
 
 import click
 
-from px4fuse.errors import OutputError, ResultsError
+from px4fuse.errors import OutputError, ResultsError, on_one_line
 from px4fuse.writing import STANDARD_OUTPUT, write_all
 
 if TYPE_CHECKING:
@@ -225,7 +225,7 @@ def write_new(path: Path, content: bytes) -> None:
     if path.exists():
         raise OutputError(f"{path}: exists already; it was not overwritten. Give another name.")
     write_outputs({path: content})
-    click.echo(f"Wrote    {path}")
+    click.echo(f"Wrote    {on_one_line(str(path))}")
 
 
 def check_targets(targets: Iterable[Path | None]) -> None:

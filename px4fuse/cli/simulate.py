@@ -13,7 +13,7 @@ import click
 from px4fuse.cli.inputs import path_option, typed_parameters
 from px4fuse.cli.outputs import check_targets, progress, terminal, write_outputs
 from px4fuse.cli.quantity import TypedQuantity
-from px4fuse.errors import OutputError, SettingsError
+from px4fuse.errors import OutputError, SettingsError, on_one_line
 from px4fuse.reading import read_text
 from px4fuse.simulation.mistakes import MISTAKES, as_typed, made, parse
 from px4fuse.simulation.scenario import KINDS, YAWS, Scenario
@@ -212,9 +212,9 @@ def simulate(
     write_outputs(contents)
     for line in _summary(simulation):
         click.echo(line)
-    click.echo(f"Log       {output}")
+    click.echo(on_one_line(f"Log       {output}"))
     if answer_path is not None:
-        click.echo(f"Answer    {answer_path} (not for students)")
+        click.echo(on_one_line(f"Answer    {answer_path} (not for students)"))
 
 
 def _check_options(assignment: Path | None) -> None:

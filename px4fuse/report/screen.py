@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from px4fuse.errors import on_one_line
 from px4fuse.report.page import Block
 from px4fuse.report.style import GOOD, MUTED, SEVERITY_COLOURS
 from px4fuse.request import (
@@ -163,7 +164,7 @@ def print_command(console: Console, command: str, label: str = "") -> None:
 
 def print_file(console: Console, label: str, path: object) -> None:
     """Print where something was written, on one line."""
-    console.print(Text(f"{label:{INDENT}}{path}", "bold"), soft_wrap=True)
+    console.print(Text(f"{label:{INDENT}}{on_one_line(str(path))}", "bold"), soft_wrap=True)
 
 
 def plain_table(*heads: tuple[str, str]) -> Table:
