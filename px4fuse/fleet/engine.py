@@ -15,7 +15,7 @@ from px4fuse.errors import LogError, Px4FuseError, SettingsError
 from px4fuse.results.reading import one_line
 
 if TYPE_CHECKING:
-    from distributed import Client, Future
+    from distributed import Client, Future, LocalCluster
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -29,6 +29,8 @@ RESTART_S = 15.0
 TICK_S = 1.0
 # For one result to come from its worker, before the others are looked at
 FETCH_S = 10.0
+# Of a cluster of this computer, before it is given up
+STARTS = 3
 # Of the workers that had a job: another log, or another program, may have ended one or two
 ENDS = 3
 _CONFIG = {
@@ -96,7 +98,8 @@ def connected(
     try:
         import dask  # noqa: PLC0415 - of the extra `batch`
         from dask.utils import parse_bytes  # noqa: PLC0415
-        from distributed import Client, LocalCluster, default_client  # noqa: PLC0415
+        from distributed import Client, default_client  # noqa: PLC0415
+        from distributed.utils import silence_logging_cmgr  # noqa: PLC0415
     except ImportError as error:
         raise SettingsError(
             "many logs require Dask", 'Run pip install "px4fuse[batch]".'
@@ -115,7 +118,8 @@ def connected(
                 f"({one_line(str(error), 120)})",
                 "Start one with: dask scheduler",
             ) from error
-        with client, client.as_current():
+        # a scheduler that goes is said here, in one line: Dask would print its tracebacks
+        with silence_logging_cmgr(logging.CRITICAL), client, client.as_current():
             _check(client, scheduler)
             yield client
         return
@@ -129,7 +133,24 @@ def connected(
         return
     with (
         dask.config.set(_CONFIG),
-        LocalCluster(
+        _local_cluster(workers, limit) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client
+
+
+def _local_cluster(workers: int | None, limit: str | int, tries: int = STARTS) -> LocalCluster:
+    """Workers of this computer; tried again where one ends while it starts.
+
+    Raises
+    ------
+    Px4FuseError
+        They do not start.
+    """
+    from distributed import LocalCluster  # noqa: PLC0415
+
+    try:
+        return LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
             memory_limit=limit,
@@ -138,10 +159,14 @@ def connected(
             scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
             preload=["px4fuse.fleet.job"],
             silence_logs=logging.CRITICAL,
-        ) as cluster,
-        Client(cluster) as client,
-    ):
-        yield client
+        )
+    except RuntimeError as error:
+        if tries > 1:
+            return _local_cluster(workers, limit, tries - 1)
+        raise Px4FuseError(
+            f"the workers do not start ({one_line(str(error), 120)})",
+            "Give them more memory (--memory), or use fewer (--workers).",
+        ) from error
 
 
 def _check(client: Client, address: str) -> None:
