@@ -158,7 +158,7 @@ class AidsAlone:
 
 
 def run_or_judge_aids(
-    request: ComparisonRequest, progress: Progress = silent
+    request: ComparisonRequest, progress: Progress = silent, flight: Flight | None = None
 ) -> Analysis | AidsAlone:
     """As :func:`run`; without a position source the aids of EKF2 alone.
 
@@ -167,7 +167,7 @@ def run_or_judge_aids(
     LogError, MissingDataError, SettingsError
         As of :func:`run`; the flight has neither a position nor aids that can be judged.
     """
-    flight = read_flight(request, progress)
+    flight = flight or read_flight(request, progress)
     given = request.position_source is not None
     if given or any(track.origin.automatic for track in flight.positions):
         return run(request, progress, flight)

@@ -161,6 +161,7 @@ def test_logs_without_a_position_are_not_judged_but_known(shared_logs, client):
     assert row["firmware"] == "PX4 v1.16.1"
     assert row["duration_s"] > 10
     assert "--position-source vehicle_gps_position" in row["remedy"]
+    assert row["aids"].startswith("gnss_pos variance overstated;gnss_vel variance overstated;")
 
 
 # ------------------------------------------------------------------ resuming

@@ -14,7 +14,7 @@ import msgspec
 
 from px4fuse.errors import LogError, MissingDataError, Px4FuseError, SettingsError
 from px4fuse.fleet.logs import CHANGED, local_file
-from px4fuse.fleet.rows import FAILED, NOT_JUDGED, Row, log_columns, rows_of
+from px4fuse.fleet.rows import FAILED, NOT_JUDGED, Row, log_columns, rows_of, what_was_found
 from px4fuse.reading import files_by_sha256, max_log_bytes
 from px4fuse.request import ComparisonRequest, command_line, with_options
 
@@ -125,8 +125,8 @@ def refused(error: Px4FuseError, status: str, name: str = "") -> Row:
 
 def _compared(job: Job, path: Path, sha256: str) -> Outcome:
     # only workers need all of it
-    from px4fuse.analysis import read_flight, run  # noqa: PLC0415
-    from px4fuse.findings import find  # noqa: PLC0415
+    from px4fuse.analysis import AidsAlone, read_flight, run_or_judge_aids  # noqa: PLC0415
+    from px4fuse.findings import find, find_aids  # noqa: PLC0415
     from px4fuse.results.build import log_part, results  # noqa: PLC0415
     from px4fuse.results.contract import to_json  # noqa: PLC0415
     from px4fuse.results.model import Student  # noqa: PLC0415
@@ -136,7 +136,10 @@ def _compared(job: Job, path: Path, sha256: str) -> Outcome:
     try:
         flight = read_flight(request)
         known |= log_columns(log_part(flight))
-        analysis, command = run(request, flight=flight), command_line(request)
+        analysis, command = run_or_judge_aids(request, flight=flight), command_line(request)
+        if isinstance(analysis, AidsAlone):
+            known |= what_was_found(find_aids(analysis.aids), analysis.aids)
+            raise MissingDataError(analysis.lacking.reason, analysis.lacking.remedy)
         findings = find(analysis)
         found = results(request, analysis, findings, Student(), command)
         text, report = to_json(found), b""

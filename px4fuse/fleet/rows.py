@@ -8,6 +8,8 @@ from typing import Any
 
 import pandas as pd
 
+from px4fuse.ekf2.aids import AidResult
+from px4fuse.findings import Finding
 from px4fuse.fleet.measures import at
 from px4fuse.record import Unavailable
 from px4fuse.results.comparison import Log
@@ -56,7 +58,7 @@ PLACES = {
     "clock_offset_high_s": "clock.interval_s.1",
     "rejected_share": "axes.{axis}.rejected_share",
     "model_correlation": "ekf2_replay.agreement.{axis}.innovation_correlation",
-    **dict.fromkeys(("story", "findings", "results", "report", "change"), ""),
+    **dict.fromkeys(("aids", "story", "findings", "results", "report", "change"), ""),
 }
 _NUMBERS = ("_m", "_s", "_s2", "_hz", "_mean", "_factor", "_share", "_correlation")
 #: Types of the columns; absent numbers are NA, absent texts are empty
@@ -73,12 +75,8 @@ def rows_of(found: ComparisonResults) -> list[Row]:
     ``variance_factor`` in the results. SIGMA_Z and SIGMA_A are what the data ask for, north and
     east together. The clock offset is there where it is determinable.
     """
-    causes = [one for one in found.findings if one.caused_by is None]
-    common = log_columns(found.log) | {
-        "story": "\n".join(found.story),
-        "findings": BETWEEN_FINDINGS.join(one.id for one in causes),
-        "severities": sorted({one.severity for one in causes}),
-    }
+    common = log_columns(found.log) | what_was_found(found.findings, found.aids)
+    common["story"] = "\n".join(found.story)
     clock = bool(at(found, "clock.determinable"))
     rows = []
     for name, axis in found.axes.items():
@@ -95,6 +93,17 @@ def rows_of(found: ComparisonResults) -> list[Row]:
                 row[column] = at(found, place.format(axis=name, tuned=tuned))
         rows.append(row)
     return rows
+
+
+def what_was_found(findings: Iterable[Finding], aids: Mapping[str, AidResult]) -> Row:
+    """Causes among the findings, and the verdict on each aid that EKF2 fused."""
+    causes = [one for one in findings if one.caused_by is None]
+    fused = [f"{name} {aid.verdict}" for name, aid in aids.items() if aid.verdict != "idle"]
+    return {
+        "aids": BETWEEN_FINDINGS.join(fused),
+        "findings": BETWEEN_FINDINGS.join(one.id for one in causes),
+        "severities": sorted({one.severity for one in causes}),
+    }
 
 
 def log_columns(log: Log) -> Row:
