@@ -199,10 +199,10 @@ def _key() -> list[bytes]:
 
 
 TARGETS = (
-    Target("ULog", _ulogs, read_log, ".ulg", False, 120, 2.0),
-    Target("MAVLink", _recordings, read_log, ".tlog", False, 120, 2.0),
+    Target("ULog", _ulogs, read_log, ".ulg", False, 120, 0.5),
+    Target("MAVLink", _recordings, read_log, ".tlog", False, 120, 0.5),
     Target("trajectory", _text(_TRACK, _EUROC, _KITTI), read_trajectory, ".txt", True, 1800, 20.0),
-    Target("position file", _text(*_POSITIONS), read_position_csv, ".csv", True, 900, 14.0),
+    Target("position file", _text(*_POSITIONS), read_position_csv, ".csv", True, 900, 5.0),
     Target("g2o", _text(_GRAPH_2D, _GRAPH_3D), read_g2o, ".g2o", True, 1800, 20.0),
     Target("pose graph", _text(_GRAPH_2D, _GRAPH_3D), _graph, ".g2o", True, 180, 2.0),
     Target(
@@ -215,11 +215,11 @@ TARGETS = (
     ),
     Target(
         "results", lambda: [(REPOSITORY / "reports/aisle_uwb.json").read_bytes()],
-        lambda path: read_results(path.read_bytes()), ".json", True, 100, 4.0,
+        lambda path: read_results(path.read_bytes()), ".json", True, 100, 2.0,
     ),
     Target(
         "report", lambda: [(REPOSITORY / "reports/aisle_uwb.pdf").read_bytes()], _report, ".pdf",
-        False, 15, 0.6,
+        False, 15, 0.2,
     ),
     Target("rubric", lambda: [rubric_text().encode()], read_rubric, ".toml", True, 900, 8.0),
     Target("overrides", _text(_OVERRIDES), read_overrides, ".csv", True, 900, 6.0),
