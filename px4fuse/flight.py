@@ -260,8 +260,9 @@ class AidLog:
     samples : DataFrame
         By time of measurement, for each axis: ``innovation_<axis>`` (measurement minus prediction)
         and ``variance_<axis>`` (S); where the aid has a topic of its own also ``noise_<axis>``
-        (R), ``ratio_<axis>`` (ν²/(gate²·S)), ``fused`` and ``rejected`` (1 or 0). In the aid's
-        unit, variances in its square.
+        (R), ``ratio_<axis>`` (ν²/(gate²·S)), ``fused`` and ``rejected`` (1 or 0), of external
+        vision's position ``observation_<axis>`` as well. In the aid's unit, variances in its
+        square.
     meant : Series or None
         1 while EKF2 means to fuse it, 0 while it does not, a step function; None where the log
         does not tell.

@@ -10,6 +10,7 @@ import pytest
 from exchange import replace
 from flights import Estimator, Imu, Uwb, aisle_flight, unavailable
 from msgspec.structs import asdict
+from pyulog import ULog
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import compare, compare_prepared
@@ -135,9 +136,30 @@ class TestSample:
             stated = truth.position_rmse_m, truth.velocity_rmse_m_s
             assert stated == pytest.approx((rms(position), rms(velocity)))
             variance = sample_flight.ekf2.variance.loc[start:end]
-            error = np.interp(variance.index, position.index, position, np.nan, np.nan)
-            nees = np.nanmean(error**2 / variance[f"{name}_m2"])
-            assert truth.nees_position_mean == pytest.approx(nees)
+            error = np.interp(variance.index, velocity.index, velocity, np.nan, np.nan)
+            nees = np.nanmean(error**2 / variance[f"{name}_m2_s2"])
+            assert truth.nees_velocity_mean == pytest.approx(nees)
+
+    def test_ekf2_claims_its_position_where_it_met_the_measurement(
+        self, sample: Comparison, sample_flight: Flight, sample_log: Path
+    ) -> None:
+        """Published positions lag by the output predictor, whose lag no variance states."""
+        (met,) = ULog(str(sample_log), ["estimator_aid_src_ev_pos"]).data_list
+        at = met.data["timestamp_sample"] * 1e-6 - sample_flight.log.boot_time_s
+        inside = (at >= sample.segment.start_s) & (at <= sample.segment.end_s)
+        true = sample_flight.truth.samples
+        for number, name in enumerate(("north", "east")):
+            observed, state_minus, s, r = (
+                met.data[f"{field}[{number}]"][inside].astype(float)
+                for field in ("observation", "innovation", "innovation_variance",
+                              "observation_variance")
+            )  # fmt: skip
+            error = observed + state_minus - np.interp(at[inside], true.index, true[f"{name}_m"])
+            nees = float(np.mean(error**2 / (s - r)))
+            truth = sample[name].filters["ekf2"].truth
+            assert truth.nees_position_mean == pytest.approx(nees, rel=1e-6)
+            assert 0.6 < nees < 1.1
+            assert truth.position_rmse_m > rms(error)
 
     def test_our_errors_are_those_of_the_prediction_at_ekf2s_times(
         self, sample: Comparison, sample_flight: Flight

@@ -20,7 +20,7 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.model import MODEL_NOTE
 from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.settings import Settings
-from px4fuse.findings import NAMES, Finding, find
+from px4fuse.findings import NAMES, Finding, by_root, find
 from px4fuse.flight import (
     AXIS_NAMES,
     QUATERNION_COLUMNS,
@@ -234,6 +234,7 @@ FAULTS = [
 # Tested where their estimates are
 ELSEWHERE = {
     "accelerometer_bias", "aid_biased", "aid_starved", "aid_understated", "ekf2_ev_delay_wrong",
+    "ekf2_gate_small",
     "ekf2_heading_wrong", "false_loop_closure",
     "loop_closure_doubtful", "loop_drift_understated", "loop_end_assumed", "loop_of_absolute_track",
     "sigma_a_large", "sigma_a_small", "sigma_z_large", "sigma_z_small", "source_clock_changes",
@@ -316,6 +317,28 @@ def test_a_fault_is_named_with_its_evidence_and_no_unrelated_error(fault: Fault)
     assert fault.says in first.message
     errors = {f.id for f in findings if f.severity == "error" and f.caused_by is None}
     assert errors <= {fault.id, FOLLOWS.get(fault.id)}
+
+
+@pytest.mark.parametrize(
+    ("gate", "must"), [(1.0, 0.5340), (1.5, 0.2494), (2.0, 0.0889), (2.8, 0.0102), (3.0, None)]
+)
+def test_a_gate_that_must_reject_is_named_before_what_it_does(
+    gate: float, must: float | None
+) -> None:
+    """Shares as tables of the normal distribution have them, for two axes."""
+    flight = aisle_flight(**ekf2(rejected_share=0.3))
+    first, *others = found(compare(replace(flight, ekf2=replace(flight.ekf2, gate=gate))))
+    if must is None:
+        assert "ekf2_gate_small" not in ids((first, *others))
+        return
+    assert (first.id, first.severity) == ("ekf2_gate_small", "error")
+    assert first.evidence == {"gate": gate, "rejected_by_gate": pytest.approx(must, abs=1e-4)}
+    assert "here it rejected 3" in first.message or "here it rejected 2" in first.message
+    group = by_root((first, *others))[0]
+    assert {"ekf2_rejecting", "ekf2_variance_understated"} <= {one.id for one in group}
+    # a gate that rejects nothing is nobody's mistake
+    quiet = aisle_flight()
+    assert not found(compare(replace(quiet, ekf2=replace(quiet.ekf2, gate=gate))))
 
 
 @pytest.mark.parametrize(

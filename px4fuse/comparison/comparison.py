@@ -25,6 +25,7 @@ from px4fuse.comparison.preparation import Choices, prepare
 from px4fuse.comparison.projection import (
     MIN_COMMON_SAMPLES,
     continuous_state,
+    project_horizon,
     project_innovations,
     project_state,
     project_truth,
@@ -33,7 +34,7 @@ from px4fuse.comparison.projection import (
 from px4fuse.filter.consistency import GATE_SIGMA, HorizontalNis, assess, assess_horizontal
 from px4fuse.filter.kalman import Replay, replay, state_at, variance_at
 from px4fuse.filter.settings import Settings
-from px4fuse.flight import Ekf2, Flight, Unavailable, sample_rate
+from px4fuse.flight import RECORD_NOT_LOGGED, Ekf2, Flight, Unavailable, sample_rate
 
 STATE = ("position_m", "velocity_m_s")
 VARIANCES = ("position_variance_m2", "velocity_variance_m2_s2")
@@ -71,7 +72,9 @@ def compare_prepared(
         state, statement = continuous_state(ekf2, prepared.source, prepared.segment)
         notes += [f"EKF2 {statement}"] if statement else []
         notes += ekf2.notes
-        ekf2 = replace(ekf2, state=state)
+        # where resets are undone, positions of the horizon are in other frames
+        same = state.equals(ekf2.state)
+        ekf2 = ekf2 if same else replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
     progress(", ".join(line.name for line in prepared.lines))
     axes = {
         line.name: _compare_axis(prepared, ekf2, replay(line, prepared.settings))
@@ -93,12 +96,14 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, run: Replay) -
     variance: Frame
     innovations: Frame
     difference: Difference | Unavailable
+    horizon = None
     if isinstance(ekf2, Unavailable):
         state = variance = innovations = difference = ekf2
         times, gate = run.steps.index.to_numpy(), GATE_SIGMA
     else:
         state = project_state(ekf2.state, axis, segment)
         variance = project_variance(ekf2, axis, segment)
+        horizon = project_horizon(ekf2, axis, segment)
         innovations = project_innovations(flight, ekf2, prepared.source, axis, segment)
         difference = _difference(run, state)
         times, gate = state.index.to_numpy(), ekf2.gate
@@ -120,7 +125,9 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, run: Replay) -
         ),
         filters={
             "kf": _summary(updates, run.steps, kf_against_truth(run, truth, times), GATE_SIGMA),
-            "ekf2": _summary(innovations, variance, against_truth(state, variance, truth), gate),
+            "ekf2": _summary(
+                innovations, variance, against_truth(state, variance, truth, horizon), gate
+            ),
         },
         difference=difference,
         rejected_share=float(rejected.mean()) if len(rejected) else None,
@@ -193,8 +200,14 @@ def kf_against_truth(run: Replay, truth: Frame, times: Array) -> AgainstTruth | 
     return against_truth(state, variance, truth)
 
 
-def against_truth(state: Frame, variance: Frame, truth: Frame) -> AgainstTruth | Unavailable:
-    """A filter against the truth along one axis: its errors, and NEES at its variances' times."""
+def against_truth(
+    state: Frame, variance: Frame, truth: Frame, horizon: pd.DataFrame | None = None
+) -> AgainstTruth | Unavailable:
+    """A filter against the truth along one axis: its errors, and NEES at its variances' times.
+
+    ``horizon`` holds positions with the variances that are stated of these very positions, where
+    that is not the state itself.
+    """
     if isinstance(state, Unavailable):
         return state
     if isinstance(truth, Unavailable):
@@ -215,6 +228,11 @@ def against_truth(state: Frame, variance: Frame, truth: Frame) -> AgainstTruth |
         for stated, error in zip(VARIANCES, errors, strict=True)
         if not isinstance(variance, Unavailable)
     }
+    if horizon is not None:
+        true_m = np.interp(horizon.index, truth.index, truth["position_m"], np.nan, np.nan)
+        error = horizon["position_m"].to_numpy() - true_m
+        stated = horizon["position_variance_m2"]
+        nees[VARIANCES[0]] = _nees(horizon.index.to_numpy(), error, stated)
     return AgainstTruth(
         count=len(position),
         position_rmse_m=_rmse(position),

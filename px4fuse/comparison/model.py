@@ -35,7 +35,9 @@ class AgainstTruth(Record, frozen=True, kw_only=True):
     """One filter against ground truth that it has not used.
 
     NEES is per component (1 is consistent); it is strongly autocorrelated within one flight, so
-    no band is stated. None where the variance or the true velocity is not logged.
+    no band is stated. EKF2's is of its position at its fusion horizon, where its variance is
+    stated, as far as that is logged; errors are those of what it publishes. None where the variance
+    or the true velocity is not logged.
     """
 
     count: Count

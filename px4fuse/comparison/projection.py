@@ -12,6 +12,7 @@ from px4fuse.arrays import Array
 from px4fuse.ekf2_parameters import EV_POS
 from px4fuse.filter.signals import AISLE, Axis, Segment, along, within
 from px4fuse.flight import (
+    AXIS_NAMES,
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
     STATE_COLUMNS,
@@ -123,6 +124,36 @@ def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame |
     if projected.empty:
         return Unavailable("EKF2 variances", "no sample in the segment", "Analyse more of the log.")
     return projected
+
+
+def project_horizon(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | None:
+    """EKF2's position (m) at its fusion horizon and the variance that it states of it, or None.
+
+    What is published is that position carried to the present by the output predictor, which lags;
+    the variance says nothing about that. Where EKF2 met external vision, its position before the
+    update is observation minus innovation, and its variance P⁻ = S - R; before v1.16 the log also
+    has its delayed state. EKF2 logs no covariance between axes, so none is added.
+    """
+    weights = dict(zip(AXIS_NAMES, axis.direction.tolist(), strict=True))
+    aid = ekf2.aids.get("ev_hgt" if axis.name == "down" else "ev_pos")
+    if aid is not None and f"observation_{aid.axes[0]}" in aid.samples:
+        samples = within(aid.samples, segment)
+        position, variance = (
+            sum(weights[name] ** power * (samples[f"{a}_{name}"] - samples[f"{b}_{name}"])
+                for name in aid.axes)
+            for power, a, b in ((1, "observation", "innovation"), (2, "variance", "noise"))
+        )  # fmt: skip
+        found = pd.DataFrame({"position_m": position, "position_variance_m2": variance})
+        return found[found["position_variance_m2"] > 0.0]
+    if isinstance(ekf2.record, Unavailable):
+        return None
+    delayed = within(ekf2.record.delayed, segment)
+    found = pd.DataFrame(
+        {"position_m": along(delayed, POSITION_COLUMNS, axis.direction),
+         "position_variance_m2": along(delayed, POSITION_VARIANCE_COLUMNS, axis.direction**2)},
+        index=delayed.index,
+    ).dropna()  # fmt: skip
+    return found if len(found) else None
 
 
 def project_innovations(

@@ -46,6 +46,7 @@ NAMES: Mapping[str, str] = {
     "kf_variance_understated": "a filter variance that is too small",
     "ekf2_variance_overstated": "EKF2 that is too cautious about its variance",
     "ekf2_variance_understated": "EKF2 that is too sure: its variance is too small",
+    "ekf2_gate_small": "a gate of EKF2 that rejects good positions",
     "ekf2_rejecting": "EKF2 that rejects good measurements",
     "ekf2_ev_delay_wrong": "a delay set in EKF2 that is not that of the positions",
     "aid_understated": "an aid that EKF2 trusts too much",
@@ -99,6 +100,11 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
         "ekf2_rejecting",
     ),
     "errors_larger_than_claimed": _OVERSTATED,
+    # what is rejected is not corrected: EKF2 drifts, resets, and its innovations grow
+    "ekf2_gate_small": (
+        "ekf2_rejecting", "ekf2_resets", "ekf2_fusion_interrupted", "ekf2_variance_understated",
+        "errors_larger_than_claimed",
+    ),
     "source_may_drift": _OVERSTATED,
     "ekf2_ev_delay_wrong": ("errors_larger_than_claimed",),
     "source_smoothed": (

@@ -1,12 +1,14 @@
-"""EKF2's gate threw measurements away."""
+"""EKF2's gate threw measurements away, or is so narrow that it must."""
 
 from __future__ import annotations
+
+import math
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.ekf2_parameters import EV_POS, PARAMETERS
-from px4fuse.findings.model import Found, finding, moments
+from px4fuse.findings.model import Finding, Found, finding, moments
 from px4fuse.flight import Ekf2, Unavailable
 
 REJECTED_SHARE_WARNING = 0.01  # of the innovations; 5 σ rejects 6e-7 when consistent
@@ -20,6 +22,32 @@ OUTLIERS = "Remove the outliers (line of sight, anchor survey)."
 
 def detect(analysis: Analysis) -> Found:
     """A rejection is of the horizontal vector, so one horizontal axis speaks for all."""
+    rejections = tuple(_rejections(analysis))
+    yield from _narrow_gate(analysis, rejections)
+    yield from rejections
+
+
+def _narrow_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> Found:
+    """The gate by itself: what it rejects of a source that is as good as EKF2 expects."""
+    ekf2 = analysis.flight.ekf2
+    if isinstance(ekf2, Ekf2) and rejections:
+        # both axes must be inside, each normal: erf(gate/√2)²
+        must = 1.0 - math.erf(ekf2.gate / math.sqrt(2.0)) ** 2
+        if must >= REJECTED_SHARE_WARNING:
+            usual = PARAMETERS[EV_POS.gate].default
+            yield finding(
+                rejections[0].severity,
+                "ekf2_gate_small",
+                f"{EV_POS.gate} is {ekf2.gate:g}: such a gate rejects {must:.0%} of the samples of "
+                "a source that is as good as EKF2 expects",
+                f"; here it rejected {rejections[0].evidence['rejected_share']:.0%}, and what it "
+                "kept pulled EKF2 less than it should.",
+                f"Set {EV_POS.gate} to {usual:g}, PX4's default, and judge the rest of it then.",
+                {"gate": ekf2.gate, "rejected_by_gate": must},
+            )
+
+
+def _rejections(analysis: Analysis) -> Found:
     ekf2, axes = analysis.flight.ekf2, analysis.axes.values()
     horizontal = [result for result in axes if result.axis.name != "down"][:1]
     for result in (*horizontal, *(result for result in axes if result.axis.name == "down")):

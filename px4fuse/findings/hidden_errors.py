@@ -56,7 +56,8 @@ class Hidden:
     @property
     def claimed_m(self) -> float:
         """Standard deviation that the filter states."""
-        return self.rmse_m / float(np.sqrt(self.nees))
+        stated: float | None = getattr(self.statement, "sigma_p_median_m", None)
+        return stated or self.rmse_m / float(np.sqrt(self.nees))
 
 
 def hidden_errors(comparison: Comparison) -> list[Hidden]:

@@ -93,6 +93,8 @@ SOURCES: Mapping[str, AidSource] = {
 }  # fmt: skip
 # Releases whose rows say "fused" whether it was or not (v1.15, v1.16): the control bit tells
 FLAG_ALWAYS_SET = ("gravity", "drag")
+# Their observation is a position in EKF2's frame (that of GNSS is latitude and longitude)
+WITH_OBSERVATION = ("ev_pos", "ev_hgt")
 STATUS_FLAGS, STATUS = "estimator_status_flags", "estimator_status"
 
 

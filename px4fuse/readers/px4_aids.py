@@ -20,6 +20,7 @@ from px4fuse.readers.px4_aid_sources import (
     SOURCES,
     STATUS,
     STATUS_FLAGS,
+    WITH_OBSERVATION,
     AidSource,
 )
 from px4fuse.readers.px4_innovations import JOIN_TOLERANCE_S
@@ -71,6 +72,7 @@ def _own_topic(
         f"{ours}_{axis}": px4 + element
         for axis, element in zip(source.axes, at, strict=True)
         for ours, px4 in (
+            *((("observation", "observation"),) if name in WITH_OBSERVATION else ()),
             ("innovation", "innovation"), ("variance", "innovation_variance"),
             ("noise", "observation_variance"), ("ratio", "test_ratio"),
         )
