@@ -488,12 +488,28 @@ def test_without_truth_both_are_judged_by_their_innovations() -> None:
         )),
     ],
 )  # fmt: skip
-def test_the_setting_that_is_further_off_is_blamed_and_only_for_what_it_does(
-    nis: float, noises: Any, since: str | None
+def test_a_setting_is_blamed_only_for_what_it_does(
+    nis: float, noises: Any, since: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ours = along(1.0, nis, ekf2_truth=against_truth(1.0), kf_truth=against_truth(1.0))
-    first, *_ = story(flight_of(ours, tuning=tuned(*noises)), ())
-    assert first.endswith(f", since {since} that this flight asks for.") is (since is not None)
+    one = flight_of(ours, tuning=tuned(*noises), settings=CHOSEN)
+
+    def told(explained: float) -> str:
+        """With replays that explain so much by the one setting, and nothing by the other."""
+
+        def after(_: Any, settings: Settings) -> float:
+            changed = "SIGMA_A" if settings.sigma_a_m_s2 != 1.0 else "SIGMA_Z"
+            share = explained if since and since.startswith(changed) else 0.0
+            return float(nis ** (1.0 - share))
+
+        monkeypatch.setattr(telling, "nis_with", after)
+        return story(one, ())[0]
+
+    said = f", since {since} that this flight asks for (replayed: mean NIS {nis:g} → 1)."
+    assert told(1.0).endswith(said) is (since is not None)
+    assert ("since" in told(0.62)) is (since is not None)
+    for too_little_or_beyond in (0.0, 0.45, -1.0, 1.6, 2.7):
+        assert "since" not in told(too_little_or_beyond)
     for silent in (flight_of(ours), flight_of(ours, tuning=tuned(*noises), source=ODOMETRY)):
         assert "since" not in story(silent, ())[0]
 

@@ -7,6 +7,8 @@ why EKF2 differs.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,18 +17,22 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import AgainstTruth, AxisComparison, Difference, FilterName
 from px4fuse.comparison.why import the
 from px4fuse.ekf2.walk import Why
-from px4fuse.filter.kalman import state_at
+from px4fuse.filter.kalman import replay, state_at
+from px4fuse.filter.settings import Settings
 from px4fuse.findings.causes import SETTINGS, VARIANCES
 from px4fuse.findings.hidden_errors import hidden_errors
 from px4fuse.findings.model import Finding
 from px4fuse.findings.sigma import tuned_for
 from px4fuse.flight import Unavailable
 from px4fuse.loop.loop import Loop
-from px4fuse.plain import excess_words, length_words
+from px4fuse.plain import excess_words, length_words, number_words
 
 MOST_SENTENCES = 3
 # What the first sentence tells already
 TOLD_FIRST = VARIANCES | {"errors_larger_than_claimed", "ekf2_unavailable"}
+# Share of the logarithm of the mean NIS that a cause explains
+EXPLAINS = 0.5
+CLAIMED = "claimed"
 # What weighs less than why EKF2 differs
 EFFECTS = frozenset({"ekf2_resets", "ekf2_rejecting", "ekf2_fusion_interrupted"})
 
@@ -67,6 +73,8 @@ def _verdict(analysis: Analysis, since: str) -> str:
     (ours_off, ours), (ekf2_off, ekf2) = (
         (_error(result, owner), _knows(analysis, result, owner)) for owner in ("kf", "ekf2")
     )
+    if ours.startswith(CLAIMED):  # an error beyond a claim has other causes than the size of S
+        since = ""
     our_filter = f"our filter was {ours_off}{ours}{since}"
     if isinstance(result.ekf2_state, Unavailable):
         return f"{along} {our_filter}; there is no EKF2 beside it: {result.ekf2_state.reason}."
@@ -96,7 +104,7 @@ def _knows(analysis: Analysis, result: AxisComparison, owner: FilterName) -> str
     """Whether a filter's variance is what its innovations, and the truth, show."""
     for hidden in hidden_errors(analysis):
         if hidden.owner == owner and hidden.axis == result.axis.name:
-            return f"claimed {length_words(hidden.claimed_m)}"
+            return f"{CLAIMED} {length_words(hidden.claimed_m)}"
     statement = result.filters[owner]
     if isinstance(statement, Unavailable):
         return "cannot be judged by innovations, since the log has none or too few"
@@ -109,23 +117,41 @@ def _knows(analysis: Analysis, result: AxisComparison, owner: FilterName) -> str
 
 
 def _since(analysis: Analysis) -> str:
-    """The setting that makes our variance too large or too small, where the data say so."""
+    """The setting that makes our variance too large or too small.
+
+    Where the data ask for another value, and a replay with it explains at least half of how far the
+    mean NIS is from 1 (by its logarithm), without going as far to the other side.
+    """
     settings, statement = analysis.settings, analysis.main.filters["kf"]
     if isinstance(statement, Unavailable) or statement.verdict == "consistent":
         return ""
     tuned, over = tuned_for(analysis, analysis.main.axis.name), statement.variance_factor > 1.0
     if analysis.source.origin.may_drift or tuned is None:
         return ""
-    off = []
-    for label, unit, chosen, noise in (
-        ("SIGMA_A", "m/s²", settings.sigma_a_m_s2, tuned.filter_sigma_a),
-        ("SIGMA_Z", "m", settings.sigma_z_m, tuned.sigma_z),
-    ):
+    causes, before = [], statement.nis_mean
+    for field, unit, noise in (
+        ("sigma_a_m_s2", "m/s²", tuned.filter_sigma_a), ("sigma_z_m", "m", tuned.sigma_z)
+    ):  # fmt: skip
+        chosen = getattr(settings, field)
         end, asked = (noise.high, noise.value or noise.high) if over else (noise.low, noise.value)
         if end is not None and asked and (chosen > end if over else chosen < end):
-            said = f"{label} {chosen:g} is {'larger' if over else 'smaller'} than the {asked:.2g}"
-            off.append((abs(np.log(chosen / asked)), f"{said} {unit}"))
-    return f", since {max(off)[1]} that this flight asks for" if off else ""
+            changed: dict[str, Any] = {field: asked}
+            after = nis_with(analysis, replace(settings, **changed))
+            explained = 1.0 - float(np.log(after) / np.log(before))
+            if EXPLAINS <= explained <= 2.0 - EXPLAINS:
+                label, side = field[:7].upper(), "larger" if over else "smaller"
+                causes.append((
+                    explained, f", since {label} {chosen:g} is {side} than the {asked:.2g} {unit} "
+                    f"that this flight asks for (replayed: mean NIS {number_words(before, 2)} → "
+                    f"{number_words(after, 2)})",
+                ))  # fmt: skip
+    return min(causes, key=lambda cause: abs(cause[0] - 1.0))[1] if causes else ""
+
+
+def nis_with(analysis: Analysis, settings: Settings) -> float:
+    """Mean NIS of our filter along the axis of the lab with other settings, by a replay."""
+    updates = replay(analysis.main.axis, settings).updates
+    return float(np.mean(updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]))
 
 
 def _cause(analysis: Analysis, finding: Finding) -> str:
