@@ -13,7 +13,7 @@ from page_tools import axes_of, words
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.why import why_ekf2_differs
+from px4fuse.comparison.why import why_ekf2_differs, with_words
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.walk import SAMPLES, STEPS, Why
 from px4fuse.filter.clock import ClockOffset
@@ -254,3 +254,27 @@ def test_the_story_leaves_wrong_stamps_to_their_finding(sample: Analysis) -> Non
     assert told[1:] == (late.cause,)
     assert late.sentences[1].startswith(late.cause.removesuffix("."))
     assert "; most at" not in late.cause
+
+
+@pytest.mark.parametrize(
+    ("share", "weight", "words"),
+    [
+        (0.47, "The largest part", "47% of the mean square"),
+        (0.5, "Most", "50% of the mean square"),
+        (1.0, "Most", "100% of the mean square"),
+        (1.4, "Most", "all of the mean square and more, which other changes take back"),
+    ],
+)
+def test_most_is_at_least_half_and_no_share_above_all(
+    sample: Analysis, share: float, weight: str, words: str
+) -> None:
+    why = of(sample)
+    whole, names = why.position_mean_square_m2, [step.name for step in why.steps]
+    parts = [share * whole, *[0.001 * whole] * (len(names) - 1)]
+    steps = tuple(
+        replace(step, position_mean_square_m2=part)
+        for step, part in zip(why.steps, parts, strict=True)
+    )
+    told = with_words("aisle", replace(why, steps=steps), sample, model_of(sample), None, None)
+    assert told.cause.startswith(f"{weight} of what ours and EKF2 are apart along the aisle is the")
+    assert f"the {names[0]} ({words}): " in told.cause

@@ -143,8 +143,10 @@ def with_words(
             f"what ours and EKF2 are apart along {the(name)}"
         )
     else:
+        half = 0.5 * why.position_mean_square_m2
+        weight = "Most" if first.position_mean_square_m2 >= half else "The largest part"
         cause = (
-            f"Most of what ours and EKF2 are apart along {the(name)} is the {first.name} "
+            f"{weight} of what ours and EKF2 are apart along {the(name)} is the {first.name} "
             f"({_share(first, why)}): {because[first.name]}"
         )
         more = _moment(first)
@@ -185,7 +187,10 @@ def the(axis: str) -> str:
 
 
 def _share(part: Step, why: Why) -> str:
-    return f"{part.position_mean_square_m2 / why.position_mean_square_m2:.0%} of the mean square"
+    share = part.position_mean_square_m2 / why.position_mean_square_m2
+    if share > 1.0:  # the steps add up to all of it, and some have a negative sign
+        return "all of the mean square and more, which other changes take back"
+    return f"{share:.0%} of the mean square"
 
 
 def _moment(part: Step) -> str:
