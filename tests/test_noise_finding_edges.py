@@ -465,7 +465,16 @@ def test_without_truth_both_are_judged_by_their_innovations() -> None:
     )
     (said,) = story(flight_of(along(0.25, 4.0, difference=difference)), ())
     assert said.endswith(
-        "by its own innovations EKF2 is 4 times too modest, our filter 4 times too sure of itself."
+        "by its own innovations EKF2 is 4 times too modest, our filter is 4 times too sure of "
+        "itself."
+    )
+    mute = axis(
+        "aisle", ekf2=NONE, kf=statement(1.0), ekf2_state=made(pd.DataFrame), difference=difference
+    )
+    (said,) = story(flight_of(mute), ())
+    assert said.endswith(
+        "by its own innovations EKF2 cannot be judged, since the log has no innovations or too "
+        "few, our filter is honest about it."
     )
     (said,) = story(flight_of(along(0.25, 4.0), source=ODOMETRY), ())
     assert "both were flown" in said

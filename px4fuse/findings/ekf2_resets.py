@@ -27,8 +27,9 @@ def detect(analysis: Analysis) -> Found:
         yield finding(
             "warning" if horizontal else "info",
             "ekf2_resets",
-            f"EKF2 reset its position {times(len(inside))} ({horizontal} horizontal), by up to "
-            f"{max(sizes):.2f} m at {at_s:.1f} s",
+            f"EKF2 reset its {'height' if not horizontal else 'position'} {times(len(inside))}"
+            + (f" ({horizontal} horizontally)" if 0 < horizontal < len(inside) else "")
+            + f", by up to {max(sizes):.2f} m at {at_s:.1f} s",
             f". In the comparison: {treated}.",
             "Look for the gap or rejection at that time."
             if horizontal

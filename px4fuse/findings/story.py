@@ -86,10 +86,18 @@ def _verdict(analysis: Analysis, since: str) -> str:
     if source.origin.may_drift:
         judged = f"both follow {source.name}, which may drift"
     elif ekf2 == ours and not since:
-        judged = f"by their own innovations both are {ours}"
+        judged = f"by their own innovations both {_with_verb(ours, 'are')}"
     else:
-        judged = f"by its own innovations EKF2 is {ekf2}, our filter {ours}{since}"
+        judged = (
+            f"by its own innovations EKF2 {_with_verb(ekf2, 'is')}, our filter "
+            f"{_with_verb(ours, 'is')}{since}"
+        )
     return f"{along} {apart}, and the log has no truth: {judged}."
+
+
+def _with_verb(said: str, verb: str) -> str:
+    """What :func:`_knows` says, after a subject."""
+    return said if said.startswith("cannot") else f"{verb} {said}"
 
 
 def _error(result: AxisComparison, owner: FilterName) -> str:
@@ -107,7 +115,7 @@ def _knows(analysis: Analysis, result: AxisComparison, owner: FilterName) -> str
             return f"{CLAIMED} {length_words(hidden.claimed_m)}"
     statement = result.filters[owner]
     if isinstance(statement, Unavailable):
-        return "cannot be judged by innovations, since the log has none or too few"
+        return "cannot be judged, since the log has no innovations or too few"
     factor = statement.variance_factor
     if statement.verdict == "consistent":
         return "honest about it"
