@@ -310,6 +310,7 @@ LOOPS: dict[str, tuple[Any, str, dict[str, Any], dict[str, Any], float, float]] 
     "a drift that explains everything": (OPEN, "", {"position_drift_m": 50.0}, {}, 0, 10),
     "the same, without a key": (None, "", {"position_drift_m": 50.0}, {}, 0, 10),
     "a heading that drifts by a right angle": (OPEN, "", {"heading_drift_deg": 90.0}, {}, 0, 10),
+    "honest, drift as it was": (OPEN, ELSEWHERE, {"position_drift_m": 1.2}, REJECTED, 40, 40),
     "a drift of nothing": (CLOSED, "", {"position_drift_m": 0.01}, REJECTED, 0, 10),
     "landed where the odometry ends": (
         None, "", {"landed_at": {"forward_m": 1.42, "right_m": 0.0}}, PERFECT, 0, 10,

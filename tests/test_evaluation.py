@@ -447,6 +447,9 @@ def test_a_camera_is_compared_around_its_constant_rotation_in_the_vehicle() -> N
     assert (got.body_rotation * mounted).magnitude() < 0.01
     assert "constant rotation of 120" in got.notes[0]
     assert got.rpe[0].translation_m.rmse < 0.03
+    for one, other in ((replace(camera, rotation=None), reference),
+                       (camera, replace(reference, rotation=None))):  # fmt: skip
+        assert evaluate(one, other).body_rotation is None
     for same in (replace(camera, frame="unknown", kind="unknown"), replace(camera, frame="NED")):
         assert evaluate(same, reference, alignment="se3").body_rotation is None
 

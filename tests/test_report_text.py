@@ -21,12 +21,14 @@ from px4fuse.filter.clock import ClockOffset, PartOffset
 from px4fuse.filter.likelihood import preintegrate, states
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import Unavailable
+from px4fuse.recording import ClockMap
 from px4fuse.report import clock, fonts, notes
 from px4fuse.report.document import Document
 from px4fuse.report.notes import write
 from px4fuse.report.page import Block, Page, data, printable
 from px4fuse.report.pdf import compiled
 from px4fuse.report.sensitivity import PAIRS, SETTINGS, WINDOW_S, _settled, _window
+from px4fuse.report.words import clock_words
 from px4fuse.results.model import Student
 
 THAI, HAN, ARABIC = "สมชาย", "王小明", "محمد"
@@ -284,3 +286,16 @@ def test_the_window_lies_where_nothing_is_missing_and_something_moves() -> None:
     start, end = _window(velocity, [(5.0 * i, 5.0 * i + 4.0) for i in range(16)])
     assert start >= 78.0
     assert _window(velocity[:20], []) == (0.0, pytest.approx(3.8))
+
+
+def test_how_a_clock_was_mapped_is_told_by_its_figures_or_by_its_note() -> None:
+    mapped = ClockMap("the sender's clock", "TIMESYNC", 40, 0.25, 3.0, 0.002, "over the link")
+    assert clock_words(mapped) == (
+        "the sender's clock by TIMESYNC: offset +0.2500 s, drift +3 ppm, jitter 2 ms, 40 pairs; "
+        "over the link"
+    )
+    for by_note in (
+        replace(mapped, method="boot clock"), replace(mapped, distinct_stamps=1),
+        replace(mapped, note="over the link, at its own speed"),
+    ):  # fmt: skip
+        assert clock_words(by_note) == f"the sender's clock: {by_note.note}"
