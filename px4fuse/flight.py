@@ -254,8 +254,8 @@ class AidLog:
 
     Attributes
     ----------
-    topic : str
-        Where its innovations are from.
+    topics : tuple of str
+        Where its innovations, and their variances, are from.
     axes : tuple of str
     samples : DataFrame
         By time of measurement, for each axis: ``innovation_<axis>`` (measurement minus prediction)
@@ -268,13 +268,16 @@ class AidLog:
         does not tell.
     parameters : mapping
         EKF2's for this aid, by PX4 name, as at the log's start.
+    left_out : int
+        Innovations without a variance near in time, which are not among the samples.
     """
 
-    topic: str
+    topics: tuple[str, ...]
     axes: tuple[str, ...]
     samples: pd.DataFrame
     meant: pd.Series[float] | None
     parameters: Mapping[str, float] = field(default_factory=dict)
+    left_out: int = 0
 
     __repr__ = brief
 

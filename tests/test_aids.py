@@ -55,7 +55,7 @@ def aid_log(
     if own:
         columns |= {"fused": 1.0 - beyond, "rejected": beyond}
     frame = pd.DataFrame(columns, index=pd.Index(TIMES, name="time_s"))
-    return AidLog("a_topic", axes, frame, meant, parameters)
+    return AidLog(("a_topic",), axes, frame, meant, parameters)
 
 
 def judged(log: AidLog, name: str = "gnss_pos") -> AidResult:

@@ -43,7 +43,7 @@ from px4fuse.flight import (
 )
 from px4fuse.origin import ALIGNED, GNSS, KEPT, MOTION_CAPTURE, REBUILT, RECEIVED
 from px4fuse.readers import read_log
-from px4fuse.readers.px4_innovations import JOIN_TOLERANCE_S
+from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S
 
 HALF_PERIOD_S = 0.005  # of EKF2's update, EKF2_PREDICT_US 10,000
 HOUR_US = 3_600_000_000
@@ -710,7 +710,6 @@ STREAMS = {
         "ekf2_innovations": (
             "estimator_innovations",
             "estimator_innovation_variances",
-            "estimator_innovation_test_ratios",
         ),
         "ekf2_fusing": ("estimator_status_flags",),
     },
@@ -917,7 +916,7 @@ def test_vision_that_shows_only_in_innovations_is_rebuilt(shared_logs):
     track, _ = choose_source(flight)
     assert (track.origin.passage, flight.ekf2.innovation_topics) == (
         REBUILT.passage,
-        ("estimator_innovations",),
+        ("estimator_innovations", "estimator_innovation_variances"),
     )
     assert (flight.ekf2.fusing[["horizontal", "vertical", "yaw"]].mean() > 0.9).all()
 

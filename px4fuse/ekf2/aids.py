@@ -203,7 +203,7 @@ def _judge(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidResult:
             )  # fmt: skip
     idle = not tried.any()
     return AidResult(
-        label=aid.label, unit=aid.unit, topic=log.topic, intended_share=intended_share,
+        label=aid.label, unit=aid.unit, topic=log.topics[0], intended_share=intended_share,
         fused_share=_share(fused & meant, meant), fused_logged=fused_logged,
         rejected_share=_share(rejected & meant, meant), longest_without_s=without_s,
         resets=int(reset.sum()), gate=gate, noise=noise_median,

@@ -23,8 +23,11 @@ from px4fuse.readers.px4_aid_sources import (
     WITH_OBSERVATION,
     AidSource,
 )
-from px4fuse.readers.px4_innovations import JOIN_TOLERANCE_S
 from px4fuse.readers.ulog_topics import Topics
+
+# innovations and variances are logged by separate rate limiters, up to one interval of the default
+# profile (0.5 s) apart; S changes little in that time
+JOIN_TOLERANCE_S = 0.6
 
 
 def read_aids(topics: Topics) -> dict[str, AidLog]:
@@ -39,7 +42,7 @@ def read_aids(topics: Topics) -> dict[str, AidLog]:
         told = meant.get(name)
         log = _own_topic(topics, name, source, told)
         # an aid that was never meant to be fused stands at its last value, or is another's
-        if log is None and told is not None and told.any():
+        if log is None and (name.startswith("ev_") if told is None else told.any()):
             log = _snapshots(topics, name, source, told)
         if log is not None:
             found[name] = replace(log, parameters=AIDS[name].in_log(topics.ekf2_parameters))
@@ -86,11 +89,11 @@ def _own_topic(
     if meant is not None and name in FLAG_ALWAYS_SET:
         frame["fused"] = at_times(meant, frame.index)
     frame = frame[(frame[[f"variance_{axis}" for axis in source.axes]] > 0.0).all(axis=1)]
-    return _log(layout.topic, source, frame, meant) if len(frame) else None
+    return _log((layout.topic,), source, frame, meant) if len(frame) else None
 
 
 def _snapshots(
-    topics: Topics, name: str, source: AidSource, meant: pd.Series[float]
+    topics: Topics, name: str, source: AidSource, meant: pd.Series[float] | None
 ) -> AidLog | None:
     """An aid by the topics that hold the last value of every aid."""
     gauss = name == "mag_heading" and any("cs_mag" in one for one in topics.of(STATUS_FLAGS))
@@ -113,18 +116,23 @@ def _snapshots(
                 frame, topics.of_primary(variances).dropna(), left_index=True, right_index=True,
                 direction="nearest", tolerance=JOIN_TOLERANCE_S,  # type: ignore[arg-type]
             )  # fmt: skip
+        before = len(frame)
         frame = frame.dropna()
+        left_out = before - len(frame)
         frame = frame[(frame[[f"variance_{axis}" for axis in source.axes]] > 0.0).all(axis=1)]
-        frame = frame[at_times(meant, frame.index) > 0.0]
+        if meant is not None:
+            frame = frame[at_times(meant, frame.index) > 0.0]
         if len(frame):
-            return _log(values.topic, source, frame, meant)
+            used = tuple(dict.fromkeys((values.topic, variances.topic)))
+            return replace(_log(used, source, frame, meant), left_out=left_out)
     return None
 
 
 def _fresh(frame: pd.DataFrame) -> pd.DataFrame:
     """Without repeats and without zeros, the value before any fusion."""
-    first = frame.iloc[:, 0]
-    return frame[first.ne(first.shift()) & (first != 0.0)]
+    known = frame.dropna()
+    first = known.iloc[:, 0]
+    return known[first.ne(first.shift()) & (first != 0.0)]
 
 
 def _columns(name: str, source: AidSource, fields: tuple[str, ...] | list[str]) -> dict[str, str]:
@@ -141,9 +149,9 @@ def _variance(field: str) -> str:
 
 
 def _log(
-    topic: str, source: AidSource, frame: pd.DataFrame, meant: pd.Series[float] | None
+    topics: tuple[str, ...], source: AidSource, frame: pd.DataFrame, meant: pd.Series[float] | None
 ) -> AidLog:
     """The record, with the sign that everyone else gives an innovation."""
     innovations = [f"innovation_{axis}" for axis in source.axes]
-    return AidLog(topic, source.axes, frame.assign(**{one: -frame[one] for one in innovations}),
+    return AidLog(topics, source.axes, frame.assign(**{one: -frame[one] for one in innovations}),
                   meant)  # fmt: skip

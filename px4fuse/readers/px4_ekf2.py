@@ -33,8 +33,8 @@ from px4fuse.flight import (
 )
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.layouts import Layout, elements
-from px4fuse.readers.px4_aids import read_aids
-from px4fuse.readers.px4_innovations import read_innovations
+from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S, read_aids
+from px4fuse.readers.px4_innovations import innovations_of
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 
 VISION = "vehicle_visual_odometry"
@@ -68,7 +68,20 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         )
     fusing = _read_fusing(topics)
     gate = settings_in_force(parameters)[EV_POS.gate]
-    innovations, innovation_topics, notes = read_innovations(topics, fusing, gate)
+    aids = read_aids(topics)
+    innovations, innovation_topics = innovations_of(aids, fusing, gate)
+    notes = [
+        f"{topic} has no time of measurement in this release: EKF2's innovations carry the time of "
+        "their publication, up to 0.2 s later"
+        for topic in innovation_topics[:1]
+        if not any("timestamp_sample" in table for table in topics.of(topic))
+    ]
+    notes += [
+        f"{log.left_out} samples of {log.topics[0]} ({', '.join(log.axes)}) have no "
+        f"{log.topics[-1]} within {JOIN_TOLERANCE_S:g} s and were left out"
+        for log in (aids[name] for name in ("ev_pos", "ev_hgt") if name in aids)
+        if log.left_out
+    ]
     step_s = _step_s(topics)
     return Ekf2(
         state=state,
@@ -79,12 +92,12 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         resets=read_resets(local),
         instances=topics.primary,
         gate=gate,
-        notes=notes,
+        notes=tuple(notes),
         accelerometer_bias=_read_accelerometer_bias(topics, step_s),
         step_s=step_s,
         horizon_s=_horizon_s(topics, step_s),
         record=_read_record(topics, step_s),
-        aids=read_aids(topics),
+        aids=aids,
     )
 
 
@@ -92,21 +105,13 @@ def ekf2_topics(topics: Topics, ekf2: Ekf2 | Unavailable) -> Mapping[str, tuple[
     """Topics behind each part that is there, by the part's name in ``Flight.streams``."""
     if isinstance(ekf2, Unavailable):
         return {}
-    joined = (
-        layout.topic
-        for axis in px4.INNOVATIONS.values()
-        for layouts in axis
-        if layouts[0].topic in ekf2.innovation_topics
-        for layout in layouts
-    )
-    used = dict.fromkeys((*ekf2.innovation_topics, *joined))
     fusing = topics.find(px4.FUSING)
     return {
         "ekf2_state": tuple(layout.topic for layout in px4.LOCAL_POSITION),
         "ekf2_variance": ()
         if isinstance(ekf2.variance, Unavailable)
         else tuple(_state_vectors(topics))[:1],
-        "ekf2_innovations": tuple(name for name in used if topics.instances(name)),
+        "ekf2_innovations": ekf2.innovation_topics,
         "ekf2_fusing": ()
         if isinstance(ekf2.fusing, Unavailable) or fusing is None
         else (fusing.topic,),

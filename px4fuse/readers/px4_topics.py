@@ -13,13 +13,11 @@ from dataclasses import dataclass
 from px4fuse.ekf2_parameters import AID_MASK, EV_POS
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
-    AXIS_NAMES,
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
     QUATERNION_COLUMNS,
     ROTATION_VARIANCE_COLUMNS,
     SPECIFIC_FORCE_COLUMNS,
-    AxisName,
 )
 from px4fuse.origin import ALIGNED, GNSS, KEPT, MOTION_CAPTURE, REBUILT, RECEIVED, Origin
 from px4fuse.readers.layouts import (
@@ -104,50 +102,6 @@ AIDING_FLAGS: Mapping[str, str] = {
     "cs_rngbcn_fusion": "ranging beacons",
 }
 AIDING_BITS: Mapping[str, int] = {"GPS": 2, "optical flow": 3, "vision velocity": 24}
-
-
-def _innovations(axis: AxisName) -> tuple[tuple[Layout, ...], ...]:
-    """Topics of an axis' innovations, joined by time: the aid source's, then the older ones.
-
-    The aid source records every fusion attempt with its exact time. v1.11 to v1.13 store the larger
-    of the two horizontal test ratios in element 0.
-    """
-    number = AXIS_NAMES.index(axis)
-    topic, at = ("ev_hgt", "") if axis == "down" else ("ev_pos", f"[{number}]")
-    field = "ev_vpos" if axis == "down" else f"ev_hpos[{number}]"
-    return (
-        (
-            Layout(
-                f"estimator_aid_src_{topic}",
-                {
-                    "innovation_m": f"innovation{at}",
-                    "innovation_variance_m2": f"innovation_variance{at}",
-                    "observation_variance_m2": f"observation_variance{at}",
-                    "test_ratio": f"test_ratio{at}",
-                },
-                "v1.14",
-                {"fused": "fused", "rejected": "innovation_rejected"},
-            ),
-        ),
-        (
-            Layout("estimator_innovations", {"innovation_m": field}, "v1.11"),
-            Layout("estimator_innovation_variances", {"innovation_variance_m2": field}, "v1.11"),
-            Layout("estimator_innovation_test_ratios", {"test_ratio": field}, "v1.11"),
-        ),
-        (
-            Layout(
-                "ekf2_innovations",
-                {
-                    "innovation_m": f"vel_pos_innov[{3 + number}]",
-                    "innovation_variance_m2": f"vel_pos_innov_var[{3 + number}]",
-                },
-                "v1.8 to v1.10",
-            ),
-        ),
-    )
-
-
-INNOVATIONS = {axis: _innovations(axis) for axis in AXIS_NAMES}
 
 LAND_DETECTED = (Layout("vehicle_land_detected", {"landed": "landed"}, "v1.8"),)
 
@@ -323,7 +277,6 @@ def topics() -> list[str]:
         IMU, ATTITUDE, LOCAL_POSITION, SENSOR_BIAS, SELECTOR, FUSING, LAND_DETECTED, FLIGHT_MODE,
         TRUTH_LOCAL, TRUTH_GLOBAL, TRUTH_ATTITUDE, GPS, AID_OBSERVATION_HORIZONTAL,
         AID_OBSERVATION_VERTICAL, *(track.layouts for track in TRACKS),
-        *(layouts for axis in INNOVATIONS.values() for layouts in axis),
     )  # fmt: skip
     named = {layout.topic for group in groups for layout in group}
     return sorted(named | UNUSED.keys() | {*ESTIMATOR_STATES})
