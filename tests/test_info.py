@@ -117,6 +117,7 @@ def test_abilities_are_what_compare_then_does(sample_flight):
     assert all(ability.possible for ability in inventory.abilities)
     assert inventory.segment == comparison.segment
     assert '"estimator_aid_src_ev_pos 0"' in remedies(inventory)[0]  # few of its innovations
+    assert "external vision, position 2 Hz, " in ability(inventory, "aids").reason
     said = ability(inventory, "EKF2 innovations").reason
     for axis in comparison.axes.values():
         if not isinstance(axis.ekf2_innovations, Unavailable):
@@ -175,7 +176,7 @@ def test_a_log_of_other_topics_is_described_all_the_same(tmp_path):
     [
         ("sensor_combined", "IMU", {"acceleration"}),
         ("vehicle_local_position", "EKF2 state",
-         {"EKF2 states", "EKF2 variances", "EKF2 innovations"}),
+         {"EKF2 states", "EKF2 variances", "EKF2 innovations", "aids"}),
     ],
 )  # fmt: skip
 def test_what_a_topic_is_needed_for(tmp_path, topic_, part, lost):
@@ -402,7 +403,7 @@ def test_every_recording_is_described_or_refused_in_one_line(shared_logs, monkey
         assert code in (0, 2), path.name
         assert len(err.splitlines()) == code // 2, path.name
         if code == 0:
-            assert len(strict(out)["abilities"]) == 6, path.name
+            assert len(strict(out)["abilities"]) == 7, path.name
 
 
 @pytest.mark.reallogs
@@ -417,7 +418,7 @@ def test_every_log_is_described_or_refused_in_one_line(shared_logs, monkeypatch,
         assert widest(out) <= WIDTH, path.name
         inventory = take_inventory(flight)
         strict(json.dumps(to_plain(inventory)))
-        assert len(inventory.abilities) == 6, path.name
+        assert len(inventory.abilities) == 7, path.name
         assert all(a.reason for a in inventory.abilities), path.name
         try:
             choose_source(flight)

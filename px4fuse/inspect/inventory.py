@@ -12,6 +12,7 @@ import pandas as pd
 
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
+from px4fuse.ekf2.aids import judge_aids
 from px4fuse.errors import MissingDataError, Px4FuseError
 from px4fuse.filter.signals import IMU_GAP_INTERVALS, IMU_GAP_S, Segment, ned_acceleration, within
 from px4fuse.findings import ekf2_not_fusing, imu, missing, named, recording
@@ -329,6 +330,12 @@ def _abilities(flight: Flight, compared: Comparison | None, reason: str) -> Iter
             yield Ability(name, False, found.reason)
         else:
             yield Ability(name, True, found)
+    aids, ekf2 = judge_aids(flight), flight.ekf2
+    if isinstance(aids, Unavailable):
+        yield Ability("aids", False, aids.reason)
+    elif isinstance(ekf2, Ekf2):
+        rates = [f"{a.label} {sample_rate(ekf2.aids[n].samples):.2g} Hz" for n, a in aids.items()]
+        yield Ability("aids", True, f"each judged by its own innovations: {', '.join(rates)}")
 
 
 def _done(compared: Comparison) -> dict[str, str | Unavailable]:
