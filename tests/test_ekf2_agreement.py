@@ -56,11 +56,13 @@ def test_the_first_five_seconds_of_each_stretch_are_not_judged() -> None:
     assert settled(times, judged).tolist() == [False, True, True, False, False, True, False]
 
 
-def agreeing(correlation: float = 1.0, s: float = 1.0, nis: float = 1.0) -> AxisAgreement:
+def agreeing(
+    correlation: float = 1.0, s: float = 1.0, nis: float = 1.0, published_m: float = 0.0
+) -> AxisAgreement:
     return AxisAgreement(
         innovation_correlation=correlation, innovation_rms_difference=0.0, s_ratio_median=s,
         s_ratio_p5=s, s_ratio_p95=s, nis_mean_logged=1.0, nis_mean_replayed=nis,
-        position_rms_difference_m=0.0, velocity_rms_difference_m_s=0.0,
+        position_rms_difference_m=published_m, velocity_rms_difference_m_s=0.0,
     )  # fmt: skip
 
 
@@ -71,6 +73,8 @@ def agreeing(correlation: float = 1.0, s: float = 1.0, nis: float = 1.0) -> Axis
         (agreeing(s=1.051), 0.0, 0.0, False, "is 1.05 of the logged one"),
         (agreeing(s=0.949), 0.0, 0.0, False, "is 0.95 of the logged one"),
         (agreeing(0.95), 0.0, 0.0, True, "correlate by 0.9500"),
+        (agreeing(published_m=0.09), 0.0, 0.0, True, "correlate by 1.0000 or better"),
+        (agreeing(published_m=0.11), 0.0, 0.0, False, "what is published is 0.11 m off the log"),
         (agreeing(0.949), 0.0, 0.09, False, "correlate by 0.95 only"),
         # where much is rejected, shares and NIS decide
         (agreeing(0.5), 0.1, 0.06, True, "6.0% of the samples are rejected, 10.0% in the log"),

@@ -21,6 +21,8 @@ MAX_REPEAT_S = 0.5
 # dropouts S is off by more than 5 % or the correlation below 0.9 (tests/benchmarks/bench_ekf2.py)
 MIN_CORRELATION = 0.95
 MAX_S_OFF = 0.05
+# Of the position that EKF2 publishes; there it is within 0.013 m
+MAX_PUBLISHED_OFF_M = 0.10
 # Where EKF2 rejects much, one sample on the edge of the gate decides the next ones: then shares
 # and mean NIS must agree, and single samples when the model rejects what EKF2 rejected
 REJECTING_SHARE = 0.1
@@ -175,6 +177,12 @@ def _verdict(
             )
     worst = min(found.innovation_correlation for found in axes.values())
     if worst >= MIN_CORRELATION:
+        off_m = max(found.position_rms_difference_m for found in axes.values())
+        if off_m > MAX_PUBLISHED_OFF_M:
+            return False, (
+                f"the innovations agree, but what is published is {off_m:.2f} m off the log (RMS; "
+                f"at most {MAX_PUBLISHED_OFF_M:g} m): EKF2's output is not of this filter alone"
+            )
         return True, f"replayed and logged innovations correlate by {worst:.4f} or better"
     if max(logged_share, replayed_share) < REJECTING_SHARE:
         return False, (
