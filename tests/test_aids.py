@@ -312,3 +312,22 @@ def test_flights_of_the_real_ekf2(name: str) -> None:
             assert nis == pytest.approx(stated, rel=0.02)
             compared += 1
     assert compared >= 2
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize("name", ["v1.16.1_gps_nominal", "v1.14.4_gps_magdist"])
+@pytest.mark.parametrize("command", ["compare", "tune", "sync"])
+def test_no_parameter_of_external_vision_is_named_for_gnss(
+    name: str, command: str, tmp_path: Path
+) -> None:
+    if not (SHARED_LOGS / "gps").exists():
+        pytest.skip("../shared is absent")
+    more = ("-o", tmp_path / "r.pdf") if command == "compare" else ()
+    log = SHARED_LOGS / "gps" / f"{name}.ulg"
+    done = run(command, log, "--position-source", "vehicle_gps_position", *more)
+    assert done.exit_code == 0, done.output
+    findings = tmp_path / "r.json"
+    said = str(json.loads(findings.read_text())["findings"]) if more else done.output
+    assert len(said) > 100
+    for wrong in ("EKF2_EVP_NOISE", "EKF2_EV_DELAY", "anchors", "UWB"):
+        assert wrong not in said

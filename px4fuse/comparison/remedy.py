@@ -83,6 +83,17 @@ def asked_of_ekf2(
     return changes
 
 
+def vision_delay_ms(comparison: Comparison) -> float | None:
+    """What EKF2 takes positions of the source to be older than their stamps (ms).
+
+    None where the log does not tell, or EKF2 does not take the source as external vision: GNSS has
+    a delay of its own, and stamps that EKF2 does not use.
+    """
+    if not comparison.source.origin.is_vision:
+        return None
+    return comparison.flight.log.parameters.get(EV_POS.delay)
+
+
 def tuned_noise_m(tuning: Mapping[str, AxisTuning | Unavailable]) -> float | None:
     """Horizontal measurement noise (m) that the data ask for; None where they do not tell."""
     known = (tuning.get(name) for name in (HORIZONTAL, AISLE, "north", "east"))

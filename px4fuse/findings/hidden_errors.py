@@ -36,8 +36,8 @@ REMEDIES = {
     "LOG), or give the filter a second, absolute source.",
     "frame": "Turn and shift the source's frame into that of the truth before you judge a filter "
     "by it, and take no noise from these innovations.",
-    "ekf2": "Our filter errs less with the same source, so the error is EKF2's own: look at "
-    "EKF2_EV_DELAY, at its heading, and at what else it fuses.",
+    "ekf2": "Our filter errs less with the same source, so the error is EKF2's own: look at the "
+    "delay that it takes the source to have, at its heading, and at what else it fuses.",
     "shared": "Look for an error that source and filter share: the clock (px4fuse sync LOG), a "
     "source that smooths its positions, its scale, the survey of the anchors.",
 }

@@ -96,7 +96,7 @@ def typed_offset_s(comparison: Comparison, clock: ClockOffset) -> float:
 
 def delay(analysis: Analysis, clock: ClockOffset) -> Found:
     """EKF2_EV_DELAY lies outside what the clock offset and EKF2's step leave open."""
-    delay_ms = analysis.flight.log.parameters.get("EKF2_EV_DELAY")
+    delay_ms = remedy.vision_delay_ms(analysis)
     asked_ms = -1e3 * clock.offset_s
     known_ms = 1e3 * max(clock.chance_s + EKF2_UPDATE_S, OFFSET_S)
     if delay_ms is None or abs(delay_ms - asked_ms) < known_ms:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.remedy import vision_delay_ms
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
 from px4fuse.findings.source_clock import typed_offset_s
 from px4fuse.flight import Unavailable
@@ -58,7 +59,7 @@ def _stamps_wrong(clock: ClockOffset) -> bool:
 
 def _delay_wrong(comparison: Comparison, clock: ClockOffset) -> bool:
     """Whether PX4's EKF2_EV_DELAY is known, and not what the data ask for."""
-    delay, (low, high) = comparison.flight.log.parameters.get("EKF2_EV_DELAY"), clock.interval_s
+    delay, (low, high) = vision_delay_ms(comparison), clock.interval_s
     if delay is None or not clock.determinable:
         return False
     return not -(high + NEGLIGIBLE_S) <= delay * 1e-3 <= -(low - NEGLIGIBLE_S)
@@ -93,7 +94,7 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
         advice["Reading"] = f"the stamps are {side} by {abs(offset):.3f} s"
         typed = typed_offset_s(comparison, clock)
         advice["Re-run"] = f"px4fuse compare LOG --clock-offset {typed:.3f}"
-    delay = comparison.flight.log.parameters.get("EKF2_EV_DELAY")
+    delay = vision_delay_ms(comparison)
     if delay is not None and not _delay_wrong(comparison, clock):
         advice["PX4"] = f"EKF2_EV_DELAY {delay:g} ms fits"
     elif delay is not None and offset > 0.0 and delay <= 0.0:

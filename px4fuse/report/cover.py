@@ -93,7 +93,8 @@ def facts(document: Document) -> dict[str, str]:
         f"{source.name}: {source.description}, {source.rate_hz:.1f} Hz, {source.frame}; "
         f"{comparison.source_reason}"
     )
-    if any(part.source == "vehicle_visual_odometry" for part in comparison.missing):
+    received = any(part.source == "vehicle_visual_odometry" for part in comparison.missing)
+    if received and source.origin.is_vision:
         position += ". SDLOG_PROFILE 129 would have logged it as it arrived"
     placed, clock = "", ""
     if source.alignment is not None:

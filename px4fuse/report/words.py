@@ -249,7 +249,7 @@ def tuning_advice(
             f"is below what this logging rate can show{bound}: between samples the process noise "
             "hides it. Log the source at a higher rate."
         )
-    elif log.autopilot == "PX4" and not drifts:
+    elif log.autopilot == "PX4" and not drifts and comparison.source.origin.is_vision:
         now = log.parameters.get("EKF2_EVP_NOISE")
         advice["PX4"] = f"EKF2_EVP_NOISE {sigma_z.value:.3g}"
         advice["PX4"] += "" if now is None else f" (now {now:g})"
