@@ -120,7 +120,7 @@ def test_only_what_happens_in_the_segment_counts(monkeypatch: pytest.MonkeyPatch
     reset, switch = ekf2_resets.detect(analysis(ekf2={"instances": switches, "resets": resets}))
     assert switch.evidence == {"count": 2, "at_s": 10.5}
     assert reset.evidence == {"count": 2, "largest_m": 5.0, "at_s": 10.5}
-    assert "2 times (1 horizontal), by up to 5.00 m at 10.5 s. In the" in reset.message
+    assert "2 times (1 horizontally), by up to 5.00 m at 10.5 s. In the" in reset.message
     assert reset.message.endswith(" comparison: resets undone.")
     lost = tuple(Dropout(at, 1.0) for at in (8.9, 9.0, 50.0, 110.0, 110.1))
     finding = only(recording.dropouts, analysis(log=log(dropouts=(*lost, Dropout(60.0, 0.5)))))
