@@ -282,6 +282,13 @@ def run_preparation(
             f"{flight.log.name}: `clock_offset_s` auto: not determinable: {clock.reason}",
             "Give the seconds to add, or leave it out.",
         )
+    low, high = clock.interval_s
+    if low <= 0.0 <= high:
+        note = (
+            f"--clock-offset auto: {clock.offset_s:+.3f} s, 95 % {low:+.3f} s to {high:+.3f} s, "
+            "holds zero: nothing was added to the stamps"
+        )
+        return replace(prepared, notes=(*prepared.notes, note))
     settings = replace(settings, clock_offset_s=clock.offset_s)
     return prepare(flight, settings, input_required=required, **choices)
 

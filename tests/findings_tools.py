@@ -100,7 +100,8 @@ def analysis(
     """What is not given is not there."""
     if isinstance(ekf2, dict):
         ekf2 = made(Ekf2, **ekf2)
-    flown = {"imu": NONE, "attitude": NONE, "positions": (), "streams": {}, **(flight or {})}
+    usual_flight = {"imu": NONE, "attitude": NONE, "positions": (), "streams": {}, "airborne": NONE}
+    flown = {**usual_flight, **(flight or {})}
     usual = dict.fromkeys(
         ("clock", "ekf2_model", "loop", "heading", "explained", "smoothing"), NONE
     )

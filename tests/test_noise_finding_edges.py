@@ -523,6 +523,18 @@ def test_a_setting_is_blamed_only_for_what_it_does(
         assert "since" not in story(silent, ())[0]
 
 
+def test_what_was_no_flight_is_said_first() -> None:
+    ours = along(1.0, 1.0)
+    still = source(samples=positions(np.arange(0.0, 120.0), np.full(120, 0.2)))
+    for parts, said in (
+        ({}, "Along the aisle both were flown"),
+        ({"flight": {"airborne": ((1.0, 2.0),)}}, "Along the aisle both were flown"),
+        ({"flight": {"airborne": ()}}, "The vehicle never took off: along the aisle both"),
+        ({"source": still}, "The vehicle hovered: along the aisle both"),
+    ):
+        assert story(flight_of(ours, **parts), ())[0].startswith(said)
+
+
 def test_what_weighs_most_is_told_in_order() -> None:
     def found(name: str, level: Any = "error", **parts: Any) -> Finding:
         return Finding(name, level, "So.", "Do.", headline=f"It is {name}", **parts)

@@ -197,6 +197,14 @@ def test_auto_without_imu_is_refused_with_the_reason(tmp_path) -> None:
 
 
 @pytest.mark.usefixtures("no_drawing")
+def test_auto_adds_nothing_where_zero_is_as_good(sample_log) -> None:
+    request = ComparisonRequest(log=str(sample_log), clock_offset_s="auto", axes=("north", "east"))
+    found = run_comparison(request)
+    assert found.settings.clock_offset_s == 0.0
+    (said,) = (note for note in found.notes if note.startswith("--clock-offset auto: "))
+    assert said.endswith("holds zero: nothing was added to the stamps")
+
+
 @pytest.mark.reallogs
 def test_auto_brings_late_stamps_to_the_truth(shared_logs, tmp_path, monkeypatch, capsys) -> None:
     log = shared_logs / "simulated" / "v1.16.1_aisle_clock_late.ulg"

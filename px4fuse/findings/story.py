@@ -23,9 +23,10 @@ from px4fuse.findings.causes import SETTINGS, VARIANCES
 from px4fuse.findings.hidden_errors import hidden_errors
 from px4fuse.findings.model import Finding
 from px4fuse.findings.sigma import tuned_for
+from px4fuse.findings.source_positions import MOTION_RANGE_M, motion_range_m
 from px4fuse.flight import Unavailable
 from px4fuse.loop.loop import Loop
-from px4fuse.plain import excess_words, length_words, number_words
+from px4fuse.plain import capital, excess_words, length_words, number_words
 
 MOST_SENTENCES = 3
 # What the first sentence tells already
@@ -69,7 +70,7 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
 def _verdict(analysis: Analysis, since: str) -> str:
     """How far off both filters were, and whether they knew it."""
     result, source = analysis.main, analysis.source
-    along = f"Along {the(result.axis.name)}"
+    along = capital(f"{_flown(analysis)}along {the(result.axis.name)}")
     (ours_off, ours), (ekf2_off, ekf2) = (
         (_error(result, owner), _knows(analysis, result, owner)) for owner in ("kf", "ekf2")
     )
@@ -93,6 +94,13 @@ def _verdict(analysis: Analysis, since: str) -> str:
             f"{_with_verb(ours, 'is')}{since}"
         )
     return f"{along} {apart}, and the log has no truth: {judged}."
+
+
+def _flown(analysis: Analysis) -> str:
+    """What was not much of a flight, before a sentence about it."""
+    if analysis.flight.airborne == ():
+        return "the vehicle never took off: "
+    return "the vehicle hovered: " if motion_range_m(analysis) < MOTION_RANGE_M else ""
 
 
 def _with_verb(said: str, verb: str) -> str:
