@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from px4fuse.errors import SettingsError
+from px4fuse.errors import SettingsError, did_you_mean
 
 
 @dataclass(frozen=True)
@@ -203,7 +203,7 @@ def check(chosen: Mapping[str, float]) -> dict[str, float]:
         if known is None:
             raise SettingsError(
                 f"{name}: the model of EKF2 does not have this parameter",
-                f"It knows {', '.join(PARAMETERS)}.",
+                f"{did_you_mean(name, PARAMETERS)}It knows {', '.join(PARAMETERS)}.",
             )
         if not known.minimum <= value <= known.maximum or not math.isfinite(value):
             unit = f" {known.unit}" if known.unit else ""

@@ -17,6 +17,20 @@ as Python does, in backticks (`sigma_z_m`); the command line puts its options in
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """The known name that a mistyped one is nearest to, as a question; empty where none is near.
+
+    >>> did_you_mean("EKF2_EVP_NOIS", ["EKF2_EVP_GATE", "EKF2_EVP_NOISE"]), did_you_mean("x", ["y"])
+    ('Did you mean EKF2_EVP_NOISE? ', '')
+    """
+    import difflib  # noqa: PLC0415 - where something is wrong only
+
+    near = difflib.get_close_matches(name, list(known), n=1)
+    return f"Did you mean {near[0]}? " if near else ""
+
 
 def on_one_line(text: str) -> str:
     r"""A text without what would break or rewrite the line on which it is printed.

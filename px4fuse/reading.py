@@ -7,12 +7,14 @@ memory. So a file is looked at before it is opened, and no more than its limit i
 from __future__ import annotations
 
 import hashlib
+import os
 import stat
 from collections.abc import Iterable
+from contextlib import suppress
 from contextvars import ContextVar
 from pathlib import Path
 
-from px4fuse.errors import LogError, Px4FuseError, on_one_line
+from px4fuse.errors import LogError, Px4FuseError, did_you_mean, on_one_line
 
 #: Largest flight log that is read, in bytes; ``--max-size`` sets it for one command
 max_log_bytes: ContextVar[int] = ContextVar("max_log_bytes", default=2_000_000_000)
@@ -50,7 +52,11 @@ def size_of(path: Path, refuse: type[Px4FuseError], name: str = "") -> int:
     try:
         status = path.stat()
     except (OSError, ValueError) as error:  # ValueError: a path with a NUL in it
-        raise _unreadable(name, error, refuse) from error
+        near = ""
+        with suppress(OSError):  # a folder that may not be looked into has no names to offer
+            if isinstance(error, FileNotFoundError):
+                near = did_you_mean(path.name, os.listdir(path.parent)).strip()  # noqa: PTH208
+        raise _unreadable(name, error, refuse, near) from error
     if stat.S_ISDIR(status.st_mode):
         raise refuse(f"{name}: is a folder", "Give a file.")
     if not stat.S_ISREG(status.st_mode):
@@ -206,9 +212,11 @@ def _read(path: Path, count: int, refuse: type[Px4FuseError], name: str) -> byte
         raise _unreadable(name, error, refuse) from error
 
 
-def _unreadable(name: str, error: Exception, refuse: type[Px4FuseError]) -> Px4FuseError:
+def _unreadable(
+    name: str, error: Exception, refuse: type[Px4FuseError], remedy: str = ""
+) -> Px4FuseError:
     reason = getattr(error, "strerror", None) or error
-    return refuse(f"{name}: cannot be read ({reason}).")
+    return refuse(f"{name}: cannot be read ({reason}).", remedy)
 
 
 def _megabytes(size: int) -> str:

@@ -129,6 +129,22 @@ def test_random_bytes_behind_a_good_first_line(workspace, content):
     refusal(workspace)
 
 
+def test_a_mistyped_name_and_a_table_get_the_command_that_was_meant(tmp_path):
+    log = make_log().write(tmp_path / "aisle_uwb.ulg")
+    with pytest.raises(
+        LogError, match=r"\(No such file or directory\). Did you mean aisle_uwb.ulg\?$"
+    ):
+        read_log(log.with_name("aisle_uvb.ulg"))
+    with pytest.raises(LogError, match=r"\(No such file or directory\)\.$"):
+        read_log(tmp_path / "quite another.bin")
+    table = tmp_path / "uwb.csv"
+    table.write_text("time_s,x_m,y_m,z_m\n0,1,2,3\n")
+    assert refusal(table) == (
+        "uwb.csv: a table, not a flight log. If it holds positions, give it beside the log of the "
+        "flight: px4fuse compare LOG --position uwb.csv."
+    )
+
+
 def test_a_log_of_topics_that_are_none_of_ours(tmp_path):
     at = stamps(2.0, 10.0)
     log = Log([topic("battery_status", at, {"voltage_v": np.full(len(at), 16.0)})])

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TypedDict, Unpack
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.errors import MissingDataError, SettingsError
+from px4fuse.errors import MissingDataError, SettingsError, did_you_mean
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import MIN_MEASUREMENTS, Segment, make_axes, within
 from px4fuse.flight import Flight, PositionTrack, Truth, Unavailable
@@ -118,11 +118,11 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
     for track in flight.positions:
         if track.name == name:
             return track, "chosen with --position-source"
-    have = ", ".join(track.name for track in flight.positions) or "none"
+    names = [track.name for track in flight.positions]
     reasons = {missing.source: missing.reason for missing in flight.missing}
     raise MissingDataError(
         f"{flight.log.name}: position source {name}: {reasons.get(name, 'no such source')}",
-        f"This log has: {have}.",
+        f"{did_you_mean(name, names)}This log has: {', '.join(names) or 'none'}.",
     )
 
 

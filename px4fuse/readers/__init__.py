@@ -10,6 +10,7 @@ from px4fuse.reading import read_head, shown
 
 _SNIFF_BYTES = 16
 ULOG_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
+TABLES = (".csv", ".tsv")
 DATAFLASH_MAGIC = b"\xa3\x95"  # libraries/AP_Logger/LogStructure.h
 
 
@@ -46,6 +47,12 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
         raise LogError(
             f"{name}: not a PX4 ULog but an ArduPilot DataFlash log, which px4fuse does not read",
             "Give the .tlog that the ground station wrote.",
+        )
+    if path.suffix.lower() in TABLES and head.isascii():
+        raise LogError(
+            f"{name}: a table, not a flight log",
+            "If it holds positions, give it beside the log of the flight: px4fuse compare LOG "
+            f"--position {name}.",
         )
     from px4fuse.readers.mavlink import read_mavlink  # noqa: PLC0415
 

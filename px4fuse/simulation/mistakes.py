@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from px4fuse.errors import SettingsError
+from px4fuse.errors import SettingsError, did_you_mean
 
 _Units = Mapping[str, float]
 SECONDS: _Units = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6}
@@ -293,7 +293,8 @@ def parse(texts: Iterable[str]) -> Mistakes:
         name, equals, values = text.strip().partition("=")
         if name not in MISTAKES:
             raise SettingsError(
-                f"--mistake {text}: not a known mistake", f"Choose from {', '.join(MISTAKES)}."
+                f"--mistake {text}: not a known mistake",
+                f"{did_you_mean(name, MISTAKES)}Choose from {', '.join(MISTAKES)}.",
             )
         mistake = MISTAKES[name]
         given = values.split(",") if equals else []
