@@ -512,6 +512,16 @@ def test_not_a_number_everywhere(tmp_path, name, field, value):
     assert missing[field if field == "observation" else name]()
 
 
+@pytest.mark.parametrize("value", [7.4e8, -1.1e4])
+def test_a_force_that_no_sensor_measures_is_damage(tmp_path, value):
+    """A single one made the noises' information indefinite by rounding (found by fuzzing)."""
+    log = make_log("v1.16", 10.0)
+    log["sensor_combined"]["accelerometer_m_s2"][500, 2] = value
+    flight = read_log(log.write(tmp_path / "l.ulg"))
+    assert len(flight.imu) == 999
+    assert flight.imu["down_m_s2"].abs().max() < 10.0
+
+
 def test_not_a_number_here_and_there(tmp_path):
     log = make_log("v1.16", 2.0)
     log["sensor_combined"]["accelerometer_m_s2"][[10, 20], 1] = np.nan

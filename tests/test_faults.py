@@ -41,7 +41,6 @@ def kill_workers(most: int, stop: threading.Event) -> None:
 @pytest.mark.parametrize(("most", "works"), [(1, True), (1000, False)])
 def test_a_worker_that_ends_while_it_starts_is_started_again(most: int, works: bool) -> None:
     stop = threading.Event()
-    stop = threading.Event()
     thread = threading.Thread(target=kill_workers, args=(most, stop))
     thread.start()
     try:
@@ -144,4 +143,4 @@ def test_an_interrupted_comparison_leaves_nothing_in_part(
     else:
         assert process.returncode == 130
         assert left == []
-        assert said == "px4fuse: interrupted, nothing was written.\n" or after_s < 1.0
+        assert said in {"px4fuse: interrupted, nothing was written.\n", ""}

@@ -44,7 +44,9 @@ from px4fuse.readers.mavlink_senders import (
     map_senders,
 )
 from px4fuse.readers.parts import (
+    BEYOND_IMU,
     ends_in_flight,
+    finite_rows,
     missing_parts,
     stretches_of_flight,
     stretches_of_modes,
@@ -130,8 +132,7 @@ def _read_imu(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
         rows = rows[table["id"] == np.bincount(table["id"]).argmax()]
     del table
     imu = recording.read(layout, rows)
-    if imu.isna().any(axis=None):
-        imu = imu.dropna()
+    imu = finite_rows(imu, imu.columns.tolist(), BEYOND_IMU)
     if len(imu) < 2:
         return Unavailable(
             "IMU",

@@ -17,6 +17,8 @@ from px4fuse.flight import (
 
 # No position, velocity, acceleration or angle of a flight in SI units comes near it
 DAMAGED = 1e9
+# m/s² and rad/s: more than any accelerometer (400 g) or gyro (4000 °/s) measures
+BEYOND_IMU = 1e4
 MIN_NORM = 0.5  # a zero quaternion is no attitude
 
 
@@ -64,12 +66,12 @@ def stretches_of_modes(names: pd.Series, end_s: float) -> tuple[FlightMode, ...]
     )
 
 
-def finite_rows(samples: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
+def finite_rows(samples: pd.DataFrame, columns: list[str], limit: float = DAMAGED) -> pd.DataFrame:
     """Rows of a frame in which all of some float columns are finite, and none is beyond physics.
 
     A value of 1e30 is damage as much as NaN is, and its square would soon be infinite.
     """
-    possible: BoolArray = (np.abs(samples[columns].to_numpy()) < DAMAGED).all(axis=1)
+    possible: BoolArray = (np.abs(samples[columns].to_numpy()) < limit).all(axis=1)
     return samples[possible]
 
 

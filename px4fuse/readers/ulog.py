@@ -19,6 +19,7 @@ from px4fuse.flight import (
 )
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.parts import (
+    BEYOND_IMU,
     ends_in_flight,
     finite_rows,
     missing_parts,
@@ -171,7 +172,7 @@ def _read_imu(topics: Topics) -> pd.DataFrame | None:
         keep = increasing(time_us.astype(np.int64) + topics.zero_us)
         imu = imu.iloc[keep].set_axis(pd.Index(time_us[keep] * 1e-6, name="time_s"))
     columns = SPECIFIC_FORCE_COLUMNS + ANGULAR_RATE_COLUMNS
-    return finite_rows(imu[columns], columns)
+    return finite_rows(imu[columns], columns, BEYOND_IMU)
 
 
 def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavailable:
