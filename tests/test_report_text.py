@@ -21,6 +21,7 @@ from px4fuse.filter.clock import ClockOffset, PartOffset
 from px4fuse.filter.likelihood import preintegrate, states
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import Unavailable
+from px4fuse.origin import RECEIVED
 from px4fuse.recording import ClockMap
 from px4fuse.report import clock, fonts, notes
 from px4fuse.report.document import Document
@@ -220,6 +221,7 @@ def with_clock(found: ClockOffset | Unavailable, applied_s: float, delay_ms: flo
         flight=SimpleNamespace(
             log=SimpleNamespace(name="x.ulg", parameters={"EKF2_EV_DELAY": delay_ms})
         ),
+        source=SimpleNamespace(origin=RECEIVED),
     )
     return Document(analysis, (), Student(), "")  # type: ignore[arg-type]
 
