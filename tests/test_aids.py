@@ -21,6 +21,7 @@ from px4fuse.errors import MissingDataError
 from px4fuse.findings import find_aids
 from px4fuse.flight import AidLog, Unavailable
 from px4fuse.readers import read_log
+from px4fuse.readers.px4_innovations import innovations_of
 from px4fuse.results.contract import AidsResults
 from px4fuse.results.reading import read_results
 
@@ -331,3 +332,18 @@ def test_no_parameter_of_external_vision_is_named_for_gnss(
     assert len(said) > 100
     for wrong in ("EKF2_EVP_NOISE", "EKF2_EV_DELAY", "anchors", "UWB"):
         assert wrong not in said
+
+
+def test_a_rejection_that_is_not_logged_is_beyond_the_gate_and_of_both_axes() -> None:
+    log = aid_log(own=False)
+    samples = log.samples.copy()
+    samples["innovation_north"], samples["innovation_east"] = 0.1, 0.1
+    samples.iloc[10, 0], samples.iloc[20, 0] = 4.9 * 0.5, -5.1 * 0.5
+    fusing = pd.DataFrame({"horizontal": [1.0], "vertical": [0.0], "yaw": [0.0]}, index=[0.0])
+    found, topics = innovations_of({"ev_pos": replace(log, samples=samples)}, fusing, 5.0)
+    for axis in ("north", "east"):
+        frame = found[axis]
+        assert isinstance(frame, pd.DataFrame)
+        assert np.flatnonzero(frame["rejected"]).tolist() == [20]
+    assert isinstance(found["down"], Unavailable)
+    assert topics == ("a_topic",)
