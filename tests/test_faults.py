@@ -124,7 +124,7 @@ def test_junk_in_thousands_costs_a_line_each(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT for one process")
-@pytest.mark.parametrize("after_s", [0.3, 0.9, 1.5, 2.1, 2.7])
+@pytest.mark.parametrize("after_s", [0.8, 1.2, 1.6, 2.1, 2.7])
 def test_an_interrupted_comparison_leaves_nothing_in_part(
     after_s: float, tmp_path: Path, sample_log: Path
 ) -> None:
@@ -143,4 +143,4 @@ def test_an_interrupted_comparison_leaves_nothing_in_part(
     else:
         assert process.returncode == 130
         assert left == []
-        assert said in {"px4fuse: interrupted, nothing was written.\n", ""}
+        assert said == "px4fuse: interrupted, nothing was written.\n"
