@@ -128,7 +128,7 @@ def _with_truth(one: Any, truth: Any) -> Any:
     known = {
         name: getattr(one, name) for name in Consistency.__struct_fields__ if hasattr(one, name)
     }
-    return made(FilterSummary, **known, truth=truth)
+    return made(FilterSummary, **known, sigma_p_median_m=None, truth=truth)
 
 
 def statement(nis: float = 1.0, verdict: str = "consistent", **parts: Any) -> Any:

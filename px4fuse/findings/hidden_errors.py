@@ -14,9 +14,8 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
+from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison, FilterSummary
 from px4fuse.errors import TrajectoryError
-from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import Finding, Found, finding, info
@@ -49,15 +48,14 @@ class Hidden:
 
     owner: str
     axis: str
-    statement: Consistency
+    statement: FilterSummary
     rmse_m: float
     nees: float
 
     @property
     def claimed_m(self) -> float:
         """Standard deviation that the filter states."""
-        stated: float | None = getattr(self.statement, "sigma_p_median_m", None)
-        return stated or self.rmse_m / float(np.sqrt(self.nees))
+        return self.statement.sigma_p_median_m or self.rmse_m / float(np.sqrt(self.nees))
 
 
 def hidden_errors(comparison: Comparison) -> list[Hidden]:

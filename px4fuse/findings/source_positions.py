@@ -144,12 +144,9 @@ def outliers(analysis: Analysis) -> Found:
     if share < OUTLIERS or count < MIN_OUTLIERS:
         return
     first = ", ".join(f"{time:.1f}" for time in times_s[:3])
-    aid, likely = (
-        analysis.source.origin.aid,
-        "for UWB most likely reflections without line of sight",
-    )
+    origin, likely = analysis.source.origin, "for UWB most likely reflections without line of sight"
     cure = "Give the tag line of sight to the anchors there, or reject them before they are sent"
-    if analysis.source.origin.kind == "gnss":
+    if origin.kind == "gnss":
         likely = "of GNSS most likely reflections, or a solution that changed"
         cure = "Give the antenna a free sky, away from walls and from what radiates"
     yield finding(
@@ -158,7 +155,7 @@ def outliers(analysis: Analysis) -> Found:
         f"{count} of {tuned.count} measurements ({share:.1%}) are outliers that no noise explains",
         f" ({tuned.name}; at {first} s{' and more' if count > 3 else ''}): {likely}. They pull "
         "both filters, and look like noise unless they are left out.",
-        f"{cure}; do not raise SIGMA_Z{'' if aid is None else f' or {aid.noise}'} for them.",
+        f"{cure}; do not raise SIGMA_Z{f' or {origin.aid.noise}' if origin.aid else ''} for them.",
         {"count": count, "share": share, "first_s": times_s[0]},
         moments(times_s),
     )
@@ -169,17 +166,11 @@ def stated_variance(analysis: Analysis) -> Found:
     source, tuned = analysis.source, analysis.tuning.get(HORIZONTAL)
     # where the source smooths, the noise from one position to the next is not all
     smooths = isinstance(analysis.smoothing, Unavailable) or low_pass(analysis) is not None
-    if smooths or not isinstance(tuned, AxisTuning):
+    if smooths or not isinstance(tuned, AxisTuning) or not source.origin.is_vision:
         return
     reported = within(source.samples, analysis.segment)[POSITION_VARIANCE_COLUMNS[:2]].dropna()
     noise, low, high = tuned.sigma_z.value, tuned.sigma_z.low, tuned.sigma_z.high
-    if (
-        not source.origin.is_vision
-        or reported.empty
-        or noise is None
-        or low is None
-        or high is None
-    ):
+    if reported.empty or noise is None or low is None or high is None:
         return
     sigma = float(np.sqrt(reported.to_numpy().mean(axis=1)).mean())
     factor = (sigma / noise) ** 2

@@ -20,7 +20,7 @@ from px4fuse.ekf2.walk import Why
 from px4fuse.filter.kalman import replay, state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.findings.causes import SETTINGS, VARIANCES
-from px4fuse.findings.hidden_errors import hidden_errors
+from px4fuse.findings.hidden_errors import Hidden, hidden_errors
 from px4fuse.findings.model import Finding
 from px4fuse.findings.sigma import tuned_for
 from px4fuse.findings.source_positions import MOTION_RANGE_M, motion_range_m
@@ -33,7 +33,6 @@ MOST_SENTENCES = 3
 TOLD_FIRST = VARIANCES | {"errors_larger_than_claimed", "ekf2_unavailable"}
 # Share of the logarithm of the mean NIS that a cause explains
 EXPLAINS = 0.5
-CLAIMED = "claimed"
 # What weighs less than why EKF2 differs
 EFFECTS = frozenset({"ekf2_resets", "ekf2_rejecting", "ekf2_fusion_interrupted"})
 
@@ -74,8 +73,6 @@ def _verdict(analysis: Analysis, since: str) -> str:
     (ours_off, ours), (ekf2_off, ekf2) = (
         (_error(result, owner), _knows(analysis, result, owner)) for owner in ("kf", "ekf2")
     )
-    if ours.startswith(CLAIMED):  # an error beyond a claim has other causes than the size of S
-        since = ""
     our_filter = f"our filter was {ours_off}{ours}{since}"
     if isinstance(result.ekf2_state, Unavailable):
         return f"{along} {our_filter}; there is no EKF2 beside it: {result.ekf2_state.reason}."
@@ -87,11 +84,11 @@ def _verdict(analysis: Analysis, since: str) -> str:
     if source.origin.may_drift:
         judged = f"both follow {source.name}, which may drift"
     elif ekf2 == ours and not since:
-        judged = f"by their own innovations both {_with_verb(ours, 'are')}"
+        judged = f"by their own innovations both {_verb(result, 'kf', 'are ')}{ours}"
     else:
         judged = (
-            f"by its own innovations EKF2 {_with_verb(ekf2, 'is')}, our filter "
-            f"{_with_verb(ours, 'is')}{since}"
+            f"by its own innovations EKF2 {_verb(result, 'ekf2')}{ekf2}, our filter "
+            f"{_verb(result, 'kf')}{ours}{since}"
         )
     return f"{along} {apart}, and the log has no truth: {judged}."
 
@@ -103,9 +100,15 @@ def _flown(analysis: Analysis) -> str:
     return "the vehicle hovered: " if motion_range_m(analysis) < MOTION_RANGE_M else ""
 
 
-def _with_verb(said: str, verb: str) -> str:
-    """What :func:`_knows` says, after a subject."""
-    return said if said.startswith("cannot") else f"{verb} {said}"
+def _verb(result: AxisComparison, owner: FilterName, verb: str = "is ") -> str:
+    """What stands before words of :func:`_knows`; "cannot be judged" has a verb of its own."""
+    return "" if isinstance(result.filters[owner], Unavailable) else verb
+
+
+def _hidden(analysis: Analysis, result: AxisComparison, owner: FilterName) -> Hidden | None:
+    """The error of one filter that its innovations do not show, where there is one."""
+    found = hidden_errors(analysis)
+    return next((h for h in found if (h.owner, h.axis) == (owner, result.axis.name)), None)
 
 
 def _error(result: AxisComparison, owner: FilterName) -> str:
@@ -118,9 +121,8 @@ def _error(result: AxisComparison, owner: FilterName) -> str:
 
 def _knows(analysis: Analysis, result: AxisComparison, owner: FilterName) -> str:
     """Whether a filter's variance is what its innovations, and the truth, show."""
-    for hidden in hidden_errors(analysis):
-        if hidden.owner == owner and hidden.axis == result.axis.name:
-            return f"{CLAIMED} {length_words(hidden.claimed_m)}"
+    if hidden := _hidden(analysis, result, owner):
+        return f"claimed {length_words(hidden.claimed_m)}"
     statement = result.filters[owner]
     if isinstance(statement, Unavailable):
         return "cannot be judged, since the log has no innovations or too few"
@@ -136,10 +138,13 @@ def _since(analysis: Analysis) -> str:
     """The setting that makes our variance too large or too small.
 
     Where the data ask for another value, and a replay with it explains at least half of how far the
-    mean NIS is from 1 (by its logarithm), without going as far to the other side.
+    mean NIS is from 1 (by its logarithm), without going as far to the other side. An error beyond
+    what the filter claims has other causes than the size of S.
     """
     settings, statement = analysis.settings, analysis.main.filters["kf"]
     if isinstance(statement, Unavailable) or statement.verdict == "consistent":
+        return ""
+    if _hidden(analysis, analysis.main, "kf"):
         return ""
     tuned, over = tuned_for(analysis, analysis.main.axis.name), statement.variance_factor > 1.0
     if analysis.source.origin.may_drift or tuned is None:
