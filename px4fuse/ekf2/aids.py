@@ -6,6 +6,8 @@ Definitions as in :mod:`px4fuse.filter.consistency`; what PX4 logs and where it 
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
@@ -66,6 +68,11 @@ class AidAxis(Record, frozen=True, kw_only=True):
     ljung_box_p: Share
     bias_p: Share
 
+    @property
+    def pull(self) -> float:
+        """Mean innovation over √S: how far the aid pulls EKF2, and to which side."""
+        return self.innovation_mean / self.s_sqrt_median
+
 
 class AidResult(Record, frozen=True, kw_only=True):
     """What EKF2 did with one aid in flight, and whether its variance was right.
@@ -120,7 +127,7 @@ class AidResult(Record, frozen=True, kw_only=True):
     @property
     def nis_mean(self) -> float:
         """Mean NIS of all axes (NaN without any)."""
-        return float(np.mean([axis.nis_mean for axis in self.axes.values()] or [np.nan]))
+        return _mean_nis(self.axes)
 
 
 def flown(flight: Flight) -> tuple[float, float] | Unavailable:
@@ -261,11 +268,14 @@ def _verdict(axes: dict[str, AidAxis], longest_without: float) -> AidVerdict:
         return "too few samples"
     if any(_pulls(axis) for axis in axes.values()):
         return "biased"
-    nis = float(np.mean([axis.nis_mean for axis in axes.values()]))
+    nis = _mean_nis(axes)
     said = verdict_of(nis, nis_band(sum(axis.samples for axis in axes.values())))
     return said if max(nis, 1.0 / nis) > MATTERS**2 else "consistent"
 
 
+def _mean_nis(axes: Mapping[str, AidAxis]) -> float:
+    return float(np.mean([axis.nis_mean for axis in axes.values()] or [np.nan]))
+
+
 def _pulls(axis: AidAxis) -> bool:
-    pull = abs(axis.innovation_mean) / axis.s_sqrt_median
-    return pull > FELT and pull > BIASED * np.sqrt(axis.nis_mean)
+    return abs(axis.pull) > max(FELT, BIASED * math.sqrt(axis.nis_mean))

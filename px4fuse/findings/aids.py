@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from px4fuse.analysis import Analysis
-from px4fuse.ekf2.aids import STARVED_S, AidAxis, AidResult
+from px4fuse.ekf2.aids import STARVED_S, AidResult
 from px4fuse.ekf2_parameters import AIDS
 from px4fuse.findings.model import Found, info, warning
 from px4fuse.flight import Unavailable
@@ -60,7 +60,7 @@ def find_in(aids: Mapping[str, AidResult]) -> Found:
                 {"aid": name, "nis_mean": aid.nis_mean, "rejected_share": aid.rejected_share},
             )
         elif aid.verdict == "biased":
-            axis, worst = max(aid.axes.items(), key=_pull)
+            axis, worst = max(aid.axes.items(), key=lambda item: abs(item[1].pull))
             yield info(
                 "aid_biased",
                 f"Innovations of {aid.label} are not zero in the mean",
@@ -72,10 +72,6 @@ def find_in(aids: Mapping[str, AidResult]) -> Found:
                 {"aid": name, "axis": axis, "innovation_mean": worst.innovation_mean,
                  "s_sqrt_median": worst.s_sqrt_median},
             )  # fmt: skip
-
-
-def _pull(axis: tuple[str, AidAxis]) -> float:
-    return abs(axis[1].innovation_mean) / axis[1].s_sqrt_median
 
 
 def _noise_words(aid: AidResult) -> str:

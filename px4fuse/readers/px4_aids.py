@@ -51,18 +51,21 @@ def read_aids(topics: Topics) -> dict[str, AidLog]:
 
 def _intentions(topics: Topics) -> Iterator[tuple[str, pd.Series[float]]]:
     """By aid, a step function: 1 while EKF2 means to fuse it, 0 while it does not."""
-    fields = {field for table in topics.of(STATUS_FLAGS) for field in table}
-    layout = Layout(STATUS, {"bits": "control_mode_flags"})
-    for name, source in SOURCES.items():
-        group = next((group for group in source.flags if {*group} <= fields), None)
-        if group is not None:
-            flags = topics.of_primary(Layout(STATUS_FLAGS, dict(zip(group, group, strict=True))),
-                                      step=True)  # fmt: skip
-            yield name, flags.max(axis=1)
-        elif not fields and source.bit is not None and topics.find((layout,)) is not None:
-            bits = topics.of_primary(layout, step=True)["bits"].dropna()
-            on = bits.to_numpy().astype(np.int64) >> source.bit & 1
-            yield name, pd.Series(on.astype(float), index=bits.index)
+    if tables := topics.of(STATUS_FLAGS):
+        named = {flag for source in SOURCES.values() for group in source.flags for flag in group}
+        known = sorted(named.intersection(*tables))
+        flags = topics.of_primary(Layout(STATUS_FLAGS, dict(zip(known, known, strict=True))),
+                                  step=True)  # fmt: skip
+        for name, source in SOURCES.items():
+            group = next((group for group in source.flags if {*group} <= {*known}), None)
+            if group is not None:
+                yield name, flags[list(group)].max(axis=1)
+    elif topics.find((layout := Layout(STATUS, {"bits": "control_mode_flags"}),)) is not None:
+        bits = topics.of_primary(layout, step=True)["bits"].dropna()
+        for name, source in SOURCES.items():
+            if source.bit is not None:
+                on = bits.to_numpy().astype(np.int64) >> source.bit & 1
+                yield name, pd.Series(on.astype(float), index=bits.index)
 
 
 def _own_topic(

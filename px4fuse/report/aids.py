@@ -8,11 +8,10 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.ekf2.aids import AidResult, flown
-from px4fuse.findings import by_root
 from px4fuse.flight import AidLog, Flight, Unavailable, at_times
 from px4fuse.plain import factor_words, number_words
-from px4fuse.report.cover import write_finding
-from px4fuse.report.document import AidsDocument, Document, who
+from px4fuse.report.cover import about, write_findings
+from px4fuse.report.document import AidsDocument, Document
 from px4fuse.report.marks import GROUND
 from px4fuse.report.page import Cell, Page, appendix
 from px4fuse.report.style import (
@@ -61,10 +60,8 @@ def write_appendix(page: Page, document: Document) -> Mapping[str, AidResult]:
 
 def draw_alone(document: AidsDocument) -> Iterator[Page]:
     """Draw the page of a flight without a position source."""
-    alone, log = document.alone, document.alone.flight.log
-    page = Page(TITLE, LEAD)
-    about = (log.name, f"{log.duration_s:.1f} s", f"{log.firmware}, {log.hardware}")
-    page.write(" · ".join(filter(None, (who(document.student, ", "), *about))), colour=MUTED)
+    alone, page = document.alone, Page(TITLE, LEAD)
+    page.write(about(document.student, alone.flight.log), colour=MUTED)
     write_alone(page, document)
     _strips(page, alone.flight, alone.aids)
     yield page
@@ -76,11 +73,7 @@ def write_alone(page: Page, document: AidsDocument) -> None:
     page.write(f"Our filter has nothing to compare with EKF2: {lacking.reason}.", above=2.0)
     page.write(with_options(lacking.remedy), colour=MUTED)
     write_aids(page, document.alone.aids)
-    page.heading("Findings", above=8.0)
-    if not document.findings:
-        page.write("None: no detector has anything to say about this flight.")
-    for group in by_root(document.findings):
-        write_finding(page, group)
+    write_findings(page, document.findings)
 
 
 def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
@@ -100,10 +93,9 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
         ]  # fmt: skip
         for name, axis in aid.axes.items():
             low, high = axis.nis_band
-            pull = axis.innovation_mean / axis.s_sqrt_median
             rows.append([
                 *begun, name, f"{axis.samples}", number_words(axis.nis_mean),
-                f"{low:.2f} – {high:.2f}", f"{pull:+.2f}",
+                f"{low:.2f} – {high:.2f}", f"{axis.pull:+.2f}",
             ])  # fmt: skip
             begun = [""] * len(begun)
         if not aid.axes:

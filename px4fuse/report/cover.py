@@ -15,6 +15,7 @@ from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.signals import AISLE, Axis, within
 from px4fuse.findings import Finding, by_root
 from px4fuse.flight import Ekf2, Truth, Unavailable
+from px4fuse.recording import LogInfo
 from px4fuse.report.document import Document, who
 from px4fuse.report.marks import LANDING, TAKE_OFF
 from px4fuse.report.page import WIDTH, Page, halves, legend_above, words
@@ -27,6 +28,7 @@ from px4fuse.report.words import (
     verdict_words,
     write_errors,
 )
+from px4fuse.results.model import Student
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,20 +48,28 @@ def draw(document: Document) -> Iterator[Page]:
     """Draw the cover; findings that it has no room for go to the next page."""
     page = Page("Two-state Kalman filter against EKF2")
     page.foot(_plan(document, facts(document)))
-    log = document.analysis.flight.log
-    about = (log.name, f"{log.duration_s:.1f} s", f"{log.firmware}, {log.hardware}")
-    student = who(document.student, ", ")
-    page.write(" · ".join(filter(None, (student, *about))), colour=MUTED, above=-4.0)
+    page.write(about(document.student, document.analysis.flight.log), colour=MUTED, above=-4.0)
     for sentence in document.story:
         page.write(sentence, size=10.5, above=2.0)
     _verdict(page, document)
     write_errors(page, document)
-    page.heading("Findings", 10.5, above=12.0)
-    if not document.findings:
-        page.write("None: no detector has anything to say about this flight.")
-    for group in by_root(document.findings):
-        write_finding(page, group)
+    write_findings(page, document.findings)
     yield page
+
+
+def about(student: Student, log: LogInfo) -> str:
+    """Whose report it is, and of which flight, on one line."""
+    told = (log.name, f"{log.duration_s:.1f} s", f"{log.firmware}, {log.hardware}")
+    return " · ".join(filter(None, (who(student, ", "), *told)))
+
+
+def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
+    """Write all findings below a heading, each with what follows from it."""
+    page.heading("Findings", 10.5, above=12.0)
+    if not findings:
+        page.write("None: no detector has anything to say about this flight.")
+    for group in by_root(findings):
+        write_finding(page, group)
 
 
 def _verdict(page: Page, document: Document) -> None:
