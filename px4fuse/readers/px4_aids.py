@@ -6,7 +6,7 @@ topics and fields are rows of :mod:`px4fuse.readers.px4_aid_sources`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -30,13 +30,14 @@ from px4fuse.readers.ulog_topics import Topics
 JOIN_TOLERANCE_S = 0.6
 
 
-def read_aids(topics: Topics) -> dict[str, AidLog]:
+def read_aids(topics: Topics, meant: Mapping[str, pd.Series[float]]) -> dict[str, AidLog]:
     """Every aid of which the log has innovations, by PX4's name.
+
+    ``meant`` is what :func:`intentions` says.
 
     Of several topics the aid's own is taken: it has each attempt to fuse, with its time, and what
     came of it. The others repeat a value until the next one, which counts once.
     """
-    meant = dict(_intentions(topics))
     found = {}
     for name, source in SOURCES.items():
         told = meant.get(name)
@@ -49,23 +50,29 @@ def read_aids(topics: Topics) -> dict[str, AidLog]:
     return found
 
 
-def _intentions(topics: Topics) -> Iterator[tuple[str, pd.Series[float]]]:
-    """By aid, a step function: 1 while EKF2 means to fuse it, 0 while it does not."""
-    if tables := topics.of(STATUS_FLAGS):
-        named = {flag for source in SOURCES.values() for group in source.flags for flag in group}
-        known = sorted(named.intersection(*tables))
+def intentions(topics: Topics) -> dict[str, pd.Series[float]]:
+    """By aid, a step function: 1 while EKF2 means to fuse it, 0 while it does not.
+
+    By its flags, or else by the bits of the older topic.
+    """
+    meant, tables = {}, topics.of(STATUS_FLAGS)
+    named = {flag for source in SOURCES.values() for group in source.flags for flag in group}
+    known = sorted(named.intersection(*tables)) if tables else []
+    if known:
         flags = topics.of_primary(Layout(STATUS_FLAGS, dict(zip(known, known, strict=True))),
                                   step=True)  # fmt: skip
         for name, source in SOURCES.items():
             group = next((group for group in source.flags if {*group} <= {*known}), None)
             if group is not None:
-                yield name, flags[list(group)].max(axis=1)
-    elif topics.find((layout := Layout(STATUS, {"bits": "control_mode_flags"}),)) is not None:
+                meant[name] = flags[list(group)].max(axis=1)
+    layout = Layout(STATUS, {"bits": "control_mode_flags"})
+    if not known and topics.find((layout,)) is not None:
         bits = topics.of_primary(layout, step=True)["bits"].dropna()
         for name, source in SOURCES.items():
             if source.bit is not None:
                 on = bits.to_numpy().astype(np.int64) >> source.bit & 1
-                yield name, pd.Series(on.astype(float), index=bits.index)
+                meant[name] = pd.Series(on.astype(float), index=bits.index)
+    return meant
 
 
 def _own_topic(

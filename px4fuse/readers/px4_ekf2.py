@@ -33,7 +33,8 @@ from px4fuse.flight import (
 )
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.layouts import Layout, elements
-from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S, read_aids
+from px4fuse.readers.px4_aid_sources import STATUS, STATUS_FLAGS
+from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S, intentions, read_aids
 from px4fuse.readers.px4_innovations import innovations_of
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 
@@ -66,9 +67,10 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         return Unavailable(
             "EKF2", "vehicle_local_position holds no finite sample", "Wait until EKF2 has started."
         )
-    fusing = _read_fusing(topics)
+    meant = intentions(topics)
+    fusing = _fusing(topics, meant)
     gate = settings_in_force(parameters)[EV_POS.gate]
-    aids = read_aids(topics)
+    aids = read_aids(topics, meant)
     innovations, innovation_topics = innovations_of(aids, fusing, gate)
     notes = [
         f"{topic} has no time of measurement in this release: EKF2's innovations carry the time of "
@@ -105,16 +107,13 @@ def ekf2_topics(topics: Topics, ekf2: Ekf2 | Unavailable) -> Mapping[str, tuple[
     """Topics behind each part that is there, by the part's name in ``Flight.streams``."""
     if isinstance(ekf2, Unavailable):
         return {}
-    fusing = topics.find(px4.FUSING)
     return {
         "ekf2_state": tuple(layout.topic for layout in px4.LOCAL_POSITION),
         "ekf2_variance": ()
         if isinstance(ekf2.variance, Unavailable)
         else tuple(_state_vectors(topics))[:1],
         "ekf2_innovations": ekf2.innovation_topics,
-        "ekf2_fusing": ()
-        if isinstance(ekf2.fusing, Unavailable) or fusing is None
-        else (fusing.topic,),
+        "ekf2_fusing": () if isinstance(ekf2.fusing, Unavailable) else (_flags_topic(topics),),
     }
 
 
@@ -227,28 +226,25 @@ def _age_s(topics: Topics, topic: str) -> pd.Series:
     return pd.Series(dtype=np.float64)
 
 
-def _read_fusing(topics: Topics) -> pd.DataFrame | Unavailable:
-    layout = topics.find(px4.FUSING)
-    if layout is None:
+def _fusing(topics: Topics, meant: Mapping[str, pd.Series[float]]) -> pd.DataFrame | Unavailable:
+    """What EKF2 means to fuse of external vision."""
+    vision = {"horizontal": "ev_pos", "vertical": "ev_hgt", "yaw": "ev_yaw"}
+    if not {*vision.values()} <= meant.keys():
         return Unavailable(
             "EKF2 fusion flags",
-            "neither estimator_status_flags nor estimator_status is in the log",
+            f"neither {STATUS_FLAGS} nor {STATUS} is in the log",
             px4.DEFAULT_PROFILE,
         )
-    frame = topics.of_primary(layout, step=True)
-    if "flags" in frame:
-        flags = frame["flags"].dropna()
-        bits = flags.to_numpy().astype(np.int64)
-        frame = pd.DataFrame(
-            {name: (bits >> bit & 1).astype(float) for name, bit in px4.CONTROL_MODE_BITS.items()},
-            index=flags.index,
-        )
-    frame = frame[["horizontal", "vertical", "yaw"]].dropna()
+    frame = pd.DataFrame({group: meant[aid] for group, aid in vision.items()}).dropna()
     if frame.empty:
         return Unavailable(
-            "EKF2 fusion flags", f"{layout.topic} holds no usable sample", "Record again."
+            "EKF2 fusion flags", f"{_flags_topic(topics)} holds no usable sample", "Record again."
         )
     return frame
+
+
+def _flags_topic(topics: Topics) -> str:
+    return STATUS_FLAGS if topics.instances(STATUS_FLAGS) else STATUS
 
 
 def read_resets(local: pd.DataFrame) -> tuple[Reset, ...]:

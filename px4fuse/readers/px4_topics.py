@@ -78,17 +78,6 @@ ACCELEROMETER_BIAS_STATE = 13
 
 SELECTOR = (Layout("estimator_selector_status", {"instance": "primary_instance"}, "v1.12"),)
 
-FUSING = (
-    Layout(
-        "estimator_status_flags",
-        {"horizontal": "cs_ev_pos", "vertical": "cs_ev_hgt", "yaw": "cs_ev_yaw"},
-        "v1.12",
-    ),
-    Layout("estimator_status", {"flags": "control_mode_flags"}, "v1.8"),
-)
-# estimator_status.control_mode_flags, msg/EstimatorStatus.msg
-CONTROL_MODE_BITS: Mapping[str, int] = {"horizontal": 12, "yaw": 13, "vertical": 14}
-
 # Horizontal aiding besides vision position, by the flags of all releases from v1.12, and before by
 # the bits of estimator_status.control_mode_flags
 AIDING_FLAGS: Mapping[str, str] = {
@@ -274,7 +263,7 @@ UNUSED: Mapping[str, str] = {
 def topics() -> list[str]:
     """Every topic named in this table, sorted: all that a reader needs to decode."""
     groups = (
-        IMU, ATTITUDE, LOCAL_POSITION, SENSOR_BIAS, SELECTOR, FUSING, LAND_DETECTED, FLIGHT_MODE,
+        IMU, ATTITUDE, LOCAL_POSITION, SENSOR_BIAS, SELECTOR, LAND_DETECTED, FLIGHT_MODE,
         TRUTH_LOCAL, TRUTH_GLOBAL, TRUTH_ATTITUDE, GPS, AID_OBSERVATION_HORIZONTAL,
         AID_OBSERVATION_VERTICAL, *(track.layouts for track in TRACKS),
     )  # fmt: skip
