@@ -1,0 +1,140 @@
+"""What a report shows, as text that can be read and compared line by line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import Collection
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.legend import Legend
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.text import Text
+
+from px4fuse.report.page import Block
+
+# Numbers of which only the spread is kept
+MANY = 12
+
+
+def value(part: Any, digits: int = 4) -> str:
+    """A value in few digits, so that the last ones of another machine do not show."""
+    if isinstance(part, bool) or part is None or isinstance(part, str):
+        return str(part)
+    if isinstance(part, float | int | np.floating | np.integer):
+        return f"{0.0 if abs(part) < 1e-9 else part:.{digits}g}"
+    if isinstance(part, Mapping):
+        return "{" + ", ".join(f"{name}: {value(each)}" for name, each in part.items()) + "}"
+    if isinstance(part, Sequence | np.ndarray):
+        if len(part) > MANY and all(isinstance(each, float | int) for each in part):
+            return numbers(part)
+        return "[" + ", ".join(value(each) for each in part) + "]"
+    return type(part).__name__
+
+
+def numbers(some: Any) -> str:
+    """How many numbers there are, and how they are spread: first, last, mean, deviation."""
+    known = np.ma.filled(np.ma.asarray(some, dtype=float), np.nan).ravel()
+    known = known[np.isfinite(known)]
+    if not len(known):
+        return "0"
+    return f"{len(known)} {value([known[0], known[-1], known.mean(), known.std()])}"
+
+
+def colour(given: Any) -> str:
+    """Colours as red, green, blue and opacity."""
+    try:
+        return str(to_hex(given, keep_alpha=True))
+    except (TypeError, ValueError):
+        return f"{len(given)} colours {numbers(given)}"
+
+
+def of_artist(artist: Any) -> Iterator[str]:
+    """One line about something drawn."""
+    label = str(artist.get_label())
+    name = f"{type(artist).__name__} {'' if label.startswith('_') else label!r}"
+    looks = f"z {value(artist.get_zorder())} alpha {value(artist.get_alpha())}"
+    match artist:
+        case Line2D():
+            marks = f"{artist.get_marker()} {value(artist.get_markersize())}"
+            width = f"{artist.get_linestyle()} {value(artist.get_linewidth())}"
+            x, y = (numbers(part) for part in artist.get_data())
+            yield f"{name} {colour(artist.get_color())} {width} {marks} {looks}: {x}; {y}"
+        case Text():
+            if artist.get_text():
+                place = value(artist.get_position())
+                side = f"{artist.get_ha()} {artist.get_va()}"
+                letters = f"{value(artist.get_size())} {colour(artist.get_color())}"
+                yield f"Text {artist.get_text()!r} at {place} {side} {letters}"
+        case AxesImage():
+            yield f"{name} {value(artist.get_extent())} {value(artist.get_clim())}: " + numbers(
+                artist.get_array()
+            )
+        case Collection():
+            paths = [path.vertices for path in artist.get_paths()]
+            shape = numbers(np.concatenate(paths)) if paths else "0"
+            faces = colour(artist.get_facecolor())
+            yield (
+                f"{name} {faces} {numbers(artist.get_linewidth())} {looks}: "
+                f"{numbers(artist.get_offsets())}; {shape}; {numbers(artist.get_array())}"
+            )
+        case Patch():
+            corners = artist.get_path().transformed(artist.get_patch_transform()).vertices
+            yield f"{name} {colour(artist.get_facecolor())} {looks}: {numbers(corners)}"
+        case Legend():
+            names = [text.get_text() for text in artist.get_texts()]
+            anchor = value(artist.get_bbox_to_anchor()._bbox.bounds)
+            yield f"Legend {names} {anchor} {artist._loc} {value(artist.handlelength)}"
+
+
+def of_axes(axes: Axes) -> Iterator[str]:
+    """Where axes are, what they span, and what is drawn in them."""
+    spans = value([*axes.get_xlim(), *axes.get_ylim()])
+    scales = f"{axes.get_xscale()} {axes.get_yscale()} {'' if axes.axison else 'bare'}"
+    yield f"axes {value(axes.get_position().bounds)} spans {spans} {scales}".rstrip()
+    labels = axes.get_title(), axes.get_xlabel(), axes.get_ylabel()
+    yield f"  labels {labels} ticks {axes.xaxis.get_tick_params()['labelbottom']}"
+    legend = axes.get_legend()
+    drawn = [*axes.lines, *axes.collections, *axes.patches, *axes.images, *axes.texts]
+    for artist in [*drawn, *([legend] if legend else [])]:
+        yield from (f"  {line}" for line in of_artist(artist))
+
+
+def of_figure(figure: Figure) -> Iterator[str]:
+    """All that a figure draws."""
+    yield f"figure {value(figure.get_size_inches())}"
+    for artist in [*figure.texts, *figure.lines, *figure.legends]:
+        yield from of_artist(artist)
+    for axes in figure.axes:
+        yield from of_axes(axes)
+
+
+def of_blocks(blocks: Sequence[Block]) -> Iterator[str]:
+    """What stands on pages, a line for each word, table row and artist."""
+    for block in blocks:
+        inner = ("figure", "axes", "columns", "blocks", "rows")
+        plain = {name: part for name, part in block.items() if name not in inner}
+        yield value(plain)
+        for row in block.get("rows", ()):
+            yield f"  {value(row)}"
+        if "figure" in block:
+            yield from (f"  {line}" for line in of_figure(block["figure"]))
+        for below in (*block.get("columns", ()), block.get("blocks", ())):
+            yield from (f"  {line}" for line in of_blocks(below))
+
+
+def of_values(part: Any, path: str = "") -> Iterator[str]:
+    """Every value of some results by its path."""
+    if isinstance(part, Mapping):
+        for name, below in part.items():
+            yield from of_values(below, f"{path}.{name}" if path else str(name))
+    elif isinstance(part, list) and any(isinstance(each, dict | list) for each in part):
+        for place, below in enumerate(part):
+            yield from of_values(below, f"{path}.{place}")
+    else:
+        yield f"{path} {value(part)}"
