@@ -118,6 +118,20 @@ def test_rubbish_costs_nothing_of_the_flight(
     assert not flight.log.ends_in_flight
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_rubbish_that_looks_like_headers_takes_its_neighbours_alone(
+    seed: int, sample_log: Path
+) -> None:
+    """One in twenty random headers is of a kind that there is, and leads into what is whole."""
+    dice = random.Random(seed)
+    content = sample_log.read_bytes()
+    at = dice.randrange(len(content) // 5, len(content) - 30_000)
+    found = whole_messages(content[:at] + dice.randbytes(20_000) + content[at + 20_000 :])
+    assert 19_500 < found.lost_bytes < 20_700
+    assert found.content[:at].startswith(content[: at - 500])
+    assert found.content.endswith(content[at + 20_500 :])
+
+
 def test_a_recording_that_ends_in_flight_says_so(tmp_path: Path, sample_log: Path) -> None:
     content = sample_log.with_suffix(".tlog").read_bytes()
     path = tmp_path / "half.tlog"

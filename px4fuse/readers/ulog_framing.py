@@ -9,14 +9,18 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 
 HEADER_BYTES = 16
 KINDS = frozenset(b"FBIMPQARDLCSO")
 _KIND = re.compile(b"[FBIMPQARDLCSO]")
+_DATA, _DATA_KIND = ord("D"), re.compile(b"D")
 # So many headers in a row that make sense are found in rubbish by chance once in 10¹⁴ places
 IN_A_ROW = 12
+# Of a topic and as long as all of that topic by chance once in 10⁸ places
+FEW = 3
 # What is no kind of message may be one of a later PX4, if a message stands behind it
 LETTERS = frozenset(range(ord("A"), ord("Z") + 1))
 # The message of flags holds where data were appended after a crash of the logger
@@ -68,33 +72,54 @@ def _walk(content: bytes, start: int, end: int) -> tuple[list[tuple[int, int]], 
     """Stretches of whole messages between two places, and whether the last one is cut off."""
     pieces = []
     at = begun = before = start
+    # Of each number of a topic: bytes of its last message, and of all, once two had as many
+    last: dict[int, int] = {}
+    sizes: dict[int, int] = {}
+    sure = start  # where the last message of a topic ends that is as long as those before it
     while at + 3 <= end:
         size, kind = content[at] | content[at + 1] << 8, content[at + 2]
         behind = at + 3 + size
         known = kind in KINDS or (kind in LETTERS and _is_row(content, behind, end, IN_A_ROW))
         if known and size and behind <= end:
-            before, at = at, behind
-            continue
-        # cut off, unless sound messages follow; where they begin inside of the last message, that
-        # one was none: its size was overwritten
-        begins = _next(content, before + 1, end)
-        if begins is not None and begins < at:
+            topic = content[at + 3] | content[at + 4] << 8 if kind == _DATA and size > 1 else None
+            if topic is None or sizes.get(topic, size) == size:
+                if topic is not None and last.get(topic) == size:
+                    sizes[topic] = size
+                    sure = behind
+                elif topic is not None:
+                    last[topic] = size
+                before, at = at, behind
+                continue
+        # cut off, unless sound messages follow. Headers in rubbish can look sound: what stands
+        # behind the last sure message, or this one if its size was overwritten, was none
+        begins = _next(content, sure if sizes else before + 1, end, sizes)
+        if begins is not None and sizes:
+            at = sure
+        elif begins is not None and begins < at:
             at = before
         if at > begun:
             pieces.append((begun, at))
         if begins is None:
             return pieces, known and behind > end
-        at = begun = before = begins
+        at = begun = before = sure = begins
     if at > begun:
         pieces.append((begun, at))
     return pieces, at < end
 
 
-def _next(content: bytes, start: int, end: int) -> int | None:
-    """Where the next message begins, with others behind it."""
-    for found in _KIND.finditer(content, start + 2, end):
+def _next(content: bytes, start: int, end: int, sizes: Mapping[int, int]) -> int | None:
+    """Where the next message begins, with others behind it.
+
+    Where sizes of topics are known it is one of these: in rubbish a header of another kind leads
+    to a sound message by chance, and all between would be lost.
+    """
+    for found in (_DATA_KIND if sizes else _KIND).finditer(content, start + 2, end):
         at = found.start() - 2
-        if _is_row(content, at, end, IN_A_ROW):
+        if sizes:
+            size, topic = struct.unpack("<HxH", content[at : at + 5].ljust(5))
+            if sizes.get(topic) != size:
+                continue
+        if _is_row(content, at, end, FEW if sizes else IN_A_ROW):
             return at
     return None
 
