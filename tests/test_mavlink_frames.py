@@ -295,6 +295,23 @@ def test_half_a_hundredth_that_is_no_frame_is_damage(tmp_path, share: float, sai
     assert log.bytes - log.bytes_read >= len(junk)
 
 
+@pytest.mark.parametrize("stamped", [True, False])
+@pytest.mark.parametrize("missing", [0, 1, 11, 25, 30])
+def test_a_recording_that_is_cut_off_says_so(tmp_path, stamped: bool, missing: int):
+    made = Aisle(seconds=20.0).record()
+    content = made.tlog() if stamped else made.raw()
+    (tmp_path / "made.tlog").write_bytes(content[: len(content) - missing])
+    log = read_log(tmp_path / "made.tlog").log
+    wanted = f"the file ends in mid-frame after {log.duration_s:.1f} s"
+    assert [text.startswith(wanted) for text in log.damage] == [True] * (missing > 0)
+
+
+@pytest.mark.parametrize("behind", [b"\x00" * 50, raw_frame(60_000, b"abcdefg", seed=7)])
+def test_what_follows_the_last_frame_is_not_always_the_next(read, behind: bytes):
+    """Rubbish, and a whole frame of a dialect that is not known here."""
+    assert not read(b"".join(beats(6)) + behind).in_frame
+
+
 @pytest.mark.parametrize("junk", [b"\x00" * 50, b"\xfd" * 50, b"\xfe" * 300, bytes(range(256))])
 def test_junk_between_frames_costs_itself(read, junk):
     parts = beats(6)

@@ -45,6 +45,7 @@ from px4fuse.readers.mavlink_senders import (
 )
 from px4fuse.readers.parts import (
     BEYOND_IMU,
+    cut_off,
     ends_in_flight,
     finite_rows,
     missing_parts,
@@ -96,10 +97,13 @@ def read_mavlink(path: Path, system: int | None = None) -> Flight:
     positions, missing_positions = read_positions(recording, mapped, remedies["position"])
     truth = read_truth(recording, positions, remedies)
     airborne = _read_airborne(recording, remedies["landed"])
+    in_flight = ends_in_flight(airborne, recording.duration_s)
+    end = (cut_off("frame", recording.duration_s, in_flight),) if frames.in_frame else ()
     return Flight(
         log=structs.replace(
             _describe(recording, parameters, autopilot),
-            ends_in_flight=ends_in_flight(airborne, recording.duration_s),
+            damage=(*end, *recording.damage),
+            ends_in_flight=in_flight,
         ),
         imu=imu,
         attitude=attitude,
@@ -317,7 +321,6 @@ def _describe(
         start_unix_s=_start_unix_s(recording),
         senders=describe_senders(recording),
         vehicle=vehicle,
-        damage=recording.damage,
         bytes_read=len(frames.content) - frames.bad_bytes,
     )
 

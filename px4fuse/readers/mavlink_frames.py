@@ -78,6 +78,8 @@ class Frames:
         a sender sent of one message most have another checksum than its definition gives.
     bad_bytes : int
         Bytes that belong to no frame.
+    in_frame : bool
+        Whether the file ends in the middle of a frame.
     bad_stamps : int
     """
 
@@ -95,6 +97,7 @@ class Frames:
     received_us: Integers | None
     passed_over: Mapping[int, int]
     bad_bytes: int
+    in_frame: bool
     bad_stamps: int
 
     def __len__(self) -> int:
@@ -232,6 +235,7 @@ def read_frames(path: Path) -> Frames:
         received_us=received,
         passed_over=passed_over,
         bad_bytes=bad_bytes,
+        in_frame=_is_begun(content[int(end[-1]) :], stamp),
         bad_stamps=bad_stamps,
     )
 
@@ -268,6 +272,13 @@ def _without_overlap(start: Integers, end: Integers) -> tuple[Integers, Integers
             keep.append(row)
             reached = int(end[row])
     return start[keep], end[keep]
+
+
+def _is_begun(rest: bytes, stamp: int) -> bool:
+    """Whether what follows the last good frame ends with the beginning of another one."""
+    rest = rest[sum(size for _, size in _whole_frames(rest, 0, len(rest), stamp)) :]
+    begun = rest[stamp : stamp + 1] in (b"", bytes([MAGIC_1]), bytes([MAGIC_2]))
+    return 0 < len(rest) < stamp + LONGEST_FRAME and begun
 
 
 def _any_of(values: tuple[int, ...], increasing: Integers) -> bool:

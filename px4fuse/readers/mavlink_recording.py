@@ -41,7 +41,7 @@ RESTART_MESSAGES = 20
 STRAY_SHARE = 0.01
 # Samples further than this before or after the session have an impossible stamp
 OUTSIDE_S = 60.0
-# More bytes than this outside of frames are damage; a stream begins and ends in mid-frame
+# More bytes than this outside of frames are damage; a stream may begin in mid-frame
 DAMAGED_SHARE = 0.002
 # From this number on, stamps of the autopilot that stand still are no clock
 MIN_STAMPS = 10

@@ -55,6 +55,15 @@ def ends_in_flight(
     )
 
 
+def cut_off(part: str, duration_s: float, in_flight: bool) -> str:
+    """What is said of a file that ends in the middle of a part of it."""
+    flying = ", in flight" if in_flight else ""
+    return (
+        f"the file ends in mid-{part} after {duration_s:.1f} s{flying}: what came after is not "
+        "in it"
+    )
+
+
 def stretches_of_modes(names: pd.Series, end_s: float) -> tuple[FlightMode, ...]:
     """Stretches (s) of a step function of time whose values are names of flight modes."""
     changes = names[names.ne(names.shift())]

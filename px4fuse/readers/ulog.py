@@ -20,6 +20,7 @@ from px4fuse.flight import (
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.parts import (
     BEYOND_IMU,
+    cut_off,
     ends_in_flight,
     finite_rows,
     missing_parts,
@@ -114,11 +115,7 @@ def _lost(topics: Topics, imu: pd.DataFrame | Unavailable, in_flight: bool) -> t
     framing, log = topics.framing, topics.log
     said = []
     if framing.in_message:
-        flying = ", in flight" if in_flight else ""
-        said.append(
-            f"the file ends in mid-message after {log.duration_s:.1f} s{flying}: what came after "
-            "is not in it"
-        )
+        said.append(cut_off("message", log.duration_s, in_flight))
     if framing.lost_bytes > LEAST_LOST * framing.in_message:
         steps = np.array([]) if isinstance(imu, Unavailable) else np.diff(imu.index.to_numpy())
         silent_s = float(steps[steps > LOST_FROM_S].sum())
