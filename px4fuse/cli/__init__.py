@@ -33,6 +33,7 @@ COMMANDS = {
     "simulate": "Simulate a flight with chosen mistakes, as ULog.",
     "verify": "Check a report against its log, number by number.",
     "grade": "Verify and score a class's reports.",
+    "sample": "Write the sample flights, to try things on.",
     "lesson": "Run the lesson's worked examples through this engine.",
 }
 

@@ -24,8 +24,26 @@ REPLAY_PPM = 10_000.0
 SOURCES_HEAD = ("", "source", "samples", "Hz", "gaps", "span (s)")
 
 
+def _versions(context: click.Context, _: click.Parameter, wanted: bool) -> None:
+    if not wanted:
+        return
+    import platform
+
+    from px4fuse.results.model import provenance
+
+    made = provenance("")
+    libraries = ", ".join(f"{name} {version}" for name, version in made.libraries.items())
+    click.echo(f"px4fuse {made.px4fuse}, Python {made.python}, {platform.platform()}")
+    click.echo(libraries)
+    context.exit()
+
+
 @click.command()
 @click.argument("log", type=Named())
+@click.option(
+    "--versions", is_flag=True, is_eager=True, expose_value=False, callback=_versions,
+    help="Print versions, system and libraries, for a bug report, and exit.",
+)  # fmt: skip
 @json_option
 @recording_options
 def info(log: Path, json_path: Path | None, **given: Any) -> None:

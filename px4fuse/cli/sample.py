@@ -1,0 +1,42 @@
+"""``px4fuse sample``: the sample flights, to try things on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from px4fuse.cli.inputs import path_option
+from px4fuse.cli.outputs import finish
+
+FOLDER = Path("sample_logs")
+
+
+@click.command()
+@path_option(
+    "-o", "--output", metavar="DIR", default=FOLDER, help="Where to.  [default: sample_logs]"
+)
+def sample(output: Path) -> None:
+    """Write the sample flights: an aisle with UWB, a loop on visual-inertial odometry."""
+    from importlib.resources import files
+
+    from px4fuse.errors import MissingDataError, OutputError
+    from px4fuse.report.screen import print_command
+    from px4fuse.request import ComparisonRequest, command_line
+
+    try:
+        flights = [one for one in files("px4fuse_samples").iterdir() if one.is_file()]
+    except ModuleNotFoundError:
+        raise MissingDataError(
+            "the sample flights are not installed", 'Run pip install "px4fuse[samples]".'
+        ) from None
+    contents = {output / one.name: one.read_bytes() for one in sorted(flights, key=str)}
+    for path, content in contents.items():
+        if path.is_file() and path.read_bytes() != content:
+            raise OutputError(
+                f"{path}: another file of that name is there; nothing was written. Move it away, "
+                "or give another folder with -o."
+            )
+    first = next(path for path in contents if path.suffix == ".ulg")
+    command = command_line(ComparisonRequest(log=str(first)), "compare", typed=True)
+    finish(contents, lambda console: print_command(console, command, "Next"))

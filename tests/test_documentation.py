@@ -1,0 +1,203 @@
+"""What README and documentation tell a newcomer to type works word for word."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import matplotlib as mpl
+import pytest
+from batch_tools import tiny_logs
+from class_tools import in_this_process
+from click.testing import CliRunner
+from conftest import REPOSITORY as ROOT
+from matplotlib import pyplot
+
+from px4fuse.cli import COMMANDS, cli
+from px4fuse.fleet.engine import connected
+
+pytestmark = pytest.mark.usefixtures("analysed_once")
+
+PAGES = {
+    path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8")
+    for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+}
+README = PAGES["README.md"]
+BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.DOTALL | re.MULTILINE)
+
+
+def blocks(page: str, kind: str) -> list[str]:
+    return [text for name, text in BLOCK.findall(PAGES[page]) if name == kind]
+
+
+def commands(page: str) -> list[str]:
+    """Lines of a page to type, without the readers of pipes."""
+    lines = [line for text in blocks(page, "sh") for line in text.splitlines()]
+    return [line.split(" | ")[0] for line in lines if line.startswith("px4fuse ")]
+
+
+@pytest.fixture
+def at_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder that looks like a fresh clone, so that outputs do not land in this one."""
+    samples = ROOT / "sample_logs"
+    shutil.copytree(samples, tmp_path / "sample_logs")
+    shutil.copytree(samples, tmp_path / "installed" / "px4fuse_samples")
+    monkeypatch.syspath_prepend(str(tmp_path / "installed"))
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def workers():
+    """Of the session, so that a batch begins none of its own, as another test's does."""
+    with connected(workers=1, memory="2GB"):
+        yield
+
+
+def typed(line: str) -> None:
+    result = CliRunner().invoke(cli, shlex.split(line, comments=True)[1:])
+    assert result.exit_code == 0, (line, result.output)
+
+
+@pytest.mark.usefixtures("no_drawing", "at_root")  # tests of their own draw each kind of report
+@pytest.mark.parametrize("page", [page for page in PAGES if commands(page)])
+def test_commands_run_in_order(page: str, request, monkeypatch, tmp_path: Path) -> None:
+    if page == "docs/instructors.md":
+        pytest.skip("a test of its own makes what its commands need")
+    for number, line in enumerate(commands(page)):
+        if line.startswith("px4fuse batch"):  # the sample logs themselves are in the other lines
+            request.getfixturevalue("workers")
+            folder = tmp_path / f"batch_{number}"
+            folder.mkdir()
+            tiny_logs(folder / "sample_logs", 1)
+            monkeypatch.chdir(folder)
+            typed(line)
+            monkeypatch.chdir(tmp_path)
+        else:
+            typed(line)
+
+
+@pytest.mark.usefixtures("drawn_once", "at_root")
+def test_the_instructors_four_commands_run_in_order(monkeypatch) -> None:
+    in_this_process(monkeypatch)
+    Path("roster.csv").write_text("id,name\n1001,Ada Lovelace\n1002,Grace Hopper\n")
+    Path("notes.md").write_text("# What I found\n\nThe stamps are late.\n")
+    lines = commands("docs/instructors.md")
+    assert len(lines) == 4
+    for line in lines:
+        result = CliRunner().invoke(cli, shlex.split(line)[1:])
+        assert result.exit_code == 0, (line, result.output)
+    assert {path.name for path in Path("flights").glob("*.ulg")} == {"1001.ulg", "1002.ulg"}
+    assert "verified" in result.output
+    table = Path("class/class.csv").read_text(encoding="utf-8-sig")
+    assert "Ada Lovelace,1001,verified" in table
+
+
+@pytest.mark.usefixtures("at_root")
+@pytest.mark.parametrize("page", ["README.md", "docs/python.md"])
+def test_python_examples_run(page: str, capsys) -> None:
+    """In the page's order, on the tables that its own command extracts."""
+    mpl.use("Agg")
+    for line in commands(page):
+        if line.startswith("px4fuse extract"):
+            typed(line)
+            capsys.readouterr()
+    for block in blocks(page, "python"):
+        exec(compile(block, page, "exec"), {})
+        said = capsys.readouterr().out
+        numbers = re.findall(r"-?\d+\.\d+", said)
+        assert numbers
+        assert all(abs(float(number)) < 1e3 for number in numbers)
+        assert len(said.splitlines()) < 150 or "gain" in said  # no table is printed whole
+    plots = sum(len(re.findall(r"\S\.plot\(\)", block)) for block in blocks(page, "python"))
+    assert len(pyplot.get_fignums()) == plots > 0
+    pyplot.close("all")
+
+
+def test_the_readme_is_short_and_says_how_long_things_take() -> None:
+    assert len(README.splitlines()) <= 200
+    for said in ("a minute", "ten minutes", "seconds"):
+        assert said in README
+
+
+@pytest.mark.parametrize(("page", "most"), [("README.md", 3), ("docs/lab.md", 2)])
+def test_the_lab_has_a_command_for_each_step(page: str, most: int) -> None:
+    steps = re.split(r"\n\*\*\d\. ", PAGES[page].split("The lab in five steps\n")[-1])[1:]
+    assert len(steps) == 5
+    for number, step in enumerate(steps, 1):
+        step = step.split("\n## ")[0]  # noqa: PLW2901 - what follows the lab
+        assert 1 <= len(re.findall(r"^px4fuse ", step, re.MULTILINE)) <= most
+        assert page == "README.md" or f"reports/lab_{number}.png)" in step
+
+
+def test_pictures_are_small_and_made_by_the_script() -> None:
+    script = (ROOT / "tests" / "benchmarks" / "readme_pictures.py").read_text(encoding="utf-8")
+    pictures = re.findall(r"!\[[^]]+\]\((\S+\.png)\)", README + PAGES["docs/lab.md"])
+    assert len({Path(picture).name for picture in pictures}) == 7
+    for picture in pictures:
+        file = ROOT / "reports" / Path(picture).name
+        assert file.stat().st_size <= 100_000
+        assert f'Picture("{file.stem}"' in script
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_shells_complete_as_said(shell, monkeypatch, capsys) -> None:
+    said = PAGES["docs/commands.md"]
+    assert f"_PX4FUSE_COMPLETE={shell}_source px4fuse" in said or f"`{shell}_source`" in said
+    monkeypatch.setenv("_PX4FUSE_COMPLETE", f"{shell}_source")
+    with pytest.raises(SystemExit) as done:
+        cli.main(prog_name="px4fuse")
+    assert done.value.code == 0
+    assert "px4fuse" in capsys.readouterr().out
+    monkeypatch.setenv("_PX4FUSE_COMPLETE", f"{shell}_complete")
+    monkeypatch.setenv("COMP_WORDS", "px4fuse comp")
+    monkeypatch.setenv("COMP_CWORD", "comp" if shell == "fish" else "1")
+    with pytest.raises(SystemExit):
+        cli.main(prog_name="px4fuse")
+    assert "compare" in capsys.readouterr().out
+
+
+def test_every_command_is_in_the_table() -> None:
+    for command in COMMANDS:
+        assert f"`px4fuse {command}" in PAGES["docs/commands.md"]
+
+
+def test_ci_runs_the_readmes_test_command() -> None:
+    command = ".venv/bin/python -m pytest"
+    assert command in README
+    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    assert script.rstrip().endswith(command)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_linked_files_and_headings_exist(page: str) -> None:
+    folder = (ROOT / page).parent
+    targets = re.findall(r"\]\(([^)]+)\)", PAGES[page])
+    targets += re.findall(r"(?<=\{image\} )\S+|(?<=\}`)[^`]+", PAGES[page])
+    for target in targets:
+        target = target.partition("<")[2].removesuffix(">") or target  # noqa: PLW2901 - a download
+        name, _, heading = target.partition("#")
+        if "//" in target or name.startswith("made/"):  # the build makes and checks these
+            continue
+        path = folder / name if name else ROOT / page
+        assert path.exists(), target
+        headings = (
+            re.findall(r"^#+ (.*)", path.read_text(encoding="utf-8"), re.M) if heading else []
+        )
+        anchors = [re.sub(r"[^\w -]", "", each).lower().replace(" ", "-") for each in headings]
+        assert not heading or heading in anchors, target
+
+
+def test_the_index_shows_the_readme_with_absolute_links() -> None:
+    """By the rules that the build gives its plugin."""
+    import tomllib
+
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    rules = settings["tool"]["hatch"]["metadata"]["hooks"]["fancy-pypi-readme"]["substitutions"]
+    text = README
+    for rule in rules:
+        text = re.sub(rule["pattern"], rule["replacement"], text)
+    links = re.findall(r"\]\(([^)]+)\)", text)
+    assert len(links) == len(re.findall(r"\]\(([^)]+)\)", README)) > 20
+    assert all(link.startswith("https://") for link in links)
