@@ -24,7 +24,7 @@ import findings_pages  # noqa: E402
 from px4fuse.cli import COMMANDS, cli  # noqa: E402
 
 project = "px4fuse"
-author = "The px4fuse authors"
+author = copyright = "The px4fuse authors"  # noqa: A001 - as Sphinx calls it
 release = metadata.version("px4fuse")
 extensions = [
     "myst_nb",  # Markdown, and the notebook, which is executed
@@ -34,6 +34,9 @@ extensions = [
 ]
 exclude_patterns = ["_build", "jupyter_execute"]
 html_theme = "furo"
+html_static_path = ["style.css"]
+html_css_files = ["style.css"]
+smartquotes = False  # two dashes begin an option
 html_title = f"px4fuse {release}"
 # formulas are drawn by a script of the network; without one they stand as they are written
 myst_enable_extensions = ["dollarmath"]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 import sys
+import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +41,7 @@ from px4fuse.simulation.flights import simulate_flight  # noqa: E402
 from px4fuse.simulation.mistakes import parse  # noqa: E402
 from px4fuse.simulation.scenario import Scenario  # noqa: E402
 
+MEANINGS = tomllib.loads(Path(__file__).with_name("meanings.toml").read_text(encoding="utf-8"))
 FINDINGS = ROOT / "px4fuse" / "findings"
 # What `px4fuse simulate` is told, with the settings of the comparison, to show a finding
 SIMULATED: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
@@ -173,7 +175,8 @@ def page(name: str, example: Example | None, folder: Path) -> Iterator[str]:
     stem, said = written_in()[name]
     title = NAMES[name]
     yield f"# {title[0].upper()}{title[1:]}\n\n`{name}`\n"
-    yield f"## What it means\n\n{said}\n"
+    yield f"## What it means\n\n{MEANINGS[name]}\n"
+    yield f"In the detector's own words: *{said}*\n"
     causes = [cause for cause, brought in CONSEQUENCES.items()
               if any(each.partition(":")[0] == name for each in brought)]  # fmt: skip
     follows = [each.partition(":")[0] for each in CONSEQUENCES.get(name, ())]

@@ -143,6 +143,17 @@ def test_a_mistyped_name_and_a_table_get_the_command_that_was_meant(tmp_path):
         "uwb.csv: a table, not a flight log. If it holds positions, give it beside the log of the "
         "flight: px4fuse compare LOG --position uwb.csv."
     )
+    path = tmp_path / "slam.tum"
+    path.write_text("0.0 1 2 3 0 0 0 1\n")
+    assert refusal(path) == (
+        "slam.tum: a trajectory or a pose graph, not a flight log. Score it with px4fuse evaluate, "
+        "or correct its loop: px4fuse loop slam.tum."
+    )
+    report = tmp_path / "log.pdf"
+    report.write_bytes(b"%PDF-1.7 and so on")
+    assert refusal(report) == (
+        "log.pdf: a PDF, not a flight log. To check a report: px4fuse verify log.pdf LOG."
+    )
 
 
 def test_a_log_of_topics_that_are_none_of_ours(tmp_path):

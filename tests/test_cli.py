@@ -2,15 +2,19 @@
 
 import json
 import os
+import platform
+import shutil
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 
 import jsonschema
 import pypdf
 import pytest
-from cli_tools import run, run_main
+from cli_tools import contents, run, run_main
 from click.testing import Result
+from conftest import REPOSITORY as ROOT
 
 from px4fuse.cli import COMMANDS
 from px4fuse.results.contract import schema
@@ -213,3 +217,58 @@ def test_a_segment_beyond_the_data_is_cut_and_said_to_be(tmp_path, sample_log):
     assert settings["start_s"] == 0.0
     assert 129.0 < settings["end_s"] < 130.0
     assert "cut at the ends of the data" in settings["segment_reason"]
+
+
+# --------------------------------------------------------------------------- sample and versions
+
+
+@pytest.fixture
+def samples_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the distribution of the sample flights puts them, and an empty folder."""
+    shutil.copytree(ROOT / "sample_logs", tmp_path / "site" / "px4fuse_samples")
+    monkeypatch.syspath_prepend(str(tmp_path / "site"))
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+
+
+@pytest.mark.usefixtures("samples_installed")
+def test_sample_writes_the_flights_and_says_what_to_do_with_them() -> None:
+    made = run("sample")
+    assert made.exit_code == 0, made.output
+    assert made.output.splitlines()[0].split(maxsplit=1) == [
+        "Next", f"px4fuse compare {Path('sample_logs') / 'aisle_uwb.ulg'}"
+    ]  # fmt: skip
+    for name in ("aisle_uwb.ulg", "aisle_uwb.tlog", "loop_vio.ulg", "loop_slam.tum"):
+        assert (Path("sample_logs") / name).read_bytes() == (
+            ROOT / "sample_logs" / name
+        ).read_bytes()
+    assert run("sample").exit_code == 0  # they are the same
+
+
+@pytest.mark.usefixtures("samples_installed")
+def test_sample_overwrites_nothing(monkeypatch, capsys) -> None:
+    Path("flights").mkdir()
+    Path("flights/loop_slam.tum").write_text("mine")
+    code, out, err = run_main(monkeypatch, capsys, "sample", "-o", "flights")
+    assert (code, out) == (2, "")
+    assert "loop_slam.tum: another file of that name is there; nothing was written" in err
+    assert contents(Path("flights")) == {"loop_slam.tum": b"mine"}
+
+
+def test_without_the_samples_it_says_what_to_install(monkeypatch, capsys) -> None:
+    monkeypatch.setitem(sys.modules, "px4fuse_samples", None)
+    code, _, err = run_main(monkeypatch, capsys, "sample")
+    assert code == 2
+    assert err == (
+        'px4fuse: the sample flights are not installed. Run pip install "px4fuse[samples]".\n'
+    )
+
+
+def test_versions_are_for_a_bug_report() -> None:
+    made = run("info", "--versions")
+    assert made.exit_code == 0
+    first, libraries = made.output.splitlines()
+    assert first.startswith(
+        f"px4fuse {metadata.version('px4fuse')}, Python {platform.python_version()}"
+    )
+    assert f"numpy {metadata.version('numpy')}" in libraries

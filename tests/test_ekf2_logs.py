@@ -36,7 +36,7 @@ def test_the_figures_of_the_benchmark_hold_on_every_simulated_flight(shared_logs
     assert {path.stem for path in paths} - models.keys() == NOT_CARRIED.keys()
     left = bench_ekf2.waterfalls(models)
     bench_ekf2.counterfactuals(models)
-    assert bench_ekf2.readme_table(models, left) == bench_ekf2.in_readme()
+    assert bench_ekf2.agreement_page(models, left) == bench_ekf2.in_page()
 
 
 @pytest.mark.parametrize("name", NOT_CARRIED)

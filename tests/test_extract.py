@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 from cli_tools import run, run_main
 from click.testing import Result
+from conftest import REPOSITORY
 from exchange import replace
 from flights import Estimator, aisle_flight
 from msgspec import structs
@@ -25,9 +26,9 @@ from px4fuse.inspect import tables as extraction
 from px4fuse.readers import read_log
 from px4fuse.recording import ClockMap, Dropout, InputFile
 
-# As it stands in the README: the lesson's Example 1 on one's own flight
-README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
-(LESSON,) = re.findall(r"```python\n(import numpy.*?)```", README, re.DOTALL)
+# As it stands in the documentation: the lesson's Example 1 on one's own flight
+PAGE = (REPOSITORY / "docs" / "python.md").read_text(encoding="utf-8")
+(LESSON,) = re.findall(r"```python\n(import numpy.*?)```", PAGE, re.DOTALL)
 
 
 def extract(*arguments: str | Path) -> Result:
@@ -112,6 +113,20 @@ def test_the_lists_of_a_flight_are_tables():
     clock = tables["clocks"].dropna(axis=1).iloc[0].to_dict()
     told = structs.asdict(flight.clocks[0])
     assert clock == {name: value for name, value in told.items() if value is not None}
+
+
+def test_all_that_an_analysis_reads_is_extracted(sample_flight):
+    """EKF2's own parameters, and the orientation of odometry."""
+    flight = read_log(REPOSITORY / "sample_logs" / "loop_vio.ulg")
+    tables = extraction.tables(flight)
+    values = dict(tables["parameters"].to_numpy().tolist())
+    assert values.items() >= flight.ekf2.record.parameters.items()
+    assert values["EKF2_GYR_NOISE"] == pytest.approx(0.015)
+    turned = tables["orientation_vehicle_visual_odometry"]
+    (track,) = [one for one in flight.positions if one.orientation is not None]
+    np.testing.assert_array_equal(turned[list("wxyz")], track.orientation[list("wxyz")])
+    assert len(turned) == len(tables["position_vehicle_visual_odometry"])
+    assert not any(name.startswith("orientation") for name in extraction.tables(sample_flight))
 
 
 def test_files_are_what_a_spreadsheet_reads_and_all_are_said(written):
@@ -293,10 +308,10 @@ def test_parquet_holds_the_same_tables(tmp_path, sample_log, sample_flight):
 def test_the_lesson_by_hand_is_what_compare_does(
     tmp_path, monkeypatch, capsys, sample_log, sample_flight
 ):
-    """The README's ten lines round every measurement to the DT grid; else they are our filter."""
+    """The ten lines round every measurement to the DT grid; else they are our filter."""
     monkeypatch.chdir(tmp_path)
     assert extract(sample_log, "-o", "reports/tables").exit_code == 0
-    exec(compile(LESSON, "README.md", "exec"), {})
+    exec(compile(LESSON, "python.md", "exec"), {})
     printed = np.array(
         [
             [float(number) for number in re.findall(r"-?\d+\.\d+", line)]

@@ -24,8 +24,10 @@ from px4fuse.cli import cli
 from px4fuse.comparison.model import Comparison, UnjudgedFilter
 from px4fuse.display import Shown
 from px4fuse.filter.consistency import Consistency
+from px4fuse.filter.heading import HeadingPart, turned
 from px4fuse.fleet.changes import changes
 from px4fuse.fleet.inputs import DiffInput
+from px4fuse.flight import Flight
 from px4fuse.request import with_options
 from px4fuse.results.build import results as build
 from px4fuse.results.contract import ComparisonResults
@@ -83,6 +85,7 @@ def results(sample_log, analysis) -> dict[str, Shown]:
             DiffInput("aisle_uwb.json", "results", read_results(SHIPPED.read_bytes())),
             DiffInput("small.ulg", "log", results_of(analysis), analysis),
         ),
+        "HeadingError": analysis.heading,
     }
 
 
@@ -94,6 +97,7 @@ def results_of(analysis: px4fuse.Analysis) -> ComparisonResults:
 NAMES = [
     "Flight", "Comparison", "Analysis", "AxisComparison", "Consistency", "Why", "AxisTuning",
     "ClockOffset", "Loop", "Trajectory", "Evaluation", "PairwiseError", "WhatIf", "Changes",
+    "HeadingError",
 ]  # fmt: skip
 
 
@@ -182,7 +186,9 @@ def test_arguments_that_make_no_sense_are_refused(analysis, arguments, said):
 
 
 def test_an_axis_that_was_not_analysed_is_named(analysis):
-    with pytest.raises(px4fuse.Px4FuseError, match="no axis 'up' here: north, east, down, aisle"):
+    with pytest.raises(
+        px4fuse.Px4FuseError, match="no axis 'up' here. It has: north, east, down, aisle"
+    ):
         analysis["up"]
 
 
@@ -355,7 +361,9 @@ def test_names_of_files_are_no_markup(results):
     assert "<b>" not in html
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name != "Consistency"])
+@pytest.mark.parametrize(
+    "name", [name for name in NAMES if name not in ("Consistency", "HeadingError")]
+)
 def test_pictures_are_axes(results, name):
     drawn = np.atleast_1d(results[name].plot()).ravel()
     assert all(isinstance(ax, Axes) for ax in drawn)
@@ -401,3 +409,30 @@ def test_a_flight_without_anything_shows_itself(analysis):
     assert "no EKF2" in repr(without)
     assert not any(column.startswith(("ekf2", "truth")) for column in without.to_frame())
     assert without.plot()[0].get_ylabel() == "Position (m)"
+
+
+def test_a_mistyped_name_gets_the_one_that_was_meant(sample_flight: Flight) -> None:
+    for call, said in (
+        (lambda: px4fuse.compare(sample_flight, sigma_z=0.1), "`sigma_z`. Did you mean sigma_z_m?"),
+        (lambda: px4fuse.close_loop("x", landed=(0, 0)), "`landed`. Did you mean landed_at?"),
+        (lambda: px4fuse.what_if(sample_flight, chnages=[]), "`chnages`. Did you mean changes?"),
+    ):
+        with pytest.raises(TypeError, match=re.escape(said)):
+            call()
+    with pytest.raises(AttributeError, match=r"'comapre'. Did you mean compare\?$"):
+        px4fuse.comapre  # noqa: B018
+    with pytest.raises(AttributeError, match=r"has no attribute 'zzz'$"):
+        px4fuse.zzz  # noqa: B018
+
+
+def test_a_heading_says_itself_in_a_sentence() -> None:
+    parts = tuple(
+        HeadingPart(2.0 * i, 2.0 * i + 2.0, turn, 1.0) for i, turn in enumerate((-36, -9))
+    )
+    drifts = turned(parts, 1e-9, "positions")
+    assert repr(drifts) == (
+        "the source's frame is turned by -22.5° (± 1.0) against the vehicle's heading, from -36.0° "
+        "to -9.0° (by the positions)"
+    )
+    assert "the same all along" in repr(turned(parts, 0.5, "orientation"))
+    assert drifts.to_frame()["heading_error_deg"].tolist() == [-36, -9]

@@ -9,7 +9,7 @@ from typing import Literal
 import pandas as pd
 
 from px4fuse.display import Shown
-from px4fuse.errors import MissingDataError
+from px4fuse.errors import MissingDataError, did_you_mean
 from px4fuse.filter.consistency import Consistency, HorizontalNis
 from px4fuse.filter.kalman import Replay
 from px4fuse.filter.settings import Settings
@@ -193,7 +193,10 @@ class Comparison(Shown):
             It was not analysed.
         """
         if axis not in self.axes:
-            raise MissingDataError(f"no axis {axis!r} here: {', '.join(self.axes)}.")
+            raise MissingDataError(
+                f"no axis {axis!r} here",
+                f"{did_you_mean(axis, self.axes)}It has: {', '.join(self.axes)}.",
+            )
         return self.axes[axis]
 
     @property

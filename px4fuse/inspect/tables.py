@@ -165,6 +165,11 @@ def _tables(flight: Flight) -> Iterator[DescribedTable]:
         words = {"frame": track.frame, "description": track.description}
         origin = (track.topics, track.clock)
         yield _table(name, _timed(track.samples), origin, "position", **words)
+        if track.orientation is not None:
+            turned = _timed(track.orientation)
+            yield _table(
+                f"orientation_{name.partition('_')[2]}", turned, origin, "orientation", **words
+            )
     if isinstance(flight.ekf2, Ekf2):
         yield from _ekf2(flight, flight.ekf2)
     if isinstance(flight.truth, Truth):
@@ -176,13 +181,21 @@ def _tables(flight: Flight) -> Iterator[DescribedTable]:
     if log.dropouts:
         rows = [(dropout.start_s, dropout.duration_s) for dropout in log.dropouts]
         yield _table("dropouts", _listed(["time_s", "duration_s"], rows))
-    if log.parameters:
-        values = pd.DataFrame(list(log.parameters.items()), columns=["name", "value"])
-        yield _table("parameters", values)
+    if parameters := _parameters(flight):
+        yield _table("parameters", pd.DataFrame(parameters.items(), columns=["name", "value"]))
     if flight.clocks:
         mapped = pd.DataFrame([structs.asdict(clock) for clock in flight.clocks])
         # NaN where they do tell the time
         yield _table("clocks", mapped.astype({"distinct_stamps": np.float64}))
+
+
+def _parameters(flight: Flight) -> dict[str, float]:
+    """Every parameter that an analysis reads."""
+    found = dict(flight.log.parameters)
+    if isinstance(flight.ekf2, Ekf2):
+        for part in (flight.ekf2.record, *flight.ekf2.aids.values()):
+            found |= {} if isinstance(part, Unavailable) else part.parameters
+    return found
 
 
 def _listed(columns: list[str], rows: Iterable[tuple[float, ...]]) -> pd.DataFrame:

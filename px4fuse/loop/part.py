@@ -146,8 +146,9 @@ def measured_end(
         heading_change_deg=turned_deg,
         sigma_m=0.05,
         sigma_heading_deg=None if turned_deg is None else 2.0,
-        source=f"measured: it landed {forward_m:g} m ahead and {right_m:g} m to the right of where "
-        "it took off (--landed-at)",
+        source=f"measured: it landed {abs(forward_m):g} m {'behind' if forward_m < 0 else 'ahead'} "
+        f"and {abs(right_m):g} m to the {'left' if right_m < 0 else 'right'} of where it took off "
+        "(--landed-at)",
         assumed=False,
     )
 

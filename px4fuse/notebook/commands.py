@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
+from inspect import signature
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, ParamSpec, TypeVar, get_args
 
 from px4fuse.analysis import Analysis, run, run_what_if
 from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.whatif import WhatIf
-from px4fuse.errors import MissingDataError, SettingsError
+from px4fuse.errors import MissingDataError, SettingsError, did_you_mean
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.analysis import analyse
@@ -34,8 +36,26 @@ from px4fuse.trajectory.model import Trajectory
 
 Pathlike = str | Path
 Progress = Callable[[str], None]
+Given = ParamSpec("Given")
+Made = TypeVar("Made")
 
 
+def _with_names(function: Callable[Given, Made]) -> Callable[Given, Made]:
+    """The function, which says what a mistyped argument was meant to be."""
+    known = signature(function).parameters
+
+    @wraps(function)
+    def call(*args: Given.args, **named: Given.kwargs) -> Made:
+        for name in named:
+            near = "" if name in known else did_you_mean(name, known)
+            if near:
+                raise TypeError(f"{function.__name__}() has no argument `{name}`. {near.strip()}")
+        return function(*args, **named)
+
+    return call
+
+
+@_with_names
 def compare(
     log: Pathlike | Flight,
     settings: Settings | None = None,
@@ -160,6 +180,7 @@ def _reference(given: Pathlike | Trajectory) -> Trajectory:
     return read_source(str(given), default="truth").trajectory
 
 
+@_with_names
 def close_loop(
     source: Pathlike | Trajectory,
     *,
@@ -222,6 +243,7 @@ def close_loop(
     )
 
 
+@_with_names
 def what_if(
     log: Pathlike | Flight | Model,
     changes: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,

@@ -17,6 +17,7 @@ from px4fuse.ekf2.walk import Why
 from px4fuse.ekf2.whatif import Summary, WhatIf
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.consistency import Consistency
+from px4fuse.filter.heading import HeadingError
 from px4fuse.filter.tuning import AxisTuning, Noise
 from px4fuse.findings import SEVERITIES, find
 from px4fuse.findings.story import story
@@ -281,6 +282,25 @@ def _(clock: ClockOffset) -> pd.DataFrame:
         for at, part in enumerate(clock.parts, 1)
     ]
     return pd.DataFrame(rows, columns=["part", "start_s", "end_s", "offset_s", "sigma_s"])
+
+
+@words.register
+def _(heading: HeadingError) -> str:
+    first, last = heading.ends
+    changes = (
+        f"from {first.heading_error_deg:+.1f}° to {last.heading_error_deg:+.1f}°"
+        if heading.drifts
+        else "the same all along"
+    )
+    return (
+        f"the source's frame is turned by {heading.turn_deg:+.1f}° (± {heading.sigma_deg:.1f}) "
+        f"against the vehicle's heading, {changes} (by the {heading.by})"
+    )
+
+
+@frame.register
+def _(heading: HeadingError) -> pd.DataFrame:
+    return pd.DataFrame([row(part) for part in heading.parts])
 
 
 # -- paths -----------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from px4fuse.reading import read_head, shown
 
 _SNIFF_BYTES = 16
 ULOG_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
+TRAJECTORIES = (".tum", ".g2o")
 TABLES = (".csv", ".tsv")
 DATAFLASH_MAGIC = b"\xa3\x95"  # libraries/AP_Logger/LogStructure.h
 
@@ -53,6 +54,15 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
             f"{name}: a table, not a flight log",
             "If it holds positions, give it beside the log of the flight: px4fuse compare LOG "
             f"--position {name}.",
+        )
+    if head.startswith(b"%PDF-"):
+        raise LogError(
+            f"{name}: a PDF, not a flight log", f"To check a report: px4fuse verify {name} LOG."
+        )
+    if path.suffix.lower() in TRAJECTORIES and head.isascii():
+        raise LogError(
+            f"{name}: a trajectory or a pose graph, not a flight log",
+            f"Score it with px4fuse evaluate, or correct its loop: px4fuse loop {name}.",
         )
     from px4fuse.readers.mavlink import read_mavlink  # noqa: PLC0415
 

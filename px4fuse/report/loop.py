@@ -29,7 +29,7 @@ from px4fuse.request import LoopRequest
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import MANY_CLOSURES, SOLUTIONS, SolvedGraph
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
-from px4fuse.trajectory.model import AXES_OF_FRAME
+from px4fuse.trajectory.model import AXES_OF_FRAME, in_words
 from px4fuse.trajectory.scores import Interval, Statistics
 
 if TYPE_CHECKING:
@@ -291,7 +291,7 @@ def closure_words(loop: Loop) -> str:
         return f"path {loop.path_length_m:.1f} m; no closure error is stated: it did not come back"
     text = (
         f"{error:.2f} m after {loop.path_length_m:.1f} m = {error / loop.path_length_m:.2%} "
-        f"({', '.join(f'{name} {part:+.2f} m' for name, part in misclosure.items())})"
+        f"({in_words(misclosure)})"
     )
     turned = loop.heading_error_deg
     if isinstance(turned, Unavailable):

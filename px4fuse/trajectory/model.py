@@ -32,6 +32,26 @@ AXES_OF_FRAME: Mapping[Frame, tuple[str, str, str]] = {
 AxisLengths = Annotated[dict[str, float], Meta(min_length=3, max_length=3)]
 
 
+# Where what is negative along an axis lies
+OPPOSITE = {
+    "north": "south", "east": "west", "up": "down", "down": "up", "forward": "back",
+    "right": "left",
+}  # fmt: skip
+
+
+def in_words(vector_m: Mapping[str, float]) -> str:
+    """A vector by the names of the axes, without signs where the axes have a direction.
+
+    >>> in_words({"forward": 1.0, "right": -0.5}), in_words({"x": -1.0})
+    ('1.00 m forward, 0.50 m left', '-1.00 m along x')
+    """
+    return ", ".join(
+        f"{value:.2f} m along {name}" if name not in OPPOSITE
+        else f"{abs(value):.2f} m {OPPOSITE[name] if value < 0.0 else name}"
+        for name, value in vector_m.items()
+    )  # fmt: skip
+
+
 def by_axis(frame: Frame, vector_m: Array) -> dict[str, float]:
     """A vector by the names of the axes."""
     return dict(zip(AXES_OF_FRAME[frame], vector_m.tolist(), strict=True))

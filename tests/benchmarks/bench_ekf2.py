@@ -3,9 +3,9 @@
 Prints the tables; what is not a time is asserted. Flights are those of the further logs, which are
 not part of the project; without them, the sample flight alone.
 
-    python tests/benchmarks/bench_ekf2.py [FOLDER] [--readme]
+    python tests/benchmarks/bench_ekf2.py [FOLDER] [--write]
 
-``--readme`` writes the table of the README again.
+``--write`` writes the table of the documentation again.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ REPOSITORY = Path(__file__).parents[2]
 SHARED = REPOSITORY.parent / "shared" / "logs"
 SIMULATED = SHARED / "simulated"
 SAMPLE = REPOSITORY / "sample_logs" / "aisle_uwb.ulg"
-README = REPOSITORY / "README.md"
+PAGE = REPOSITORY / "docs" / "ekf2.md"
 BEGIN, END = "<!-- bench_ekf2: begin -->", "<!-- bench_ekf2: end -->"
 OVERCONFIDENT, OUTLIERS = "overconfident", "nlos"
 
@@ -115,8 +115,8 @@ def waterfalls(models: dict[str, Model]) -> dict[str, float]:
     return unexplained
 
 
-def readme_table(models: dict[str, Model], left: dict[str, float]) -> str:
-    """Agreement on every flight as the README has it."""
+def agreement_page(models: dict[str, Model], left: dict[str, float]) -> str:
+    """Agreement on every flight as the documentation has it."""
     lines = [
         "| flight | innovations | correlation n/e | S replayed / logged, 5 to 95 % | rejected | "
         "published, m rms n/e | left |",
@@ -134,16 +134,16 @@ def readme_table(models: dict[str, Model], left: dict[str, float]) -> str:
     return "\n".join(lines)
 
 
-def in_readme() -> str:
-    """The table that the README has."""
-    return README.read_text(encoding="utf-8").split(BEGIN)[1].split(END)[0].strip()
+def in_page() -> str:
+    """The table that the documentation has."""
+    return PAGE.read_text(encoding="utf-8").split(BEGIN)[1].split(END)[0].strip()
 
 
-def write_readme(table: str) -> None:
-    """Put the table into the README."""
-    text = README.read_text(encoding="utf-8")
+def write_page(table: str) -> None:
+    """Put the table into the PAGE."""
+    text = PAGE.read_text(encoding="utf-8")
     before, end = text.split(BEGIN)[0], text.split(END)[1]
-    README.write_text(f"{before}{BEGIN}\n{table}\n{END}{end}", encoding="utf-8")
+    PAGE.write_text(f"{before}{BEGIN}\n{table}\n{END}{end}", encoding="utf-8")
 
 
 def horizontal_rmse(summary: Summary) -> float:
@@ -217,7 +217,7 @@ def main(folder: Path, *, readme: bool) -> None:
     models = agreement_table(paths)
     left = waterfalls(models)
     if readme:
-        write_readme(readme_table(models, left))
+        write_page(agreement_page(models, left))
     counterfactuals(models)
     flight = read_log(SAMPLE)
     model = open_model(flight)
@@ -226,5 +226,5 @@ def main(folder: Path, *, readme: bool) -> None:
 
 
 if __name__ == "__main__":
-    folders = [word for word in sys.argv[1:] if word != "--readme"]
-    main(Path(folders[0]) if folders else SIMULATED, readme="--readme" in sys.argv)
+    folders = [word for word in sys.argv[1:] if word != "--write"]
+    main(Path(folders[0]) if folders else SIMULATED, readme="--write" in sys.argv)
