@@ -30,7 +30,6 @@ extensions = [
     "myst_nb",  # Markdown, and the notebook, which is executed
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",  # numpydoc's sections
-    "sphinx.ext.mathjax",
 ]
 exclude_patterns = ["_build", "jupyter_execute"]
 html_theme = "furo"
@@ -38,8 +37,6 @@ html_static_path = ["style.css"]
 html_css_files = ["style.css"]
 smartquotes = False  # two dashes begin an option
 html_title = f"px4fuse {release}"
-# formulas are drawn by a script of the network; without one they stand as they are written
-myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True

@@ -176,7 +176,7 @@ def page(name: str, example: Example | None, folder: Path) -> Iterator[str]:
     title = NAMES[name]
     yield f"# {title[0].upper()}{title[1:]}\n\n`{name}`\n"
     yield f"## What it means\n\n{MEANINGS[name]}\n"
-    yield f"In the detector's own words: *{said}*\n"
+    yield f"In the detector's own words: {' '.join(said.split())}\n"
     causes = [cause for cause, brought in CONSEQUENCES.items()
               if any(each.partition(":")[0] == name for each in brought)]  # fmt: skip
     follows = [each.partition(":")[0] for each in CONSEQUENCES.get(name, ())]

@@ -187,7 +187,7 @@ def test_arguments_that_make_no_sense_are_refused(analysis, arguments, said):
 
 def test_an_axis_that_was_not_analysed_is_named(analysis):
     with pytest.raises(
-        px4fuse.Px4FuseError, match="no axis 'up' here. It has: north, east, down, aisle"
+        px4fuse.Px4FuseError, match=r"no axis 'up' here\. It has: north, east, down, aisle"
     ):
         analysis["up"]
 
