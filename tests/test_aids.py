@@ -146,6 +146,9 @@ def test_the_gate_is_the_log_s_own_and_else_the_parameter() -> None:
      ("gnss_pos", {"EKF2_GPS_P_NOISE": 0.1}, "the accuracy that the receiver states"),
      ("gnss_hgt", {"EKF2_GPS_P_NOISE": 0.5**0.5 / 3.0}, "EKF2_GPS_P_NOISE"),
      ("ev_yaw", {"EKF2_EVA_NOISE": 0.125}, "EKF2_EVA_NOISE"),
+     ("gnss_pos", {"EKF2_GPS_P_NOISE": 0.5**1.5 / 1.019}, "EKF2_GPS_P_NOISE"),
+     ("gnss_pos", {"EKF2_GPS_P_NOISE": 0.5**1.5 / 1.025},
+      "the accuracy that the receiver states"),
      ("mag", {"EKF2_MAG_NOISE": 0.05}, "EKF2_MAG_NOISE"), ("gnss_pos", {}, "the accuracy that "
      "the receiver states")],
 )  # fmt: skip

@@ -390,7 +390,7 @@ def test_logs_are_found_in_folders_globs_and_urls(tmp_path, monkeypatch):
     rows = job.analyse(work_on(log.address)).rows
     assert {(row["name"], row["log_sha256"]) for row in rows} == {("x.ulg", sha256)}
     (small,) = job.analyse(work_on(log.address, max_bytes=10)).rows
-    assert "more than the limit" in small["reason"]
+    assert small["reason"] == "1 MB, more than the limit of 0 MB"
 
 
 # ------------------------------------------------------------------ a cluster of its own

@@ -230,6 +230,9 @@ def test_alignments_without_motion_are_refused() -> None:
             fit(still, still[::-1].copy() + up, kind)  # type: ignore[arg-type]
     with pytest.raises(TrajectoryError, match="Only 2 poses"):
         fit(up[:2], up[:2], "none")
+    unmoved = fit(up[:9], up[:9] + 1.0, "none")
+    assert (unmoved.quaternion_wxyz, unmoved.scale) == ((1.0, 0.0, 0.0, 0.0), 1.0)
+    assert unmoved.translation_m == (0.0, 0.0, 0.0)
 
 
 # -- association -----------------------------------------------------------------------------------

@@ -22,9 +22,23 @@ from typing import Any
 import pytest
 from cli_tools import run
 from conftest import REPOSITORY, page_of
-from golden_tools import numbers, of_blocks, of_values
+from flights import unexplained, with_noises
+from golden_tools import numbers, of_blocks, of_values, value
+from made_up_fleet import made_up
+from test_aids import gnss_log
+from test_findings import FAULTS
 
+import px4fuse
+from px4fuse.comparison.comparison import compare
+from px4fuse.explore.data import flight_data
+from px4fuse.explore.figures import document_json
+from px4fuse.explore.packing import Packer
+from px4fuse.filter.settings import Settings
+from px4fuse.findings import find
+from px4fuse.fleet.page import html_text
+from px4fuse.plain import plain
 from px4fuse.report import pdf
+from px4fuse.request import ComparisonRequest
 from px4fuse.simulation.flights import answer, simulate
 from px4fuse.simulation.mistakes import MISTAKES, parse
 from px4fuse.simulation.scenario import Scenario
@@ -76,20 +90,20 @@ def agrees(name: str, lines: list[str]) -> None:
     assert text == kept, "\n".join(list(different)[:40])
 
 
+def rounded(text: str) -> str:
+    """Numbers with a fraction in four digits."""
+    return re.sub(r"-?\d+\.\d+(?:e[-+]?\d+)?", lambda found: value(float(found[0])), text)
+
+
 def written(path: Path) -> Iterator[str]:
     """The numbers of results."""
     results = json.loads(path.read_text(encoding="utf-8"))
     yield from of_values({name: results[name] for name in results if name not in NOT_KEPT})
 
 
-@pytest.mark.usefixtures("analysed_once")
-@pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_shows_what_it_showed(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shutil.copytree(REPOSITORY / "sample_logs", tmp_path / "sample_logs")
-    (tmp_path / "notes.md").write_text(NOTES)
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture
+def kept_pages(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """The blocks of what is reported, instead of a PDF."""
     blocks: list[Any] = []
 
     def keep(made: list[Any]) -> list[Any]:
@@ -98,13 +112,24 @@ def test_a_command_shows_what_it_showed(
 
     monkeypatch.setattr(pdf, "data", keep)
     monkeypatch.setattr(pdf, "compiled", lambda report: page_of(None, report["results"]))
+    return blocks
+
+
+@pytest.mark.usefixtures("analysed_once")
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_command_shows_what_it_showed(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept_pages: list[Any]
+) -> None:
+    shutil.copytree(REPOSITORY / "sample_logs", tmp_path / "sample_logs")
+    (tmp_path / "notes.md").write_text(NOTES)
+    monkeypatch.chdir(tmp_path)
     for command in COMMANDS[name]:
         before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.json")}
-        blocks.clear()
+        kept_pages.clear()
         result = run(*command.split())
         assert result.exit_code == 0, (command, result.output)
     output = re.sub(r"px4fuse \d\S*", "px4fuse VERSION", result.output)
-    lines = [f"$ px4fuse {command}", *output.splitlines(), "", *of_blocks(blocks), ""]
+    lines = [f"$ px4fuse {command}", *output.splitlines(), "", *of_blocks(kept_pages), ""]
     for path in sorted(tmp_path.rglob("*.json")):
         if path.stat().st_mtime_ns != before.get(path):
             lines += [path.name, *written(path)]
@@ -130,3 +155,48 @@ def test_a_simulated_flight_is_as_it_was(kind: str) -> None:
         if mistake.kind in ("", kind):
             lines += ["", name, *(line for line in spread(kind, name) if line not in clean)]
     agrees(f"simulated_{kind}", lines)
+
+
+def test_findings_say_what_they_said() -> None:
+    """Each fault's finding with its sentence, remedy and evidence."""
+    lines = []
+    for fault in FAULTS:
+        comparison = compare(fault.fly(), Settings(**fault.settings))
+        asked = "sigma_z_asked_m" in fault.evidence
+        found = find(with_noises(comparison) if asked else unexplained(comparison))
+        one = next(each for each in found if each.id == fault.id)
+        lines += [f"{one.id} {one.severity} {value(one.evidence)}", one.message, one.remedy, ""]
+    agrees("findings", [rounded(line) for line in lines])
+
+
+def test_a_flight_on_gnss_shows_its_aids(tmp_path: Path, kept_pages: list[Any]) -> None:
+    log = gnss_log("v1.16").write(tmp_path / "a.ulg")
+    result = run("compare", log, "-o", tmp_path / "a.pdf")
+    assert result.exit_code == 0, result.output
+    output = result.output.replace(str(tmp_path), "").splitlines()
+    agrees("aids", [*output, "", *of_blocks(kept_pages), *written(tmp_path / "a.json")])
+
+
+def test_the_page_of_a_fleet_holds_what_it_held() -> None:
+    text = html_text(made_up(12), "Bench", "px4fuse 1")
+    (content,) = re.findall(r'<script type="application/json" id="content">(.*?)</script>', text)
+    above = re.sub(r"<(script|style).*?</\1>", "", text, flags=re.DOTALL)
+    drawn = [rounded(line) for line in above.splitlines() if line.strip()]
+    agrees("fleet_page", [*drawn, *of_values(json.loads(content))])
+
+
+@pytest.mark.usefixtures("analysed_once")
+def test_the_plots_to_explore_are_what_they_were(sample_log: Path) -> None:
+    request = ComparisonRequest(log=str(sample_log))
+    analysis = px4fuse.compare(str(sample_log))
+    data = flight_data(analysis, find(analysis), request, Packer(), beside=False)
+    document, _ = document_json([data], [analysis.tuning])
+    ids: dict[str, str] = {}
+
+    def named(found: re.Match[str]) -> str:
+        """Bokeh counts what a process makes."""
+        return ids.setdefault(found[0], f"id{len(ids)}")
+
+    lines = [re.sub(r"\bp\d{4,}\b", named, line) for line in of_values(document["roots"])]
+    drawn = [rounded(line[:200]) for line in lines if " id" not in line]
+    agrees("explore", [*drawn, *(line[:200] for line in of_values(plain(data)))])

@@ -285,7 +285,7 @@ def test_files_that_are_too_large(tmp_path):
     assert peak < 3 * MAX_BYTES
 
 
-def test_bombs_and_lies(tmp_path):
+def test_bombs_and_lies(tmp_path, monkeypatch):
     packed = zipped({"bomb.pdf": bytes(20_000_000)})
     path = write(tmp_path / "x.zip", packed)
     assert "shrinks more than 100 times" in reason(only(path))
@@ -294,12 +294,15 @@ def test_bombs_and_lies(tmp_path):
     # a declared size that is smaller than what there is: zipfile stops there, and the sum is off
     path.write_bytes(packed.replace(struct.pack("<I", 20_000_000), struct.pack("<I", 1000)))
     assert "cannot be read" in reason(only(path))
+    monkeypatch.setattr(submissions, "MAX_BYTES", len(PDF))
+    path.write_bytes(zipped({"just.pdf": PDF}))
+    assert read(only(path)) == PDF
 
 
 @pytest.mark.parametrize(
     ("limit", "value", "said"),
     [
-        ("MAX_TOTAL_BYTES", 50, "unpacks to more than"),
+        ("MAX_TOTAL_BYTES", 50, "unpacks to more than 0 GB."),
         ("MAX_INNER_BYTES", 200, "it holds too many zip files"),
         ("MAX_ENTRIES", 3, "more than 3 entries"),
         ("MAX_DIRECTORY_BYTES", 100, "not a zip file, or damaged"),

@@ -227,8 +227,9 @@ class Cover:
                 for test, lines in self.lines.items()
                 if path in lines
             }
-            return sorted(share, key=share.__getitem__, reverse=True)
-        in_order = sorted(found, key=self.width.__getitem__)
+            in_order, files = sorted(share, key=share.__getitem__, reverse=True), []
+        else:
+            in_order = sorted(found, key=self.width.__getitem__)
         # what keeps all that is printed and drawn covers much and misses little: after the nearest
         kept = [test for test in in_order[NEAREST:] if "test_golden" in test]
         others = [test for test in in_order[NEAREST:] if test not in kept]
