@@ -61,16 +61,18 @@ def at_once(monkeypatch) -> list[str]:
     return asked
 
 
+def in_turn(function, jobs, **_):
+    """One job after the other, in this process."""
+    for index, job in enumerate(jobs):
+        function_, job_ = pickle.loads(pickle.dumps((function, job)))
+        yield index, pickle.loads(pickle.dumps(function_(job_)))
+
+
 def in_this_process(monkeypatch) -> None:
     """Do without the processes that keep what strangers wrote within bounds: each takes seconds.
 
     What goes to them and what comes back is pickled all the same.
     """
-
-    def in_turn(function, jobs, **_):
-        for index, job in enumerate(jobs):
-            function_, job_ = pickle.loads(pickle.dumps((function, job)))
-            yield index, pickle.loads(pickle.dumps(function_(job_)))
 
     for module in (grading, sheets, workers):
         monkeypatch.setattr(module, "run_bounded", in_turn)

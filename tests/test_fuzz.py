@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from fuzz import TARGETS, Target, tried
+from fuzz import COMMANDS, TARGETS, Target, tried
 
 
 @pytest.mark.parametrize("target", TARGETS, ids=lambda one: one.name)
@@ -17,3 +17,10 @@ def test_whatever_is_read_is_a_result_or_one_line(target: Target, tmp_path: Path
     assert outcome.escaped == []
     # neither is all of it refused at the door, nor is nothing damaged
     assert min(outcome.read, outcome.refused) > 0 or target.name == "MAVLink"
+
+
+@pytest.mark.parametrize(
+    "target", [one for one in COMMANDS if one.in_suite], ids=lambda one: one.name
+)
+def test_whole_commands_end_as_they_should(target: Target, tmp_path: Path) -> None:
+    assert tried(target, target.in_suite, seed=1, folder=tmp_path).escaped == []

@@ -3,7 +3,8 @@
 ``python tests/studies/fuzz.py --inputs 1000000 --seed 1`` tries so many in all, shared out by what
 each target costs, and prints cases, how many were read and refused, and what escaped: any other
 exception, a warning, or more than :data:`SLOW_S`. ``--pipelines 1000`` takes so many damaged logs
-through all of ``compare`` instead. An escape is printed with the number that makes it again.
+through all of ``compare`` instead, ``--commands 400`` so many files through whole commands. An
+escape is printed with the number that makes it again.
 
 A part of it runs in the suite: ``tests/test_fuzz.py``.
 """
@@ -14,16 +15,21 @@ import argparse
 import contextlib
 import io
 import random
+import shutil
 import sys
 import tempfile
 import time
 import traceback
 import warnings
+import zipfile
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
+from unittest import mock
+
+from click.testing import CliRunner
 
 TESTS = Path(__file__).resolve().parents[1]
 if str(TESTS) not in sys.path:
@@ -31,15 +37,20 @@ if str(TESTS) not in sys.path:
 
 import mavlink_tools  # noqa: E402
 import ulog_tools  # noqa: E402
+from class_tools import in_turn  # noqa: E402
 from made_up_fleet import made_up  # noqa: E402
 
 from px4fuse import answers  # noqa: E402
 from px4fuse.analysis import run_or_judge_aids  # noqa: E402
 from px4fuse.assignment.key import Answer, AnswerKey, key_text, read_key  # noqa: E402
 from px4fuse.assignment.roster import read_people, read_roster  # noqa: E402
+from px4fuse.cli import cli  # noqa: E402
 from px4fuse.errors import Px4FuseError  # noqa: E402
+from px4fuse.fleet.engine import connected  # noqa: E402
 from px4fuse.fleet.regressions import read_baseline  # noqa: E402
 from px4fuse.fleet.rows import table_of  # noqa: E402
+from px4fuse.grading import grade as grading  # noqa: E402
+from px4fuse.grading import sheets  # noqa: E402
 from px4fuse.grading.overrides import read_overrides  # noqa: E402
 from px4fuse.grading.rubric import read_rubric, rubric_text  # noqa: E402
 from px4fuse.readers import read_log  # noqa: E402
@@ -50,10 +61,11 @@ from px4fuse.readers.trajectory import read_trajectory  # noqa: E402
 from px4fuse.request import ComparisonRequest  # noqa: E402
 from px4fuse.results.reading import read_results  # noqa: E402
 from px4fuse.trajectory.graph.analysis import analyse_graph  # noqa: E402
+from px4fuse.verification import workers  # noqa: E402
 from px4fuse.verification.intake import Refused, read_report  # noqa: E402
 
 REPOSITORY = TESTS.parent
-SLOW_S = 5.0
+SLOW_S, COMMAND_S = 5.0, 15.0
 # Numbers and words that parsers stumble over
 ODD = (
     b"nan", b"-inf", b"1e999", b"-1e-400", b"1.8e308", b"0", b"-0", b"", b"9" * 400, b"0x1p3",
@@ -115,6 +127,8 @@ class Target:
         Inputs that the suite tries.
     weight : float
         Share of a study's inputs: what is cheap is tried more often.
+    slow_s : float
+        CPU time that no input may take.
     """
 
     name: str
@@ -124,6 +138,7 @@ class Target:
     words: bool
     in_suite: int
     weight: float
+    slow_s: float = SLOW_S
 
 
 @dataclass
@@ -230,6 +245,56 @@ TARGETS = (
 )  # fmt: skip
 
 
+def _command(*words: str) -> Callable[[Path], object]:
+    """A whole command in this process, with its output beside the input."""
+
+    def read(path: Path) -> object:
+        out = path.parent / "out"
+        shutil.rmtree(out, ignore_errors=True)
+        given = [word.format(path=path, out=out) for word in words]
+        with contextlib.ExitStack() as stack:
+            for module in (grading, sheets, workers):
+                stack.enter_context(mock.patch.object(module, "run_bounded", in_turn))
+            done = CliRunner().invoke(cli, given)
+        if done.exception is not None and not isinstance(done.exception, SystemExit):
+            raise done.exception
+        if done.exit_code == 2:
+            raise Px4FuseError(done.output.splitlines()[-1])
+        assert done.exit_code in (0, 1)
+        return done.output
+
+    return read
+
+
+def _handed_in() -> list[bytes]:
+    report = (REPOSITORY / "reports/aisle_uwb.pdf").read_bytes()
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in (
+            "Ada Lovelace_7_assignsubmission_file_/r.pdf",
+            "Grace_8_assignsubmission_file_/r.pdf",
+        ):
+            archive.writestr(name, report)
+    return [out.getvalue()]
+
+
+LOG = str(REPOSITORY / "sample_logs/aisle_uwb.ulg")
+COMMANDS = (
+    Target("grade", _handed_in, _command("grade", "{path}", "--logs", LOG, "-o", "{out}"), ".zip",
+           False, 2, 1.0, COMMAND_S),
+    Target("grade by rubric", lambda: [rubric_text().encode()],
+           _command("grade", str(REPOSITORY / "reports/aisle_uwb.pdf"), "--logs", LOG, "--rubric",
+                    "{path}", "-o", "{out}"), ".toml", True, 2, 1.0, COMMAND_S),
+    Target("verify", lambda: [(REPOSITORY / "reports/aisle_uwb.pdf").read_bytes()],
+           _command("verify", "{path}", LOG), ".pdf", False, 2, 1.0, COMMAND_S),
+    Target("assign", _text(_ROSTER, _MOODLE),
+           _command("simulate", "--assignment", "{path}", "--secret", "open sesame", "--preview",
+                    "-o", "{out}"), ".csv", True, 20, 2.0, COMMAND_S),
+    Target("batch", lambda: _ulogs() + _recordings(), _command("batch", "{path}", "-o", "{out}"),
+           ".ulg", False, 0, 1.0, COMMAND_S),
+)  # fmt: skip
+
+
 def attempt(target: Target, content: bytes, path: Path, outcome: Outcome, label: str) -> None:
     """Read one input, and count what came of it."""
     path.write_bytes(content)
@@ -256,7 +321,7 @@ def attempt(target: Target, content: bytes, path: Path, outcome: Outcome, label:
         )
     if printed.getvalue():
         outcome.escaped.append(f"{label}: it printed {printed.getvalue()[:80]!r}")
-    if (took := time.process_time() - begin) > SLOW_S:
+    if (took := time.process_time() - begin) > target.slow_s:
         outcome.escaped.append(f"{label}: took {took:.1f} s of CPU")
 
 
@@ -292,12 +357,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--inputs", type=int, default=1_000_000)
     parser.add_argument("--pipelines", type=int, default=0)
+    parser.add_argument("--commands", type=int, default=0)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", default="")
     given = parser.parse_args()
-    targets = [one for one in TARGETS if given.only in one.name]
+    targets = [one for one in (COMMANDS if given.commands else TARGETS) if given.only in one.name]
     weights = sum(one.weight for one in targets)
-    jobs = [(one, round(given.inputs * one.weight / weights)) for one in targets]
+    inputs = given.commands or given.inputs
+    jobs = [(one, round(inputs * one.weight / weights)) for one in targets]
     if given.pipelines:
         logs = Target("compare, ULog", _flights, pipeline, ".ulg", False, 0, 1.0)
         sent = Target("compare, MAVLink", _flown, pipeline, ".tlog", False, 0, 1.0)
@@ -306,7 +373,9 @@ def main() -> None:
             (sent, given.pipelines - given.pipelines * 2 // 3),
         ]
     print(f"{'target':20}{'inputs':>10}{'read':>10}{'refused':>10}{'escaped':>10}{'s':>8}")
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
+        if any(target.name == "batch" for target, _ in jobs):
+            stack.enter_context(connected(workers=1, memory="2GB"))
         for target, count in jobs:
             begin = time.monotonic()
             outcome = tried(target, count, given.seed, Path(folder))
