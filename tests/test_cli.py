@@ -272,3 +272,23 @@ def test_versions_are_for_a_bug_report() -> None:
         f"px4fuse {metadata.version('px4fuse')}, Python {platform.python_version()}"
     )
     assert f"numpy {metadata.version('numpy')}" in libraries
+
+
+@pytest.mark.parametrize(
+    ("words", "loaded"),
+    [(("info", "{log}"), False), (("extract", "{log}", "-o", "{out}"), True), ((), False)],
+)
+def test_an_extra_costs_nothing_where_it_is_not_used(
+    words: tuple[str, ...], loaded: bool, sample_log: Path, tmp_path: Path
+) -> None:
+    """In a process of its own: here everything is loaded already."""
+    typed = [word.format(log=sample_log, out=tmp_path / "out") for word in words]
+    script = (
+        f"import sys; sys.argv[1:] = {typed!r}\nfrom px4fuse.cli import main\n"
+        "try:\n    main()\nexcept SystemExit:\n    pass\n"
+        "print('pyarrow', bool(sys.modules.get('pyarrow')), 'dask' in sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines()[-1] == f"pyarrow {loaded} False"

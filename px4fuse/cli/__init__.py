@@ -38,6 +38,10 @@ COMMANDS = {
 }
 
 
+# pandas loads pyarrow wherever it is installed: 70 MB that only these need
+PARQUET = ("batch", "extract")
+
+
 class LazyGroup(click.Group):
     """A group whose commands are imported when they are called."""
 
@@ -115,6 +119,8 @@ def main() -> None:
     atexit.register(gc.freeze)  # and while everything is thrown away, as much again
     for name, one in ONE_THREAD.items():  # commands load the libraries later
         os.environ.setdefault(name, one)
+    if not set(PARQUET) & set(sys.argv[1:2]):
+        sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]  # as if there were none
     _open_streams()
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # σ and ν on a Windows console with a legacy code page
