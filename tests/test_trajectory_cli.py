@@ -373,7 +373,7 @@ REFUSED = {
     "empty trajectory": ("loop empty.tum", "empty.tum: the file is empty"),
     "text junk": ("loop junk.txt", "junk.txt: not a trajectory file"),
     "another table": ("loop uwb.csv", "uwb.csv: 4 columns"),
-    "PDF": ("loop f.pdf", "f.pdf: not a PX4 ULog"),
+    "PDF": ("loop f.pdf", "f.pdf: a PDF, not a flight log"),
     "DataFlash": ("loop df.BIN", "df.BIN: not a PX4 ULog but an ArduPilot DataFlash"),
     "cut log": ("loop cut.ulg", "cut.ulg: a ULog without any data"),
     "two poses": ("loop two.tum", "two.tum: poses: 2"),

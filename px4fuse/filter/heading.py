@@ -68,7 +68,7 @@ class HeadingPart(Record, frozen=True):
     sigma_deg: NotNegative
 
 
-class HeadingError(Shown, Record, frozen=True, eq=False):
+class HeadingError(Shown, Record, frozen=True):
     """By how much the source's frame is turned against the logged attitude, over the flight.
 
     Attributes

@@ -15,6 +15,7 @@ import ast
 import json
 import os
 import random
+import re
 import shutil
 import subprocess
 import sys
@@ -135,10 +136,12 @@ def mutants(path: Path) -> Iterator[Mutant]:
 
 def copied(folder: Path) -> Path:
     """A copy of the checkout to change and test in, compiled."""
-    kept = ("px4fuse", "tests", "sample_logs", "reports")
+    kept = ("px4fuse", "tests", "docs", "sample_logs", "reports")
     for name in kept:
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for file in ("pyproject.toml", "README.md", "CHANGELOG.md"):
+    for file in ("pyproject.toml", "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md",
+                 "CITATION.cff", ".ci/run"):  # fmt: skip
+        (folder / file).parent.mkdir(exist_ok=True)
         shutil.copy2(ROOT / file, folder / file)
     subprocess.run([sys.executable, "-m", "compileall", "-q", str(folder)], check=True)
     return folder
@@ -157,7 +160,7 @@ def passes(folder: Path, *arguments: str, before: Sequence[str] = (), seconds: f
     return run.returncode == 0
 
 
-def make_map(out: Path, workers: int) -> None:
+def make_map(out: Path, workers: int, only: str) -> None:
     """Run every test file under coverage; keep in ``out`` which lines each of its tests covers.
 
     What runs outside a test (imports, fixtures) is kept under the empty name.
@@ -192,7 +195,8 @@ def make_map(out: Path, workers: int) -> None:
             print(f"{took:6.1f} s {'passed' if passed else 'FAILED'} {path.name}", flush=True)
 
         with ThreadPoolExecutor(workers) as pool:
-            list(pool.map(run, sorted((ROOT / "tests").glob("test_*.py"))))
+            files = sorted((ROOT / "tests").glob("test_*.py"))
+            list(pool.map(run, [file for file in files if re.search(only, file.stem)]))
 
 
 class Cover:
@@ -254,11 +258,15 @@ def main() -> None:
     parser.add_argument("--number", type=int, default=300)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=300.0)
-    parser.add_argument("--only", default="", help="part of the path of the files to change")
+    parser.add_argument(
+        "--only",
+        default="",
+        help="part of the path of the files to change; of the map pattern of its tests",
+    )
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     given = parser.parse_args()
     if given.map:
-        make_map(given.folder, given.workers)
+        make_map(given.folder, given.workers, given.only)
         return
     cover = Cover(given.folder)
     files = [path for path in sorted((ROOT / "px4fuse").rglob("*.py")) if given.only in str(path)]
