@@ -157,6 +157,21 @@ class AidsAlone:
     __repr__ = brief
 
 
+def bad_verdicts(found: Analysis | AidsAlone) -> dict[str, str]:
+    """What a test rig stops at: EKF2's axes and aids whose verdict is bad, with it.
+
+    What is overstated, idle or has too few samples is not; nor is our own filter.
+    """
+    bad = {}
+    if isinstance(found, Analysis):
+        for name, axis in found.axes.items():
+            ekf2 = axis.filters["ekf2"]
+            if not isinstance(ekf2, Unavailable) and ekf2.verdict == "variance understated":
+                bad[f"EKF2, {name}"] = ekf2.verdict
+    aids = {} if isinstance(found.aids, Unavailable) else found.aids
+    return bad | {aid.label: aid.verdict for aid in aids.values() if aid.is_bad}
+
+
 def run_or_judge_aids(
     request: ComparisonRequest, progress: Progress = silent, flight: Flight | None = None
 ) -> Analysis | AidsAlone:

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from cli_tools import run
+from cli_tools import run, run_main
 from conftest import SHARED_LOGS
 from exchange import replace
 from flights import aisle_flight
 from ulog_tools import Log, make_log, seconds_of, stamps, topic
 
+from px4fuse.analysis import AidsAlone, bad_verdicts
 from px4fuse.ekf2.aids import AidResult, judge_aids
 from px4fuse.ekf2_parameters import AIDS
 from px4fuse.errors import MissingDataError
@@ -159,6 +160,18 @@ def test_who_set_the_noise(name: str, parameters: dict[str, float], set_by: str)
     assert judged(aid_log(own=False, **parameters), name).noise_from == ""
 
 
+@pytest.mark.parametrize(("silent_s", "verdict"), [(7.6, "consistent"), (12.0, "starved")])
+def test_an_aid_logged_once_a_second_is_not_starved_by_a_few_rows(
+    silent_s: float, verdict: str
+) -> None:
+    """A row of zeros is one that fell between two samples."""
+    log = aid_log(own=False, meant=steps((0.0, 1.0)))
+    thinned = replace(log, samples=log.samples.iloc[::10])
+    assert judged(
+        replace(thinned, samples=outage_free(thinned, 20.0, 20.0 + silent_s))
+    ).verdict == (verdict)
+
+
 def test_findings_name_the_aid_its_figures_and_when() -> None:
     log = aid_log()
     silent = replace(log, samples=outage_free(log, 20.0, 41.0), meant=steps((0.0, 1.0)))
@@ -247,6 +260,27 @@ def test_each_release_s_innovations_are_read_once_and_with_everybody_s_sign(
 
 
 # ------------------------------------------------------------------------------ reported
+
+
+def test_checks_end_a_rig_where_a_verdict_on_ekf2_is_bad(
+    tmp_path: Path, monkeypatch, capsys
+) -> None:
+    log = gnss_log("v1.16").write(tmp_path / "a.ulg")
+    code, _, err = run_main(
+        monkeypatch, capsys, "compare", log, "--checks", "-o", tmp_path / "a.pdf"
+    )
+    bad = [each.label for each in judge_aids(read_log(log)).values() if each.is_bad]
+    assert code == (1 if bad else 0)
+    assert [line.partition(": ")[0] for line in err.splitlines()] == bad
+
+
+@pytest.mark.parametrize(("sigma", "bad"), [(0.5, False), (0.25, False), (1.5, True)])
+def test_what_is_bad_for_a_rig(sigma: float, bad: bool) -> None:
+    """Too sure is, too modest is not."""
+    flight = aisle_flight(duration_s=60.0)
+    made = replace(flight, ekf2=replace(flight.ekf2, aids={"gnss_pos": aid_log(sigma=sigma)}))
+    alone = AidsAlone(made, judge_aids(made), Unavailable("it", "not there", "Log it."))
+    assert bad_verdicts(alone) == ({"GNSS position": "variance understated"} if bad else {})
 
 
 def test_a_log_without_position_gets_its_aids_judged(tmp_path: Path) -> None:

@@ -44,11 +44,17 @@ SEVERITIES = ("error", "warning", "info")
     default=None,
     help="Exit with 1 if there is a finding of at least this severity.",
 )
+@click.option(
+    "--checks",
+    is_flag=True,
+    help="Exit with 1 if a verdict on EKF2 is bad: an aid starved, biased or trusted too much.",
+)
 def compare(
     log: Path,
     output: Path | None,
     json_path: Path | None,
     fail_on: str | None,
+    checks: bool,
     **given: Any,
 ) -> None:
     """Compare a flight's EKF2 with a two-state Kalman filter over IMU and position.
@@ -56,7 +62,7 @@ def compare(
     LOG is a PX4 ULog or a MAVLink recording (.tlog or raw stream). Writes a PDF report and its
     results as JSON, for example reports/LOG_sigma-z-0.05.pdf and .json.
     """
-    from px4fuse.analysis import AidsAlone, run_or_judge_aids
+    from px4fuse.analysis import AidsAlone, bad_verdicts, run_or_judge_aids
     from px4fuse.findings import find, find_aids
     from px4fuse.report.document import AidsDocument, Document
     from px4fuse.report.terminal import print_aids, print_summary
@@ -83,6 +89,11 @@ def compare(
         finish(contents, partial(print_aids, document=document))
     else:
         finish(contents, partial(print_summary, document=document, request=request, report=output))
+    bad = bad_verdicts(analysis) if checks else {}
+    for name, verdict in bad.items():
+        click.echo(f"{name}: {verdict}", err=True)
+    if bad:
+        sys.exit(1)
     if fail_on is not None:
         worst = SEVERITIES[: SEVERITIES.index(fail_on) + 1]
         if any(one.severity in worst and one.caused_by is None for one in document.findings):

@@ -31,6 +31,7 @@ BIASED, FELT = 0.5, 0.2
 # Longest time (s) without a sample fused while EKF2 means to fuse it. EKF2 itself resets to an aid
 # after 7 s (reset_timeout_max); rates of 2 Hz are the slowest of the default profile
 STARVED_S = 5.0
+STARVED_INTERVALS = 10.0  # of its samples that were logged
 # Within this of a parameter, R is formed by it
 SAME_NOISE = 0.02
 # Height (m) from which a flight is judged, of low ones half of the highest: below, the rotors' wash
@@ -125,6 +126,14 @@ class AidResult(Record, frozen=True, kw_only=True):
         return self.longest_without_s[1] - self.longest_without_s[0]
 
     @property
+    def is_bad(self) -> bool:
+        """Whether EKF2 went without it, is misled by it or trusts it too much.
+
+        One that is overstated is no fault: stock settings are.
+        """
+        return self.verdict in ("starved", "biased", "variance understated")
+
+    @property
     def nis_mean(self) -> float:
         """Mean NIS of all axes (NaN without any)."""
         return _mean_nis(self.axes)
@@ -215,7 +224,9 @@ def _judge(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidResult:
         rejected_share=_share(rejected & meant, meant), longest_without_s=without_s,
         resets=int(reset.sum()), gate=gate, noise=noise_median,
         noise_from=_noise_from(aid, log, noise_median), axes=axes,
-        verdict="idle" if idle else _verdict(axes, without_s[1] - without_s[0]),
+        verdict="idle" if idle else _verdict(
+            axes, without_s[1] - without_s[0], times[fused & (not fused_logged)]
+        ),
     )  # fmt: skip
 
 
@@ -261,8 +272,10 @@ def _longest_without(
     return float(ends[longest]), float(ends[longest + 1])
 
 
-def _verdict(axes: dict[str, AidAxis], longest_without: float) -> AidVerdict:
-    if longest_without > STARVED_S:
+def _verdict(axes: dict[str, AidAxis], longest_without: float, fused_s: Array) -> AidVerdict:
+    # rows that EKF2's aids share are thinned, and zero where they fell between two samples
+    interval_s = float(np.median(np.diff(fused_s))) if len(fused_s) > 1 else 0.0
+    if longest_without > max(STARVED_S, STARVED_INTERVALS * interval_s):
         return "starved"
     if not axes:
         return "too few samples"

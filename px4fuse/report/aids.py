@@ -85,7 +85,7 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
         meant = "" if aid.intended_share is None else f"{aid.intended_share:.0%}"
         noise = "" if aid.noise is None else f"{number_words(aid.noise)} {aid.unit}"
         colour = GOOD if aid.verdict == "consistent" else MUTED
-        if aid.verdict in ("starved", "variance understated", "biased"):
+        if aid.is_bad:
             colour = SEVERITY_COLOURS["warning"]
         begun: list[Cell] = [
             aid.label, (aid_verdict_words(aid), colour), meant, f"{aid.rejected_share:.1%}",
