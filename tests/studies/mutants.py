@@ -24,6 +24,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from pathlib import Path
 from queue import Queue
 from typing import NamedTuple
@@ -217,28 +218,40 @@ class Cover:
     def of(self, mutant: Mutant) -> list[str]:
         """Tests to run for a change, those that cover least first.
 
-        A line that runs while its module is imported is tested by what covers the module most;
-        one of a fixture by the whole file.
+        A line that runs while its module is imported is tested by what covers the module most
+        (which test imports it first is chance); one of a fixture by the whole file.
         """
         path = mutant.path
-        found = [test for test, lines in self.lines.items() if mutant.line in lines.get(path, ())]
-        files = [
-            file for file, lines in self.fixtures.items() if mutant.line in lines.get(path, ())
-        ]
-        if not found and files:
+        covered = (self.lines, self.fixtures)
+        tests, files = (
+            [n for n, c in of.items() if mutant.line in c.get(path, ())] for of in covered
+        )
+        first, last = [], files if len(files) < FEW else []
+        in_order = sorted(tests, key=self.width.__getitem__)
+        if not in_function(path, mutant.line):
             share = {
                 test: len(lines[path]) / self.width[test]
                 for test, lines in self.lines.items()
                 if path in lines
             }
-            in_order, files = sorted(share, key=share.__getitem__, reverse=True), [RECORDS]
-        else:
-            in_order = sorted(found, key=self.width.__getitem__)
+            in_order = sorted(share, key=share.__getitem__, reverse=True)
+            first, last = [RECORDS], []
         # what keeps all that is printed and drawn covers much and misses little: after the nearest
         kept = [test for test in in_order[NEAREST:] if "test_golden" in test]
         others = [test for test in in_order[NEAREST:] if test not in kept]
-        few = files if len(files) < FEW else []
-        return [*(few if few == [RECORDS] else ()), *in_order[:NEAREST], *kept, *others, *few]
+        return [*first, *in_order[:NEAREST], *kept, *others, *last]
+
+
+@cache
+def _bodies(path: str) -> list[range]:
+    tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
+    functions = [n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef)]
+    return [range(one.body[0].lineno, (one.end_lineno or 0) + 1) for one in functions]
+
+
+def in_function(path: str, line: int) -> bool:
+    """Whether a line runs when a function is called, not when its module is imported."""
+    return any(line in body for body in _bodies(path))
 
 
 # Looks at every class of the package, and covers no line
@@ -247,7 +260,7 @@ RECORDS = "tests/test_records.py"
 FEW = 8
 # Tests that one process runs, in turn: what covers least most often fails
 NEAREST = 4
-PORTIONS = (NEAREST, 12, 40, 120, 10_000)
+PORTIONS = (NEAREST + 1, 16, 40, 120, 10_000)
 
 
 def main() -> None:
