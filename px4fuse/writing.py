@@ -21,6 +21,8 @@ from px4fuse.errors import OutputError
 STANDARD_OUTPUT = Path("-")
 # How long a named pipe is waited for that nobody reads yet
 READER_S = 5.0
+# Whether a file that another program has open cannot be replaced
+LOCKS = sys.platform == "win32"
 #: What ends a run from outside: Ctrl-C, termination, and (not on Windows) a closed terminal
 STOPPING = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 
@@ -188,8 +190,10 @@ def _explained(path: Path) -> Iterator[None]:
     except OSError as error:
         name = "standard output" if path == STANDARD_OUTPUT else path
         why = "nobody reads this pipe" if error.errno == errno.ENXIO else error.strerror
+        locked = LOCKS and isinstance(error, PermissionError)
+        remedy = "Close the program that has it open, or choose" if locked else "Choose"
         raise OutputError(
-            f"{name}: cannot be written ({why}). Choose another place for it."
+            f"{name}: cannot be written ({why}). {remedy} another place for it."
         ) from error
 
 

@@ -18,6 +18,7 @@ from cli_tools import run_main
 from conftest import REPOSITORY
 from ulog_tools import make_log
 
+from px4fuse import writing
 from px4fuse.errors import OutputError
 from px4fuse.writing import STANDARD_OUTPUT, write_all
 
@@ -151,6 +152,25 @@ def test_a_rename_that_fails_half_way_puts_back_what_was_there(
         write_all(dict.fromkeys(paths, b"new"), told.append)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
     assert told == []
+
+
+@pytest.mark.parametrize(
+    ("locks", "said"),
+    [
+        (True, r"\. Close the program that has it open, or choose another"),
+        (False, r"\. Choose another"),
+    ],
+)
+def test_where_a_viewer_locks_a_file_it_is_to_be_closed(
+    tmp_path, monkeypatch, locks: bool, said: str
+) -> None:
+    path = tmp_path / "r.pdf"
+    path.write_bytes(b"old")
+    monkeypatch.setattr(writing, "LOCKS", locks)
+    refuse_renames_to(path, monkeypatch)
+    with pytest.raises(OutputError, match=said):
+        write_all({path: b"new"})
+    assert path.read_bytes() == b"old"
 
 
 def test_what_cannot_be_put_back_is_said(tmp_path, monkeypatch) -> None:
