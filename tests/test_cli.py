@@ -292,3 +292,26 @@ def test_an_extra_costs_nothing_where_it_is_not_used(
         [sys.executable, "-c", script], capture_output=True, text=True, check=True
     )
     assert done.stdout.splitlines()[-1] == f"pyarrow {loaded} False"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("compare", "{log}", "-o", "r.pdf"), ("extract", "{log}", "-o", "t"), ("explore", "{log}"),
+     ("simulate", "--passes", "1", "-o", "s.ulg"), ("answers", "{log}", "-o", "a.toml"),
+     ("grade", "--write-rubric", "r.toml")],
+)  # fmt: skip
+def test_no_file_is_opened_in_the_encoding_of_the_machine(
+    words: tuple[str, ...], sample_log: Path, tmp_path: Path
+) -> None:
+    """With a console of Windows' western code page, and a decimal comma where there is one."""
+    typed = [word.format(log=sample_log) for word in words]
+    script = (
+        "import warnings, sys\n"
+        "warnings.filterwarnings('error', category=EncodingWarning, module='px4fuse')\n"
+        f"sys.argv[1:] = {typed!r}\nfrom px4fuse.cli import main\nmain()"
+    )
+    environment = {**os.environ, "PYTHONUTF8": "0", "LC_ALL": "de_DE.UTF-8",
+                   "PYTHONIOENCODING": "cp1252", "PYTHONPATH": os.pathsep.join(sys.path)}  # fmt: skip
+    command = [sys.executable, "-X", "warn_default_encoding", "-c", script]
+    done = subprocess.run(command, capture_output=True, cwd=tmp_path, env=environment, check=False)
+    assert done.returncode == 0, done.stderr.decode("cp1252")[-300:]

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from exchange import replace
+from flights import Uwb, aisle_flight
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -487,3 +488,27 @@ def test_nothing_changes_its_input(sample_flight):
     continuous_state(shifted, track, segment)
     for part, copy in zip(parts, before, strict=True):
         pd.testing.assert_frame_equal(part, copy)
+
+
+@pytest.mark.parametrize(
+    ("across_m", "heading_deg", "called"),
+    [(1.0, None, "the aisle"), (4.0, None, "the longest direction"), (4.0, 30.0, "the aisle")],
+)
+def test_an_aisle_is_what_was_flown_as_one_or_asked_for(
+    across_m: float, heading_deg: float | None, called: str
+) -> None:
+    """An ellipse of 10 m by so much: what is not three times longer than wide is no aisle."""
+    flight = aisle_flight(uwb=Uwb(sigma_m=0.01))
+    (track,) = flight.positions
+    samples = track.samples.copy()
+    phase = 2.0 * np.pi * samples.index.to_numpy() / 20.0
+    samples["north_m"], samples["east_m"] = 5.0 * np.cos(phase), across_m / 2.0 * np.sin(phase)
+    round_trip = replace(track, samples=samples)
+    found = {
+        axis.name: axis for axis in make_axes(flight, round_trip, ALL, heading_deg=heading_deg)
+    }
+    assert found["aisle"].called == called
+    assert found["north"].called == "north"
+    assert found["aisle"].elongation == (
+        None if heading_deg else pytest.approx(10.0 / across_m, rel=0.02)
+    )

@@ -36,7 +36,6 @@ from px4fuse.ekf2.walk import (
 from px4fuse.ekf2_parameters import EV_POS
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.kalman import state_at
-from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.flight import Unavailable
 
@@ -131,6 +130,7 @@ def with_words(
     used_m, rejected = noise_used_m(model), model.agreement.rejected_share_logged
     too_sure = asked_m is not None and used_m * TOO_SMALL < asked_m and rejected >= REJECTED_SHARE
     first, *others = _parts(why, too_sure=too_sure)
+    apart = f"of what ours and EKF2 are apart along {comparison.axes[name].axis.called}"
     because = _reasons(why, comparison, model, clock)
     if too_sure:
         cause = (
@@ -139,15 +139,13 @@ def with_words(
             f"{_coasted(why)}"
         )
         more = (
-            f". This noise and the rejections that follow from it are {_share(first, why)} of "
-            f"what ours and EKF2 are apart along {the(name)}"
+            f". This noise and the rejections that follow from it are {_share(first, why)} {apart}"
         )
     else:
         half = 0.5 * why.position_mean_square_m2
         weight = "Most" if first.position_mean_square_m2 >= half else "The largest part"
         cause = (
-            f"{weight} of what ours and EKF2 are apart along {the(name)} is the {first.name} "
-            f"({_share(first, why)}): {because[first.name]}"
+            f"{weight} {apart} is the {first.name} ({_share(first, why)}): {because[first.name]}"
         )
         more = _moment(first)
     sentences = [*_wrong_stamps(comparison, model, clock), f"{cause}{more}."]
@@ -179,11 +177,6 @@ def _parts(why: Why, *, too_sure: bool) -> list[Step]:
     )
     # the cause comes first, even where its steps also bring the tracks nearer
     return [joined, *(step for step in parts if step not in two)]
-
-
-def the(axis: str) -> str:
-    """The name of an axis in a sentence."""
-    return f"the {axis}" if axis == AISLE else axis
 
 
 def _share(part: Step, why: Why) -> str:

@@ -28,6 +28,8 @@ from px4fuse.flight import (
 )
 
 AISLE = "aisle"
+# A track that is so many times longer than wide was flown along an aisle
+ELONGATED = 3.0
 # An IMU interval is a gap when it is longer than this and than five median intervals.
 IMU_GAP_S = 0.1
 IMU_GAP_INTERVALS = 5.0
@@ -89,6 +91,8 @@ class Axis:
         Position measurements along the axis; n ≥ 3.
     acceleration : Acceleration or Unavailable
         The filter's input.
+    elongation : float or None
+        How many times longer than wide the track is; None where the direction was given.
     """
 
     name: str
@@ -98,8 +102,17 @@ class Axis:
     measurement_time_s: Array
     measurement_m: Array
     acceleration: Acceleration | Unavailable
+    elongation: float | None = None
 
     __repr__ = brief
+
+    @property
+    def called(self) -> str:
+        """What the axis is in a sentence; an aisle is what was flown as one, or asked for."""
+        if self.name != AISLE:
+            return self.name
+        flown = self.elongation is None or self.elongation >= ELONGATED
+        return "the aisle" if flown else "the longest direction"
 
 
 def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
@@ -204,7 +217,7 @@ def make_axes(
     where = f"{flight.log.name}: {track.name}"
     axes = []
     for name in asked:
-        direction, heading, note = _direction(name, track, segment, heading_deg)
+        direction, heading, note, elongation = _direction(name, track, segment, heading_deg)
         projected = along(samples, POSITION_COLUMNS, direction)
         finite = np.isfinite(projected)
         if np.count_nonzero(finite) < MIN_MEASUREMENTS:
@@ -217,7 +230,8 @@ def make_axes(
             else project_acceleration(acceleration, direction, segment)
         )
         time = samples.index.to_numpy()[finite]
-        axes.append(Axis(name, direction, heading, note, time, projected[finite], pushed))
+        measured = time, projected[finite]
+        axes.append(Axis(name, direction, heading, note, *measured, pushed, elongation))
     if not axes:
         raise MissingDataError(f"{where} has no finite position in this segment.")
     return tuple(axes)
@@ -243,17 +257,18 @@ def along(frame: pd.DataFrame, columns: list[str], weights: Array) -> Array:
 
 def _direction(
     name: str, track: PositionTrack, segment: Segment, heading_deg: float | None
-) -> tuple[Array, float | None, str]:
+) -> tuple[Array, float | None, str, float | None]:
+    elongation = None
     if name != AISLE:
         at = AXIS_NAMES.index(name)
-        return np.eye(3)[at], (None if name == "down" else 90.0 * at), ""
+        return np.eye(3)[at], (None if name == "down" else 90.0 * at), "", None
     if heading_deg is None:
         heading, elongation = aisle_heading(track, segment)
         note = f"horizontal principal direction, {elongation:.1f} times longer than wide"
     else:
         heading, note = heading_deg, "given with --heading"
     angle = np.radians(heading)
-    return np.array([np.cos(angle), np.sin(angle), 0.0]), heading, note
+    return np.array([np.cos(angle), np.sin(angle), 0.0]), heading, note, elongation
 
 
 def project_acceleration(

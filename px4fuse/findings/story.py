@@ -15,7 +15,6 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import AgainstTruth, AxisComparison, Difference, FilterName
-from px4fuse.comparison.why import the
 from px4fuse.ekf2.walk import Why
 from px4fuse.filter.kalman import replay, state_at
 from px4fuse.filter.settings import Settings
@@ -69,7 +68,7 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
 def _verdict(analysis: Analysis, since: str) -> str:
     """How far off both filters were, and whether they knew it."""
     result, source = analysis.main, analysis.source
-    along = capital(f"{_flown(analysis)}along {the(result.axis.name)}")
+    along = capital(f"{_flown(analysis)}along {result.axis.called}")
     (ours_off, ours), (ekf2_off, ekf2) = (
         (_error(result, owner), _knows(analysis, result, owner)) for owner in ("kf", "ekf2")
     )

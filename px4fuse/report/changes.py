@@ -8,7 +8,6 @@ import pandas as pd
 from rich.console import Console
 
 from px4fuse.comparison.model import AxisComparison
-from px4fuse.comparison.why import the
 from px4fuse.plain import number_words
 from px4fuse.report import panels
 from px4fuse.report.document import ChangesDocument
@@ -89,7 +88,7 @@ def _write(page: Page, results: ChangeResults, *, short: bool = False) -> None:
 def _flights(a: AxisComparison, b: AxisComparison) -> Page:
     """Both flights along one axis, with common scales."""
     page = Page(
-        f"A and B along {the(a.axis.name)}",
+        f"A and B along {a.axis.called}",
         "A at the left, B at the right. Ours is dark and solid, EKF2 lighter and dashed, the truth "
         "dotted. An error is the distance from the truth, and without one that of ours from EKF2.",
     )

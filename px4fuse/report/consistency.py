@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.comparison.model import AxisComparison, FilterSummary, UnjudgedFilter
-from px4fuse.comparison.why import the
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital, number_words, p_words
@@ -46,7 +45,7 @@ class Series(NamedTuple):
 def draw(document: Document) -> Iterator[Page]:
     """Draw one page: the axis of the lab in three panels, all axes in a table."""
     result = document.analysis.main
-    along = the(result.axis.name)
+    along = result.axis.called
     page = Page(
         "Appendix: consistency",
         "Innovations ν of a filter that knows its own variance S are as large as S says (NIS = "

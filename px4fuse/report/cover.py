@@ -10,7 +10,6 @@ import pandas as pd
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.why import the
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.signals import AISLE, Axis, within
 from px4fuse.findings import Finding, by_root
@@ -75,7 +74,7 @@ def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
 def _verdict(page: Page, document: Document) -> None:
     """The main axis, large: each filter on its half of the page."""
     result, columns = document.analysis.main, []
-    along = the(result.axis.name)
+    along = result.axis.called
     for (name, one), colour in zip(filters(result).items(), (OURS, EKF2), strict=False):
         judged = isinstance(one, Consistency)
         column, _ = halves()

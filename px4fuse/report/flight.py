@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import pandas as pd
 
 from px4fuse.comparison.model import Difference
-from px4fuse.comparison.why import the
 from px4fuse.flight import Unavailable
 from px4fuse.report import marks, panels
 from px4fuse.report.document import Document
@@ -26,7 +25,7 @@ GAP = 14.0  # points between columns
 def draw(document: Document) -> Iterator[Page]:
     """Draw one page."""
     result = document.analysis.main
-    page = Page(f"The flight along {the(result.axis.name)}")
+    page = Page(f"The flight along {result.axis.called}")
     _legend(page, document)
     reference = panels.error_reference(result)
     shown = [panels.POSITION, panels.VELOCITY]

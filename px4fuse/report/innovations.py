@@ -10,7 +10,6 @@ import pandas as pd
 
 from px4fuse.comparison.events import Span
 from px4fuse.comparison.model import AxisComparison
-from px4fuse.comparison.why import the
 from px4fuse.filter.signals import Segment
 from px4fuse.report import panels
 from px4fuse.report.document import Document
@@ -32,7 +31,7 @@ ZOOM_SHARE, ZOOM = 0.66, 125.0  # of the page's width; height of the axes in poi
 def draw(document: Document) -> Iterator[Page]:
     """Draw one page: innovations, σ_p and σ_v on one time axis, then the zooms."""
     result = document.analysis.main
-    page = Page(f"Innovations and variances along {the(result.axis.name)}")
+    page = Page(f"Innovations and variances along {result.axis.called}")
     for panel in (panels.INNOVATIONS, panels.SIGMA_P, panels.SIGMA_V):
         last, first = panel is panels.SIGMA_V, panel is panels.INNOVATIONS
         panel.put(page, document, result, last=last, strip=first)

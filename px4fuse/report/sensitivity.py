@@ -11,7 +11,6 @@ import pandas as pd
 from px4fuse.arrays import Array
 from px4fuse.comparison.events import Span
 from px4fuse.comparison.model import AxisComparison
-from px4fuse.comparison.why import the
 from px4fuse.filter.fitting import FIRST_WIDTH
 from px4fuse.filter.likelihood import States, preintegrate, states, total_over_grid
 from px4fuse.filter.tuning import HORIZONTAL, MIN_MEASUREMENTS, AxisTuning, Noise
@@ -94,7 +93,7 @@ def draw(document: Document) -> Iterator[Page]:
         axes.set_xlim(*window)
         legend_above(axes)
     page.numbers(
-        f"Velocity along {the(result.axis.name)} (m/s) over the {window[1] - window[0]:.0f} s with "
+        f"Velocity along {result.axis.called} (m/s) over the {window[1] - window[0]:.0f} s with "
         "the most motion in which nothing is missing."
     )
     _table(page, result, run, chosen, velocity)
