@@ -310,8 +310,8 @@ def test_no_file_is_opened_in_the_encoding_of_the_machine(
         "warnings.filterwarnings('error', category=EncodingWarning, module='px4fuse')\n"
         f"sys.argv[1:] = {typed!r}\nfrom px4fuse.cli import main\nmain()"
     )
-    environment = {**os.environ, "PYTHONUTF8": "0", "LC_ALL": "de_DE.UTF-8",
-                   "PYTHONIOENCODING": "cp1252", "PYTHONPATH": os.pathsep.join(sys.path)}  # fmt: skip
+    console = {"PYTHONUTF8": "0", "LC_ALL": "de_DE.UTF-8", "PYTHONIOENCODING": "cp1252"}
+    environment = {**os.environ, **console, "PYTHONPATH": os.pathsep.join(sys.path)}
     command = [sys.executable, "-X", "warn_default_encoding", "-c", script]
     done = subprocess.run(command, capture_output=True, cwd=tmp_path, env=environment, check=False)
     assert done.returncode == 0, done.stderr.decode("cp1252")[-300:]
