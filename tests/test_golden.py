@@ -29,6 +29,7 @@ from test_aids import gnss_log
 from test_findings import FAULTS
 
 import px4fuse
+from px4fuse.cli import COMMANDS as CLI_COMMANDS
 from px4fuse.comparison.comparison import compare
 from px4fuse.explore.data import flight_data
 from px4fuse.explore.figures import document_json
@@ -155,6 +156,16 @@ def test_a_simulated_flight_is_as_it_was(kind: str) -> None:
         if mistake.kind in ("", kind):
             lines += ["", name, *(line for line in spread(kind, name) if line not in clean)]
     agrees(f"simulated_{kind}", lines)
+
+
+def test_help_says_what_it_said() -> None:
+    lines = []
+    for command in ("", *CLI_COMMANDS, "lesson kalman"):
+        lines += [
+            f"$ px4fuse {command} --help",
+            *run(*command.split(), "--help").output.splitlines(),
+        ]
+    agrees("help", lines)
 
 
 def test_findings_say_what_they_said() -> None:
