@@ -154,6 +154,7 @@ def test_a_scale_is_not_drawn_to_zero_by_the_noise_of_the_acceleration() -> None
             sigma_a_m_s2=0.2,
             sigma_z_m=0.1,
             outlier_time_s=np.array([]),
+            clock_offset_s=0.0,
         )
         assert isinstance(found, Explained)
         scales.append(found.scale.value)

@@ -95,7 +95,7 @@ def explained(
     sigma_a_m_s2: float,
     sigma_z_m: float,
     outlier_time_s: Array,
-    clock_offset_s: float = 0.0,
+    clock_offset_s: float,
 ) -> Explained | Unavailable:
     """Estimate biases and scale, and look for jumps of the source.
 

@@ -295,6 +295,8 @@ def main() -> None:
             names = cover.of(mutant)
             if not names:
                 return "uncovered"
+            if "    >>> " in (ROOT / mutant.path).read_text(encoding="utf-8"):
+                names = [mutant.path, *names]
             tree = trees.get()
             file = tree / mutant.path
             source = file.read_text(encoding="utf-8")
