@@ -62,7 +62,8 @@ def of_artist(artist: Any) -> Iterator[str]:
     match artist:
         case Line2D():
             marks = f"{artist.get_marker()} {value(artist.get_markersize())}"
-            width = f"{artist.get_linestyle()} {value(artist.get_linewidth())}"
+            dashes = value(artist._unscaled_dash_pattern)
+            width = f"{artist.get_linestyle()} {dashes} {value(artist.get_linewidth())}"
             x, y = (numbers(part) for part in artist.get_data())
             yield f"{name} {colour(artist.get_color())} {width} {marks} {looks}: {x}; {y}"
         case Text():

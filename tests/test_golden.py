@@ -61,6 +61,10 @@ LATE = "simulate --mistake clock-offset=0.2 --mistake nlos --passes 2 --seed 5 -
 COMMANDS = {
     "compare": ("compare sample_logs/aisle_uwb.ulg --student Ana --id 7 --notes notes.md",),
     "compare_mistakes": (LATE, "compare late.ulg --sigma-z 0.3"),
+    "compare_rejecting": (
+        "simulate --mistake ekf2-noise --mistake dropout --passes 2 --seed 8 -o r.ulg",
+        "compare r.ulg",
+    ),
     "compare_mavlink": ("compare sample_logs/aisle_uwb.tlog",),
     "compare_external": (
         "compare sample_logs/aisle_uwb.ulg --position sample_logs/aisle_uwb_external.csv",
