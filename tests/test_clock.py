@@ -511,3 +511,14 @@ def test_the_offset_of_simulated_flights(shared_logs, name: str, true_s: float) 
         advice = clock_advice(compared, found)["PX4"]
         assert "EKF2_EV_DELAY is 175 ms" in advice
         assert "set it, or correct the sender's clock" in advice
+
+
+def test_a_profile_without_a_minimum_says_nothing_of_its_place() -> None:
+    """Its standard deviation is then all that was looked at."""
+    grid = np.linspace(-0.5, 0.7, 13)
+    found, sigma = clock._vertex(grid, -((grid - 0.1) ** 2))
+    assert found in (grid[0], grid[-1])
+    assert sigma == pytest.approx(1.2)
+    found, sigma = clock._vertex(grid, 8.0 * (grid - 0.13) ** 2)
+    assert found == pytest.approx(0.13)
+    assert sigma == pytest.approx(0.25)  # of exp(-profile)

@@ -474,6 +474,16 @@ def test_interchanged_and_doubtful_arguments_are_warned_about() -> None:
         assert said in evaluate(estimate, reference, **how).warnings[0]
 
 
+@pytest.mark.parametrize(("offset_s", "said"), [(0.08, False), (0.12, True)])
+def test_clocks_that_fit_better_apart_are_warned_about(offset_s: float, said: bool) -> None:
+    """Less may be the filter's own lag."""
+    truth = replace(flight(), name="log:truth", kind="truth")
+    slam = moved(truth, TURN, SHIFT, kind="slam", name="slam")
+    late = replace(slam, time_s=slam.time_s - offset_s)
+    warned = " ".join(evaluate(late, truth).warnings)
+    assert ("motions fit best with +0.120 s added" in warned) is said
+
+
 # -- clocks ----------------------------------------------------------------------------------------
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from importlib import import_module
 from pathlib import Path
 
 import jsonschema
@@ -228,3 +229,19 @@ def error(summary: Summary) -> float:
     assert all(isinstance(part, float) for part in parts)
     assert summary.position_rmse_to_truth_m == pytest.approx(np.hypot(*parts))
     return float(np.hypot(*parts))
+
+
+def test_results_alone_are_not_mixed_with_how_far_it_is(
+    sample_log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = import_module("px4fuse.cli.whatif")
+    shown, alone = command.progress, []
+
+    def recorded(is_alone: bool, steps: tuple[str, ...]) -> object:
+        alone.append(is_alone)
+        return shown(is_alone, steps)
+
+    monkeypatch.setattr(command, "progress", recorded)
+    assert run(sample_log, "--json", "-").exit_code == 0
+    assert run(sample_log).exit_code == 0
+    assert alone == [True, False]

@@ -106,6 +106,10 @@ def test_what_eats_memory_is_ended():
     jobs = [("square", 2), ("hog", 10 * MEMORY), ("square", 3)]
     results, _ = run(jobs, processes=1, memory_bytes=MEMORY)
     assert results == [4, Failed("it needed more memory than one file may take."), 9]
+    # the next job would not find enough memory in that process
+    jobs = [("process", 0), ("hog", 10 * MEMORY), ("process", 0)]
+    (before, _, after), _ = run(jobs, processes=1, memory_bytes=MEMORY)
+    assert before != after
 
 
 def test_processes_are_replaced_after_some_jobs(monkeypatch):

@@ -91,7 +91,7 @@ def smoothing(
     level = sigma_a_m_s2 * SIGMA_A_FACTORS[:, None], sigma_z_m * SIGMA_Z_FACTORS[None, :]
     settings = replace(settings, input="imu")
 
-    def score(correlation: float, offset_s: float = 0.0) -> tuple[float, float]:
+    def score(correlation: float, offset_s: float) -> tuple[float, float]:
         moved = [
             replace(
                 axis, measurement_time_s=time + offset_s, measurement_m=axis.measurement_m[middle]
@@ -100,13 +100,13 @@ def smoothing(
         ]
         return _score(moved, settings, bad, correlation, level)
 
-    plain = score(0.0)[0]
+    plain = score(0.0, 0.0)[0]
     if clock_offset_s:
         plain = min(plain, score(0.0, clock_offset_s)[0])
     found = plain, 0.0, sigma_z_m
     # from none on, for as long as more of it makes the positions more likely
     for correlation in CORRELATIONS[1:].tolist():
-        here, sigma = score(correlation)
+        here, sigma = score(correlation, 0.0)
         if here >= found[0] and (found[1] > 0.0 or correlation > FIRST_CORRELATIONS):
             break
         found = min(found, (here, correlation, sigma))
@@ -114,7 +114,7 @@ def smoothing(
     place = int(np.searchsorted(CORRELATIONS, found[1]))
     around = CORRELATIONS[place - 1 : place + 2] if place else np.zeros(0)
     for correlation in ((around[:-1] + around[1:]) / 2.0).tolist():
-        here, sigma = score(correlation)
+        here, sigma = score(correlation, 0.0)
         found = min(found, (here, correlation, sigma))
     best, at, noise = found
     lag = -float(np.median(np.diff(time)) / np.log(at)) if at else 0.0
