@@ -11,6 +11,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import matplotlib as mpl
+import msgspec
 import numpy as np
 import pandas as pd
 import pytest
@@ -436,3 +437,22 @@ def test_a_heading_says_itself_in_a_sentence() -> None:
     )
     assert "the same all along" in repr(turned(parts, 0.5, "orientation"))
     assert drifts.to_frame()["heading_error_deg"].tolist() == [-36, -9]
+
+
+@pytest.mark.parametrize(
+    ("known", "said"),
+    [
+        ((None, None, None), "SIGMA_Z not determinable;"),
+        ((None, None, 0.25), "SIGMA_Z at most 0.25 m;"),
+        ((0.1, None, 0.2), "SIGMA_Z 0.1 m (95 %: 0 to 0.2);"),
+        ((0.1, 0.05, None), "SIGMA_Z 0.1 m (95 %: 0.05 to ?);"),
+    ],
+)
+def test_a_noise_that_is_not_known_says_so(
+    analysis, known: tuple[float | None, ...], said: str
+) -> None:
+    value, *ends = known
+    tuned = msgspec.structs.replace(
+        analysis.tuning["horizontal"], sigma_z_m=value, sigma_z_m_interval=tuple(ends)
+    )
+    assert said in repr(tuned)

@@ -704,3 +704,7 @@ def test_bad_options_are_one_line_and_write_nothing(arguments, said, tmp_path, m
     assert said in error
     assert error.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_a_gap_may_begin_with_the_flight():
+    assert parse(["dropout=8,0"]).dropout_at_s == 0.0
