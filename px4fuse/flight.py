@@ -170,12 +170,6 @@ class PositionTrack:
         """Samples per second between gaps (NaN with fewer than two samples)."""
         return sample_rate(self.samples)
 
-    @property
-    def stamps(self) -> Literal["measurement", "arrival"]:
-        """What its time stamps tell: when the position was measured, or when it arrived."""
-        arrived = self.clock_map is not None and self.clock_map.method in ARRIVAL_METHODS
-        return "arrival" if arrived else "measurement"
-
 
 @dataclass(frozen=True)
 class Reset:
