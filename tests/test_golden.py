@@ -65,6 +65,7 @@ COMMANDS = {
         "simulate --mistake ekf2-noise --mistake dropout --passes 2 --seed 8 -o r.ulg",
         "compare r.ulg",
     ),
+    "compare_loop": ("compare sample_logs/loop_vio.ulg",),
     "compare_mavlink": ("compare sample_logs/aisle_uwb.tlog",),
     "compare_external": (
         "compare sample_logs/aisle_uwb.ulg --position sample_logs/aisle_uwb_external.csv",
