@@ -119,7 +119,8 @@ def axis(name: str = "north", **parts: Any) -> Any:
     filters = {
         key: _with_truth(parts.pop(key, NONE), parts.pop(f"{key}_truth", NONE)) for key in FILTERS
     }
-    return SimpleNamespace(axis=SimpleNamespace(name=name), filters=filters, **usual | parts)
+    axis = SimpleNamespace(name=name, called="the aisle" if name == "aisle" else name)
+    return SimpleNamespace(axis=axis, filters=filters, **usual | parts)
 
 
 def _with_truth(one: Any, truth: Any) -> Any:

@@ -142,7 +142,7 @@ def of_command(page: Browser, sample_log: Path) -> ComparisonRequest:
     assert words[:2] == ["px4fuse", "compare"]
     with compare_command.make_context("compare", words[2:]) as context:
         given = dict(context.params)
-        for name in ("output", "json_path", "fail_on"):
+        for name in ("output", "json_path", "fail_on", "checks"):
             given.pop(name)
         read_person(given)
         given.pop("log")

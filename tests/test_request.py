@@ -84,7 +84,8 @@ def parsed(command: str) -> Request:
     made = compare if name == "compare" else loop
     context = made.make_context(name, [*options, "--", file])
     own = (
-        "output", "json_path", "fail_on", "student", "student_id", "notes", "answers", "tum", "g2o",
+        "output", "json_path", "fail_on", "checks", "student", "student_id", "notes", "answers",
+        "tum", "g2o",
     )  # fmt: skip
     given_ = {key: value for key, value in context.params.items() if key not in own}
     if name == "compare":
@@ -146,7 +147,7 @@ def test_what_px4fuse_cannot_have_recorded_is_refused(recorded: object, says: st
 def test_every_option_of_an_analysis_is_in_the_request(command, declared, kinds) -> None:
     """An option that the request forgets would be missing from every record."""
     about_outputs = {"-o", "--json", "--student", "--id", "--notes", "--answers", "--fail-on",
-                     "--tum", "--g2o", "--closures", "--robust", "--max-size"}  # fmt: skip
+                     "--checks", "--tum", "--g2o", "--closures", "--robust", "--max-size"}  # fmt: skip
     options = {parameter.opts[0] for parameter in command.params if parameter.opts[0][0] == "-"}
     assert options - about_outputs == {option.name for option in declared.values()}
     assert set(declared) <= {field for kind in kinds for field in kind.__struct_fields__}
