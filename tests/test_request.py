@@ -146,8 +146,10 @@ def test_what_px4fuse_cannot_have_recorded_is_refused(recorded: object, says: st
 )
 def test_every_option_of_an_analysis_is_in_the_request(command, declared, kinds) -> None:
     """An option that the request forgets would be missing from every record."""
-    about_outputs = {"-o", "--json", "--student", "--id", "--notes", "--answers", "--fail-on",
-                     "--checks", "--tum", "--g2o", "--closures", "--robust", "--max-size"}  # fmt: skip
+    about_outputs = {
+        "-o", "--json", "--student", "--id", "--notes", "--answers", "--fail-on", "--checks",
+        "--tum", "--g2o", "--closures", "--robust", "--max-size",
+    }  # fmt: skip
     options = {parameter.opts[0] for parameter in command.params if parameter.opts[0][0] == "-"}
     assert options - about_outputs == {option.name for option in declared.values()}
     assert set(declared) <= {field for kind in kinds for field in kind.__struct_fields__}
