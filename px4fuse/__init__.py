@@ -7,6 +7,8 @@
 """
 
 import importlib as _importlib
+import sys as _sys
+import types as _types
 import typing as _typing
 
 if _typing.TYPE_CHECKING:
@@ -36,6 +38,8 @@ if _typing.TYPE_CHECKING:
     from px4fuse.notebook.commands import close_loop as close_loop
     from px4fuse.notebook.commands import compare as compare
     from px4fuse.notebook.commands import evaluate as evaluate
+    from px4fuse.notebook.commands import explore as explore
+    from px4fuse.notebook.commands import report as report
     from px4fuse.notebook.commands import what_if as what_if
     from px4fuse.readers import read_log as read_log
     from px4fuse.readers.trajectory import read_trajectory as read_trajectory
@@ -62,7 +66,7 @@ _PUBLIC = {
     "fleet.run": ("batch",),
     "flight": ("Flight", "Unavailable"),
     "loop.loop": ("Loop",),
-    "notebook.commands": ("close_loop", "compare", "evaluate", "what_if"),
+    "notebook.commands": ("close_loop", "compare", "evaluate", "explore", "report", "what_if"),
     "readers": ("read_log",),
     "readers.trajectory": ("read_trajectory",),
     "request": ("ComparisonRequest", "LoopRequest", "PositionFile"),
@@ -89,3 +93,13 @@ def __getattr__(name: str) -> _typing.Any:
     value = getattr(_importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
     globals()[name] = value
     return value
+
+
+class _Package(_types.ModuleType):
+    """The package, of which two functions have the names of rooms: attributes are the functions."""
+
+    explore = property(lambda _: __getattr__("explore"), lambda *_: None)
+    report = property(lambda _: __getattr__("report"), lambda *_: None)
+
+
+_sys.modules[__name__].__class__ = _Package

@@ -74,6 +74,8 @@ class Analysis(Comparison):
         Loop closure of the flight's odometry.
     heading : HeadingError or Unavailable
         How the source's frame is turned against the vehicle's heading.
+    request : ComparisonRequest or None
+        What was asked for; None where :func:`explain` was given a comparison.
     """
 
     tuning: Tuning
@@ -82,6 +84,7 @@ class Analysis(Comparison):
     why: Mapping[str, Why | Unavailable]
     loop: Loop | Unavailable
     heading: HeadingError | Unavailable
+    request: ComparisonRequest | None = None
 
     @property
     def ekf2_replay(self) -> Ekf2Replay | Unavailable:
@@ -211,7 +214,7 @@ def run(
     LogError, MissingDataError, SettingsError
         A file cannot be read, the flight lacks what was asked for, or a setting is out of range.
     """
-    return explain(run_comparison(request, progress, flight), progress)
+    return replace(explain(run_comparison(request, progress, flight), progress), request=request)
 
 
 def read_flight(request: ComparisonRequest, progress: Progress = silent) -> Flight:

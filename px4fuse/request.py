@@ -431,7 +431,7 @@ def command_line(
     return join(["px4fuse", *words])
 
 
-def settings_name(request: ComparisonRequest | EvaluationRequest) -> str:
+def settings_name(request: ComparisonRequest | EvaluationRequest | LoopRequest) -> str:
     """What is not at its default, as a part of a file name.
 
     >>> settings_name(ComparisonRequest(log="a.ulg", sigma_z_m=0.05, mavlink="b/c.tlog"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,35 @@ def show(browser: Browser, file: Path, at: str = "", width: int = 1400) -> Brows
         assert time.monotonic() < end, browser.complaints()
         time.sleep(0.05)
     return browser
+
+
+def axe() -> str:
+    """axe-core, to be run in a page."""
+    return files("axe_core_python").joinpath("axe.min.js").read_text(encoding="utf-8") + ";1"
+
+
+def serious(browser: Browser) -> list[Any]:
+    """What axe-core, which is in the page, finds that shuts somebody out."""
+    found = ask(
+        browser,
+        "axe.run().then((r) => r.violations.map((v) => [v.impact, v.id, v.nodes[0].html]))",
+    )
+    return [one for one in found if one[0] in ("serious", "critical")]
+
+
+def open_view(browser: Browser, name: str) -> None:
+    """Show a tab of the page."""
+    ask(browser, f"Explore.then((e) => {{ e.open({json.dumps(name)}); }})")
+    settle(browser)
+
+
+def settle(browser: Browser) -> None:
+    """Until what is under way is drawn, what follows the end of a drag too."""
+    ask(
+        browser,
+        "new Promise((r) => setTimeout(() => requestAnimationFrame(() => requestAnimationFrame(r)),"
+        "200))",
+    )
 
 
 def ask(browser: Browser, script: str) -> Any:

@@ -7,16 +7,18 @@ import hashlib
 import json
 import re
 import shlex
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import pytest
 from browser import Browser, Elements
 from click.testing import CliRunner, Result
 from exchange import replace
-from explore_tools import ask, show
+from explore_tools import ask, open_view, settle, show
 from flights import Imu, aisle_flight, unexplained
 
 from px4fuse.analysis import Analysis, run, run_comparison
@@ -130,10 +132,6 @@ def drag(page: Browser, knob: str, share: float) -> None:
             clickCount=1,
         )  # fmt: skip
     settle(page)
-
-
-def settle(page: Browser) -> None:
-    ask(page, "new Promise((r) => requestAnimationFrame(() => requestAnimationFrame(r)))")
 
 
 def of_command(page: Browser, sample_log: Path) -> ComparisonRequest:
@@ -268,6 +266,7 @@ def test_a_bad_address_or_number_is_refused_in_words(page: Browser) -> None:
 def test_steps_through_measurements(page: Browser, made: tuple[Path, Analysis]) -> None:
     result = made[1].main
     updates, steps = result.replay.updates, result.replay.steps
+    open_view(page, "step")
     page.click("#next-0")
     page.click("#next-0")
     page.click("#next-0")
@@ -296,13 +295,16 @@ def test_steps_through_measurements(page: Browser, made: tuple[Path, Analysis]) 
 def test_findings_and_buttons_move_all_plots(page: Browser) -> None:
     span = "document.getElementById('span').textContent"
     whole = page.ask(span)
+    open_view(page, "recorded")
     page.click(".jump")
     settle(page)
     low, high = (float(word) for word in re.findall(r"[\d.]+", page.ask(span)))
+    assert page.ask("document.querySelector('[data-plot=innovation]').checkVisibility()")
     finding = page.ask("document.querySelector('.jump').textContent")
     assert low < float(re.findall(r"[\d.]+", finding)[0]) < high < low + 10.0
     points = ask(
-        page, "Explore.then((e) => Array.from(e.model('steps-source-0').data.t.slice(0, 2)))"
+        page,
+        "Explore.then((e) => Array.from(e.model('sigma_p:steps-source-0').data.t.slice(0, 2)))",
     )
     assert low - 1.0 < points[0] <= low
     page.click("#whole")
@@ -346,7 +348,9 @@ def test_ekf2_at_a_stop_is_what_whatif_says(page: Browser, made: tuple[Path, Ana
     (replay,) = replay_settings(model, [changes])
     segment = made[1].segment
     assert counts == within(replay.updates, segment)["rejected"].sum()
-    drawn = ask(page, "Explore.then((e) => Array.from(e.model('rejected-source-0').data.nu))")
+    drawn = ask(
+        page, "Explore.then((e) => Array.from(e.model('innovation:rejected-source-0').data.nu))"
+    )
     expected = within(replay.updates, segment)
     nu = expected["innovation_north_m"][expected["rejected"] > 0]
     np.testing.assert_allclose(drawn, nu, rtol=0.0, atol=6e-4)
@@ -359,6 +363,7 @@ def test_ekf2_at_a_stop_is_what_whatif_says(page: Browser, made: tuple[Path, Ana
 
 
 def test_the_pointer_tells_values_and_the_dark_has_its_colours(page: Browser) -> None:
+    open_view(page, "track")
     x, y = page.ask(
         "(() => { const node = document.getElementById('position-0');"
         "node.scrollIntoView({block: 'center'}); const box = node.getBoundingClientRect();"
@@ -400,6 +405,7 @@ def test_copies_the_command(page: Browser) -> None:
 def test_a_box_on_the_track_is_a_time(page: Browser) -> None:
     span = "document.getElementById('span').textContent"
     whole = page.ask(span)
+    open_view(page, "step")
     x, y, width, height = page.ask(
         "(() => { const node = document.getElementById('plan-0');"
         "node.scrollIntoView({block: 'center'}); const box = node.getBoundingClientRect();"
@@ -522,3 +528,39 @@ def test_bad_input_leaves_nothing(
     assert done.exit_code != 0
     assert said in f"{done.output}{done.exception}"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_without_a_log_it_is_the_sample_flight(
+    sample_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "px4fuse_samples", None)
+    done = explore()
+    assert "no log was given" in f"{done.output}{done.exception}"
+    assert list(tmp_path.iterdir()) == []
+    here = tmp_path / "sample_logs"
+    here.mkdir()
+    (here / sample_log.name).write_bytes(sample_log.read_bytes())
+    done = explore("--start", "20", "--end", "40")
+    assert done.exit_code == 0, done.output
+    assert "No log was given: this is the sample flight, aisle_uwb.ulg." in done.stderr
+    assert (tmp_path / "reports" / "aisle_uwb_start-20_end-40.html").is_file()
+
+
+def test_open_opens_what_is_looked_at(
+    sample_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr(click, "launch", opened.append)
+    monkeypatch.chdir(tmp_path)
+    log, part = str(sample_log), ["--start", "20", "--end", "40"]
+    for words, name in (
+        (["explore", log, *part, "--open", "-o", "page.html"], "page.html"),
+        (["compare", log, *part, "--show", "-o", "report.pdf"], "report.pdf"),
+        (["evaluate", f"{log}:ekf2", f"{log}:truth", "--picture", "a.png", "--open"], "a.png"),
+        (["compare", log, *part, "--json", "only.json", "-o", "other.pdf"], None),
+    ):
+        done = CliRunner().invoke(cli, words)
+        assert done.exit_code == 0, done.output
+        assert opened == ([] if name is None else [str(tmp_path / name)])
+        opened.clear()

@@ -456,3 +456,33 @@ def test_a_noise_that_is_not_known_says_so(
         analysis.tuning["horizontal"], sigma_z_m=value, sigma_z_m_interval=tuple(ends)
     )
     assert said in repr(tuned)
+
+
+def test_report_and_page_are_written_as_by_the_commands(
+    analysis: px4fuse.Analysis, tmp_path: Path
+) -> None:
+    import px4fuse.report.pdf  # a room of the same name as the function
+
+    report = px4fuse.report(analysis, tmp_path / "x.pdf")
+    page = px4fuse.explore(analysis, str(tmp_path / "x.html"))
+    assert report == tmp_path / "x.pdf"
+    assert report.read_bytes().startswith(b"%PDF")
+    assert page.read_bytes().startswith(b"<!DOCTYPE html>")
+    results = read_results((tmp_path / "x.json").read_bytes())
+    assert isinstance(results, ComparisonResults)
+    assert results.request.sigma_z_m == 0.2
+    assert results.provenance.command == "px4fuse compare aisle_uwb.ulg --sigma-z 0.2"
+    verified = CliRunner().invoke(
+        cli, ["verify", str(report), str(Path("sample_logs") / analysis.flight.log.name)]
+    )
+    assert verified.exit_code == 0, verified.output
+
+
+def test_what_cannot_be_written_is_said(analysis: px4fuse.Analysis, tmp_path: Path) -> None:
+    for function, name in ((px4fuse.report, "x.html"), (px4fuse.explore, "x.pdf")):
+        with pytest.raises(px4fuse.Px4FuseError, match="give a name that ends in"):
+            function(analysis, tmp_path / name)
+    bare = dataclasses.replace(analysis, request=None)
+    with pytest.raises(px4fuse.Px4FuseError, match="does not say what was asked for"):
+        px4fuse.report(bare, tmp_path / "x.pdf")
+    assert list(tmp_path.iterdir()) == []

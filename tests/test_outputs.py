@@ -15,11 +15,10 @@ from cli_tools import contents, run, run_main
 from click.testing import CliRunner
 from ulog_tools import ev_error, ev_stamps, make_log, position
 
-import px4fuse.report.pdf
 from px4fuse.analysis import run_comparison
 from px4fuse.cli import cli
 from px4fuse.errors import MissingDataError
-from px4fuse.report import fonts
+from px4fuse.report import fonts, pdf
 from px4fuse.request import ComparisonRequest
 
 pytestmark = pytest.mark.usefixtures("analysed_once")
@@ -30,7 +29,7 @@ SECONDS = 20.0
 @pytest.fixture
 def no_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pages take most of the time, and none of them is looked at here."""
-    monkeypatch.setattr(px4fuse.report.pdf, "render", lambda document, text: b"%PDF-")
+    monkeypatch.setattr(pdf, "render", lambda document, text: b"%PDF-")
 
 
 @pytest.fixture
@@ -71,7 +70,7 @@ def test_a_name_that_no_font_has_is_said_before_the_report(
         told.append(capsys.readouterr().err)
         return b"%PDF-"
 
-    monkeypatch.setattr(px4fuse.report.pdf, "render", render)
+    monkeypatch.setattr(pdf, "render", render)
     monkeypatch.setattr(fonts, "_others", lambda: ())
     fonts.font_of.cache_clear()
     run_main(monkeypatch, capsys, *f"compare l.ulg -o r.pdf --student {name}".split())

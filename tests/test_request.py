@@ -148,8 +148,10 @@ def test_every_option_of_an_analysis_is_in_the_request(command, declared, kinds)
     """An option that the request forgets would be missing from every record."""
     about_outputs = {
         "-o", "--json", "--student", "--id", "--notes", "--answers", "--fail-on", "--checks",
-        "--tum", "--g2o", "--closures", "--robust", "--max-size",
+        "--tum", "--g2o", "--closures", "--robust", "--max-size", "--show",
     }  # fmt: skip
     options = {parameter.opts[0] for parameter in command.params if parameter.opts[0][0] == "-"}
-    assert options - about_outputs == {option.name for option in declared.values()}
+    asked = {option.name for option in declared.values()}
+    # --open is of a loop that did not close, and elsewhere of what was written
+    assert options - about_outputs - ({"--open"} - asked) == asked
     assert set(declared) <= {field for kind in kinds for field in kind.__struct_fields__}

@@ -23,6 +23,7 @@ COMMANDS = {
     "diff": "Say what changed between two flights or two settings.",
     "answers": "Write the form about a flight, to be filled in.",
     "explore": "Turn the filter's knobs on a flight, in a web page.",
+    "practice": "Find what is wrong with simulated flights, in a web page.",
     "info": "Say what is in a log and what can be done with it.",
     "extract": "Write a log's data as tidy tables, CSV or Parquet.",
     "tune": "Find the noises that the data ask for, with intervals.",

@@ -13,11 +13,12 @@ from typing import Any
 import click
 
 from px4fuse.cli.compare import SEVERITIES
-from px4fuse.cli.inputs import path_option, settings_options
+from px4fuse.cli.inputs import open_option, path_option, settings_options
 from px4fuse.cli.outputs import (
     Interrupted,
     ShowStep,
     check_targets,
+    open_written,
     progress,
     terminal,
     write_outputs,
@@ -77,6 +78,7 @@ CLUSTERS = ("slurm", "kubernetes")
     help="Exit with 1 if a log has failed, is worse than the baseline (or has failed), or there is "
     "a finding of at least this severity.",
 )
+@open_option
 def batch(
     logs: tuple[str, ...],
     output: Path | None,
@@ -139,6 +141,7 @@ def batch(
     if junit_path is not None:
         write_outputs({junit_path: junit(fleet.table)})
     print_fleet(terminal(), fleet)
+    open_written(output / "fleet.html")
     severities = SEVERITIES[: SEVERITIES.index(fail_on) + 1] if fail_on in SEVERITIES else ()
     failed = fail_on is not None and bool((fleet.table["status"] == FAILED).any())
     failed |= fail_on == WORSE and bool((fleet.table["change"] != "").any())

@@ -13,6 +13,7 @@ from px4fuse.cli.inputs import (
     Named,
     analysis_options,
     comparison_request,
+    open_option,
     person_options,
     read_person,
     report_options,
@@ -49,6 +50,7 @@ SEVERITIES = ("error", "warning", "info")
     is_flag=True,
     help="Exit with 1 if a verdict on EKF2 is bad: an aid starved, biased or trusted too much.",
 )
+@open_option
 def compare(
     log: Path,
     output: Path | None,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from px4fuse.cli.inputs import Named, max_size_option, path_option, results_option
+from px4fuse.cli.inputs import Named, max_size_option, open_option, path_option, results_option
 from px4fuse.cli.outputs import finish, free_report, progress, report_paths, result_files
 from px4fuse.writing import STANDARD_OUTPUT
 
@@ -34,6 +34,7 @@ STEPS = (
     type=click.Choice(["worse"]),
     help="Exit with 1 if a number is significantly worse in B, or B has a new error.",
 )
+@open_option
 def diff(
     a: Path, b: Path, output: Path | None, json_path: Path | None, fail_on: str | None
 ) -> None:

@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import Named, max_size_option, path_option, request_options, results_option
+from px4fuse.cli.inputs import (
+    Named,
+    max_size_option,
+    open_option,
+    path_option,
+    request_options,
+    results_option,
+)
 from px4fuse.cli.outputs import (
     check_targets,
     finish,
@@ -68,6 +75,7 @@ def delta(text: str) -> Delta:
     help="The picture: the path by its error, APE, RPE.  [default: beside the PDF]",
 )
 @results_option
+@open_option
 def evaluate(
     estimate: Path,
     reference: Path,
@@ -84,7 +92,7 @@ def evaluate(
     (JSON); where -o, --picture or --json names a file, only what is named and what stands beside
     the PDF.
     """
-    from px4fuse.loop.sources import read_source
+    from px4fuse.loop.sources import file_name, read_source
     from px4fuse.report.evaluation import picture as draw
     from px4fuse.report.evaluation import print_evaluation
     from px4fuse.results.build_trajectories import evaluation_results
@@ -113,7 +121,7 @@ def evaluate(
         )
         results = evaluation_results(found, command_line(request))
         if output is None and picture is None and json_path is None:
-            name = f"{_name(estimate)}_against_{_name(reference)}"
+            name = f"{file_name(estimate)}_against_{file_name(reference)}"
             output = free_report(name, settings_name(request), results, _same)
         contents = result_files(results, json_path, output, found, step)
         picture = _picture(output, picture, json_path)
@@ -129,14 +137,6 @@ def _same(old: EvaluationResults, mine: EvaluationResults) -> bool:
         (one.provenance.command, one.estimate.sha256, one.reference.sha256) for one in (old, mine)
     )
     return first == second
-
-
-def _name(source: Path) -> str:
-    """What a trajectory is called in a file name: ``flight_vio`` of ``flight.ulg:vio``."""
-    from px4fuse.loop.sources import split_part
-
-    path, part = split_part(str(source))
-    return path.stem if part is None else f"{path.stem}_{part}"
 
 
 def _picture(output: Path | None, picture: Path | None, json_path: Path | None) -> Path | None:

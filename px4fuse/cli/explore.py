@@ -7,9 +7,16 @@ from typing import Any
 
 import click
 
-from px4fuse.cli.inputs import Named, analysis_options, comparison_request, path_option
-from px4fuse.cli.outputs import check_targets, finish, progress
-from px4fuse.errors import OutputError, SettingsError
+from px4fuse.cli.inputs import (
+    Named,
+    analysis_options,
+    comparison_request,
+    open_option,
+    path_option,
+)
+from px4fuse.cli.outputs import check_targets, finish, progress, web_page
+from px4fuse.cli.sample import sample_log
+from px4fuse.errors import SettingsError
 from px4fuse.request import settings_name
 from px4fuse.writing import STANDARD_OUTPUT
 
@@ -17,20 +24,20 @@ STEPS = (
     "reading", "filtering", "tuning", "clock offset", "changes of the clock", "replaying EKF2",
     "heading", "looking for a loop", "writing the page",
 )  # fmt: skip
-ENDINGS = (".html", ".htm")
 
 
 @click.command()
-@click.argument("logs", nargs=-1, required=True, type=Named())
+@click.argument("logs", nargs=-1, type=Named())
 @analysis_options
 @path_option("-o", "--output", metavar="FILE.html", help="The page.  [default: reports/LOG.html]")
-@click.option("--open", "show", is_flag=True, help="Open it in the browser.")
-def explore(logs: tuple[Path, ...], output: Path | None, show: bool, **given: Any) -> None:
+@open_option
+def explore(logs: tuple[Path, ...], output: Path | None, **given: Any) -> None:
     """Write a web page with sliders for SIGMA_A, SIGMA_Z, DT and the clock offset.
 
-    LOG is a PX4 ULog or a MAVLink recording; with two of them, both stand side by side. The page is
-    one file that needs no network: it replays the filter in the browser at every move and shows
-    what that does to innovations, variances and errors.
+    LOG is a PX4 ULog or a MAVLink recording; with two of them, both stand side by side; without one
+    it is the sample flight. The page is one file that needs no network: it replays the filter in
+    the browser at every move and shows what that does to innovations, variances and errors, one
+    step at a time if you like, and takes you on a tour of the flight.
     """
     from px4fuse.analysis import run
     from px4fuse.findings import find
@@ -39,11 +46,10 @@ def explore(logs: tuple[Path, ...], output: Path | None, show: bool, **given: An
         raise SettingsError(f"{len(logs)} logs: give one, or two to see them side by side.")
     if len(logs) == 2 and (given["mavlink"] is not None or given["position"] is not None):
         raise SettingsError("--mavlink and --position belong to one log: give only one LOG.")
-    if output is not None and output.suffix.lower() not in ENDINGS and output != STANDARD_OUTPUT:
-        raise OutputError(f"{output}: a web page. Give a name that ends in .html with -o.")
+    logs = logs or (sample_log(),)
     requests = [comparison_request(log, dict(given)) for log in logs]
     stems = "_".join(log.stem for log in logs)
-    target = output or Path("reports", f"{stems}{settings_name(requests[0])}.html")
+    target = web_page(output, Path("reports", f"{stems}{settings_name(requests[0])}.html"))
     check_targets([target])  # before the work, not after it
     with progress(target == STANDARD_OUTPUT, STEPS) as step:
         found = []
@@ -56,7 +62,3 @@ def explore(logs: tuple[Path, ...], output: Path | None, show: bool, **given: An
 
         content = html_text(found).encode()
     finish({target: content}, lambda _: None)
-    if show and target != STANDARD_OUTPUT:
-        import webbrowser
-
-        webbrowser.open(target.resolve().as_uri())

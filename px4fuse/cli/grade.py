@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import Named, max_size_option, path_option
-from px4fuse.cli.outputs import Interrupted, progress, terminal, write_new
+from px4fuse.cli.inputs import Named, max_size_option, open_option, path_option
+from px4fuse.cli.outputs import Interrupted, open_written, progress, terminal, write_new
 from px4fuse.errors import OutputError, SettingsError
 
 if TYPE_CHECKING:
@@ -85,6 +85,7 @@ if TYPE_CHECKING:
     help="Write an autograder for Gradescope, with --logs, --key, --rubric and --late, and stop.",
 )
 @path_option("--gradescope", metavar="DIR", help="Run inside that autograder, on its folder.")
+@open_option
 def grade(
     submissions: tuple[Path, ...],
     logs: tuple[Path, ...],
@@ -167,6 +168,7 @@ def grade(
         left = "but what is graded is kept. The same command goes on from there."
         raise Interrupted(stopped, left) from None
     _print(outcome)
+    open_written(output / "class.html")
 
 
 def _check_places(output: Path, given: tuple[Path, ...]) -> None:

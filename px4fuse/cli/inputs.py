@@ -13,6 +13,7 @@ from click.core import ParameterSource
 from msgspec import NODEFAULT, Struct
 from msgspec.structs import fields
 
+from px4fuse.cli.outputs import OPENED
 from px4fuse.cli.quantity import TypedQuantity
 from px4fuse.errors import SettingsError
 from px4fuse.reading import max_log_bytes, read_text
@@ -127,6 +128,25 @@ json_option = path_option(
     metavar="FILE",
     help="Write it as JSON; - prints that alone on standard output.",
 )
+
+
+def _opened(*names: str) -> Option:
+    """That what was written is to be opened; :func:`~px4fuse.cli.outputs.finish` does."""
+
+    def keep(ctx: click.Context, parameter: click.Parameter, value: bool) -> None:
+        del parameter
+        ctx.meta[OPENED] = value
+
+    return click.option(
+        *names, is_flag=True, expose_value=False, callback=keep,
+        help="Open what was written, in the program for it.",
+    )  # fmt: skip
+
+
+#: Of every command that writes something to look at
+open_option = _opened("--open", "--show", "opened")
+#: Of the command whose --open is of a loop that did not close
+show_option = _opened("--show", "shown")
 #: Whose report it is
 person_options = _together(
     click.option("--student", metavar="NAME", help="Name on the report."),

@@ -9,22 +9,31 @@ import click
 
 from px4fuse.cli.inputs import (
     Named,
-    json_option,
     max_size_option,
     path_option,
     person_options,
     read_person,
     request_options,
+    results_option,
+    show_option,
     typed_parameters,
 )
-from px4fuse.cli.outputs import check_targets, finish, progress, report_paths, result_files
+from px4fuse.cli.outputs import (
+    check_targets,
+    finish,
+    free_report,
+    progress,
+    report_paths,
+    result_files,
+)
 from px4fuse.errors import SettingsError
 from px4fuse.reading import shown
-from px4fuse.request import LOOP_OPTIONS, Landing, LoopRequest, command_line
+from px4fuse.request import LOOP_OPTIONS, Landing, LoopRequest, command_line, settings_name
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
     from px4fuse.loop.loop import Loop
+    from px4fuse.results.contract import LoopResults
 
 STEPS = (
     "reading", *(f"solving: pose graph, {name}" for name in ("all", "gated", "DCS", "GNC")),
@@ -70,12 +79,18 @@ def landing(text: str) -> Landing:
 @request_options(LoopRequest, LOOP_OPTIONS)
 @max_size_option
 @person_options
-@path_option("-o", "--output", metavar="FILE.pdf", help="A report, and its results beside it.")
-@json_option
+@path_option(
+    "-o",
+    "--output",
+    metavar="FILE.pdf",
+    help="The report.  [default: reports/SOURCE_loop.pdf]",
+)
+@results_option
 @path_option(
     "--tum", metavar="FILE", help="Write the corrected path as a TUM file, in the axes of SOURCE."
 )
 @path_option("--g2o", metavar="FILE", help="Write the pose graph, solved, as a g2o file.")
+@show_option
 def loop(
     source: Path,
     output: Path | None,
@@ -88,10 +103,11 @@ def loop(
 
     SOURCE is a flight log (its visual-inertial odometry, or EKF2's track; LOG:vio, LOG:ekf2 and
     LOG:kf choose), a trajectory (TUM, EuRoC, ORB-SLAM3), or a pose graph (g2o), which is solved.
+    Writes a report (PDF) and its results as JSON, except of a pose graph.
     """
     from px4fuse.analysis import run_loop
     from px4fuse.findings import find_loop
-    from px4fuse.loop.sources import is_g2o, split_part
+    from px4fuse.loop.sources import file_name, is_g2o, split_part
     from px4fuse.report.document import LoopDocument
     from px4fuse.report.loop import print_loop
     from px4fuse.results.build_trajectories import loop_results
@@ -104,16 +120,25 @@ def loop(
         _solve(source, json_path, g2o, True if given["robust"] else None)
         return
     request = loop_request(source, given)
-    results = (json_path,) if output is None else report_paths(output, json_path)
+    alone = output is None and json_path is not None
+    results = (json_path,) if alone else report_paths(output or Path("reports/A.pdf"), json_path)
     check_targets([tum, g2o, *results])
     with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
         found = run_loop(request, step)
         findings = find_loop(found)
         document = LoopDocument(found, findings, person, command_line(request))
         made = loop_results(request, found, findings, person, document.command)
+        if output is None and not alone:
+            output = free_report(f"{file_name(source)}_loop", settings_name(request), made, _same)
         contents = _files(found, tum, g2o)
         contents |= result_files(made, json_path, output, document, step)
     finish(contents, lambda console: print_loop(console, found, findings, request))
+
+
+def _same(old: LoopResults, mine: LoopResults) -> bool:
+    """Whether an earlier report is of the same."""
+    first, second = ((one.request, one.track.sha256, one.student) for one in (old, mine))
+    return first == second
 
 
 def loop_request(source: Path, given: dict[str, Any]) -> LoopRequest:

@@ -32,6 +32,10 @@ INPUTS = (
 )  # fmt: skip
 # Under it a run keeps which files it has written, for what is said where it then ends early
 WRITTEN = "px4fuse.written"
+# And under this one whether what was written is to be opened
+OPENED = "px4fuse.opened"
+# What is looked at first, of all that a command writes
+TO_LOOK_AT = (".html", ".htm", ".pdf", ".png")
 
 
 class Interrupted(click.ClickException):
@@ -145,6 +149,20 @@ def _is_ours(file: Path, is_same: Callable[[Results], bool]) -> bool:
         return is_same(read_results(text))
     except (OSError, PyPdfError, KeyError, ValueError, ResultsError):
         return False  # not a report, or not one that this version reads
+
+
+def web_page(output: Path | None, default: Path) -> Path:
+    """Where a web page goes.
+
+    Raises
+    ------
+    OutputError
+        The name does not end as that of a web page.
+    """
+    endings = (".html", ".htm")
+    if output is not None and output.suffix.lower() not in endings and output != STANDARD_OUTPUT:
+        raise OutputError(f"{output}: a web page. Give a name that ends in .html with -o.")
+    return output or default
 
 
 def report_paths(output: Path, json_path: Path | None) -> tuple[Path, Path]:
@@ -272,6 +290,16 @@ def finish(contents: Mapping[Path, bytes], show: Callable[[Console], None]) -> N
         show(console)
         for path in contents:
             print_file(console, "Wrote", path)
+    open_written()
+
+
+def open_written(*besides: Path) -> None:
+    """Open what was written to be looked at, where --open asks for it."""
+    meta = click.get_current_context().meta
+    written: list[Path] = [*besides, *meta.get(WRITTEN, [])]
+    seen = [path for ending in TO_LOOK_AT for path in written if path.suffix.lower() == ending]
+    if meta.get(OPENED) and seen:
+        click.launch(str(seen[0].resolve()))
 
 
 def terminal() -> Console:

@@ -10,6 +10,36 @@ from px4fuse.cli.inputs import path_option
 from px4fuse.cli.outputs import finish
 
 FOLDER = Path("sample_logs")
+SAMPLE = "aisle_uwb.ulg"
+INSTALL = 'pip install "px4fuse[samples]"'
+
+
+def sample_log() -> Path:
+    """The sample flight where no log is given: here if it is here, else the installed one.
+
+    Raises
+    ------
+    MissingDataError
+        There is none.
+    """
+    from importlib.resources import as_file, files
+
+    from px4fuse.errors import MissingDataError
+
+    here = FOLDER / SAMPLE
+    if here.is_file():
+        found = here
+    else:
+        try:
+            with as_file(files("px4fuse_samples") / SAMPLE) as installed:
+                found = installed
+        except ModuleNotFoundError:
+            raise MissingDataError(
+                "no log was given, and the sample flights are not here either",
+                f"Give a LOG, or run {INSTALL}.",
+            ) from None
+    click.echo(f"No log was given: this is the sample flight, {SAMPLE}.", err=True)
+    return found
 
 
 @click.command()
@@ -27,9 +57,7 @@ def sample(output: Path) -> None:
     try:
         flights = [one for one in files("px4fuse_samples").iterdir() if one.is_file()]
     except ModuleNotFoundError:
-        raise MissingDataError(
-            "the sample flights are not installed", 'Run pip install "px4fuse[samples]".'
-        ) from None
+        raise MissingDataError("the sample flights are not installed", f"Run {INSTALL}.") from None
     contents = {output / one.name: one.read_bytes() for one in sorted(flights, key=str)}
     for path, content in contents.items():
         if path.is_file() and path.read_bytes() != content:

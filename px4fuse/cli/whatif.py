@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import Named, flight_options, json_option, path_option
+from px4fuse.cli.inputs import Named, flight_options, json_option, open_option, path_option
 from px4fuse.cli.outputs import finish, progress, report_paths, result_files
 from px4fuse.cli.quantity import NAMES, in_unit
 from px4fuse.errors import SettingsError
@@ -37,6 +37,7 @@ STEPS = (
 @flight_options
 @path_option("-o", "--output", metavar="FILE.pdf", help="A page, and its results beside it.")
 @json_option
+@open_option
 def whatif(
     log: Path,
     changes: tuple[str, ...],

@@ -18,6 +18,7 @@ from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.explore.ekf2_grid import grid_data, judged_numbers
 from px4fuse.explore.packing import COARSE, Packer
+from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.consistency import CONFIDENCE, nis_band
 from px4fuse.filter.model import INITIAL_COVARIANCE
 from px4fuse.filter.settings import (
@@ -29,6 +30,8 @@ from px4fuse.filter.settings import (
 )
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, along, imu_gaps, within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.findings.causes import SETTINGS
+from px4fuse.findings.hidden_errors import CONTENT_NIS, NEES_LARGE, hidden_errors
 from px4fuse.findings.model import Finding, by_root
 from px4fuse.findings.story import story
 from px4fuse.flight import POSITION_COLUMNS, PositionTrack, Unavailable
@@ -40,6 +43,10 @@ OFFSET_REACH_S = 0.6
 RUNNING = 30
 # The track on the plan is drawn with at most so many points
 MAX_PLAN_POINTS = 2000
+# Findings that other settings would take away or bring
+OF_KNOBS = SETTINGS | {
+    "kf_variance_overstated", "kf_variance_understated", "process_noise_forgotten",
+}  # fmt: skip
 
 
 def flight_data(
@@ -49,6 +56,7 @@ def flight_data(
     packer: Packer,
     *,
     beside: bool = False,
+    replays: bool = True,
 ) -> dict[str, Any]:
     """Everything about one flight, as JSON can hold it; arrays are places in the packer.
 
@@ -61,6 +69,8 @@ def flight_data(
     packer : Packer
     beside : bool
         Whether it stands beside another flight: then times are from the start of its segment.
+    replays : bool
+        Whether EKF2 with other parameters is among it, most of a page's size.
     """
     signals = signals_of(analysis, packer)
     settings, segment = analysis.settings, analysis.segment
@@ -78,7 +88,7 @@ def flight_data(
             for own, result in zip(signals["axes"], analysis.axes.values(), strict=True)
         ],
         "maps": _maps(analysis),
-        "grid": "only for one log" if beside else grid_data(analysis, packer),
+        "grid": _grid(analysis, packer, beside=beside, replays=replays),
         "plan": _plan(analysis, packer),
         "events": {
             "silent": list(events.gaps),
@@ -92,7 +102,7 @@ def flight_data(
             for first, *followers in by_root(findings)
         ],
         "command": _command(request, analysis),
-        "offset": _offset(request, settings),
+        "offset": _offset(request, analysis),
     }
 
 
@@ -107,6 +117,14 @@ def signals_of(comparison: Comparison, packer: Packer) -> dict[str, Any]:
     }
 
 
+def _grid(
+    analysis: Analysis, packer: Packer, *, beside: bool, replays: bool
+) -> dict[str, Any] | str:
+    if beside:
+        return "only for one log"
+    return grid_data(analysis, packer) if replays else "left out of a page of many flights"
+
+
 def ranges() -> dict[str, Any]:
     """What the settings may be, as the command line takes them, and the lesson's values."""
     return {
@@ -116,6 +134,7 @@ def ranges() -> dict[str, Any]:
         "clock-offset": list(CLOCK_OFFSET_RANGE_S),
         "lesson": _settings(Settings()),
         "running": [RUNNING, *nis_band(RUNNING)],
+        "hidden": [NEES_LARGE, CONTENT_NIS],
     }
 
 
@@ -134,12 +153,15 @@ def _settings(settings: Settings) -> dict[str, Any]:
     }
 
 
-def _offset(request: ComparisonRequest, settings: Settings) -> dict[str, Any]:
-    """How far the stamps can be moved, and why not where they cannot."""
+def _offset(request: ComparisonRequest, analysis: Analysis) -> dict[str, Any]:
+    """How far the stamps can be moved, and why not where they cannot; what fits best."""
     if request.position is not None:
         return {"why": "the clock offset of a position file is spent on placing it"}
-    centre = settings.clock_offset_s
-    return {"from": centre - OFFSET_REACH_S, "to": centre + OFFSET_REACH_S}
+    centre, clock = analysis.settings.clock_offset_s, analysis.clock
+    likely = None
+    if isinstance(clock, ClockOffset) and clock.determinable:
+        likely = centre + clock.remaining_s
+    return {"from": centre - OFFSET_REACH_S, "to": centre + OFFSET_REACH_S, "likely": likely}
 
 
 def _imu(comparison: Comparison, packer: Packer) -> dict[str, Any] | str:
@@ -191,12 +213,13 @@ def _signals(
 def _others(analysis: Analysis, result: AxisComparison, packer: Packer) -> dict[str, Any]:
     """What stands beside our filter along one axis."""
     return {
+        "called": result.axis.called,
         "heading": result.axis.heading_deg,
         "note": result.axis.note,
         "direction": result.axis.direction.tolist(),
         "bands": _bands(len(result.axis.measurement_time_s), packer),
         "map": _map_of(analysis, result.axis.name),
-        "ekf2": _ekf2(result, packer),
+        "ekf2": _ekf2(analysis, result, packer),
         "truth": _truth(result, packer),
     }
 
@@ -211,7 +234,7 @@ def _bands(count: int, packer: Packer) -> list[int]:
     return [packer.add(np.asarray(stats.chi2.ppf(end, freedom)) / freedom, COARSE) for end in ends]
 
 
-def _ekf2(result: AxisComparison, packer: Packer) -> dict[str, Any] | str:
+def _ekf2(analysis: Analysis, result: AxisComparison, packer: Packer) -> dict[str, Any] | str:
     """What EKF2 did, which no setting of ours changes; why not where there is none."""
     if isinstance(result.ekf2_state, Unavailable):
         return result.ekf2_state.reason
@@ -229,6 +252,9 @@ def _ekf2(result: AxisComparison, packer: Packer) -> dict[str, Any] | str:
             "truthP": judged.truth.position_rmse_m,
             "truthV": judged.truth.velocity_rmse_m_s,
         }
+    for hidden in hidden_errors(analysis):
+        if (hidden.owner, hidden.axis) == ("ekf2", result.axis.name):
+            made["summary"]["claimed"] = hidden.claimed_m
     if isinstance(result.ekf2_variance, pd.DataFrame):
         sigma = result.ekf2_variance.dropna().pow(0.5)
         made["variance"] = _frame(
@@ -301,6 +327,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
         "severity": finding.severity,
         "message": finding.message,
         "remedy": finding.remedy,
+        "knobs": finding.id in OF_KNOBS,
         "spans": [list(span) for span in finding.spans_s[:20]],
         "more": [],
     }

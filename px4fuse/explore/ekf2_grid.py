@@ -22,7 +22,7 @@ from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.explore.packing import Packer
 from px4fuse.filter.consistency import Consistency, assess
 from px4fuse.filter.signals import within
-from px4fuse.flight import POSITION_COLUMNS, Ekf2, Unavailable
+from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Ekf2, Unavailable
 
 # As multiples of the noise as flown, and beside the delay (ms) and the gate as flown
 NOISES = (0.25, 0.5, 1.0, 2.0, 4.0)
@@ -30,7 +30,7 @@ DELAYS_MS = (0.0, 50.0, 100.0, 150.0, 200.0)
 GATES = (3.0, 5.0)
 # Innovations of all stops together that the page draws; of more it draws every second, third, …
 MOST_DRAWN = 60_000
-MILLIMETRES, TENTHS = 1e3, 1e4
+HALF_CENTIMETRES, MILLIMETRES, TENTHS = 2e2, 1e3, 1e4
 
 
 def grid_data(analysis: Analysis, packer: Packer) -> dict[str, Any] | str:
@@ -111,6 +111,7 @@ def _case(
             for axis in HORIZONTAL
         ],
         "flag": packer.add(drawn["rejected"].to_numpy(), 1.0),
+        **_state(replay, drawn, packer),
         "rejected": packer.add(np.round(_times(shown, "rejected"), 3), MILLIMETRES),
         "reset": packer.add(np.round(_times(shown, "reset"), 3), MILLIMETRES),
         "share": float(used["rejected"].mean()) if len(used) else 0.0,
@@ -121,6 +122,23 @@ def _case(
             for name, direction in directions.items()
         },
     }
+
+
+def _state(replay: Ekf2Replay, drawn: pd.DataFrame, packer: Packer) -> dict[str, list[int]]:
+    """What is published at the innovations' times, and σ after them, north and east."""
+    times, published = drawn.index.to_numpy(), replay.published
+    made: dict[str, list[int]] = {"p": [], "v": [], "sp": [], "sv": []}
+    for axis, position, velocity in zip(
+        HORIZONTAL, POSITION_COLUMNS, VELOCITY_COLUMNS, strict=False
+    ):
+        for name, column in (("p", position), ("v", velocity)):
+            state = np.interp(times, published.index, published[column])
+            made[name].append(packer.add(state, HALF_CENTIMETRES))
+        for name, column in (
+            ("sp", f"position_variance_{axis}_m2"), ("sv", f"velocity_variance_{axis}_m2_s2")
+        ):  # fmt: skip
+            made[name].append(packer.add(np.sqrt(drawn[column].to_numpy()), MILLIMETRES))
+    return made
 
 
 def _times(updates: pd.DataFrame, column: str) -> Array:

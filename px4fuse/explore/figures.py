@@ -23,7 +23,7 @@ from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.report.style import EKF2, MEASUREMENT, OURS, TRUTH
 
-HEIGHT, TALL = 190, 250
+HEIGHT, TALL = 150, 210
 # Ours is dark, solid and round; EKF2 is lighter, dashed and square, as in the report
 OURS_LINE: dict[str, Any] = {"line_color": OURS, "line_width": 1.6, "name": "ours"}
 EKF2_LINE: dict[str, Any] = {
@@ -36,7 +36,7 @@ NIS_BAND: dict[str, Any] = {
     "level": "underlay", "fill_alpha": 0.15, "fill_color": "#4a8f5a", "line_color": "#4a8f5a",
 }  # fmt: skip
 LEFT = 96
-# What the page fills, by column
+# What the page fills, by column; each plot has its own, so that only what is seen is filled
 SOURCES = {
     "steps": "t p v sp sv",
     "updates": "t nu plus minus k0 k1 running",
@@ -51,6 +51,9 @@ SOURCES = {
     "truth_v": "t v",
     "error": "t e",
     "error_ekf2": "t e",
+    # what lies above or below the axis, at its edge
+    "beyond": "turn t y",
+    "beyond_ekf2": "turn t y",
 }
 # Label, height, scale and unit of each plot, and its lines: source, column, style, name at the
 # pointer. Later ones lie on top
@@ -125,7 +128,6 @@ def document_json(
 
 def _plots(number: int, data: dict[str, Any], time_range: Range1d) -> dict[str, Any]:
     """Every plot against time of one flight, by its name."""
-    sources = {name: _source(name, number, columns) for name, columns in SOURCES.items()}
     lacking = {
         kind
         for kind in ("ekf2", "truth")
@@ -135,6 +137,7 @@ def _plots(number: int, data: dict[str, Any], time_range: Range1d) -> dict[str, 
     for name, (label, height, scale, unit, lines) in PLOTS.items():
         if name == "error" and "truth" in lacking:
             continue
+        sources = _Sources(name, number)
         made = plots[name] = figure(
             name=f"{name}-{number}", height=height, sizing_mode="stretch_width",
             x_range=time_range, y_range=_range(), toolbar_location=None, y_axis_type=scale,
@@ -143,6 +146,7 @@ def _plots(number: int, data: dict[str, Any], time_range: Range1d) -> dict[str, 
         )  # fmt: skip
         if name == "position":
             _dots(made, sources["measured"], MEASUREMENT, 3, name="measured")
+            _beyond(made, sources["beyond"], MEASUREMENT, "measured")
         if name == "innovation":
             _innovations(made, sources, with_ekf2="ekf2" not in lacking)
         if name == "nis":
@@ -163,6 +167,25 @@ def _plots(number: int, data: dict[str, Any], time_range: Range1d) -> dict[str, 
     return plots
 
 
+class _Sources(dict[str, ColumnDataSource]):
+    """The sources of one plot, each made when it is first asked for."""
+
+    def __init__(self, plot: str, number: int) -> None:
+        self.plot, self.number = plot, number
+
+    def __missing__(self, name: str) -> ColumnDataSource:
+        self[name] = _source(f"{self.plot}:{name}", self.number, SOURCES[name])
+        return self[name]
+
+
+def _beyond(made: Any, source: ColumnDataSource, colour: str, name: str) -> None:
+    """Arrow heads at the edge that hides something, turned upside down at the lower one."""
+    made.scatter(
+        "t", "y", angle="turn", source=source, marker="triangle", size=9, fill_color=colour,
+        line_color=None, name=name,
+    )  # fmt: skip
+
+
 def _innovations(made: Any, sources: dict[str, ColumnDataSource], *, with_ekf2: bool) -> None:
     """Innovations of both filters as dots, and our ±2√S as a band."""
     updates = sources["updates"]
@@ -175,10 +198,12 @@ def _innovations(made: Any, sources: dict[str, ColumnDataSource], *, with_ekf2: 
         rejected = _dots(made, sources["rejected"], None, 7, line_color=EKF2, **square)
         _hover(made, fused, ("EKF2", "@nu{0.000} m"))
         _hover(made, rejected, ("EKF2 rejected", "@nu{0.000} m"))
+        _beyond(made, sources["beyond_ekf2"], EKF2, "ekf2")
     ours = made.scatter(
         "t", "nu", source=updates, size=4, fill_color=OURS, line_color=None, name="ours"
     )
     _hover(made, ours, ("ours", "@nu{0.000} m"), ("2√S", "@plus{0.000} m"))
+    _beyond(made, sources["beyond"], OURS, "ours")
 
 
 def _hover(made: Any, renderer: Any, *rows: tuple[str, str]) -> None:
@@ -294,17 +319,24 @@ def _plan(number: int) -> Any:
 
 
 def _step(number: int) -> Any:
-    """One measurement: what was predicted, what was measured, and what both make."""
+    """The phase plane: position and velocity with their ellipse of 2σ, and what was measured."""
     made = figure(
-        name=f"step-{number}", height=230, sizing_mode="stretch_width", x_range=_range(),
+        name=f"step-{number}", height=330, sizing_mode="stretch_width", x_range=_range(),
         y_range=_range(), tools="", toolbar_location=None,
-        x_axis_label="position (m)", y_axis_label="density (1/m)",
+        x_axis_label="position (m)", y_axis_label="velocity (m/s)",
     )  # fmt: skip
-    for name, style in (
-        ("before", OURS_LINE | {"line_dash": [6, 3]}),
-        ("posterior", OURS_LINE | {"line_width": 2.6}),
-        ("measurement", {"line_color": MEASUREMENT, "line_width": 2.0, "line_dash": [2, 2]}),
-    ):
-        source = _source(name, number, "x y")
-        made.line("x", "y", source=source, **style)
+    band: dict[str, Any] = {"left": 0.0, "right": 0.0, "visible": False}
+    made.add_layout(
+        BoxAnnotation(name="band", fill_color=MEASUREMENT, fill_alpha=0.25, line_color=None, **band)
+    )
+    made.add_layout(
+        Span(dimension="height", location=0.0, visible=False, name="measurement", line_dash=[2, 2])
+    )
+    trail = _source("trail-means", number, "p v")
+    before, now = _source("before", number, "p v"), _source("now", number, "p v")
+    mean = _source("mean", number, "p v")
+    made.line("p", "v", source=trail, line_color=MEASUREMENT, line_width=1.0, name="measured")
+    made.line("p", "v", source=before, **OURS_LINE | {"line_dash": [6, 3]})
+    made.patch("p", "v", source=now, fill_color=OURS, fill_alpha=0.25, **OURS_LINE)
+    _dots(made, mean, OURS, 7, name="ours")
     return made

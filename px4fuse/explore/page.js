@@ -1,16 +1,10 @@
-/* What moves on the page: settings to replay, replay to plots and numbers. Text from the log goes
-   into the page as text only. */
-"use strict";
+/* What moves on the page: settings to replay, replay to plots and numbers. */
 const Explore = (async () => {
-  const MOST_POINTS = 3000;
-  const read = (id) => JSON.parse(document.getElementById(id).textContent);
-  const content = read("content"), ranges = content.ranges;
-  const $ = (id) => document.getElementById(id);
-  const make = (tag, text, properties) => {
-    const node = Object.assign(document.createElement(tag), properties);
-    if (text !== undefined) node.textContent = text;
-    return node;
-  };
+  const MOST_POINTS = 3000, FEW_POINTS = 600; // of a line, and while a slider is dragged
+  const DRAG_ENDS_MS = 150;
+  const NARROW = matchMedia("(max-width: 60rem)");
+  const read = (id) => JSON.parse($(id).textContent);
+  const content = read(`content${Practice.suffix}`), ranges = content.ranges;
   if (typeof DecompressionStream === "undefined") {
     $("problem").textContent = "This browser is too old for this page: use one of 2023 or newer.";
     $("problem").hidden = false;
@@ -18,7 +12,7 @@ const Explore = (async () => {
   }
 
   // ------------------------------------------------------------------ the flights' data
-  const arrays = await Engine.unpack($("arrays").textContent, content.packed);
+  const arrays = await Engine.unpack($(`arrays${Practice.suffix}`).textContent, content.packed);
   const take = (places) => places.map((place) => arrays[place]);
   const flights = content.flights.map((flight, number) => ({
     ...flight, number,
@@ -38,6 +32,13 @@ const Explore = (async () => {
     })),
   }));
   const lone = flights[0];
+  // the truth is for afterwards
+  if (Practice.hidden) {
+    for (const axis of lone.axes) {
+      axis.truth = "shown after your answer";
+      for (const name of ["truthP", "truthV", "claimed"]) delete axis.ekf2.summary?.[name];
+    }
+  }
 
   // ------------------------------------------------------------------ settings
   const KNOBS = [
@@ -47,7 +48,7 @@ const Explore = (async () => {
       hint: "measurement noise" },
     { id: "dt", key: "dt", title: "DT", unit: "s", log: [0.01, 1], hint: "prediction step" },
     { id: "clock-offset", key: "offset", title: "Clock offset", unit: "s",
-      hint: "added to the source's stamps" },
+      hint: "added to the stamps" },
   ];
   const TICKS = 600;
   const settings = { ...lone.settings, axis: lone.main };
@@ -74,7 +75,7 @@ const Explore = (async () => {
     knob.slider = make("input", undefined, {
       type: "range", id: knob.id, min: 0, max: TICKS, step: 1, ariaLabel: knob.title });
     knob.slider.addEventListener("input", () => {
-      set({ [knob.key]: fromSlider(knob, Number(knob.slider.value)) });
+      set({ [knob.key]: fromSlider(knob, Number(knob.slider.value)) }, true);
     });
     knob.number.addEventListener("change", () => {
       const value = knob.number.value === "" ? NaN : Number(knob.number.value);
@@ -125,21 +126,30 @@ const Explore = (async () => {
     say("SIGMA_Z is the standard deviation that EKF2 gave the measurements (median).");
   });
 
-  /* Take over what differs, replay and draw; wait = false draws at once */
-  let waiting = false;
-  function set(changes) {
+  /* Take over what differs, replay and draw: at once, and then once a frame; in less detail until a
+     drag has ended */
+  let waiting = false, again = false, rest = null;
+  function set(changes, dragged = false) {
     Object.assign(settings, changes);
-    say("");
-    if (!waiting) {
-      waiting = true;
-      requestAnimationFrame(() => { waiting = false; show(); });
-    }
+    if ($("said").textContent) say("");
+    clearTimeout(rest);
+    if (dragged) rest = setTimeout(show, DRAG_ENDS_MS);
+    if (!dragged) return show();
+    if (waiting) { again = true; return; }
+    waiting = true;
+    show(true);
+    requestAnimationFrame(() => {
+      waiting = false;
+      if (again) { again = false; show(true); }
+    });
   }
 
   // ------------------------------------------------------------------ the address
   function toAddress() {
     const parts = { axis: settings.axis, input: settings.input };
     for (const knob of KNOBS) parts[knob.id] = String(settings[knob.key]);
+    Object.assign(parts, Grid.toAddress(), Practice.toAddress());
+    if (view !== "filter") parts.view = view;
     if (chosen.step !== null) parts.measurement = String(chosen.step + 1);
     const text = `#${new URLSearchParams(parts)}`;
     if (text !== location.hash) history.replaceState(null, "", text);
@@ -158,10 +168,79 @@ const Explore = (async () => {
     const input = parts.get("input");
     if (input === "zero" || (input === "imu" && hasImu)) settings.input = input;
     else if (input !== null) ignored.push("input");
+    ignored.push(...Grid.fromAddress(parts));
+    if (parts.has("view") && !isView(parts.get("view"))) ignored.push("view");
+    else open(parts.get("view") ?? view, false);
     const step = Number(parts.get("measurement"));
     if (Number.isInteger(step) && step > 0) chosen.step = step - 1;
     if (ignored.length) say(`The address has no usable ${ignored.join(", ")}: left as it was.`);
   }
+
+  // ------------------------------------------------------------------ what is in view
+  const PLOTS = { innovation: "Innovations", sigma_p: "σ position", sigma_v: "σ velocity", position: "Position",
+    velocity: "Velocity", error: "Error", nis: "NIS", gain: "Gain", strip: "Events" };
+  const GROUPS = { filter: ["Innovations and σ", ["innovation", "sigma_p", "sigma_v"]],
+    track: ["Position and truth", ["position", "velocity", "error"]],
+    more: ["NIS, gain, events", ["nis", "gain", "strip"]] };
+  const CARDS = { step: "Step by step", map: "Likelihood", numbers: "Numbers", recorded: "As recorded" };
+  const there = (name) => document.querySelector(`[data-plot=${name}]`) !== null;
+  const isView = (name) => Object.hasOwn(GROUPS, name) || Object.hasOwn(CARDS, name)
+    || (Object.hasOwn(PLOTS, name) && there(name));
+  let view = "filter";
+  /* The tab that shows it: on a narrow screen each plot has its own */
+  function tabOf(name) {
+    if (Object.hasOwn(CARDS, name)) return name;
+    if (NARROW.matches) return Object.hasOwn(GROUPS, name) ? GROUPS[name][1][0] : name;
+    return Object.keys(GROUPS).find((group) => group === name || GROUPS[group][1].includes(name));
+  }
+  const seenPlots = () => Object.hasOwn(CARDS, view) ? [] : Object.hasOwn(GROUPS, view) ? GROUPS[view][1] : [view];
+  const isSeen = (name) => name === "plan" || name === "step" ? view === "step" : name === view || seenPlots().includes(name);
+  function tabs() {
+    const names = NARROW.matches ? Object.entries(PLOTS).filter(([name]) => there(name))
+      : Object.entries(GROUPS).map(([name, [title]]) => [name, title]);
+    $("tabs").replaceChildren(...[...names, ...Object.entries(CARDS)].map(([name, title]) => {
+      const tab = make("button", title, { type: "button", id: `tab-${name}` });
+      tab.setAttribute("role", "tab");
+      tab.setAttribute("aria-controls", Object.hasOwn(CARDS, name) ? `view-${name}` : "view-plots");
+      tab.addEventListener("click", () => open(name));
+      return tab;
+    }));
+  }
+  /* Show a plot, a group of them or a card */
+  function open(name, draw = true) {
+    view = tabOf(name);
+    for (const tab of $("tabs").children) {
+      const own = tab.id === `tab-${view}`;
+      tab.ariaSelected = String(own);
+      tab.tabIndex = own ? 0 : -1;
+      if (own && draw) tab.scrollIntoView({ block: "nearest", inline: "nearest" });
+    }
+    const plots = seenPlots();
+    $("view-plots").hidden = !plots.length;
+    $("view-plots").setAttribute("aria-labelledby", `tab-${view}`);
+    for (const figure of document.querySelectorAll("[data-plot]")) figure.hidden = !plots.includes(figure.dataset.plot);
+    for (const card of Object.keys(CARDS)) $(`view-${card}`).hidden = card !== view;
+    document.body.classList.toggle("pinned", plots.length > 0);
+    if (draw) { axisShown = null; show(); }
+  }
+  $("tabs").addEventListener("keydown", (event) => {
+    const all = [...$("tabs").children], at = all.findIndex((tab) => tab.tabIndex === 0);
+    const to = { ArrowRight: at + 1, ArrowLeft: at - 1, Home: 0, End: all.length - 1 }[event.key];
+    if (to === undefined) return;
+    const tab = all[(to + all.length) % all.length];
+    tab.click();
+    tab.focus();
+    event.preventDefault();
+    event.stopPropagation();
+  });
+  $("others").open = !NARROW.matches;
+  NARROW.addEventListener("change", () => {
+    tabs();
+    $("others").open = !NARROW.matches;
+    open(view);
+  });
+  // what sticks on a small screen sticks below the knobs
+  new ResizeObserver(() => document.body.style.setProperty("--bar", `${$("bar").offsetHeight}px`)).observe($("bar"));
 
   // ------------------------------------------------------------------ Bokeh
   Bokeh.logger.set_level("off");
@@ -172,9 +251,9 @@ const Explore = (async () => {
     // the places of map, plan and step are made here, since they stand beside words
     for (const flight of flights) {
       $("maps").append(make("div", undefined, { id: `map-${flight.number}` }));
-      $("lower").append(Times.places(flight));
+      $("view-step").append(Step.places(flight), Times.places(flight));
     }
-    return read("document");
+    return read(`document${Practice.suffix}`);
   }
   const known = new Map();
   const model = (name) => {
@@ -182,22 +261,30 @@ const Explore = (async () => {
     return known.get(name);
   };
   const put = (name, flight, columns) => { model(`${name}-source-${flight.number}`).data = columns; };
+  /* Into every plot in view that has such a source */
+  const give = (name, flight, columns) => {
+    for (const plot of seenPlots()) {
+      const source = model(`${plot}:${name}-source-${flight.number}`);
+      if (source !== null) source.data = columns;
+    }
+  };
   const timeRange = model("time");
   const figures = (flight) => ["position", "velocity", "error", "innovation", "sigma_p", "sigma_v",
     "nis", "gain", "strip"].map((name) => model(`${name}-${flight.number}`)).filter(Boolean);
 
   /* Rows of columns between two times, the extremes of every column kept where there are many */
+  let most = MOST_POINTS;
   function thin(columns, keys) {
     const t = columns.t, n = t.length;
     const below = (x) => { let a = 0, b = n; while (a < b) { const c = (a + b) >> 1;
       if (t[c] < x) a = c + 1; else b = c; } return a; };
     const from = Math.max(below(timeRange.start) - 1, 0), to = Math.min(below(timeRange.end) + 2, n);
     const names = Object.keys(columns), out = {};
-    if (to - from <= MOST_POINTS) {
+    if (to - from <= most) {
       for (const name of names) out[name] = columns[name].subarray(from, to);
       return out;
     }
-    const bins = Math.floor(MOST_POINTS / 2 / keys.length), kept = [];
+    const bins = Math.floor(most / 2 / keys.length), kept = [];
     for (let b = 0; b < bins; b++) {
       const low = from + Math.floor((to - from) * b / bins);
       const high = from + Math.floor((to - from) * (b + 1) / bins), own = new Set();
@@ -234,6 +321,25 @@ const Explore = (async () => {
       }
     }
     heights.clear();
+    for (const flight of flights) marks(flight);
+  }
+  /* Arrow heads at the edge where something lies beyond it */
+  const latest = [];
+  function marks(flight) {
+    const drawn = latest[flight.number];
+    if (drawn === undefined) return;
+    const rows = (...parts) => parts.flatMap(([part, column]) => part === undefined ? []
+      : Array.from(part.t, (t, i) => [t, part[column][i]]));
+    for (const [plot, name, points] of [["position", "beyond", rows([drawn.measured, "z"])],
+      ["innovation", "beyond", rows([drawn.updates, "nu"])],
+      ["innovation", "beyond_ekf2", rows([drawn.fused, "nu"], [drawn.rejected, "nu"])]]) {
+      const source = isSeen(plot) ? model(`${plot}:${name}-source-${flight.number}`) : null;
+      if (source === null) continue;
+      const { start: low, end: high } = model(`${plot}-${flight.number}`).y_range, inside = 0.035 * (high - low);
+      const out = points.filter(([, y]) => y < low || y > high);
+      source.data = { t: out.map(([t]) => t), y: out.map(([, y]) => y > high ? high - inside : low + inside),
+        turn: out.map(([, y]) => y > high ? 0 : Math.PI) };
+    }
   }
   function extent(...columns) {
     let low = Infinity, high = -Infinity;
@@ -250,39 +356,105 @@ const Explore = (async () => {
 
   // ------------------------------------------------------------------ a replay and its numbers
   const runs = [];
-  function replayed(flight) {
+  function replayed(flight, quick) {
     const axis = axisOf(flight), run = Engine.replay(flight, axis, settings);
-    if (run === null) return { run, axis, rows: null };
-    return { run, axis, numbers: numbers(axis, run) };
+    if (run === null) return { run, axis, numbers: null };
+    return { run, axis, numbers: numbers(flight, axis, run, quick) };
   }
-  function numbers(axis, run) {
+  /* What the filter's innovations say of it; unless quick, how far off it is too */
+  function numbers(flight, axis, run, quick = false) {
     const ours = Engine.assess(run.updates.nu, run.updates.s) ?? { count: run.updates.nu.length };
     if (ours.nis !== undefined) ours.band = axis.bands.map((ends) => ends[ours.count - 1]);
+    if (quick) return ours;
     let times = run.steps.time;
     if (typeof axis.ekf2 !== "string") {
-      const [time, p, v] = axis.ekf2.state, at = Engine.stateAt(run, time);
+      const other = Grid.rows(flight, axis);
+      const [time, p, v] = other === null ? axis.ekf2.state : [other.t, other.p, other.v];
+      const at = Engine.stateAt(run, time);
       ours.ekf2P = Engine.rmse(at.p, p);
       ours.ekf2V = Engine.rmse(at.v, v);
-      times = time;
+      [times] = axis.ekf2.state;
     }
     if (typeof axis.truth !== "string") {
       const at = Engine.stateAt(run, times), { p, v } = axis.truth;
       ours.truthP = Engine.rmse(at.p, Engine.interp(times, p[0], p[1], NaN));
       ours.truthV = v === null ? null : Engine.rmse(at.v, Engine.interp(times, v[0], v[1], NaN));
+      ours.claimed = hidden(run, p, ours.nis);
     }
     return ours;
   }
-  const verdict = ({ nis, band }) => {
-    if (nis === undefined) return "not known";
-    if (nis >= band[0] && nis <= band[1]) return "consistent";
-    const [word, factor] = nis < band[0] ? ["overstated", 1 / nis] : ["understated", nis];
-    // as many digits as in the report
-    return `${word} ${Number(factor.toPrecision(factor < 2 ? 3 : 2)).toLocaleString("en")}×`;
+  /* What σ of position claims, where the truth shows an error that innovations do not
+     (hidden_errors.py) */
+  function hidden({ steps }, truth, nis) {
+    const known = Engine.interp(steps.time, truth[0], truth[1], NaN);
+    let sum = 0, count = 0;
+    steps.p.forEach((p, i) => { if (Number.isFinite(known[i])) { sum += (p - known[i]) ** 2 / steps.p00[i]; count++; } });
+    return sum / count >= ranges.hidden[0] && nis < ranges.hidden[1]
+      ? Math.sqrt(steps.p00.toSorted()[steps.p00.length >> 1]) : undefined;
+  }
+  const ekf2Of = (flight, axis) => Grid.chosen(flight, axis)?.axes[axis.name]
+    ?? (typeof axis.ekf2 === "string" ? { why: axis.ekf2 } : axis.ekf2.summary);
+
+  // ------------------------------------------------------------------ the needle and the words
+  const DECADES = [-1.3, 1.3]; // of the mean NIS that the scale shows
+  const place = (nis) => Math.min(Math.max((Math.log10(nis) - DECADES[0]) / (DECADES[1] - DECADES[0]), 0), 1);
+  for (const flight of flights) {
+    const scale = make("div", undefined, { className: "needle", id: `needle-${flight.number}` });
+    scale.setAttribute("role", "img");
+    for (const name of ["band", "hand ekf2", "hand ours"]) scale.append(make("span", undefined, { className: name }));
+    for (const nis of [0.1, 0.3, 1, 3, 10]) {
+      const tick = make("small", String(nis));
+      tick.style.left = `${100 * place(nis)}%`;
+      scale.append(tick);
+    }
+    $("needles").append(scale);
+  }
+  function drawNeedle(flight, axis, ours) {
+    const [band, theirs, own] = $(`needle-${flight.number}`).children, ekf2 = ekf2Of(flight, axis);
+    for (const [hand, one] of [[own, ours], [theirs, ekf2]]) {
+      hand.hidden = one?.nis === undefined;
+      if (!hand.hidden) hand.style.left = `${100 * place(one.nis)}%`;
+    }
+    band.hidden = ours?.band === undefined;
+    if (!band.hidden) {
+      band.style.left = `${100 * place(ours.band[0])}%`;
+      band.style.width = `${100 * (place(ours.band[1]) - place(ours.band[0]))}%`;
+    }
+    const said = [["ours", ours], ["EKF2", ekf2]].filter(([, one]) => one?.nis !== undefined)
+      .map(([who, one]) => `${who} ${Story.numberWords(one.nis, 2)} (${Story.verdict(one)})`);
+    const words = `mean NIS: ${said.join(", ") || "not known"}`;
+    $(`needle-${flight.number}`).ariaLabel = words;
+    const shown = flights.length > 1 ? `${flight.log}: ${words}` : words;
+    const line = $(`read-${flight.number}`) ?? make("p", "", { id: `read-${flight.number}`, className: "nis" });
+    line.textContent = shown;
+    if (!line.isConnected) $("needles").append(line);
+  }
+  const tried = (flight, axis) => (changes) => {
+    const run = Engine.replay(flight, axis, { ...settings, ...changes });
+    return run && numbers(flight, axis, run, true);
   };
+  function tell() {
+    const sentences = flights.map((flight) => {
+      const { axis, numbers: ours } = runs[flight.number], found = mapOf(flight), { likely } = flight.offset;
+      const [sigmaA, sigmaZ] = typeof found === "string" ? [null, null] : found.likely;
+      const candidates = [["SIGMA_A", "sigmaA", sigmaA], ["SIGMA_Z", "sigmaZ", sigmaZ], ["a clock offset of", "offset", likely]]
+        .filter(([, key, value]) => value !== null && value !== undefined && round(value, 2) !== round(settings[key], 2))
+        .map(([name, key, value]) => [`${name} ${round(value, 2)}${key === "offset" ? " s" : ""}`, { [key]: round(value, 2) }]);
+      const words = Story.sentence(axis, ours, ekf2Of(flight, axis))
+        + (Practice.hidden ? "" : Story.cure(ours, candidates, tried(flight, axis)));
+      for (const line of document.querySelectorAll(`#now-said-${flight.number}`)) {
+        line.textContent = moved(flight) ? `The knobs stand elsewhere now: ${words}` : "";
+        line.parentElement.classList.toggle("stale", moved(flight));
+      }
+      return flights.length > 1 ? `${flight.log}: ${words}` : words;
+    });
+    if ($("live").textContent !== sentences.join(" ")) $("live").textContent = sentences.join(" ");
+  }
+  const moved = (flight) => ["sigmaA", "sigmaZ", "dt", "input", "offset"].some((key) => settings[key] !== flight.settings[key]);
   const ROWS = [
     ["Mean NIS (1 is consistent)", (x) => x.nis?.toFixed(2)],
     ["95 % band of it", (x) => x.band && `${x.band[0].toFixed(2)}–${x.band[1].toFixed(2)}`],
-    ["Verdict", verdict],
+    ["Verdict", Story.verdict],
     ["Outside ±2√S (5 % is right)", (x) => x.outside === undefined ? undefined
       : `${(100 * x.outside).toFixed(1)} %`],
     ["Lag-1 correlation of ν", (x) => x.lag1?.toFixed(2)],
@@ -293,14 +465,13 @@ const Explore = (async () => {
     ["Velocity: RMS to truth", (x) => x.truthV?.toFixed(3).concat(" m/s")],
   ];
   function drawTable(flight, axis, ours) {
-    const other = Grid.chosen(flight, axis);
-    const ekf2 = other ? other.axes[axis.name] : typeof axis.ekf2 === "string" ? { why: axis.ekf2 } : axis.ekf2.summary;
+    const other = Grid.chosen(flight, axis), ekf2 = ekf2Of(flight, axis);
     let own = $(`table-${flight.number}`);
     if (own === null) {
       own = make("table", undefined, { id: `table-${flight.number}` });
       if (flights.length > 1) own.append(make("caption", flight.log));
       const head = own.createTHead().insertRow();
-      for (const name of ["", "ours", "EKF2"]) head.append(make("th", name, { scope: "col" }));
+      for (const name of ["number", "ours", "EKF2"]) head.append(make("th", name, { scope: "col" }));
       const body = own.createTBody();
       for (const [title] of ROWS) {
         const row = body.insertRow();
@@ -340,14 +511,16 @@ const Explore = (async () => {
       plus: updates.s.map((s) => 2 * Math.sqrt(s)), minus: updates.s.map((s) => -2 * Math.sqrt(s)),
       k0: updates.k0, k1: updates.k1, running: running(updates.nu, updates.s) };
     const seen = { steps: thin(saw, ["p", "sp"]), updates: thin(rows, ["nu", "plus"]) };
-    put("steps", flight, seen.steps);
-    put("updates", flight, seen.updates);
-    seen.measured = thin({ t: later(axis.time, shift - settings.offset), z: axis.z }, ["z"]);
-    put("measured", flight, seen.measured);
-    if (typeof axis.truth !== "string") {
+    give("steps", flight, seen.steps);
+    give("updates", flight, seen.updates);
+    if (isSeen("position")) {
+      seen.measured = thin({ t: later(axis.time, shift - settings.offset), z: axis.z }, ["z"]);
+      give("measured", flight, seen.measured);
+    }
+    if (isSeen("error") && typeof axis.truth !== "string") {
       const known = Engine.interp(steps.time, ...axis.truth.p, NaN);
       seen.error = thin({ t: later(steps.time, shift), e: steps.p.map((p, i) => p - known[i]) }, ["e"]);
-      put("error", flight, seen.error);
+      give("error", flight, seen.error);
     }
     return seen;
   }
@@ -363,30 +536,30 @@ const Explore = (async () => {
   /* EKF2, truth: only an axis or a zoom changes them */
   function drawOthers(flight, axis) {
     const shift = flight.shift, seen = {};
-    const give = (name, columns, keys) => { seen[name] = thin(columns, keys); put(name, flight, seen[name]); };
+    const take = (name, columns, keys) => { seen[name] = thin(columns, keys); give(name, flight, seen[name]); };
     if (typeof axis.ekf2 !== "string") {
-      // the page holds only the innovations of EKF2 with other parameters
-      const { state, variance, innovations } = axis.ekf2;
-      const own = table(["t", "p", "v"], state);
-      give("state", { ...own, t: later(own.t, shift) }, ["p", "v"]);
-      const sigma = table(["t", "sp", "sv"], variance);
-      give("variance", { ...sigma, t: later(sigma.t, shift) }, ["sp", "sv"]);
-      const rows = Grid.rows(flight, axis) ?? table(["t", "nu", "sigma", "rejected"], innovations), t = later(rows.t, shift);
+      const { state, variance, innovations } = axis.ekf2, other = Grid.rows(flight, axis);
+      const own = other ?? table(["t", "p", "v"], state);
+      take("state", { t: later(own.t, shift), p: own.p, v: own.v }, ["p", "v"]);
+      const sigma = other ?? table(["t", "sp", "sv"], variance);
+      take("variance", { t: later(sigma.t, shift), sp: sigma.sp, sv: sigma.sv }, ["sp", "sv"]);
+      const rows = other ?? table(["t", "nu", "sigma", "rejected"], innovations), t = later(rows.t, shift);
       for (const [name, flag] of [["fused", 0], ["rejected", 1]]) {
         const which = [...t.keys()].filter((i) => rows.rejected[i] === flag);
-        give(name, { t: Float64Array.from(which, (i) => t[i]),
+        take(name, { t: Float64Array.from(which, (i) => t[i]),
           nu: Float64Array.from(which, (i) => rows.nu[i]) }, ["nu"]);
       }
-      give("limits", { t, plus: rows.sigma.map((s) => 2 * s), minus: rows.sigma.map((s) => -2 * s) }, ["plus"]);
-      give("running", { t, running: running(rows.nu, rows.sigma.map((s) => s * s)) }, ["running"]);
+      take("limits", { t, plus: rows.sigma.map((s) => 2 * s), minus: rows.sigma.map((s) => -2 * s) }, ["plus"]);
+      take("running", { t, running: running(rows.nu, rows.sigma.map((s) => s * s)) }, ["running"]);
     }
     if (typeof axis.truth !== "string") {
       const { p, v } = axis.truth;
-      give("truth_p", { t: later(p[0], shift), p: p[1] }, ["p"]);
-      if (v !== null) give("truth_v", { t: later(v[0], shift), v: v[1] }, ["v"]);
+      take("truth_p", { t: later(p[0], shift), p: p[1] }, ["p"]);
+      if (v !== null) take("truth_v", { t: later(v[0], shift), v: v[1] }, ["v"]);
       if (typeof axis.ekf2 !== "string") {
-        const [time, own] = axis.ekf2.state, known = Engine.interp(time, ...p, NaN);
-        give("error_ekf2", { t: later(time, shift), e: own.map((x, i) => x - known[i]) }, ["e"]);
+        const other = Grid.rows(flight, axis), [time, own] = other ? [other.t, other.p] : axis.ekf2.state;
+        const known = Engine.interp(time, ...p, NaN);
+        take("error_ekf2", { t: later(time, shift), e: own.map((x, i) => x - known[i]) }, ["e"]);
       }
     }
     return seen;
@@ -394,20 +567,23 @@ const Explore = (async () => {
   function frames(flight, ours, others) {
     const of = (part, column) => part?.[column] ?? EMPTY;
     const { steps, updates } = ours;
-    frame("position", flight, ...extent(steps.p, of(others.state, "p"), of(others.truth_p, "p")));
-    frame("velocity", flight, ...extent(steps.v, of(others.state, "v"), of(others.truth_v, "v")));
-    frame("error", flight, ...extent(of(ours.error, "e"), of(others.error_ekf2, "e")));
+    latest[flight.number] = { ...others, ...ours };
+    if (isSeen("position")) frame("position", flight, ...extent(steps.p, of(others.state, "p"), of(others.truth_p, "p")));
+    if (isSeen("velocity")) frame("velocity", flight, ...extent(steps.v, of(others.state, "v"), of(others.truth_v, "v")));
+    if (isSeen("error")) frame("error", flight, ...extent(of(ours.error, "e"), of(others.error_ekf2, "e")));
     // neither outliers nor a gap may flatten all the rest
+    if (isSeen("innovation")) {
     const reach = 1.3 * Math.max(...[[updates.nu, updates.plus],
       [of(others.fused, "nu"), of(others.limits, "plus")]].map(([nu, plus]) => {
         const typical = quantile(plus, 0.5);
         return Math.max(typical, Math.min(quantile(nu, 0.99), 2.5 * typical));
       }));
     frame("innovation", flight, -reach, reach);
-    frame("sigma_p", flight, ...extent(steps.sp, of(others.variance, "sp")), true);
-    frame("sigma_v", flight, ...extent(steps.sv, of(others.variance, "sv")), true);
-    frame("nis", flight, ...extent(updates.running, of(others.running, "running"), ranges.running.slice(1)), true);
-    frame("gain", flight, ...extent(updates.k0, updates.k1, [0]));
+    }
+    if (isSeen("sigma_p")) frame("sigma_p", flight, ...extent(steps.sp, of(others.variance, "sp")), true);
+    if (isSeen("sigma_v")) frame("sigma_v", flight, ...extent(steps.sv, of(others.variance, "sv")), true);
+    if (isSeen("nis")) frame("nis", flight, ...extent(updates.running, of(others.running, "running"), ranges.running.slice(1)), true);
+    if (isSeen("gain")) frame("gain", flight, ...extent(updates.k0, updates.k1, [0]));
   }
 
   // ------------------------------------------------------------------ the map of both noises
@@ -487,12 +663,26 @@ const Explore = (async () => {
   // ------------------------------------------------------------------ all of it
   let axisShown = null;
   const others = [];
-  function show() {
+  /* Replay and draw what is in view; quick leaves out what is only read, until a drag has ended */
+  function show(quick = false) {
+    most = quick === true ? FEW_POINTS : MOST_POINTS;
     for (const knob of KNOBS) {
-      knob.number.value = settings[knob.key];
-      knob.slider.value = toSlider(knob, settings[knob.key]);
+      if (document.activeElement !== knob.number || !quick) knob.number.value = settings[knob.key];
+      if (quick !== true) knob.slider.value = toSlider(knob, settings[knob.key]);
       knob.slider.ariaValueText = `${settings[knob.key]} ${knob.unit}`;
     }
+    const another = axisShown !== settings.axis;
+    axisShown = settings.axis;
+    for (const flight of flights) {
+      const done = runs[flight.number] = replayed(flight, quick === true);
+      if (another) others[flight.number] = drawOthers(flight, done.axis);
+      if (done.run) frames(flight, drawOurs(flight, done), others[flight.number]);
+      drawNeedle(flight, done.axis, done.numbers);
+      if (isSeen("map")) drawMap(flight);
+    }
+    setHeights();
+    if (quick === true) return;
+    clearTimeout(rest);
     for (const name of ["axis", "input"]) {
       for (const radio of document.querySelectorAll(`[name=${name}]`)) radio.checked = radio.value === settings[name];
     }
@@ -503,19 +693,15 @@ const Explore = (async () => {
     $("ekf2-r").disabled = typeof axis.ekf2 === "string" || axis.ekf2.r === null;
     $("map-note").textContent = mapWords();
     Grid.say(lone, axis);
-    const another = axisShown !== settings.axis;
-    axisShown = settings.axis;
     for (const flight of flights) {
-      const done = runs[flight.number] = replayed(flight);
-      drawTable(flight, done.axis, done.run && done.numbers);
+      const done = runs[flight.number];
+      drawTable(flight, done.axis, done.numbers);
       $(`command-${flight.number}`).textContent = command(flight);
-      drawMap(flight);
-      if (another) others[flight.number] = drawOthers(flight, done.axis);
       if (another) times.strip(flight, done.axis);
-      if (done.run) frames(flight, drawOurs(flight, done), others[flight.number]);
-      times.step(flight);
+      times.plan(flight);
     }
-    setHeights();
+    stepper.draw();
+    tell();
     toAddress();
   }
   /* After a zoom: the same replay, other rows of it */
@@ -530,11 +716,20 @@ const Explore = (async () => {
     setHeights();
   }
 
+  const stepper = Step.start({ flights, settings, chosen, runs, model, put, figures, isSeen,
+    moved: (time) => { times.show(time); toAddress(); } });
+  const keys = { n: () => stepper.go((chosen.step ?? -1) + 1), p: () => stepper.go((chosen.step ?? 1) - 1),
+    " ": () => { open("step"); stepper.play(); } };
+  const times = Times.start({ flights, settings, model, put, timeRange, figures, look, later, isSeen, keys, open });
+  tabs();
   Grid.start(flights, arrays, () => { axisShown = null; show(); });
-  const times = Times.start({ flights, settings, chosen, runs, model, put, timeRange, figures, look, toAddress, axisOf, later });
-  addEventListener("hashchange", () => { fromAddress(); show(); });
+  addEventListener("hashchange", () => { fromAddress(); axisShown = null; show(); });
+  open(view, false);
   fromAddress();
   show();
-  look();
-  return { settings, set, show, runs, flights, model, command, numbers, timeRange };
+  const shared = { recorded: times.recorded, settings, set, show, open, runs, flights, model, command, numbers, timeRange, chosen, stepper, axisOf,
+    mapOf, round, tried, say, Grid, ekf2Of, view: () => view };
+  Tour.start(shared);
+  Practice.start(shared);
+  return shared;
 })();

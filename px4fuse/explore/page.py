@@ -1,11 +1,12 @@
-"""The page as one file: Bokeh, the flight's data, the engine and what moves them."""
+"""The page as one file: Bokeh, the flights' data, the engine and what moves them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib.metadata import version
 from importlib.resources import files
 from string import Template
-from typing import Any
+from typing import Any, Literal
 
 from bokeh.resources import Resources
 
@@ -21,6 +22,7 @@ from px4fuse.webpage.safe import part as shared
 # Longer text from a log is cut
 MAX_CHARACTERS = 2000
 Explored = tuple[Analysis, tuple[Finding, ...], ComparisonRequest]
+SCRIPTS = ("dom", "story", "grid", "step", "times", "tour")
 
 
 def html_text(flights: list[Explored]) -> str:
@@ -38,28 +40,75 @@ def html_text(flights: list[Explored]) -> str:
     """
     packer = Packer()
     data = [flight_data(*flight, packer, beside=len(flights) > 1) for flight in flights]
-    document, places = document_json(data, [analysis.tuning for analysis, _, _ in flights])
-    content = {
-        "flights": data,
-        "ranges": ranges(),
-        "packed": packer.specs,
-        "places": places,
-    }
-    scripts = {
+    return page_text(
+        data_scripts(data, [analysis for analysis, _, _ in flights], packer),
+        data,
+        command="explore",
+        heading="Turn the knobs and watch",
+        title=" and ".join(one["log"] for one in data),
+        practice="no_practice",
+    )
+
+
+def data_scripts(
+    data: list[dict[str, Any]], analyses: Sequence[Analysis], packer: Packer, suffix: str = ""
+) -> str:
+    """What the page reads of some flights, as elements that run nothing.
+
+    Parameters
+    ----------
+    data : list of dict
+        From :func:`px4fuse.explore.data.flight_data`.
+    analyses : sequence of Analysis
+    packer : Packer
+        That the data were made with.
+    suffix : str
+        Of the elements' ids, where a page has several such sets.
+    """
+    document, places = document_json(data, [analysis.tuning for analysis in analyses])
+    content = {"flights": data, "ranges": ranges(), "packed": packer.specs, "places": places}
+    return "\n".join(
+        f'<script type="{kind}" id="{name}{suffix}">{text}</script>'
+        for name, kind, text in (
+            ("content", "application/json", inert_json(_plain(content))),
+            ("document", "application/json", inert_json(document)),
+            ("arrays", "text/plain", packer.text()),
+        )
+    )
+
+
+def page_text(
+    scripts: str, data: list[dict[str, Any]], *, command: str, heading: str, title: str,
+    practice: Literal["no_practice", "practice"], quiz: str = "",
+) -> str:  # fmt: skip
+    """The page around data that :func:`data_scripts` made.
+
+    Parameters
+    ----------
+    scripts : str
+    data : list of dict
+        The flights that stand side by side.
+    command, heading, title : str
+    practice : {"no_practice", "practice"}
+        The script that asks, or does not.
+    quiz : str
+        HTML of the questions.
+    """
+    code = {
         "bokeh": _bokeh(),
         "engine": _file("engine.js"),
-        "script": _file("grid.js") + _file("times.js") + _file("page.js"),
+        "script": "".join(_file(f"{name}.js") for name in (*SCRIPTS, practice, "page")),
     }
-    names = " and ".join(one["log"] for one in data)
     return Template(_file("page.html")).substitute(
-        {f"{name}_hash": policy_hash(text) for name, text in scripts.items()},
-        **scripts,
+        {f"{name}_hash": policy_hash(text) for name, text in code.items()},
+        **code,
         style=shared("base.css") + _file("page.css"),
-        title=escaped(names),
+        command=command,
+        heading=heading,
+        title=escaped(title),
         made_with=escaped(f"px4fuse {version('px4fuse')}"),
-        content=inert_json(_plain(content)),
-        document=inert_json(document),
-        arrays=packer.text(),
+        data=scripts,
+        quiz=quiz,
         plots="\n".join(_panels(number, one) for number, one in enumerate(data)),
         count=len(data),
     )
@@ -87,15 +136,15 @@ def _plain(value: Any) -> Any:
 
 
 PANELS = (
-    ("strip", "What happened"),
+    ("innovation", "Innovations with ±2√S; arrows mark what lies beyond the axis"),
+    ("sigma_p", "Standard deviation of position: grows on predict, shrinks on update"),
+    ("sigma_v", "Standard deviation of velocity"),
     ("position", "Position"),
     ("velocity", "Velocity"),
     ("error", "Error of position against the truth"),
-    ("innovation", "Innovations with ±2√S (the farthest may lie beyond the axis)"),
-    ("sigma_p", "Standard deviation of position: grows on predict, shrinks on update"),
-    ("sigma_v", "Standard deviation of velocity"),
     ("nis", "Running mean of NIS: 1 is right, the band holds 95 %"),
     ("gain", "Gain K: position solid, velocity dotted"),
+    ("strip", "What happened"),
 )
 
 
@@ -103,7 +152,7 @@ def _panels(number: int, data: dict[str, Any]) -> str:
     """Places of the plots of one flight."""
     truth = any(isinstance(axis["truth"], dict) for axis in data["axes"])
     shown = [
-        f'<figure class="plot"><figcaption>{title}</figcaption>'
+        f'<figure class="plot" data-plot="{name}"><figcaption>{title}</figcaption>'
         f'<div id="{name}-{number}"></div></figure>'
         for name, title in PANELS
         if name != "error" or truth

@@ -1,12 +1,5 @@
-/* Time: what part of the flight is looked at, what happened when, and one measurement by itself. */
-"use strict";
+/* Time: what part of the flight is looked at, and what happened when. */
 const Times = (() => {
-  const $ = (id) => document.getElementById(id);
-  const make = (tag, text, properties) => {
-    const node = Object.assign(document.createElement(tag), properties);
-    if (text !== undefined) node.textContent = text;
-    return node;
-  };
   // by the places' names: the colours of both modes of the screen
   const COLOURS = {
     light: { ours: "#123f7a", ekf2: "#e0741a", truth: "#111111", measured: "#9a9a9a",
@@ -15,33 +8,17 @@ const Times = (() => {
       paper: "#1a1f26", ink: "#e5e9ee", muted: "#a0abb7", line: "#343c46", event: "#55616e" },
   };
 
-  /* Where the plots stand that have words beside them */
+  /* Where the plan stands */
   function places(flight) {
-    const n = flight.number, box = make("div", undefined, { className: "two" });
-    const step = make("section", undefined, { className: "card step" });
-    step.append(make("h2", "Step by step"), make("p", flight.log, { className: "note", dir: "auto" }));
-    const buttons = make("div", undefined, { className: "buttons" });
-    for (const [id, text] of [["first", "first"], ["previous", "previous measurement"],
-      ["next", "next measurement"], ["last", "last"]]) {
-      buttons.append(make("button", text, { type: "button", id: `${id}-${n}` }));
-    }
-    const slider = make("input", undefined, { type: "range", id: `cursor-${n}`, min: 0, value: 0,
-      ariaLabel: "Measurement" });
-    step.append(buttons, slider, make("p", "", { id: `now-${n}`, role: "status" }),
-      make("div", undefined, { id: `step-${n}` }),
-      make("p", "Dashed: predicted. Dotted: measured. Solid: after the update.", { className: "note" }),
-      make("div", undefined, { id: `numbers-${n}` }));
     const plan = make("section", undefined, { className: "card" });
     plan.append(make("h2", "Seen from above"),
       make("p", "Drag a box over the track to look at that time; the part in view is drawn thick.",
-        { className: "note" }), make("div", undefined, { id: `plan-${n}` }));
-    box.append(step, plan);
-    return box;
+        { className: "note" }), make("div", undefined, { id: `plan-${flight.number}` }));
+    return plan;
   }
 
   function start(page) {
-    const { flights, settings, chosen, runs, model, put, timeRange, figures, look, toAddress, axisOf,
-      later } = page;
+    const { flights, settings, model, put, timeRange, figures, look, later, isSeen, keys: others } = page;
     const lone = flights[0];
     const ends = [Math.min(...flights.map((f) => f.segment[0] - f.shift)),
       Math.max(...flights.map((f) => f.segment[1] - f.shift))];
@@ -77,10 +54,10 @@ const Times = (() => {
       wider: () => zoom(2), whole: () => view(...ends) };
     for (const [id, act] of Object.entries(actions)) $(id).addEventListener("click", act);
     const keys = { ArrowLeft: actions.earlier, ArrowRight: actions.later, "+": actions.closer,
-      "-": actions.wider, 0: actions.whole, n: () => go((chosen.step ?? -1) + 1),
-      p: () => go((chosen.step ?? 1) - 1) };
+      "-": actions.wider, 0: actions.whole, ...others };
     addEventListener("keydown", (event) => {
-      if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input")) return;
+      if (event.ctrlKey || event.metaKey || event.altKey) return;
+      if (event.target.matches("input, [role=tab], summary") || (event.key === " " && event.target.matches("button"))) return;
       if (keys[event.key]) { keys[event.key](); event.preventDefault(); }
     });
 
@@ -110,7 +87,7 @@ const Times = (() => {
 
     // ------------------------------------------------------------------ the plan
     function plan(flight) {
-      if (typeof flight.plan === "string") return;
+      if (typeof flight.plan === "string" || !isSeen("plan")) return;
       const [time, north, east] = flight.plan, t = later(time, flight.shift - settings.offset + flight.settings.offset);
       const inside = [...t.keys()].filter((i) => t[i] >= timeRange.start && t[i] <= timeRange.end);
       const track = model(`plan-source-${flight.number}`);
@@ -127,112 +104,53 @@ const Times = (() => {
       put("shown", flight, { north: inside.map((i) => north[i]), east: inside.map((i) => east[i]) });
     }
 
-    // ------------------------------------------------------------------ one measurement
-    function go(step) {
-      const done = runs[0];
-      if (!done?.run) return;
-      chosen.step = Math.min(Math.max(step, 0), done.run.updates.nu.length - 1);
-      const t = done.run.updates.time[chosen.step] - lone.shift;
-      if (t < timeRange.start || t > timeRange.end) {
+    /* Where the vehicle was at a time of the filter, and that time in view */
+    function show(t) {
+      const shown = t - lone.shift;
+      if (shown < timeRange.start || shown > timeRange.end) {
         const half = (timeRange.end - timeRange.start) / 2;
-        view(t - half, t + half);
+        view(shown - half, shown + half);
       }
-      for (const flight of flights) stepOf(flight);
-      toAddress();
-    }
-    const words = (x, digits = 4) => Math.abs(x) >= 1e-4 || x === 0 ? x.toFixed(digits) : x.toExponential(2);
-    const matrix = (a, b, d) => `[${words(a, 5)}  ${words(b, 5)}; ${words(b, 5)}  ${words(d, 5)}]`;
-    function stepOf(flight) {
-      const n = flight.number, done = runs[n];
-      const slider = $(`cursor-${n}`), cursors = figures(flight).flatMap((plot) => plot.center)
-        .filter((one) => one.name === "cursor");
-      const known = done?.run && chosen.step !== null;
-      for (const line of cursors) line.visible = Boolean(known);
-      for (const id of ["first", "previous", "next", "last"]) $(`${id}-${n}`).disabled = !done?.run;
-      if (!known) { $(`now-${n}`).textContent = "Choose a measurement: press n, or the buttons."; return; }
-      const { updates: u, steps } = done.run, m = u.nu.length;
-      const k = Math.min(chosen.step, m - 1), i = u.step[k];
-      slider.max = m - 1;
-      slider.value = k;
-      const t = u.time[k], shown = t - flight.shift;
-      for (const line of cursors) line.location = shown;
-      $(`now-${n}`).textContent = `Measurement ${k + 1} of ${m}, at ${shown.toFixed(3)} s`;
-      slider.ariaValueText = $(`now-${n}`).textContent;
-      const r = settings.sigmaZ ** 2, before = k ? u.step[k - 1] : 0;
-      const bells = [["before", u.p[k], u.p00[k]], ["measurement", u.z[k], r], ["posterior", steps.p[i], steps.p00[i]]];
-      const low = Math.min(...bells.map(([, x, s]) => x - 3.5 * Math.sqrt(s)));
-      const high = Math.max(...bells.map(([, x, s]) => x + 3.5 * Math.sqrt(s)));
-      let top = 0;
-      for (const [name, mean, variance] of bells) {
-        // from its own middle outwards, so that a narrow one is not cut between two points
-        const sigma = Math.sqrt(variance), x = [], y = [];
-        for (let j = -80; j <= 80; j++) {
-          x.push(mean + j / 20 * sigma);
-          y.push(Math.exp(-(j * j) / 800) / (sigma * Math.sqrt(2 * Math.PI)));
-        }
-        top = Math.max(top, y[80]);
-        put(name, flight, { x, y });
-      }
-      const plot = model(`step-${n}`);
-      [plot.x_range.start, plot.x_range.end] = [low, high];
-      [plot.y_range.start, plot.y_range.end] = [0, 1.08 * top];
-      const rows = [
-        ["Before", `x⁺ = [${words(steps.p[before])} m, ${words(steps.v[before])} m/s]`],
-        ["", `P⁺ = ${matrix(steps.p00[before], steps.p01[before], steps.p11[before])}`],
-        ["Predict", `${i - before} step${i - before > 1 ? "s" : ""} x⁻ = Fx + Ba, P⁻ = FPFᵀ + Q over ${words(t - steps.time[before], 3)} s`],
-        ["", `x⁻ = [${words(u.p[k])} m, ${words(u.v[k])} m/s]`],
-        ["", `P⁻ = ${matrix(u.p00[k], u.p01[k], u.p11[k])}`],
-        ["", `σ_p ${grows(steps.p00[before], u.p00[k])}: ${words(Math.sqrt(steps.p00[before]))} to ${words(Math.sqrt(u.p00[k]))} m`],
-        ["Measure", `z = ${words(u.z[k])} m, R = SIGMA_Z² = ${words(r, 5)} m²`],
-        ["Compare", `ν = z − Hx⁻ = ${words(u.nu[k])} m`],
-        ["", `S = HP⁻Hᵀ + R = ${words(u.s[k], 5)} m²; ν²/S = ${words(u.nu[k] ** 2 / u.s[k], 2)}`],
-        ["Gain", `K = P⁻Hᵀ/S = [${words(u.k0[k])}, ${words(u.k1[k])} 1/s]`],
-        ["Update", `x⁺ = x⁻ + Kν = [${words(steps.p[i])} m, ${words(steps.v[i])} m/s]`],
-        ["", `P⁺ = (I − KH)P⁻ = ${matrix(steps.p00[i], steps.p01[i], steps.p11[i])}`],
-        ["", `σ_p ${grows(u.p00[k], steps.p00[i])}: ${words(Math.sqrt(u.p00[k]))} to ${words(Math.sqrt(steps.p00[i]))} m`],
-      ];
-      const own = make("table");
-      for (const [head, text] of rows) {
-        const row = own.insertRow();
-        row.append(make("th", head, { scope: "row" }), make("td", text));
-      }
-      $(`numbers-${n}`).replaceChildren(own);
-      if (typeof flight.plan !== "string") {
+      if (!isSeen("plan")) return;
+      for (const flight of flights) {
+        if (typeof flight.plan === "string") continue;
         const [time, north, east] = flight.plan, at = [t - settings.offset + flight.settings.offset];
         put("here", flight, { north: Engine.interp(at, time, north), east: Engine.interp(at, time, east) });
       }
-    }
-    const grows = (before, after) => after > before ? "grows" : after < before ? "shrinks" : "stays";
-    for (const { number: n } of flights) {
-      const last = () => runs[n].run.updates.nu.length - 1;
-      $(`first-${n}`).addEventListener("click", () => go(0));
-      $(`previous-${n}`).addEventListener("click", keys.p);
-      $(`next-${n}`).addEventListener("click", keys.n);
-      $(`last-${n}`).addEventListener("click", () => go(last()));
-      $(`cursor-${n}`).addEventListener("input", (event) => go(Number(event.target.value)));
     }
 
     // ------------------------------------------------------------------ findings and words
     $("facts").textContent = flights.map((flight) => `${flights.length > 1 ? `${flight.log}: ` : ""}positions `
       + `from ${flight.source}, ${flight.segment.map((t) => t.toFixed(1)).join(" s to ")} s`).join("; ");
-    $("story").textContent = flights.length === 1 ? lone.story.join(" ") : "";
-    for (const flight of flights) {
-      if (flights.length > 1) $("found").append(make("h3", flight.log));
-      if (!flight.findings.length) $("found").append(make("p", "None."));
-      for (const finding of flight.findings) $("found").append(told(flight, finding));
+    /* The story and the findings of the report, with another flight's where they came later */
+    function recorded(later) {
+      $("found").replaceChildren();
+      for (const flight of flights) {
+        const { story, findings } = later ?? flight, [a, z] = [flight.settings.sigmaA, flight.settings.sigmaZ];
+        if (flights.length > 1) $("found").append(make("h3", flight.log));
+        if (!story.length) { $("found").append(make("p", "Not told yet.")); continue; }
+        $("found").append(make("p", `Recorded and judged at SIGMA_A ${a}, SIGMA_Z ${z}, DT ${flight.settings.dt} s, clock `
+          + `offset ${Number(flight.settings.offset.toPrecision(4))} s; no knob changes this:`, { className: "note" }),
+        make("p", story.join(" "), { dir: "auto", className: "story" }));
+        if (!findings.length) $("found").append(make("p", "No findings."));
+        for (const finding of findings) $("found").append(told(flight, finding));
+      }
     }
+    recorded();
     function told(flight, finding) {
       const box = make("div"), line = make("p", undefined, { dir: "auto" });
       line.append(make("span", `${finding.severity}: `, { className: `severity ${finding.severity}` }), finding.message);
       box.append(line);
       if (finding.remedy) box.append(make("p", finding.remedy, { className: "note", dir: "auto" }));
+      // the page rewrites what hangs on the knobs
+      if (finding.knobs) box.append(make("p", "", { className: "now-said", id: `now-said-${flight.number}` }));
       finding.spans.forEach(([low, high]) => {
         const text = high - low > 0.05 ? `${low.toFixed(1)} s to ${high.toFixed(1)} s` : `${low.toFixed(1)} s`;
         const button = make("button", `look at ${text}`, { type: "button", className: "jump" });
         button.addEventListener("click", () => {
           const around = Math.max(2, 0.3 * (high - low));
           view(low - flight.shift - around, high - flight.shift + around);
-          document.querySelector(".plots").scrollIntoView({ block: "start" });
+          page.open("innovation");
         });
         box.append(button);
       });
@@ -256,6 +174,8 @@ const Times = (() => {
           for (const one of plot.center) {
             if (one.type === "Grid") one.grid_line_color = colours.line;
             if (one.name === "cursor") one.line_color = colours.ink;
+            if (one.name === "measurement") one.line_color = colours.measured;
+            if (one.name === "band") one.fill_color = colours.measured;
           }
           for (const { name, glyph } of plot.renderers) colour(name, glyph, colours);
         }
@@ -275,7 +195,7 @@ const Times = (() => {
       for (const flight of flights) for (const plot of figures(flight)) plot.toolbar.active_drag = null;
     }
     said();
-    return { strip, plan, step: stepOf, view, go };
+    return { strip, plan, show, view, recorded };
   }
 
   return { places, start };

@@ -26,6 +26,12 @@ class LoopSource:
     flight: Flight | None
 
 
+def file_name(source: Path) -> str:
+    """What a source is called in a file name: ``flight_vio`` of ``flight.ulg:vio``."""
+    path, part = split_part(str(source))
+    return path.stem if part is None else f"{path.stem}_{part}"
+
+
 def split_part(argument: str) -> tuple[Path, Part | None]:
     """File and part of ``FILE`` or ``LOG:vio``, ``LOG:ekf2``, ``LOG:kf``, ``LOG:truth``.
 

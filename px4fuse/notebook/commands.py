@@ -1,4 +1,4 @@
-"""``compare``, ``close_loop``, ``evaluate`` and ``what_if`` as a notebook calls them."""
+"""``compare``, ``close_loop``, ``evaluate``, ``what_if``, ``report`` and ``explore`` in Python."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from px4fuse.analysis import Analysis, run, run_what_if
 from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.whatif import WhatIf
-from px4fuse.errors import MissingDataError, SettingsError, did_you_mean
+from px4fuse.errors import MissingDataError, OutputError, SettingsError, did_you_mean
 from px4fuse.filter.settings import Settings
+from px4fuse.findings import find
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.loop import Loop
@@ -29,10 +30,12 @@ from px4fuse.request import (
     InputName,
     PositionFile,
     WhatIfRequest,
+    command_line,
 )
 from px4fuse.trajectory import evaluation
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.model import Trajectory
+from px4fuse.writing import write_all
 
 Pathlike = str | Path
 Progress = Callable[[str], None]
@@ -241,6 +244,81 @@ def close_loop(
         spacing_m=key_frames_m,
         progress=progress,
     )
+
+
+def report(analysis: Analysis, path: Pathlike) -> Path:
+    """Write the report that ``px4fuse compare`` writes: a PDF, and its results beside it.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        From :func:`px4fuse.compare` or :func:`px4fuse.run`.
+    path : str or Path
+        Ends in .pdf.
+
+    Returns
+    -------
+    Path
+        The PDF.
+
+    Raises
+    ------
+    OutputError, SettingsError
+        It cannot be written, or the analysis was made without a request.
+    """
+    from px4fuse.report.document import Document  # noqa: PLC0415 - for who writes a report
+    from px4fuse.report.pdf import render  # noqa: PLC0415
+    from px4fuse.results.build import results  # noqa: PLC0415
+    from px4fuse.results.contract import to_json  # noqa: PLC0415
+    from px4fuse.results.model import Student  # noqa: PLC0415
+
+    target, request, findings = _ending(path, ".pdf"), _request(analysis), find(analysis)
+    document = Document(analysis, findings, Student(), command_line(request))
+    text = to_json(results(request, analysis, findings, document.student, document.command))
+    write_all({target: render(document, text), target.with_suffix(".json"): text.encode()})
+    return target
+
+
+def explore(analysis: Analysis, path: Pathlike) -> Path:
+    """Write the page that ``px4fuse explore`` writes.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        From :func:`px4fuse.compare` or :func:`px4fuse.run`.
+    path : str or Path
+        Ends in .html.
+
+    Returns
+    -------
+    Path
+        The page.
+
+    Raises
+    ------
+    OutputError, SettingsError
+        It cannot be written, or the analysis was made without a request.
+    """
+    from px4fuse.explore.page import html_text  # noqa: PLC0415 - Bokeh takes its time
+
+    target, request = _ending(path, ".html"), _request(analysis)
+    write_all({target: html_text([(analysis, find(analysis), request)]).encode()})
+    return target
+
+
+def _ending(path: Pathlike, ending: str) -> Path:
+    target = Path(path)
+    if target.suffix.lower() != ending:
+        raise OutputError(f"{target}: give a name that ends in {ending}.")
+    return target
+
+
+def _request(analysis: Analysis) -> ComparisonRequest:
+    if analysis.request is None:
+        raise SettingsError(
+            "this analysis does not say what was asked for", "Make it with px4fuse.compare."
+        )
+    return analysis.request
 
 
 @_with_names

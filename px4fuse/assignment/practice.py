@@ -1,0 +1,280 @@
+"""Flights with hidden mistakes to practise on, as one page: look, prove it by a knob, choose, see.
+
+For practice, not an exam: the answers are in the page, packed so that nobody reads them by chance.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from px4fuse.analysis import run
+from px4fuse.errors import SettingsError
+from px4fuse.explore.data import flight_data
+from px4fuse.explore.packing import Packer
+from px4fuse.explore.page import data_scripts, page_text
+from px4fuse.findings import find
+from px4fuse.findings.story import story
+from px4fuse.request import ComparisonRequest
+from px4fuse.simulation import flights
+from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.scenario import Scenario
+
+# What may be chosen, with what it stands for
+CHOICES = {
+    "source": "the positions: outliers, a jump, a silence",
+    "clock": "the clock of the positions",
+    "noise": "a noise: SIGMA_A, SIGMA_Z or EKF2_EVP_NOISE does not fit the data",
+    "gate": "EKF2's gate",
+    "frame": "the frame of the positions is turned",
+    "nothing": "nothing",
+}
+# Of two mistakes: that of the motion and one of single samples; a noise would hide another
+BOTH_SEEN = ({"clock", "source"}, {"clock", "gate"}, {"frame", "source"}, {"frame", "gate"})
+LEVELS = (1, 2, 3)
+MOST_FLIGHTS = 20
+MOST_SEED = 2**32 - 1
+SIGMA_A_M_S2, SIGMA_Z_M = 0.10, 0.10
+# Short of a minute, with two turns. A quiet IMU, which SIGMA_A fits: else its own errors would look
+# like those of clock and frame
+FLOWN: dict[str, Any] = {
+    "passes": 3, "speed_m_s": 1.5, "sigma_a_m_s2": 0.05, "accel_bias_sigma_m_s2": 0.005,
+    "gyro_bias_sigma_rad_s": 0.0002, "tilt_error_deg": 0.02, "yaw_error_deg": 0.2,
+}  # fmt: skip
+LENGTH_M = (8.0, 12.0)
+NOISY_UWB = "noisy-uwb"  # not a mistake of the log: the filter's SIGMA_Z does not fit
+
+
+@dataclass(frozen=True)
+class Trick:
+    """A mistake that may be hidden in a flight.
+
+    Attributes
+    ----------
+    choice : str
+        What it has to be called.
+    mistake : str
+        Name in :data:`px4fuse.simulation.mistakes.MISTAKES`, or :data:`NOISY_UWB`.
+    sizes : tuple of str
+        As typed, for each level.
+    view : str
+        What of the page shows it.
+    what : str
+        What was done to the flight, with its size.
+    tell_tale : str
+        How it shows, and which knob proves it.
+    either_sign : bool
+    """
+
+    choice: str
+    mistake: str
+    sizes: tuple[str, str, str]
+    view: str
+    what: str
+    tell_tale: str
+    either_sign: bool = False
+
+
+TRICKS = (
+    Trick("source", "nlos", ("5%,2m", "4%,1.5m", "3%,1.5m"), "innovation",
+          "Some positions are off (share, mean size: {size}), in bursts.",
+          "A few innovations lie far outside ±2√S, in bursts (look at north and east too), while "
+        "most fit: a SIGMA_Z that covers them is far too large for the rest."),
+    Trick("source", "jump", ("2m", "1.2m", "0.8m"), "innovation",
+          "The positions jump by {size} at two thirds of the flight, and stay.",
+          "From one moment on the innovations stand on one side until the filter has followed: "
+          "the positions jumped, and no knob takes that away."),
+    Trick("source", "dropout", ("12s", "8s", "5s"), "sigma_p",
+          "The source was silent for {size}.",
+          "σ of position grows for seconds without a measurement: the source was silent."),
+    Trick("clock", "clock-offset", ("400ms", "300ms", "250ms"), "innovation",
+          "The stamps of the positions are {size} late (with a minus: early).",
+          "The innovations grow at every start and stop and are small in between; the clock offset "
+        "that undoes it makes them small again.", either_sign=True),
+    Trick("noise", NOISY_UWB, ("0.3", "0.22", "0.18"), "innovation",
+          "The noise of the positions is {size} m, and SIGMA_Z says 0.1 m.",
+          "Far more than one innovation in twenty lies outside ±2√S all the time, without order: "
+          "a larger SIGMA_Z brings the needle into its band."),
+    Trick("noise", "ekf2-noise", ("0.03", "0.04", "0.05"), "innovation",
+          "The noise of the positions is 0.1 m, and EKF2_EVP_NOISE says {size} m.",
+          "EKF2's own limits lie close to zero while its innovations are as large as ours: its "
+          "EKF2_EVP_NOISE is too small. Our needle is in its band."),
+    Trick("noise", "vibration", ("1.5", "1", "0.6"), "innovation",
+          "The accelerometer's noise is {size} m/s² (mean over 0.1 s), and SIGMA_A says 0.1.",
+          "The innovations are too large all the time and follow each other: a larger SIGMA_A, "
+          "not a larger SIGMA_Z, brings the needle into its band."),
+    Trick("gate", "ekf2-gate", ("1", "1.2", "1.4"), "innovation",
+          "EKF2_EVP_GATE is {size}.",
+          "EKF2 rejects samples (hollow squares) that are no larger than others and fit ours: its "
+          "gate is too small."),
+    Trick("frame", "yaw", ("45deg", "35deg", "25deg"), "innovation",
+          "The axes of the positions are turned by {size} against north, clockwise.",
+          "Along north or east the innovations grow at every start and stop, and no clock offset "
+        "makes them small.",
+          either_sign=True),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Round:
+    """One flight of a set.
+
+    Attributes
+    ----------
+    scenario : Scenario
+    tricks : tuple of Trick
+        None, one or two, of different choices.
+    typed : tuple of str
+        Their sizes, in the same order.
+    """
+
+    scenario: Scenario
+    tricks: tuple[Trick, ...]
+    typed: tuple[str, ...]
+
+    @property
+    def right(self) -> list[str]:
+        """What has to be chosen."""
+        return sorted({trick.choice for trick in self.tricks}) or ["nothing"]
+
+
+def draw(seed: int, level: int = 1, count: int = 10) -> tuple[Round, ...]:
+    """Draw the flights of a set: every choice in turn, in an order by chance.
+
+    Parameters
+    ----------
+    seed : int
+        The same seed, level and count give the same set.
+    level : {1, 2, 3}
+        1: one mistake, large; 2: smaller; 3: small, and two of them in every second flight.
+    count : int
+
+    Raises
+    ------
+    SettingsError
+        A number is out of range.
+    """
+    for option, value, low, high in (
+        ("--level", level, LEVELS[0], LEVELS[-1]), ("--flights", count, 1, MOST_FLIGHTS),
+        ("--seed", seed, 0, MOST_SEED),
+    ):  # fmt: skip
+        if not low <= value <= high:
+            raise SettingsError(f"{option} {value}: give {low} to {high}.")
+    rng = np.random.default_rng([seed, level, count])
+    names: list[str] = []
+    while len(names) < count:
+        names += [str(name) for name in rng.permutation(list(CHOICES))]
+    return tuple(_round(rng, name, level) for name in names[:count])
+
+
+def _round(rng: np.random.Generator, choice: str, level: int) -> Round:
+    tricks = [one for one in TRICKS if one.choice == choice]
+    tricks = [tricks[rng.integers(len(tricks))]] if tricks else []
+    if level == LEVELS[-1] and tricks and rng.random() < 0.5:
+        others = [one for one in TRICKS if {one.choice, choice} in BOTH_SEEN]
+        tricks += [others[rng.integers(len(others))]] if others else []
+    typed = []
+    for trick in tricks:
+        minus = "-" if trick.either_sign and rng.random() < 0.5 else ""
+        typed.append(f"{minus}{trick.sizes[level - 1]}")
+    noisy = next((float(t) for one, t in zip(tricks, typed, strict=True)
+                  if one.mistake == NOISY_UWB), SIGMA_Z_M)  # fmt: skip
+    scenario = Scenario(
+        **FLOWN,
+        length_m=round(float(rng.uniform(*LENGTH_M)), 1),
+        heading_deg=round(float(rng.uniform(0.0, 359.0)), 0),
+        sigma_uwb_m=noisy,
+        seed=int(rng.integers(MOST_SEED)),
+    )
+    return Round(scenario, tuple(tricks), tuple(typed))
+
+
+def practice_text(
+    seed: int,
+    level: int = 1,
+    count: int = 10,
+    progress: Callable[[str, int, int], None] = lambda *_: None,
+) -> str:
+    """Simulate a set of flights and lay out the page that asks about them.
+
+    Parameters
+    ----------
+    seed, level, count : int
+        See :func:`draw`.
+    progress : callable
+        Told what is being done, how many flights are done, and of how many.
+
+    Returns
+    -------
+    str
+        One page that needs no network; write it as UTF-8.
+    """
+    rounds, scripts = draw(seed, level, count), []
+    data: dict[str, Any] = {}
+    for number, one in enumerate(rounds):
+        progress(f"flight {number + 1}", number, count)
+        data, script = _flown(one, number)
+        scripts.append(script)
+    choices = "\n".join(
+        f'<label><input type="checkbox" name="choice" value="{name}"> {escape(words)}</label>'
+        for name, words in CHOICES.items()
+    )
+    return page_text(
+        "\n".join(scripts), [data], command="practice", heading="What is wrong with this flight?",
+        title=f"seed {seed}, level {level}", practice="practice",
+        quiz=QUIZ.format(count=count, choices=choices),
+    )  # fmt: skip
+
+
+QUIZ = """<section class="card" id="quiz" data-rounds="{count}" aria-labelledby="quiz-title">
+<h2 id="quiz-title"></h2>
+<p id="quiz-ask">Look, turn the knobs to prove it, then choose all that is wrong. Simulated; the
+truth comes after your answer.</p>
+<fieldset id="quiz-choices"><legend>What is wrong</legend><div class="choices">{choices}</div>
+</fieldset>
+<div class="buttons"><button type="button" id="quiz-check">Check</button>
+<button type="button" id="quiz-next">Next flight</button>
+<button type="button" id="quiz-again">Begin again</button>
+<span id="quiz-score" class="note"></span></div>
+<p id="quiz-said" role="status"></p><div id="quiz-told"></div>
+<p class="note">Practice, not an exam: the answers are in this page, and the score is in its
+address. Nothing is sent anywhere.</p>
+</section>"""
+
+
+def _flown(one: Round, number: int) -> tuple[dict[str, Any], str]:
+    """One flight's data without what gives it away, and its elements with the packed answer."""
+    mistakes = [
+        f"{trick.mistake}={size}"
+        for trick, size in zip(one.tricks, one.typed, strict=True)
+        if trick.mistake != NOISY_UWB
+    ]
+    simulation = flights.simulate(one.scenario, parse(mistakes))
+    flight = flights.to_flight(simulation, f"flight {number + 1}")
+    request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
+    analysis = run(request, flight=flight)
+    findings, packer = find(analysis), Packer()
+    data = flight_data(analysis, findings, request, packer, replays=False)
+    key = {
+        "right": one.right,
+        "made": [_made(trick, size) for trick, size in zip(one.tricks, one.typed, strict=True)],
+        "story": list(story(analysis, findings)),
+        "findings": data["findings"],
+    }
+    data |= {"story": [], "findings": []}
+    packed = base64.b64encode(zlib.compress(json.dumps(key).encode())).decode()
+    scripts = data_scripts([data], [analysis], packer, f"-{number}")
+    return data, f'{scripts}\n<script type="text/plain" id="key-{number}">{packed}</script>'
+
+
+def _made(trick: Trick, size: str) -> dict[str, str]:
+    """What was done to the flight, in words, and where it shows."""
+    what = trick.what.format(size=size)
+    return {"choice": trick.choice, "what": what, "tell": trick.tell_tale, "view": trick.view}

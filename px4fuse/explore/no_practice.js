@@ -1,0 +1,2 @@
+/* A page that asks nothing. */
+const Practice = { suffix: "", hidden: false, toAddress: () => ({}), start() {} };

@@ -1,0 +1,453 @@
+"""What a user sees and does on the page: one screen, words that follow, steps, tour, everybody."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import Browser
+from explore_tools import ask, axe, open_view, serious, settle, show
+
+from px4fuse.analysis import Analysis, run
+from px4fuse.comparison.model import AgainstTruth
+from px4fuse.ekf2.model import replay_settings
+from px4fuse.explore.page import html_text
+from px4fuse.filter.consistency import Consistency
+from px4fuse.filter.kalman import replay
+from px4fuse.filter.settings import Settings
+from px4fuse.filter.signals import within
+from px4fuse.findings import find
+from px4fuse.findings.story import nis_with
+from px4fuse.flight import Unavailable
+from px4fuse.plain import length_words, number_words
+from px4fuse.request import ComparisonRequest
+
+pytestmark = pytest.mark.usefixtures("analysed_once")
+
+IN_VIEW = """(...names) => names.filter((name) => {
+  const node = document.querySelector(name), box = node.getBoundingClientRect();
+  const x = box.x + box.width / 2, y = box.y + box.height / 2;
+  return node.checkVisibility() && box.height > 0 && box.top >= 0 && box.bottom <= innerHeight
+    && node.contains(document.elementFromPoint(x, y));
+})"""
+KNOBS = ("#sigma-a", "#sigma-z", "#dt", "#clock-offset")
+STATIONS = ["Q forgotten", "R too small", "The ratio is the track", "Size is the claim", "Clocks",
+            "Outliers", "EKF2 beside you"]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def made(sample_log: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Analysis]:
+    request = ComparisonRequest(log=str(sample_log))
+    analysis = run(request)
+    file = tmp_path_factory.mktemp("screen") / "sample.html"
+    file.write_bytes(html_text([(analysis, find(analysis), request)]).encode())
+    return file, analysis
+
+
+@pytest.fixture
+def page(browser: Browser, made: tuple[Path, Analysis]) -> Iterator[Browser]:
+    yield show(browser, made[0])
+    assert browser.complaints() == []
+    assert browser.requests() <= {"file", "data", "blob"}
+
+
+def put(page: Browser, **values: float) -> None:
+    """Knobs, by their names in the page."""
+    ask(page, f"Explore.then((e) => {{ e.set({json.dumps(values)}); }})")
+    settle(page)
+
+
+def text(page: Browser, name: str) -> str:
+    return str(page.ask(f"document.getElementById({json.dumps(name)}).textContent"))
+
+
+def key(page: Browser, name: str) -> None:
+    for kind in ("keyDown", "keyUp"):
+        page.call("Input.dispatchKeyEvent", type=kind, key=name, code=name)
+
+
+# ------------------------------------------------------------------ one screen
+
+
+def test_knobs_innovations_sigmas_and_needle_are_in_view_at_once(page: Browser) -> None:
+    wanted = [*KNOBS, "#innovation-0", "#sigma_p-0", "#sigma_v-0", "#needle-0", "#live"]
+    assert page.ask(f"({IN_VIEW})(...{json.dumps(wanted)})") == wanted
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_on_a_phone_knobs_and_a_plot_stay(
+    browser: Browser, made: tuple[Path, Analysis], share: float
+) -> None:
+    show(browser, made[0], width=390)
+    browser.resize(390, 844)
+    settle(browser)
+    height = browser.ask("document.documentElement.scrollHeight")
+    assert height <= 3 * 844
+    browser.ask(f"scrollTo(0, {share * height})")
+    settle(browser)
+    wanted = [*KNOBS, "#innovation-0"]
+    assert browser.ask(f"({IN_VIEW})(...{json.dumps(wanted)})") == wanted
+    # the tabs choose which one
+    browser.ask("document.getElementById('tab-sigma_v').click()")
+    settle(browser)
+    wanted = [*KNOBS, "#sigma_v-0"]
+    assert browser.ask(f"({IN_VIEW})(...{json.dumps(wanted)})") == wanted
+    assert not browser.ask("document.querySelector('#innovation-0').checkVisibility()")
+    assert browser.complaints() == []
+
+
+def test_what_leaves_an_axis_is_marked_at_its_edge(page: Browser) -> None:
+    put(page, sigmaA=0.002)
+    drawn, low, high = ask(
+        page,
+        "Explore.then((e) => { const r = e.model('innovation-0').y_range;"
+        "const take = (name, ...columns) => {"
+        "const d = e.model(`innovation:${name}-source-0`).data;"
+        "return columns.map((column) => Array.from(d[column])); };"
+        "return [{nu: take('updates', 't', 'nu'), marks: take('beyond', 't', 'y', 'turn')},"
+        "r.start, r.end]; })",
+    )
+    t, nu = map(np.array, drawn["nu"])
+    out = (nu < low) | (nu > high)
+    assert 50 < out.sum() < len(nu)
+    at, y, turn = map(np.array, drawn["marks"])
+    np.testing.assert_array_equal(at, t[out])
+    assert ((y > low) & (y < high)).all()
+    np.testing.assert_array_equal(turn > 0.0, nu[out] < low)  # those below point down
+
+
+# ------------------------------------------------------------------ everything follows
+
+
+def test_the_words_follow_the_knobs_and_their_cure_was_replayed(
+    page: Browser, made: tuple[Path, Analysis]
+) -> None:
+    analysis = made[1]
+    told = text(page, "live")
+    ours = analysis.main.filters["kf"]
+    assert isinstance(ours, Consistency)
+    assert isinstance(ours.truth, AgainstTruth)
+    assert told.startswith(
+        f"Along the aisle our filter is {length_words(ours.truth.position_rmse_m)} from the truth "
+        "(RMS) and 18 % too modest; EKF2 is 6 cm from the truth and is honest about it."
+    )
+    assert told.split("; EKF2")[0].split("our filter is ")[1] == (
+        find_story(analysis).split("our filter was ")[1].rstrip(".")
+    )
+    put(page, sigmaA=0.002, sigmaZ=0.05)
+    told = text(page, "live")
+    now = Settings(sigma_a_m_s2=0.002, sigma_z_m=0.05)
+    nis = nis_with(analysis, now)
+    assert f"{number_words(nis, 2)} times too sure of itself" in told
+    cure = re.search(r"nearest comes SIGMA_A ([\d.]+) \(mean NIS ([\d,]+) → ([\d.]+)\)", told)
+    assert cure is not None
+    assert cure[2] == number_words(nis, 2)
+    cured = nis_with(analysis, Settings(sigma_a_m_s2=float(cure[1]), sigma_z_m=0.05))
+    assert cure[3] == number_words(cured, 2)
+    assert f"ours {number_words(nis, 2)} (understated" in text(page, "read-0")
+    hand = page.ask("document.querySelector('#needle-0 .hand.ours').style.left")
+    assert hand == "100%"
+
+
+def find_story(analysis: Analysis) -> str:
+    from px4fuse.findings.story import story
+
+    return story(analysis, ())[0]
+
+
+def test_findings_of_the_settings_follow_and_the_others_stay(
+    browser: Browser, sample_log: Path, tmp_path: Path
+) -> None:
+    request = ComparisonRequest(log=str(sample_log), sigma_z_m=1.0)
+    analysis = run(request)
+    findings = find(analysis)
+    assert any(one.id == "sigma_z_large" for one in findings)
+    file = tmp_path / "large.html"
+    file.write_bytes(html_text([(analysis, findings, request)]).encode())
+    show(browser, file)
+    open_view(browser, "recorded")
+    said = "[...document.querySelectorAll('.now-said')].map((one) => one.textContent)"
+    before = browser.ask(said)
+    assert len(before) >= 1
+    assert set(before) == {""}
+    assert "SIGMA_Z 1," in text(browser, "found")
+    put(browser, sigmaZ=0.1)
+    after = browser.ask(said)
+    assert all(one.startswith("The knobs stand elsewhere now: Along the aisle") for one in after)
+    stale = browser.ask(
+        "[...document.querySelectorAll('.stale')].map((one) => one.textContent).join(' ')"
+    )
+    assert "SIGMA_Z" in stale
+    assert "reset its height" not in stale
+    assert browser.complaints() == []
+
+
+def test_ekf2s_knobs_move_its_position_and_its_sigma(
+    page: Browser, made: tuple[Path, Analysis]
+) -> None:
+    analysis = made[1]
+    model = analysis.ekf2_model
+    assert not isinstance(model, Unavailable)
+    page.ask("location.hash = '#EKF2_EVP_NOISE=0.4&EKF2_EV_DELAY=100&axis=north&view=track'")
+    settle(page)
+    (done,) = replay_settings(model, [{"EKF2_EVP_NOISE": 0.4, "EKF2_EV_DELAY": 100.0}])
+    rows = within(done.updates, analysis.segment)
+    times = rows.index.to_numpy()
+    for view, name, column, expected in (
+        ("track", "position:state", "p",
+         np.interp(times, done.published.index, done.published["north_m"])),
+        ("track", "velocity:state", "v",
+         np.interp(times, done.published.index, done.published["north_m_s"])),
+        ("filter", "sigma_p:variance", "sp", np.sqrt(rows["position_variance_north_m2"])),
+        ("filter", "sigma_v:variance", "sv", np.sqrt(rows["velocity_variance_north_m2_s2"])),
+    ):  # fmt: skip
+        open_view(page, view)
+        drawn = ask(
+            page, f"Explore.then((e) => Array.from(e.model('{name}-source-0').data.{column}))"
+        )
+        np.testing.assert_allclose(drawn, expected, rtol=0.0, atol=3e-3)
+    result = next(one for one in analysis.axes.values() if one.axis.name == "north")
+    ours = replay(result.axis, analysis.settings)
+    shown = page.ask(
+        "[...document.querySelectorAll('#tables tbody tr')].map((row) =>"
+        "[row.cells[0].textContent, row.cells[1].textContent])"
+    )
+    # between ours and this EKF2, no longer the logged one
+    from px4fuse.filter.kalman import state_at
+
+    position, _ = state_at(ours, times)
+    apart = position - np.interp(times, done.published.index, done.published["north_m"])
+    told = float(dict(shown)["Position: RMS to EKF2"].split()[0])
+    assert told == pytest.approx(np.sqrt(np.nanmean(apart**2)), abs=2e-3)
+    address = page.ask("location.hash")
+    assert "EKF2_EVP_NOISE=0.4" in address
+    assert "EKF2_EV_DELAY=100" in address
+
+
+def test_the_address_restores_every_knob(page: Browser, made: tuple[Path, Analysis]) -> None:
+    wanted = (
+        "#axis=east&input=zero&sigma-a=0.7&sigma-z=0.07&dt=0.05&clock-offset=-0.1"
+        "&EKF2_EVP_NOISE=0.05&EKF2_EV_DELAY=50&EKF2_EVP_GATE=3&view=step&measurement=17"
+    )
+    page.ask(f"location.hash = {json.dumps(wanted)}")
+    settle(page)
+    address = page.ask("location.hash")
+    show(page, made[0])  # anew
+    page.ask(f"location.hash = {json.dumps(address)}")
+    settle(page)
+    assert page.ask("location.hash") == address
+    assert {*wanted[1:].split("&")} == {*address[1:].split("&")}
+    assert page.ask("document.getElementById('sigma-z-value').value") == "0.07"
+    assert page.ask("document.querySelector('[name=input][value=zero]').checked")
+    assert text(page, "EKF2_EVP_GATE-value") == "3 SD"
+    assert text(page, "now-0").startswith("Measurement 17 of")
+    page.ask("location.hash = '#EKF2_EVP_NOISE=0.123&view=nowhere'")
+    settle(page)
+    said = text(page, "said")
+    assert said == "The address has no usable EKF2_EVP_NOISE, view: left as it was."
+
+
+# ------------------------------------------------------------------ the step
+
+
+def test_the_ellipse_is_the_replays_p_at_every_step(
+    page: Browser, made: tuple[Path, Analysis]
+) -> None:
+    open_view(page, "step")
+    shown = ask(
+        page,
+        "Explore.then((e) => { const run = e.runs[0].run;"
+        "return Step.moments(run).map((one) => { const s = Step.state(run, one);"
+        "const {p, v} = Step.ellipse(s); return [one.i, one.u, one.updated, s.slice(0, 2),"
+        "Array.from(p), Array.from(v)]; }); })",
+    )
+    done = made[1].main.replay
+    steps, updates = done.steps, done.updates
+    columns = ["position_variance_m2", "covariance_m2_s", "velocity_variance_m2_s2"]
+    posterior = steps[columns].to_numpy()
+    assert len(shown) == len(steps) + len(updates)
+    place = {time: i for i, time in enumerate(updates.index)}
+    for i, u, updated, mean, p, v in shown:
+        # of points even around 2σ, the mean square is twice the covariance
+        x = np.array([p[:-1], v[:-1]]) - np.array(mean)[:, None]
+        (a, b), (_, d) = x @ x.T / x.shape[1] / 2.0
+        if u >= 0 and not updated:
+            row = updates.iloc[place[updates.index[u]]]
+            assert a == pytest.approx(row["prior_position_variance_m2"], abs=1e-9)
+            assert mean[0] == pytest.approx(row["measurement_m"] - row["innovation_m"], abs=1e-9)
+        else:
+            np.testing.assert_allclose([a, b, d], posterior[i], rtol=0.0, atol=1e-9)
+            assert mean[0] == pytest.approx(steps["position_m"].iloc[i], abs=1e-9)
+
+
+def test_one_step_is_drawn_and_its_equations_hold(page: Browser) -> None:
+    open_view(page, "step")
+    ask(page, "Explore.then((e) => { e.stepper.go(40); })")
+    settle(page)
+    rows = page.ask(
+        "[...document.querySelectorAll('#numbers-0 tr')].map((row) => [row.cells[1].textContent,"
+        "row.className])"
+    )
+    numbers = {
+        name: [float(word) for word in re.findall(r"-?\d+\.?\d*(?:e-?\d+)?", line.split("= [")[-1])]
+        for name in ("P⁺", "F ", "Q ", "P⁻")
+        for line, _ in rows[:7]
+        if line.startswith(name)
+    }
+    dt = numbers["F "][1]
+    f = np.array([[1.0, dt], [0.0, 1.0]])
+
+    def matrix(name: str) -> Any:
+        a, b, c, d = numbers[name][:4]
+        return np.array([[a, b], [c, d]])
+
+    np.testing.assert_allclose(
+        f @ matrix("P⁺") @ f.T + matrix("Q "), matrix("P⁻"), rtol=0.0, atol=3e-5
+    )
+    # the update is what is lit
+    assert [line.split(" ")[0] for line, lit in rows if lit][:2] == ["z", "ν"]
+    band = ask(
+        page,
+        "Explore.then((e) => { const plot = e.model('step-0');"
+        "const band = plot.center.find((one) => one.name === 'band');"
+        "return [band.visible, band.left, band.right, plot.renderers.length]; })",
+    )
+    z = float(re.search(r"z = (-?[\d.]+) m", rows[7][0])[1])  # type: ignore[index]
+    assert band[0]
+    assert band[1:3] == pytest.approx([z - 0.2, z + 0.2], abs=1e-4)
+
+
+def test_space_plays_and_pauses(page: Browser) -> None:
+    page.ask("document.activeElement.blur()")
+    for _ in range(2):
+        page.call("Input.dispatchKeyEvent", type="keyDown", key=" ", text=" ")
+        settle(page)
+        assert text(page, "play-0") in ("Play", "Pause")
+        if text(page, "play-0") == "Pause":
+            assert page.ask("document.getElementById('now-0').ariaLive") == "off"
+            ask(page, "new Promise((r) => setTimeout(r, 1300))")
+    assert text(page, "play-0") == "Play"
+    at = ask(page, "Explore.then((e) => e.stepper.at())")
+    assert at >= 2
+    ask(page, "new Promise((r) => setTimeout(r, 700))")
+    assert ask(page, "Explore.then((e) => e.stepper.at())") == at
+    page.click("#slower-0")
+    assert not page.ask("document.getElementById('faster-0').disabled")
+
+
+# ------------------------------------------------------------------ the tour
+
+
+def test_the_tour_from_end_to_end(page: Browser, made: tuple[Path, Analysis]) -> None:
+    analysis = made[1]
+    put(page, sigmaA=0.8, sigmaZ=0.2)
+    before = page.ask("location.hash")
+    page.click("#tour-start")
+    seen = []
+    knobs = "Explore.then((e) => [e.settings.sigmaA, e.settings.sigmaZ, e.settings.offset])"
+    for _ in STATIONS:
+        settle(page)
+        a, z, offset = ask(page, knobs)
+        assert page.ask(f"({IN_VIEW})('#sigma-a', '#needle-0').length") == 2
+        seen.append((text(page, "tour-title"), text(page, "tour-sentence"), a, z, offset))
+        assert text(page, "tour-task").startswith("Do: ")
+        assert text(page, "tour-see").startswith("See: ")
+        page.click("#tour-next")
+    settle(page)
+    assert [title for title, *_ in seen] == [f"{n + 1} of 7: {t}" for n, t in enumerate(STATIONS)]
+    assert page.ask("document.getElementById('tour').hidden")
+    assert page.ask("location.hash") == before
+    # the numbers are this flight's
+    _, forgotten, a, z, _ = seen[0]
+    assert a == 0.002
+    told = re.search(r"mean NIS goes from ([\d.]+) to ([\d.,]+)\.", forgotten)
+    assert told is not None
+    with_clock = _shifted(analysis, seen[0][4])
+    assert told[2] == number_words(nis_with(with_clock, Settings(a, z)), 2)
+    _, _, a, z, _ = seen[3]
+    size = re.search(r"NIS from ([\d.]+) to ([\d.]+), a ninth", seen[3][1])
+    assert size is not None
+    assert float(size[2]) == pytest.approx(float(size[1]) / 9.0, rel=0.1)
+    assert seen[6][1].startswith("EKF2's mean NIS is 0.86, ours ")
+
+
+def _shifted(analysis: Analysis, offset_s: float) -> Analysis:
+    """The same flight with its stamps corrected."""
+    from px4fuse.analysis import run_comparison
+
+    request = ComparisonRequest(
+        log=str(Path("sample_logs") / analysis.flight.log.name), clock_offset_s=offset_s,
+        start_s=analysis.segment.start_s, end_s=analysis.segment.end_s,
+        heading_deg=analysis.main.axis.heading_deg,
+    )  # fmt: skip
+    made: Any = run_comparison(request, flight=analysis.flight)
+    return made  # type: ignore[no-any-return]
+
+
+def test_the_tour_ends_by_escape_and_its_stations_can_be_gone_back(page: Browser) -> None:
+    page.click("#tour-start")
+    settle(page)
+    assert page.ask("document.getElementById('tour-back').disabled")
+    page.click("#tour-next")
+    page.click("#tour-back")
+    assert text(page, "tour-title") == "1 of 7: Q forgotten"
+    page.ask(
+        "document.getElementById('tour').dispatchEvent("
+        "new KeyboardEvent('keydown', {key: 'Escape'}))"
+    )
+    settle(page)
+    assert page.ask("document.getElementById('tour').hidden")
+    assert page.ask("document.getElementById('sigma-a-value').value") == "0.5"
+
+
+# ------------------------------------------------------------------ everybody
+
+
+def test_by_keyboard_alone(page: Browser) -> None:
+    page.ask("document.getElementById('tab-filter').focus()")
+    key(page, "ArrowRight")
+    settle(page)
+    assert page.ask("document.activeElement.id") == "tab-track"
+    assert page.ask("document.querySelector('#position-0').checkVisibility()")
+    assert not page.ask("document.querySelector('#innovation-0').checkVisibility()")
+    key(page, "End")
+    settle(page)
+    assert page.ask("document.querySelector('#view-recorded').checkVisibility()")
+    key(page, "ArrowRight")  # around
+    settle(page)
+    assert page.ask("document.activeElement.ariaSelected") == "true"
+    assert page.ask("document.activeElement.id") == "tab-filter"
+    page.ask("document.getElementById('sigma-z').focus()")
+    before = float(page.ask("document.getElementById('sigma-z-value').value"))
+    for _ in range(5):
+        page.call("Input.dispatchKeyEvent", type="rawKeyDown", key="ArrowRight",
+                  code="ArrowRight", windowsVirtualKeyCode=39)  # fmt: skip
+    settle(page)
+    assert float(page.ask("document.getElementById('sigma-z-value').value")) > before
+
+
+@pytest.mark.parametrize(("width", "height"), [(1400, 900), (390, 844)])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_nothing_serious(
+    browser: Browser, made: tuple[Path, Analysis], width: int, height: int, scheme: str
+) -> None:
+    show(browser, made[0], width=width)
+    browser.resize(width, height)
+    browser.call(
+        "Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}]
+    )
+    try:
+        browser.ask(axe())
+        for view in ("filter", "track", "step", "map", "numbers", "recorded"):
+            open_view(browser, view)
+            assert serious(browser) == [], view
+        browser.ask("document.getElementById('tour-start').click()")
+        settle(browser)
+        assert serious(browser) == []
+    finally:
+        browser.call("Emulation.setEmulatedMedia", features=[])

@@ -1,0 +1,363 @@
+"""Practice: what is drawn, what the page asks and tells, and that every tell-tale is true."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import zlib
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import pytest
+from browser import Browser
+from click.testing import CliRunner, Result
+from explore_tools import ask, axe, serious, settle, show
+from hypothesis import given
+from hypothesis import strategies as st
+
+from px4fuse.assignment.practice import (
+    CHOICES,
+    FLOWN,
+    NOISY_UWB,
+    SIGMA_A_M_S2,
+    TRICKS,
+    Trick,
+    draw,
+    practice_text,
+)
+from px4fuse.cli import cli
+from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.model import AxisComparison, Comparison
+from px4fuse.errors import SettingsError
+from px4fuse.filter.settings import Settings
+from px4fuse.flight import Flight, Unavailable
+from px4fuse.simulation.flights import simulate_flight
+from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.scenario import Scenario
+
+SEED, COUNT = 5, 10
+
+
+# ------------------------------------------------------------------ what is drawn
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 3), st.integers(1, 20))
+def test_a_set_has_every_choice_in_turn(seed: int, level: int, count: int) -> None:
+    rounds = draw(seed, level, count)
+    assert draw(seed, level, count) == rounds
+    assert len(rounds) == count
+    first = Counter(one.tricks[0].choice if one.tricks else "nothing" for one in rounds)
+    assert max(first.values()) - min(first[name] for name in CHOICES) <= 1
+    for one in rounds:
+        assert set(one.right) <= set(CHOICES)
+        assert len(one.right) == max(len(one.tricks), 1)
+        assert len(one.tricks) <= (2 if level == 3 else 1)
+        for trick, size in zip(one.tricks, one.typed, strict=True):
+            assert size.removeprefix("-") == trick.sizes[level - 1]
+            assert trick.either_sign or not size.startswith("-")
+
+
+def test_the_hardest_level_has_two_mistakes_at_times() -> None:
+    rounds = [one for seed in range(5) for one in draw(seed, 3, 12)]
+    two = sum(len(one.tricks) == 2 for one in rounds)
+    assert 0.15 * len(rounds) < two < 0.5 * len(rounds)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [((1, 4, 10), "--level 4: give 1 to 3"), ((1, 1, 21), "--flights 21: give 1 to 20"),
+     ((-1, 1, 1), "--seed -1: give 0 to")],
+)  # fmt: skip
+def test_out_of_range(words: tuple[int, int, int], said: str) -> None:
+    with pytest.raises(SettingsError, match=re.escape(said)):
+        draw(*words)
+
+
+# ------------------------------------------------------------------ the tell-tales
+
+
+def flown(trick: Trick | None, level: int, seed: int) -> Flight:
+    """With one mistake of a level, or without."""
+    size = "" if trick is None else trick.sizes[level - 1]
+    noisy = trick is not None and trick.mistake == NOISY_UWB
+    scenario = Scenario(**FLOWN, length_m=9.0 + 0.7 * seed, heading_deg=50.0 * seed, seed=seed,
+                        sigma_uwb_m=float(size) if noisy else 0.1)  # fmt: skip
+    named = [] if trick is None or noisy else [f"{trick.mistake}={size}"]
+    return simulate_flight(scenario, parse(named))
+
+
+def judged(flight: Flight, **settings: float) -> Comparison:
+    return compare(flight, Settings(**({"sigma_a_m_s2": SIGMA_A_M_S2} | settings)))
+
+
+def nis(result: AxisComparison, owner: Any = "kf") -> float:
+    found = result.filters[owner]
+    assert not isinstance(found, Unavailable)
+    return found.nis_mean
+
+
+def verdict(result: AxisComparison, owner: Any = "kf") -> str:
+    found = result.filters[owner]
+    assert not isinstance(found, Unavailable)
+    return found.verdict
+
+
+LEVELS_AND_SEEDS = [(1, 1), (2, 2), (3, 3)]
+
+
+def trick(mistake: str) -> Trick:
+    return next(one for one in TRICKS if one.mistake == mistake)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_nothing_wrong_is_honest(seed: int) -> None:
+    found = judged(flown(None, 1, seed))
+    assert verdict(found.main) == verdict(found.main, "ekf2") == "consistent"
+    assert 0.01 < np.mean(_sigmas(found.main) > 2.0) < 0.09
+
+
+def _sigmas(result: AxisComparison) -> Any:
+    rows = result.replay.updates
+    return np.abs(rows["innovation_m"]) / np.sqrt(rows["innovation_variance_m2"])
+
+
+@pytest.mark.parametrize(("level", "seed"), LEVELS_AND_SEEDS)
+def test_outliers_lie_far_outside_while_the_rest_fits(level: int, seed: int) -> None:
+    found = judged(flown(trick("nlos"), level, seed))
+    far = [np.mean(_sigmas(found.axes[name]) > 4.0) for name in ("north", "east")]
+    assert 0.01 < max(far) < 0.2
+    assert all(np.median(_sigmas(found.axes[name])) < 1.0 for name in ("north", "east"))
+    jumped = judged(flown(trick("jump"), level, seed)).main
+    rows = jumped.replay.updates
+    far = np.flatnonzero(_sigmas(jumped) > 4.0)
+    assert len(far) >= 1
+    assert far[-1] - far[0] < 25  # one burst
+    assert len(set(np.sign(rows["innovation_m"].iloc[far[:2]]))) == 1
+    silent = judged(flown(trick("dropout"), level, seed)).main
+    apart = np.diff(silent.replay.updates.index)
+    assert apart.max() > 4.0
+    steps = silent.replay.steps
+    start = silent.replay.updates.index[apart.argmax()]
+    sigma = np.sqrt(steps["position_variance_m2"])
+    assert sigma.loc[start : start + apart.max() - 0.01].max() > 2.0 * sigma.median()
+
+
+@pytest.mark.parametrize(("level", "seed"), LEVELS_AND_SEEDS)
+def test_the_clock_knob_undoes_a_clock(level: int, seed: int) -> None:
+    one = trick("clock-offset")
+    flight = flown(one, level, seed)
+    late_s = float(one.sizes[level - 1].removesuffix("ms")) / 1e3
+    wrong, right = judged(flight), judged(flight, clock_offset_s=-late_s)
+    assert nis(wrong.main) > 1.25 * nis(right.main)
+    assert verdict(wrong.main) == "variance understated"
+    assert verdict(right.main) == "consistent"
+
+
+@pytest.mark.parametrize(("level", "seed"), LEVELS_AND_SEEDS)
+def test_no_clock_knob_undoes_a_turned_frame(level: int, seed: int) -> None:
+    flight = flown(trick("yaw"), level, seed)
+    for offset_s in (-0.4, -0.2, 0.0, 0.2, 0.4):
+        found = judged(flight, clock_offset_s=offset_s)
+        worst = max(nis(found.axes[name]) for name in ("north", "east"))
+        assert worst > 1.5
+
+
+@pytest.mark.parametrize(("level", "seed"), LEVELS_AND_SEEDS)
+def test_each_noise_is_cured_by_its_own_knob(level: int, seed: int) -> None:
+    noisy = flown(trick(NOISY_UWB), level, seed)
+    assert nis(judged(noisy).main) > 2.0
+    cured = judged(noisy, sigma_z_m=float(trick(NOISY_UWB).sizes[level - 1]))
+    assert verdict(cured.main) == "consistent"
+    shaken = flown(trick("vibration"), level, seed)
+    before = judged(shaken).main
+    assert nis(before) > 1.5
+    assert _lag1(before) > 0.2  # they follow each other
+    size = float(trick("vibration").sizes[level - 1])
+    after = judged(shaken, sigma_a_m_s2=size).main
+    assert verdict(after) == "consistent"
+    wrong = judged(shaken, sigma_z_m=0.1 * np.sqrt(nis(before))).main
+    assert _lag1(wrong) > 0.2  # a larger SIGMA_Z leaves their order
+    theirs = judged(flown(trick("ekf2-noise"), level, seed)).main
+    assert verdict(theirs) == "consistent"
+    assert nis(theirs, "ekf2") > 2.0
+
+
+def _lag1(result: AxisComparison) -> float:
+    found = result.filters["kf"]
+    assert not isinstance(found, Unavailable)
+    return found.lag1_autocorrelation
+
+
+@pytest.mark.parametrize(("level", "seed"), LEVELS_AND_SEEDS)
+def test_a_small_gate_rejects_what_fits_ours(level: int, seed: int) -> None:
+    found = judged(flown(trick("ekf2-gate"), level, seed)).main
+    rows = found.ekf2_innovations
+    assert not isinstance(rows, Unavailable)
+    assert (rows["rejected"] > 0).mean() > 0.15
+    assert verdict(found) == "consistent"
+    assert np.mean(_sigmas(found) > 2.0) < 0.1
+
+
+# ------------------------------------------------------------------ the page
+
+
+@pytest.fixture(scope="module")
+def quiz(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("practice") / "quiz.html"
+    file.write_bytes(practice_text(SEED, 1, COUNT).encode())
+    return file
+
+
+def keys(file: Path) -> list[dict[str, Any]]:
+    packed = re.findall(r'id="key-\d+">([^<]+)<', file.read_text(encoding="utf-8"))
+    return [json.loads(zlib.decompress(base64.b64decode(text))) for text in packed]
+
+
+def test_nobody_reads_the_answers_by_chance(quiz: Path) -> None:
+    source = quiz.read_text(encoding="utf-8")
+    told = keys(quiz)
+    assert [one["right"] for one in told] == [one.right for one in draw(SEED, 1, COUNT)]
+    for content in re.findall(r'id="content-\d+">([^<]+)<', source):
+        flight = json.loads(content)["flights"][0]
+        assert flight["findings"] == flight["story"] == []
+        assert "mistake" not in content
+        assert "px4fuse compare 'flight" in flight["command"]["bare"]
+    for one in told:
+        assert one["story"]
+        for made in one["made"]:
+            assert made["what"] not in source
+            assert made["tell"] not in source
+
+
+def choose(page: Browser, *names: str) -> None:
+    for name in names:
+        page.click(f"[name=choice][value={name}]")
+    page.click("#quiz-check")
+    ready(page)
+
+
+def ready(page: Browser) -> None:
+    """Until the page that loads itself anew is there."""
+    ask(page, "new Promise((r) => setTimeout(r, 300))")
+    for _ in range(100):
+        if page.ask(
+            "typeof Explore !== 'undefined' && document.querySelector('#tables table') !== null"
+            " && document.getElementById('quiz-title').textContent !== ''"
+        ):
+            break
+        ask(page, "new Promise((r) => setTimeout(r, 100))")
+    ask(page, "Explore.then(() => 1)")
+    settle(page)
+
+
+def said(page: Browser, name: str) -> str:
+    return str(page.ask(f"document.getElementById({json.dumps(name)}).textContent"))
+
+
+def test_ten_flights_with_right_and_wrong_answers(browser: Browser, quiz: Path) -> None:
+    page, told = show(browser, quiz), keys(quiz)
+    points = 0
+    for number, key in enumerate(told):
+        assert said(page, "quiz-title") == f"Flight {number + 1} of 10"
+        assert "truth" not in said(page, "live")
+        assert said(page, "found") == "Not told yet."
+        assert page.ask("document.getElementById('quiz-told').textContent") == ""
+        if number == 0:
+            page.click("#quiz-check")
+            assert said(page, "quiz-said") == "Choose at least one."
+        right = number % 3 != 1
+        wrong = next(name for name in CHOICES if name not in key["right"])
+        choose(page, *(key["right"] if right else [wrong]))
+        points += right
+        answer = " and ".join(key["right"])
+        assert said(page, "quiz-said") == ("Right." if right else f"Not so. It was: {answer}.")
+        for made in key["made"]:
+            assert made["what"] in said(page, "quiz-told")
+            assert made["tell"] in said(page, "quiz-told")
+        assert f"{points} of {number + 1} right" in said(page, "quiz-score")
+        # now the truth stands beside the filter
+        assert "from the truth" in said(page, "live")
+        assert key["story"][0] in said(page, "found")
+        assert page.ask("[...document.querySelectorAll('[name=choice]')].every((b) => b.disabled)")
+        if number < 9:
+            page.click("#quiz-next")
+            ready(page)
+    assert said(page, "quiz-score") == f"{points} of 10 right: the set is done"
+    assert page.ask("document.getElementById('quiz-next').hidden")
+    assert page.complaints() == []
+    assert page.requests() <= {"file", "data", "blob"}
+    page.click("#quiz-again")
+    ready(page)
+    assert said(page, "quiz-title") == "Flight 1 of 10"
+    assert said(page, "quiz-score") == ""
+
+
+def test_half_of_two_is_half_and_nothing_excludes_the_rest(browser: Browser, quiz: Path) -> None:
+    page = show(browser, quiz)
+    page.click("[name=choice][value=gate]")
+    page.click("[name=choice][value=clock]")
+    page.click("[name=choice][value=nothing]")
+    chosen = "[...document.querySelectorAll('[name=choice]:checked')].map((b) => b.value)"
+    assert page.ask(chosen) == ["nothing"]
+    page.click("[name=choice][value=gate]")
+    assert page.ask(chosen) == ["gate"]
+    points = page.ask(
+        "['gate', 'clock gate', 'frame gate', 'clock'].map((answer) =>"
+        "Practice.points(answer, {right: ['clock', 'gate']}))"
+    )
+    assert points == [0.5, 1, 0, 0.5]
+
+
+def test_axe_finds_nothing_serious_in_the_quiz(browser: Browser, quiz: Path) -> None:
+    page = show(browser, quiz)
+    page.ask(axe())
+    assert serious(page) == []
+    choose(page, "gate")
+    page.ask(axe())
+    assert serious(page) == []
+
+
+def test_the_quiz_is_no_wider_than_a_phone(browser: Browser, quiz: Path) -> None:
+    page = show(browser, quiz, width=390)
+    assert page.ask("document.documentElement.scrollWidth") <= 390
+
+
+# ------------------------------------------------------------------ the command
+
+
+def practice(*words: str | Path) -> Result:
+    return CliRunner().invoke(cli, ["practice", *map(str, words)])
+
+
+def test_the_command_writes_one_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[str] = []
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(click, "launch", opened.append)
+    done = practice("--seed", "3", "--flights", "1")
+    assert done.exit_code == 0, done.output
+    page = tmp_path / "reports" / "practice_3.html"
+    assert [file for file in tmp_path.rglob("*") if file.is_file()] == [page]
+    (told,), (drawn,) = keys(page), draw(3, 1, 1)
+    assert told["right"] == drawn.right
+    assert opened == []  # nobody sits there
+    done = practice("--seed", "3", "--flights", "1", "--open", "-o", "a.html")
+    assert opened == [str(tmp_path / "a.html")]
+
+
+@pytest.mark.parametrize(
+    ("words", "wanted"),
+    [(["--level", "4"], "4 is not in the range"), (["-o", "a.pdf"], "ends in .html"),
+     (["--flights", "0"], "0 is not in the range"), (["--seed", "-1"], "--seed -1: give 0")],
+)  # fmt: skip
+def test_bad_input_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], wanted: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = practice(*words)
+    assert done.exit_code != 0
+    assert wanted in f"{done.output}{done.exception}"
+    assert list(tmp_path.iterdir()) == []
