@@ -12,18 +12,21 @@ import sys
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 import pandas as pd
 from matplotlib import pyplot
+from scipy.interpolate import CubicSpline
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.append(str(ROOT / "tests"))
+sys.path += [str(ROOT / "tests"), str(ROOT / "tests" / "studies")]
 
 from exchange import replace  # noqa: E402
 from flights import aisle_flight, unexplained, with_noises  # noqa: E402
+from source_errors import coloured, held, laid_over, two_levels, white  # noqa: E402
 from test_aids import aid_log, outage_free, steps  # noqa: E402
 from test_findings import FAULTS  # noqa: E402
 from test_heading import made as turned  # noqa: E402
@@ -37,10 +40,13 @@ from px4fuse.ekf2.aids import judge_aids  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402
 from px4fuse.findings import Finding, find, find_aids, find_loop  # noqa: E402
 from px4fuse.findings.causes import CONSEQUENCES, NAMES, RECORDING, SETTINGS  # noqa: E402
+from px4fuse.flight import POSITION_COLUMNS  # noqa: E402
 from px4fuse.simulation.flights import simulate_flight  # noqa: E402
 from px4fuse.simulation.mistakes import parse  # noqa: E402
 from px4fuse.simulation.scenario import Scenario  # noqa: E402
 
+slow, louder = partial(coloured, tau_s=0.5, share=1.0), partial(two_levels, factor=3.0)
+UNEQUAL_M = (0.05, 0.2, 0.1)
 MEANINGS = tomllib.loads(Path(__file__).with_name("meanings.toml").read_text(encoding="utf-8"))
 FINDINGS = ROOT / "px4fuse" / "findings"
 # What `px4fuse simulate` is told, with the settings of the comparison, to show a finding
@@ -90,6 +96,13 @@ def examples() -> dict[str, Example]:
         compared = f", compared with `{' '.join(options)}`" if options else ""
         found = [one for one in find(analysis) if one.id == name]
         keep(found, f"`{words}`{compared}", analysis)
+    for model in (slow, partial(held, share=0.2), partial(white, sigma=UNEQUAL_M), louder):
+        flight = simulate_flight(Scenario(passes=4, seed=2, ekf2=False))
+        truth = flight.truth.samples[POSITION_COLUMNS].dropna()
+        known = CubicSpline(truth.index.to_numpy(), truth.to_numpy())
+        analysis = explain(compare(laid_over(flight, known, model, 10.0, 2), Settings()))
+        found = [one for one in find(analysis) if one.id.startswith("source_")]
+        keep(found, "errors of `tests/studies/source_errors.py` on a simulated flight", analysis)
     for options, words in (
         ({"source": "sample_logs/loop_vio.ulg", "position_drift_m": 0.3}, "--drift 0.3"),
         ({"source": "sample_logs/aisle_uwb.ulg:ekf2"}, ""),

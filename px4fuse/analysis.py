@@ -38,6 +38,7 @@ from px4fuse.ekf2_parameters import check
 from px4fuse.errors import LogError, MissingDataError, SettingsError
 from px4fuse.filter.causes import AFTER_STEP_S, Explained, explained
 from px4fuse.filter.clock import ClockOffset
+from px4fuse.filter.coloured import Coloured, coloured
 from px4fuse.filter.heading import HeadingError
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Axis
@@ -53,6 +54,8 @@ if TYPE_CHECKING:
 
 # Noises that the report states: those of a source once. Each axis by itself is for `px4fuse tune`
 REPORTED = (HORIZONTAL, "down")
+# Gain of a low pass below which no slow error is looked for; clean flights have 0 to 2
+WORTH_A_LOOK_NATS = 5.0
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -114,6 +117,20 @@ class Analysis(Comparison):
             near = (time_s >= jump.time_s) & (time_s < jump.time_s + AFTER_STEP_S)
             left_out = np.union1d(left_out, time_s[near])
         return smoothing(axes, self.settings, outlier_time_s=left_out, **noises)
+
+    @cached_property
+    def coloured(self) -> Coloured | Unavailable:
+        """A slow error of the source, where something makes successive errors hang together."""
+        found, smooth = self._horizontally(), self.smoothing
+        if isinstance(found, Unavailable):
+            return found
+        if isinstance(smooth, Unavailable):
+            return smooth
+        if smooth.gain_nats < WORTH_A_LOOK_NATS:
+            return Unavailable("slow errors of the source", "its errors do not hang together", "")
+        axes, left_out, noises = found
+        del noises["clock_offset_s"]
+        return coloured(axes, self.settings, outlier_time_s=left_out, lag_s=smooth.lag_s, **noises)
 
     @cached_property
     def aids(self) -> Mapping[str, AidResult] | Unavailable:

@@ -103,7 +103,7 @@ def analysis(
     usual_flight = {"imu": NONE, "attitude": NONE, "positions": (), "streams": {}, "airborne": NONE}
     flown = {**usual_flight, **(flight or {})}
     usual = dict.fromkeys(
-        ("clock", "ekf2_model", "loop", "heading", "explained", "smoothing"), NONE
+        ("clock", "ekf2_model", "loop", "heading", "explained", "smoothing", "coloured"), NONE
     )
     by_name = {axis.axis.name: axis for axis in axes}
     return SimpleNamespace(  # type: ignore[return-value]

@@ -33,6 +33,7 @@ from px4fuse.comparison import remedy as remedies
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.whatif import WhatIf
 from px4fuse.filter.causes import Explained
+from px4fuse.filter.coloured import Coloured
 from px4fuse.filter.hypotheses import Estimate
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.smoothing import Smoothing
@@ -41,6 +42,7 @@ from px4fuse.findings import (
     imu,
     source_clock,
     source_intervals,
+    source_noise,
     source_positions,
     source_stamps,
 )
@@ -70,6 +72,20 @@ def at_multiples(multiples: list[int], base_s: float = 0.125, **parts: Any) -> A
 
 def low_pass(gain: float, lag_s: float, **parts: Any) -> Any:
     return analysis(smoothing=Smoothing(0.5, lag_s, gain, 0.1), **parts)
+
+
+def slow(gain: float, lag: float, slow_m: float = 0.1) -> Coloured:
+    return Coloured(tau_s=1.0, slow_m=slow_m, white_m=0.1, gain_nats=gain, lag_nats=lag)
+
+
+def repeating(again: int, count: int, moved_m: float = 5.0) -> Any:
+    """So many of the positions are the one before."""
+    each = np.arange(count + 1.0)
+    each[-again:] = each[-again - 1]
+    return analysis(
+        source=source(samples=positions(np.linspace(10.0, 110.0, count + 1),
+                                        moved_m * each / each.max()))
+    )  # fmt: skip
 
 
 def steps(*sizes: Any, **parts: Any) -> Any:
@@ -153,6 +169,22 @@ EDGES = [
     *((source_positions.smoothing, low_pass(gain, lag_s), expected) for gain, lag_s, expected in (
         (12.0, 0.05, "warning"), (11.9, 0.05, None), (12.0, 0.049, None),
         (12.0, 0.0999, "warning"), (12.0, 0.1, "error"))),
+    # errors that hang together without a lag are slow, not smoothed
+    *((source_positions.smoothing, low_pass(99.0, 1.0, coloured=slow(99.0, lag)), expected)
+      for lag, expected in ((3.9, None), (4.0, "error"))),
+    *((source_noise.slow, analysis(coloured=slow(gain, lag)), expected)
+      for gain, lag, expected in (
+          (8.0, 3.9, "warning"), (7.9, 0.0, None), (99.0, 4.0, None))),
+    *((source_noise.repeats, repeating(again, count), expected) for again, count, expected in (
+        (10, 200, "warning"), (9, 100, None), (10, 201, None), (30, 100, "error"),
+        (29, 100, "warning"))),
+    (source_noise.repeats, repeating(50, 100, moved_m=0.5), None),
+    *((source_noise.detect, analysis(coloured=slow(99.0, 0.0), **parts), None)
+      for parts in (ODOMETRY, MADE_OF_EKF2)),
+    (JUMPS, steps(jump(0.0, 0.9), coloured=slow(0.0, 0.0, 0.2)), None),
+    (JUMPS, steps(jump(0.0, 1.0), coloured=slow(0.0, 0.0, 0.2)), "error"),
+    (SCALE, scaled(0.5, coloured=slow(0.0, 0.0)), None),
+    (SCALE, scaled(0.5, ekf2=ages(20, 20)), None),
     (source_positions.detect, low_pass(99.0, 1.0, **ODOMETRY), None),
     (source_positions.detect, low_pass(99.0, 1.0, **MADE_OF_EKF2), None),
     *((JUMPS, steps(jump(0.0, size), jump(0.1, 0.0)), expected) for size, expected in (

@@ -15,6 +15,7 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.causes import AFTER_STEP_S, Explained
+from px4fuse.filter.coloured import Coloured
 from px4fuse.filter.signals import within
 from px4fuse.filter.smoothing import Smoothing
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -26,9 +27,11 @@ from px4fuse.plain import factor_words
 
 MOTION_RANGE_M = 0.5  # 5 to 95 %; a hovering drone with 0.1 m UWB stays below
 GAIN_NATS = 12.0  # a likelihood ratio of 160,000; clean flights have 0 to 2
+LAG_NATS = 4.0  # earlier stamps e⁴ times as likely; slow errors that do not lag have 0 to 0.1
 LAG_S = 0.05  # at 1 m/s half of a good UWB's noise
 LAG_ERROR_S = 0.10  # at 1 m/s a good UWB's noise
 JUMP_M = 0.2  # twice a good UWB's noise
+WANDERS = 5.0  # of the slow error's σ; its difference over a time has √2
 JUMP_ERROR_M = 0.5  # no longer the same place
 SCALE = 0.12  # of the distance; flights of PX4's simulation are within 0.11
 SCALE_ERROR = 0.15  # of the distance: a metre in seven
@@ -60,7 +63,9 @@ def low_pass(analysis: Analysis) -> Smoothing | None:
         return None
     if not isinstance(found, Smoothing) or found.gain_nats < GAIN_NATS or found.lag_s < LAG_S:
         return None
-    return found
+    slow = analysis.coloured
+    # errors that hang together without a lag are slow, not smoothed
+    return None if isinstance(slow, Coloured) and slow.lag_nats < LAG_NATS else found
 
 
 def smoothing(analysis: Analysis) -> Found:
@@ -87,7 +92,10 @@ def jumps(analysis: Analysis) -> Found:
     # a moving vehicle's positions jump where the stamps do
     if not isinstance(found, Explained) or any(arrivals(analysis)):
         return
-    large = [jump for jump in found.jumps if jump.size_m >= JUMP_M]
+    slow = analysis.coloured
+    # a slow error wanders by some of its σ within seconds
+    least = JUMP_M if isinstance(slow, Unavailable) else max(JUMP_M, WANDERS * slow.slow_m)
+    large = [jump for jump in found.jumps if jump.size_m >= least]
     if large:
         largest = max(large, key=lambda jump: jump.size_m)
         size, at_s, sigma = largest.size_m, largest.time_s, max(s.sigma for s in largest.step_m)
@@ -110,8 +118,10 @@ def scale(analysis: Analysis) -> Found:
     imu, found = analysis.flight.imu, analysis.explained
     if not isinstance(imu, pd.DataFrame) or too_slow(imu, MIN_IMU_RATE_HZ):
         return
-    # a low pass takes from the motion as well
+    # a low pass takes from the motion as well, and a slow error moves with it by chance
     if not isinstance(found, Explained) or low_pass(analysis) is not None:
+        return
+    if not isinstance(analysis.coloured, Unavailable) or any(arrivals(analysis)):
         return
     off, sigma = found.scale.value, found.scale.sigma
     if abs(off) >= max(SCALE, SCALE_SIGMAS * sigma):

@@ -1,0 +1,158 @@
+"""What the noise of positions is like where it is not white, equal and the same all the time.
+
+Neither filter has a state for it: R describes white noise of one size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from itertools import pairwise
+
+import numpy as np
+
+from px4fuse.analysis import Analysis
+from px4fuse.filter.coloured import Coloured
+from px4fuse.filter.likelihood import innovations, preintegrate
+from px4fuse.filter.signals import within
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, tune
+from px4fuse.findings.model import Found, error, warning
+from px4fuse.findings.source_positions import LAG_NATS, MOTION_RANGE_M, motion_range_m
+from px4fuse.flight import POSITION_COLUMNS, Unavailable
+
+COLOURED_NATS = 8.0  # a likelihood ratio of 3,000 for two more numbers; clean flights have 0
+REPEATS = 0.05  # of the positions
+REPEATS_ERROR = 0.3  # of the positions: no longer the rate that it seems
+MIN_REPEATS = 10
+UNEQUAL = 1.5  # times in σ, the larger axis over the smaller
+UNEQUAL_NIS = 1.7  # times in NIS before the noises of each axis are sought
+LEVELS = 2.0  # times in σ, the noisier part over the quieter
+LEVELS_ERROR = 4.0  # times in σ
+WINDOWS, MIN_WINDOW = 12, 25  # of the flight, and measurements in each
+
+
+def detect(analysis: Analysis) -> Found:
+    """All of them; of odometry and of what was made of EKF2's output nothing can be said."""
+    if analysis.source.orientation is not None or analysis.source.origin.reconstructed:
+        return
+    yield from repeats(analysis)
+    yield from slow(analysis)
+    yield from unequal(analysis)
+    yield from levels(analysis)
+
+
+def slow(analysis: Analysis) -> Found:
+    """Errors that hang together without a lag."""
+    found = analysis.coloured
+    if not isinstance(found, Coloured) or found.gain_nats < COLOURED_NATS:
+        return
+    if found.lag_nats >= LAG_NATS:
+        return  # smoothed
+    yield warning(
+        "source_coloured",
+        f"The errors of {analysis.source.name} hang together over about {found.tau_s:.1g} s",
+        f": a slow part of about {found.slow_m:.2g} m beside white noise of {found.white_m:.2g} m. "
+        "Both filters take each error for new: they follow the slow part, which shows in no "
+        "innovation, and claim to be better than they are.",
+        "No SIGMA_Z and no noise of EKF2 describes both parts: do not lower it to the white part. "
+        "Look for what is slow (reflections, geometry of the anchors, a filter in the sender), or "
+        "feed the filters fewer positions, further apart than that time.",
+        asdict(found),
+    )
+
+
+def repeats(analysis: Analysis) -> Found:
+    """Positions that are the one before, sent again, while the vehicle moves."""
+    if motion_range_m(analysis) < MOTION_RANGE_M:
+        return
+    sent = within(analysis.source.samples, analysis.segment)[POSITION_COLUMNS].dropna().to_numpy()
+    again = np.all(np.diff(sent, axis=0) == 0.0, axis=1)
+    count, share = int(again.sum()), float(again.mean()) if len(again) else 0.0
+    if count < MIN_REPEATS or share < REPEATS:
+        return
+    yield (error if share >= REPEATS_ERROR else warning)(
+        "source_repeats",
+        f"{share:.0%} of the positions of {analysis.source.name} are the one before, sent again",
+        f" ({count} of {len(again)}): the source holds a position until it has another. Each "
+        "repetition counts as a new measurement, with a time at which it was not measured.",
+        "Send each position once, with the time at which it was measured.",
+        {"count": count, "share": share},
+    )
+
+
+def unequal(analysis: Analysis) -> Found:
+    """North and east with noises of different size."""
+    pair = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
+    statements = [axis.filters["kf"] for axis in pair]
+    nis = [one.nis_mean for one in statements if not isinstance(one, Unavailable)]
+    if len(nis) < 2 or max(nis) < UNEQUAL_NIS * min(nis):
+        return
+    tuned = [
+        found
+        for axis in pair
+        for found in tune((axis.axis,), analysis.settings, (axis.axis.name,)).values()
+        if isinstance(found, AxisTuning)
+    ]
+    sizes = [(one.sigma_z.value, one.sigma_z.low, one.sigma_z.high, one.name) for one in tuned]
+    known = sorted((s, low, high, name) for s, low, high, name in sizes if s and low and high)
+    if len(known) < 2:
+        return
+    (small, _, small_high, less), (large, large_low, _, more) = known
+    if large < UNEQUAL * small or large_low <= small_high:
+        return
+    yield warning(
+        "source_axes_unequal",
+        f"The noise of {analysis.source.name} is {large:.2g} m along {more}, and {small:.2g} m "
+        f"along {less}",
+        ": one SIGMA_Z, or one noise of EKF2, is too large for this or too small for that axis.",
+        f"Judge each axis by itself (--axis {more} --sigma-z {large:.2g}); for EKF2 take the "
+        "larger. Place the anchors so that they surround the flight in both directions.",
+        {f"{less}_sigma_z_m": small, f"{more}_sigma_z_m": large},
+    )
+
+
+def levels(analysis: Analysis) -> Found:
+    """A part of the flight in which the bulk of the innovations is larger."""
+    tuned, chosen = analysis.tuning.get(HORIZONTAL), analysis.settings
+    if tuned is None:
+        return
+    # not known where a third looks like outliers
+    sigma_a: float | None = chosen.sigma_a_m_s2
+    sigma_z: float | None = chosen.sigma_z_m
+    if isinstance(tuned, AxisTuning):
+        sigma_a, sigma_z = tuned.filter_sigma_a.value, tuned.sigma_z.value
+    lines = [analysis.axes[name].axis for name in ("north", "east") if name in analysis.axes]
+    if sigma_a is None or sigma_z is None or len(lines) < 2:
+        return
+    # with the noises that the data ask for: others would make the innovations grow and shrink
+    made = [innovations(preintegrate(line, chosen), sigma_a, sigma_z) for line in lines]
+    normalised = np.stack([nu / np.sqrt(s) for nu, s in made])
+    time = lines[0].measurement_time_s[-normalised.shape[1] :]
+    if len(time) < WINDOWS * MIN_WINDOW // 2:
+        return
+    count = min(WINDOWS, len(time) // MIN_WINDOW)
+    edges = np.linspace(0, len(time), count + 1).astype(int)
+    # each axis by its own size, so that unequal axes are no change
+    scale = np.median(np.abs(normalised), axis=1, keepdims=True)
+    sizes = np.abs(normalised) / scale
+    sigma = np.array([np.median(sizes[:, low:high]) for low, high in pairwise(edges)])
+    loud = sigma > np.sqrt(sigma.min() * sigma.max())
+    begins = int(np.argmax(loud))
+    ends = begins + int(np.argmin(loud[begins:])) if not loud[begins:].all() else count
+    if loud.sum() != ends - begins or loud.all():
+        return  # no single part
+    quiet = np.ones(len(time), bool)
+    quiet[edges[begins] : edges[ends]] = False
+    ratio = float(np.median(sizes[:, ~quiet]) / np.median(sizes[:, quiet]))
+    if ratio < LEVELS:
+        return
+    start, end = float(time[edges[begins]]), float(time[edges[ends] - 1])
+    yield (error if ratio >= LEVELS_ERROR else warning)(
+        "source_noise_changes",
+        f"{analysis.source.name} is noisier from {start:.0f} s to {end:.0f} s: innovations are "
+        f"{ratio:.1f} times as large as in the rest of the flight",
+        ", most of them and not single ones. No SIGMA_Z fits all of it.",
+        "Look for what changed there (anchors in view, distance, people in between); let the "
+        "sender state its variance for each position, or analyse the parts with --start, --end.",
+        {"ratio": ratio, "first_s": start, "until_s": end},
+        ((start, end),),
+    )
