@@ -37,9 +37,10 @@ DETECTORS = (
 
 
 def analysed(flight: Flight, **span: float) -> Analysis:
-    """A flight with its noises, all that the detectors here need."""
+    """A flight with its noises and its clock, all that the detectors here need."""
     comparison = compare(flight, RIGHT, axes=("north", "east"), **span)
-    return replace(unexplained(comparison), tuning=noises_and_clock(comparison)[0])
+    tuning, clock = noises_and_clock(comparison)
+    return replace(unexplained(comparison), tuning=tuning, clock=clock)
 
 
 @cache

@@ -5,6 +5,7 @@ The limits are written out here, so that one that is changed must be changed her
 
 from __future__ import annotations
 
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -71,7 +72,8 @@ def at_multiples(multiples: list[int], base_s: float = 0.125, **parts: Any) -> A
 
 
 def low_pass(gain: float, lag_s: float, **parts: Any) -> Any:
-    return analysis(smoothing=Smoothing(0.5, lag_s, gain, 0.1), **parts)
+    usual = {"smoothing": Smoothing(0.5, lag_s, gain, 0.1), "clock": late(0.0)}
+    return analysis(**{**usual, **parts})
 
 
 def slow(gain: float, lag: float, slow_m: float = 0.1) -> Coloured:
@@ -94,7 +96,8 @@ def steps(*sizes: Any, **parts: Any) -> Any:
 
 def scaled(value: float, sigma: float = 0.01, imu_hz: float = 49.1, **parts: Any) -> Any:
     found = made(Explained, scale=Estimate(value, sigma), jumps=())
-    return analysis(explained=found, flight={"imu": at_rate(imu_hz)}, **parts)
+    usual = {"explained": found, "flight": {"imu": at_rate(imu_hz)}, "clock": late(0.0)}
+    return analysis(**{**usual, **parts})
 
 
 def outlying(outliers: int, count: int) -> Any:
@@ -197,6 +200,11 @@ EDGES = [
           (0.12, 0.01, "warning"), (0.119, 0.01, None), (0.15, 0.01, "error"),
           (0.149, 0.01, "warning"), (0.1875, 0.0625, "error"), (0.187, 0.0625, None))),
     (SCALE, scaled(0.5, imu_hz=48.9), None),
+    # stamps that could not be judged may be late
+    *((which, of(clock=clock), expected)
+      for which, of in ((SCALE, partial(scaled, 0.5)),
+                        (source_positions.smoothing, partial(low_pass, 99.0, 1.0)))
+      for clock, expected in ((NONE, None), (late(0.0, determinable=False), "error"))),
     (SCALE, scaled(0.5, smoothing=Smoothing(0.5, 1.0, 99.0, 0.1)), None),
     *((source_positions.detect, scaled(0.5, **parts), None) for parts in (ODOMETRY, MADE_OF_EKF2)),
     *((source_positions.outliers, outlying(outliers, count), expected)

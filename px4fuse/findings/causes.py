@@ -132,7 +132,10 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
     "source_scale_wrong": ("errors_larger_than_claimed",),
     "accelerometer_bias": ("errors_larger_than_claimed",),
     # a step of the stamps moves positions of a vehicle that moves
-    "source_clock_changes": ("source_jumps", "ekf2_ev_delay_wrong", "errors_larger_than_claimed"),
+    "source_clock_changes": (
+        "source_jumps", "source_scale_wrong", "source_smoothed", "ekf2_ev_delay_wrong",
+        "errors_larger_than_claimed",
+    ),
     "source_stamps_of_arrival": ("source_clock_changes",),
     "source_clock_offset": (
         "source_stamps_of_arrival", "ekf2_ev_delay_wrong", "errors_larger_than_claimed",

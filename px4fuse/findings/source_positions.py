@@ -15,6 +15,7 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.causes import AFTER_STEP_S, Explained
+from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.coloured import Coloured
 from px4fuse.filter.signals import within
 from px4fuse.filter.smoothing import Smoothing
@@ -61,11 +62,18 @@ def low_pass(analysis: Analysis) -> Smoothing | None:
     # was made of EKF2's own output has EKF2's filter in it
     if source.orientation is not None or source.origin.reconstructed:
         return None
+    if not _clock_known(analysis):
+        return None
     if not isinstance(found, Smoothing) or found.gain_nats < GAIN_NATS or found.lag_s < LAG_S:
         return None
     slow = analysis.coloured
     # errors that hang together without a lag are slow, not smoothed
     return None if isinstance(slow, Coloured) and slow.lag_nats < LAG_NATS else found
+
+
+def _clock_known(analysis: Analysis) -> bool:
+    """Whether the stamps can be judged: late ones look like a lag, or like longer distances."""
+    return isinstance(analysis.clock, ClockOffset) and not any(arrivals(analysis))
 
 
 def smoothing(analysis: Analysis) -> Found:
@@ -121,7 +129,7 @@ def scale(analysis: Analysis) -> Found:
     # a low pass takes from the motion as well, and a slow error moves with it by chance
     if not isinstance(found, Explained) or low_pass(analysis) is not None:
         return
-    if not isinstance(analysis.coloured, Unavailable) or any(arrivals(analysis)):
+    if not isinstance(analysis.coloured, Unavailable) or not _clock_known(analysis):
         return
     off, sigma = found.scale.value, found.scale.sigma
     if abs(off) >= max(SCALE, SCALE_SIGMAS * sigma):
