@@ -276,9 +276,16 @@ def test_ten_flights_with_right_and_wrong_answers(browser: Browser, quiz: Path) 
         answer = " and ".join(key["right"])
         assert said(page, "quiz-said") == ("Right." if right else f"Not so. It was: {answer}.")
         for made in key["made"]:
+            assert (made["span"] is not None) == (key["right"] == ["source"])
             assert made["what"] in said(page, "quiz-told")
             assert made["tell"] in said(page, "quiz-told")
         assert f"{points} of {number + 1} right" in said(page, "quiz-score")
+        for made in key["made"]:
+            page.click("#quiz-told button")
+            settle(page)
+            low, high = ask(page, "Explore.then((e) => [e.timeRange.start, e.timeRange.end])")
+            if made["span"] is not None:
+                assert low < made["span"][0] < high < low + 25.0
         # now the truth stands beside the filter
         assert "from the truth" in said(page, "live")
         assert key["story"][0] in said(page, "found")

@@ -20,7 +20,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.explore.data import flight_data
 from px4fuse.explore.packing import Packer
 from px4fuse.explore.page import data_scripts, page_text
-from px4fuse.findings import find
+from px4fuse.findings import Finding, find
 from px4fuse.findings.story import story
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation import flights
@@ -49,6 +49,8 @@ FLOWN: dict[str, Any] = {
     "gyro_bias_sigma_rad_s": 0.0002, "tilt_error_deg": 0.02, "yaw_error_deg": 0.2,
 }  # fmt: skip
 LENGTH_M = (8.0, 12.0)
+# Of a mistake that has its moment, the finding that says when
+MOMENTS = {"nlos": "source_outliers", "jump": "source_jumps", "dropout": "source_gap"}
 NOISY_UWB = "noisy-uwb"  # not a mistake of the log: the filter's SIGMA_Z does not fit
 
 
@@ -264,7 +266,9 @@ def _flown(one: Round, number: int) -> tuple[dict[str, Any], str]:
     data = flight_data(analysis, findings, request, packer, replays=False)
     key = {
         "right": one.right,
-        "made": [_made(trick, size) for trick, size in zip(one.tricks, one.typed, strict=True)],
+        "made": [
+            _made(trick, size, findings) for trick, size in zip(one.tricks, one.typed, strict=True)
+        ],
         "story": list(story(analysis, findings)),
         "findings": data["findings"],
     }
@@ -274,7 +278,11 @@ def _flown(one: Round, number: int) -> tuple[dict[str, Any], str]:
     return data, f'{scripts}\n<script type="text/plain" id="key-{number}">{packed}</script>'
 
 
-def _made(trick: Trick, size: str) -> dict[str, str]:
-    """What was done to the flight, in words, and where it shows."""
+def _made(trick: Trick, size: str, findings: tuple[Finding, ...]) -> dict[str, Any]:
+    """What was done to the flight, in words, and where and when it shows."""
     what = trick.what.format(size=size)
-    return {"choice": trick.choice, "what": what, "tell": trick.tell_tale, "view": trick.view}
+    moments = [one.spans_s[0] for one in findings if one.id == MOMENTS.get(trick.mistake)]
+    return {
+        "choice": trick.choice, "what": what, "tell": trick.tell_tale, "view": trick.view,
+        "span": list(moments[0]) if moments else None,
+    }  # fmt: skip

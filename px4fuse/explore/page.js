@@ -727,7 +727,7 @@ const Explore = (async () => {
   open(view, false);
   fromAddress();
   show();
-  const shared = { recorded: times.recorded, settings, set, show, open, runs, flights, model, command, numbers, timeRange, chosen, stepper, axisOf,
+  const shared = { recorded: times.recorded, look: times.view, settings, set, show, open, runs, flights, model, command, numbers, timeRange, chosen, stepper, axisOf,
     mapOf, round, tried, say, Grid, ekf2Of, view: () => view };
   Tour.start(shared);
   Practice.start(shared);

@@ -72,10 +72,14 @@ const Practice = (() => {
     if (!key.made.length) {
       box.append(make("p", "Nothing was wrong: the innovations lie within ±2√S, one in twenty outside, and follow no order."));
     }
-    for (const { what, tell, view } of key.made) {
+    for (const { what, tell, view, span } of key.made) {
       const line = make("p", `${what} The tell-tale: ${tell} `);
-      const button = make("button", "show me", { type: "button", className: "jump" });
-      button.addEventListener("click", () => page.open(view));
+      const when = span === null ? "all along" : `at ${span[0].toFixed(1)} s`;
+      const button = make("button", `show me (${when})`, { type: "button", className: "jump" });
+      button.addEventListener("click", () => {
+        page.open(view);
+        if (span !== null) page.look(span[0] - 3, span[1] + 3);
+      });
       line.append(button);
       box.append(line);
     }
