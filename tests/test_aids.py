@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from flights import aisle_flight
 from ulog_tools import Log, make_log, seconds_of, stamps, topic
 
 from px4fuse.analysis import AidsAlone, bad_verdicts
+from px4fuse.ekf2 import aids
 from px4fuse.ekf2.aids import AidResult, judge_aids
 from px4fuse.ekf2_parameters import AIDS
 from px4fuse.errors import MissingDataError
@@ -384,3 +386,13 @@ def test_a_rejection_that_is_not_logged_is_beyond_the_gate_and_of_both_axes() ->
         assert np.flatnonzero(frame["rejected"]).tolist() == [20]
     assert isinstance(found["down"], Unavailable)
     assert topics == ("a_topic",)
+
+
+def test_a_gate_of_nothing_is_a_hundredth() -> None:
+    aid = next(one for one in AIDS.values() if one.gate)
+    bare = SimpleNamespace(axes=("x",), samples=pd.DataFrame(), parameters={aid.gate: 0.0})
+    assert aids._gate(aid, bare) == 0.01  # type: ignore[arg-type]
+    bare.parameters = {aid.gate: 3.5}
+    assert aids._gate(aid, bare) == 3.5  # type: ignore[arg-type]
+    bare.parameters = {}
+    assert aids._gate(aid, bare) == aid.default_gate  # type: ignore[arg-type]

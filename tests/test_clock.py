@@ -25,11 +25,13 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
-from scipy.stats import binom, chi2
+from scipy.special import stdtr
+from scipy.stats import binom, chi2, ttest_ind
 
 from px4fuse.arrays import Array
+from px4fuse.comparison import estimates
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.estimates import noises_and_clock
+from px4fuse.comparison.estimates import MIN_PARTS, noises_and_clock
 from px4fuse.filter import clock
 from px4fuse.filter.clock import (
     CHANGE_P,
@@ -522,3 +524,22 @@ def test_a_profile_without_a_minimum_says_nothing_of_its_place() -> None:
     found, sigma = clock._vertex(grid, 8.0 * (grid - 0.13) ** 2)
     assert found == pytest.approx(0.13)
     assert sigma == pytest.approx(0.25)  # of exp(-profile)
+
+
+def test_a_step_between_parts_is_students_t_times_the_places() -> None:
+    """Against scipy's two-sample t, where all parts weigh the same and scatter more than stated."""
+    offset = np.array([0.0, 0.03, -0.02, 0.01, 0.2, 0.24, 0.19, 0.22, 0.2])
+    weight = np.full(len(offset), 1e6)
+    places = range(MIN_PARTS, len(offset) - MIN_PARTS + 1)
+    told = min(ttest_ind(offset[:at], offset[at:]).pvalue for at in places)
+    assert estimates._step_p(offset, weight) == pytest.approx(told * len(places), rel=1e-9)
+    # parts that scatter less than stated count by what is stated: z, with the same freedom
+    sure = np.full(len(offset), 100.0)
+    t = min(
+        -abs(offset[:at].mean() - offset[at:].mean())
+        / np.sqrt(1.0 / sure[:at].sum() + 1.0 / sure[at:].sum())
+        for at in places
+    )
+    assert estimates._step_p(offset, sure) == pytest.approx(
+        min(1.0, 2.0 * stdtr(len(offset) - 2, t) * len(places))
+    )

@@ -32,6 +32,7 @@ from px4fuse.fleet.measures import (
 )
 from px4fuse.fleet.significance import contrast, corrected, spreads
 from px4fuse.flight import Unavailable
+from px4fuse.report import changes as changes_page
 from px4fuse.report.changes import change_line, printed
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
@@ -366,3 +367,17 @@ def test_what_one_side_lacks_is_listed(clean):
     status = {change.path: change.status for change in changes(whole, part).results.numbers}
     assert status["axes.down.filters.kf.nis_mean"] == "only in A"
     assert set(status.values()) == {"only in A", "same"}
+
+
+@pytest.mark.parametrize(
+    ("change", "printed"),
+    [(1.25, True), (1.249, False), (0.8, True), (0.801, False), (1.0, False), (None, False)],
+)
+def test_what_has_no_test_is_printed_where_it_moved_by_a_quarter(
+    change: float | None, printed: bool
+) -> None:
+    one = SimpleNamespace(status="not tested", scale="ratio", change=change)
+    assert changes_page._is_large(one) == printed  # type: ignore[arg-type]
+    for other in ({"status": "within chance"}, {"scale": "difference"}):
+        told = SimpleNamespace(**{**vars(one), "change": 9.0, **other})
+        assert not changes_page._is_large(told)  # type: ignore[arg-type]

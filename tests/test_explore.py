@@ -564,3 +564,14 @@ def test_open_opens_what_is_looked_at(
         assert done.exit_code == 0, done.output
         assert opened == ([] if name is None else [str(tmp_path / name)])
         opened.clear()
+
+
+def test_two_logs_stand_side_by_side(
+    sample_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = explore(sample_log, sample_log, "--start", "20", "--end", "30")
+    assert done.exit_code == 0, done.output
+    (page,) = tmp_path.rglob("*.html")
+    assert page.name == "aisle_uwb_aisle_uwb_start-20_end-30.html"
+    assert 'data-flights="2"' in page.read_text(encoding="utf-8")

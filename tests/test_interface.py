@@ -486,3 +486,9 @@ def test_what_cannot_be_written_is_said(analysis: px4fuse.Analysis, tmp_path: Pa
     with pytest.raises(px4fuse.Px4FuseError, match="does not say what was asked for"):
         px4fuse.report(bare, tmp_path / "x.pdf")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_counts_are_whole_numbers_also_where_some_are_missing(analysis: px4fuse.Analysis) -> None:
+    table = analysis.to_frame()
+    assert str(table["count"].dtype) == "Int64"
+    assert table["count"].notna().any()
