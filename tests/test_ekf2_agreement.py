@@ -95,20 +95,30 @@ def test_when_a_replay_is_believed(
         assert says in reason
 
 
-@pytest.mark.parametrize(("correlation", "good"), [(0.95, True), (0.949, False)])
-def test_a_replay_that_rejects_what_ekf2_rejected_must_agree(
-    correlation: float, good: bool
+@pytest.mark.parametrize("before", [True, False])
+@pytest.mark.parametrize(
+    ("axis", "good"),
+    [
+        (agreeing(0.95), True), (agreeing(0.949), False), (agreeing(s=1.049), True),
+        (agreeing(s=1.051), False), (agreeing(s=0.949), False), (agreeing(published_m=0.29), True),
+        (agreeing(published_m=0.31), False),
+    ],
+)  # fmt: skip
+def test_where_much_is_rejected_the_replay_that_obeys_the_log_decides(
+    axis: AxisAgreement, good: bool, before: bool
 ) -> None:
+    """It refuses what by its own gate agreed by chance, and rescues what parted by chance."""
     one = Agreement(
         north=agreeing(0.5), east=agreeing(0.5), ev_pos={}, samples=50, rejected_share_logged=0.2,
         rejected_share_replayed=0.2, decisions_same=0.9, published_rms_difference_m=0.0,
-        good=True, reason="so far",
+        good=before, reason="so far",
     )  # fmt: skip
-    again = replace(one, ev_pos={"north": agreeing(), "east": agreeing(correlation)})
-    found = with_obedient(one, again)
-    assert found.good is good
-    assert f"the innovations correlate by {correlation:.3f}" in found.reason
-    assert found.reason.startswith("so far; ") is good
+    for axes in ({"north": agreeing(), "east": axis}, {"north": axis, "east": agreeing()}):
+        found = with_obedient(one, replace(one, ev_pos=axes))
+        assert found.good is good
+        assert f"the innovations correlate by {axis.innovation_correlation:.3f}" in found.reason
+        assert f"is {axis.s_ratio_median:.2f} of the logged one" in found.reason
+        assert ("at least 0.95" in found.reason) is not good
 
 
 def test_what_an_axis_is_compared_by() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +13,9 @@ import pytest
 from ekf2_tools import RULES
 from exchange import replace
 from findings_tools import NONE, made
+from msgspec import structs
 
+from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.agreement import along, rms_to_truth
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, delayed_variants, open_model
@@ -31,6 +34,10 @@ from px4fuse.filter.kalman import Replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.flight import STATE_COLUMNS, Ekf2, Flight, Truth, Unavailable
+from px4fuse.readers import read_log
+from px4fuse.simulation.flights import simulate, to_ulog
+from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.scenario import Scenario
 
 
 @pytest.fixture(scope="module")
@@ -307,3 +314,87 @@ def test_samples_that_come_too_late_are_a_note() -> None:
         assert _notes(model, SimpleNamespace(late=0, lost=0)) == []  # type: ignore[arg-type]
         one.late, one.changed = 0, {}
         assert _notes(model, one)[0].startswith("as flown: 2 of 10 samples")  # type: ignore[arg-type]
+
+
+# ------------------------------------------------------------------ where single rejections decide
+
+
+def flown(tmp_path: Path, mistake: str, seed: int) -> Model:
+    """A flight with one of EKF2's parameters wrong, as its log is read."""
+    log = tmp_path / f"{seed}{mistake.partition('=')[2]}.ulg"
+    log.write_bytes(to_ulog(simulate(Scenario(seed=seed), parse([mistake] if mistake else []))))
+    opened = open_model(read_log(log))
+    assert isinstance(opened, Model)
+    return opened
+
+
+@pytest.mark.parametrize(
+    ("mistake", "seed", "changes"),
+    [("ekf2-noise=0.02", 1, {"EKF2_EVP_NOISE": 0.1}),
+     ("ekf2-noise=0.02", 2, {"EKF2_EVP_NOISE": 0.1}), ("ekf2-gate=1", 1, {"EKF2_EVP_GATE": 5.0})],
+)  # fmt: skip
+def test_a_flight_that_rejects_most_tells_what_its_cure_does(
+    tmp_path: Path, mistake: str, seed: int, changes: dict[str, float]
+) -> None:
+    """By its own gate the replay parts from these logs, with EKF2's own rejections it does not."""
+    ill, well = flown(tmp_path, mistake, seed), flown(tmp_path, "", seed)
+    assert ill.agreement.rejected_share_logged > 0.35
+    assert ill.agreement.good
+    (cured,) = found(what_if(ill, [changes])).whatif
+    truly = found(what_if(well, [{}])).logged
+    assert cured.steady
+    assert cured.nis_mean == pytest.approx(truly.nis_mean, rel=0.1)
+    assert cured.rejected_share == pytest.approx(truly.rejected_share, abs=0.03)
+    assert cured.position_rmse_to_truth_m == pytest.approx(truly.position_rmse_to_truth_m, rel=0.15)
+
+
+def test_where_most_would_be_rejected_nothing_is_predicted(model: Model) -> None:
+    chaotic, some, none = found(
+        what_if(
+            model, [{"EKF2_EVP_NOISE": 0.02}, {"EKF2_EVP_NOISE": 0.05}, {"EKF2_EVP_NOISE": 0.2}]
+        )
+    ).whatif
+    assert chaotic.rejected_share > 0.35
+    assert not chaotic.steady
+    assert some.steady
+    assert none.rejected_share <= 0.02
+    assert none.steady
+
+
+def test_a_prediction_that_a_little_noise_changes_is_not_steady(
+    model: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each of the three numbers, just inside what is allowed and just outside."""
+    north = AxisSummary(1.0, (0.9, 1.1), 0.1, 0.1, 0.1)
+    base = Summary(
+        changed={"EKF2_EVP_GATE": 3.0}, north=north, east=north, samples=500, rejected_share=0.2,
+        longest_without_fusion_s=1.0, resets=0,
+    )  # fmt: skip
+    runs: list[tuple[float, int]] = []
+
+    def disturbed(model: object, change: object, sigma_m: float, seed: int) -> None:
+        runs.append((sigma_m, seed))
+
+    def judged(changed: Summary) -> bool:
+        monkeypatch.setattr(whatif, "replay_disturbed", disturbed)
+        monkeypatch.setattr(whatif, "_of_replay", lambda *_: changed)
+        return whatif._steadied(model, base, ((0.0, 1.0),)).steady
+
+    assert judged(base)
+    assert runs == [(0.002, 0), (0.002, 1), (0.002, 2), (0.002, 3)]
+    for field, inside, outside in (
+        ("nis_mean", 1.099, 1.101), ("position_rmse_to_truth_m", 0.1149, 0.1151),
+    ):  # fmt: skip
+        for axis in ("north", "east"):
+            for value, steady in ((inside, True), (outside, False)):
+                other = structs.replace(north, **{field: value})
+                # the error is of both axes together
+                both = {"north": other, "east": other} if "rmse" in field else {axis: other}
+                assert judged(structs.replace(base, **both)) is steady
+    assert judged(structs.replace(base, rejected_share=0.2299))
+    assert not judged(structs.replace(base, rejected_share=0.2301))
+    few, many = (structs.replace(base, rejected_share=share) for share in (0.02, 0.351))
+    runs.clear()
+    assert whatif._steadied(model, few, ()).steady
+    assert not whatif._steadied(model, many, ()).steady
+    assert runs == []  # nothing to try

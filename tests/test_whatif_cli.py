@@ -18,6 +18,7 @@ from px4fuse.cli import cli
 from px4fuse.ekf2.whatif import Summary
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.errors import MissingDataError, Px4FuseError, SettingsError
+from px4fuse.flight import Flight
 from px4fuse.report.document import WhatIfDocument
 from px4fuse.report.pdf import render
 from px4fuse.report.whatif import heads, reading, rows, sweep_heads, sweep_rows
@@ -245,3 +246,19 @@ def test_results_alone_are_not_mixed_with_how_far_it_is(
     assert run(sample_log, "--json", "-").exit_code == 0
     assert run(sample_log).exit_code == 0
     assert alone == [True, False]
+
+
+def test_what_is_chaotic_has_no_numbers(sample_flight: Flight) -> None:
+    request = WhatIfRequest(
+        log=sample_flight.log.name,
+        changes={"EKF2_EVP_NOISE": 0.02},
+        sweep=Sweep("EKF2_EVP_GATE", 1.0, 5.0, 2),
+    )
+    told = run_what_if(request, flight=sample_flight)
+    table = rows(told)
+    assert {line[3] for line in table} == {"chaotic"}
+    assert all("chaotic" not in line[:3] for line in table)
+    assert [line[1] for line in sweep_rows(told)] == ["chaotic", "chaotic"]
+    said = " ".join(reading(told))
+    assert "Chaotic: more than 35% would be rejected, or 2 mm of noise" in said
+    assert "nearest to 1" not in said

@@ -177,6 +177,9 @@ def remedy_words(
     if isinstance(found, Unavailable):
         return f"{capital(setting)}. {not_replayed(found)}", True
     before, (after,) = found.replayed, found.whatif
+    if not after.steady:
+        said = settings_words(changes)
+        return f"{otherwise} What {said} would do is chaotic: single rejections decide.", False
     effect = effect_words(before, after)
     if helps(before, after):
         return f"{capital(setting)}: {effect}.", True

@@ -28,6 +28,8 @@ MAX_PUBLISHED_OFF_M = 0.10
 REJECTING_SHARE = 0.1
 MAX_REJECTED_OFF = 0.05
 MAX_NIS_OFF = 0.25
+# What is published by a filter that rejects most of its samples wanders further
+REJECTING_LOOSER = 3.0
 
 
 def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavailable:
@@ -201,15 +203,31 @@ def _verdict(
 
 
 def with_obedient(agreement: Agreement, obedient: Agreement) -> Agreement:
-    """The verdict where EKF2 rejects much, given a replay that rejects what EKF2 rejected.
+    """The verdict where EKF2 rejects much: of a replay that rejects what EKF2 rejected.
+
+    By its own gate the replay parts from the log where one sample lies on the edge, and each
+    rejection decides the next; that says nothing of the filter.
 
     Parameters
     ----------
     agreement, obedient : Agreement
         Of the replay by its own gate, and of the other.
     """
-    worst = min(axis.innovation_correlation for axis in obedient.ev_pos.values())
-    with_them = f"with EKF2's own rejections the innovations correlate by {worst:.3f}"
-    if worst >= MIN_CORRELATION:
-        return replace(agreement, reason=f"{agreement.reason}; {with_them} or better")
-    return replace(agreement, good=False, reason=f"{with_them} only (at least {MIN_CORRELATION:g})")
+    axes = obedient.ev_pos.values()
+    worst = min(axis.innovation_correlation for axis in axes)
+    ratio = max((axis.s_ratio_median for axis in axes), key=lambda s: abs(s - 1.0))
+    off_m = max(axis.position_rms_difference_m for axis in axes)
+    words = (
+        f"with EKF2's own rejections the innovations correlate by {worst:.3f} or better, their "
+        f"variance is {ratio:.2f} of the logged one, and what is published is {off_m:.2f} m off"
+    )
+    good = (
+        worst >= MIN_CORRELATION
+        and abs(ratio - 1.0) <= MAX_S_OFF
+        and off_m <= MAX_PUBLISHED_OFF_M * REJECTING_LOOSER
+    )
+    allowed = (
+        f" (at least {MIN_CORRELATION:g}, at most {MAX_S_OFF:.0%} off, and at most "
+        f"{MAX_PUBLISHED_OFF_M * REJECTING_LOOSER:g} m)"
+    )
+    return replace(agreement, good=good, reason=words + ("" if good else allowed))

@@ -97,7 +97,7 @@ def open_model(flight: Flight) -> Model | Unavailable:
     if isinstance(agreement, Unavailable):
         return agreement
     share = max(agreement.rejected_share_logged, agreement.rejected_share_replayed)
-    if agreement.good and share > REJECTING_SHARE and np.isfinite(inputs.vision.rejected).any():
+    if share > REJECTING_SHARE and np.isfinite(inputs.vision.rejected).any():
         _, obeyed = replayed(replace(flown, as_logged=True))
         if isinstance(obeyed, Agreement):
             agreement = with_obedient(agreement, obeyed)
@@ -133,6 +133,27 @@ def replay_settings(
     runs = _run_model(model, [Variant({**inputs.settings, **change}) for change in changes])
     replays = (_assemble(inputs, runs, at, change) for at, change in enumerate(changes))
     return tuple(structs.replace(replay, agreement=model.agreement) for replay in replays)
+
+
+def replay_disturbed(
+    model: Model, change: Mapping[str, float], sigma_m: float, seed: int
+) -> Ekf2Replay:
+    """Replay with one setting and noise on every position that EKF2 was sent.
+
+    Parameters
+    ----------
+    model : Model
+    change : mapping
+        As :func:`replay_settings` takes it.
+    sigma_m : float
+        Standard deviation of the noise (m), per axis.
+    seed : int
+    """
+    inputs, vision = model.inputs, model.inputs.vision
+    noise = np.random.default_rng(seed).normal(scale=sigma_m, size=vision.position_m.shape)
+    inputs = replace(inputs, vision=replace(vision, position_m=vision.position_m + noise))
+    runs = run_variants(inputs, [Variant({**inputs.settings, **check(change)})], {})
+    return _assemble(inputs, runs, 0, change)
 
 
 def delayed_variants(

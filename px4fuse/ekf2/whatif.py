@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from msgspec.structs import replace
 
 from px4fuse.arrays import Array
 from px4fuse.display import Shown
 from px4fuse.ekf2.agreement import at_times, judged_from, logged_innovations, rms_to_truth, settled
 from px4fuse.ekf2.inputs import horizontal_resets_s
-from px4fuse.ekf2.model import Model, replay_settings
+from px4fuse.ekf2.model import Model, replay_disturbed, replay_settings
 from px4fuse.ekf2.replay import HORIZONTAL, Agreement, Ekf2Replay, Spans
 from px4fuse.ekf2_parameters import check
 from px4fuse.errors import SettingsError
@@ -34,6 +35,11 @@ NO_TRUTH = Unavailable(
 )
 SWEEP_VALUES = 9
 MAX_SWEEP_VALUES = 200
+# Each rejection decides the next: a prediction is steady where millimetres of noise on positions
+# leave it where it was, and never where most samples are rejected
+DISTURBED_M, DISTURBED_RUNS = 0.002, 4
+FEW_REJECTED, MOST_REJECTED = 0.02, 0.35
+STEADY_NIS, STEADY_REJECTED, STEADY_RMSE = 1.10, 0.03, 1.15
 
 
 class AxisSummary(Record, frozen=True):
@@ -74,6 +80,8 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
         Of horizontal position.
     late, lost : int
         Samples that arrived after the fusion horizon had passed them: fused late, and never.
+    steady : bool
+        False where it is chaotic: single rejections decide, so that its numbers predict nothing.
     """
 
     changed: Mapping[str, float]
@@ -85,6 +93,7 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     resets: Count
     late: Count = 0
     lost: Count = 0
+    steady: bool = True
 
     @property
     def axes(self) -> dict[str, AxisSummary]:
@@ -161,7 +170,7 @@ def what_if(model: Model, settings: Sequence[Mapping[str, float]]) -> WhatIf | U
         agreement=model.agreement,
         logged=_of_log(flight, model.flown, judged),
         replayed=_of_replay(flight, model.flown, judged),
-        whatif=tuple(_of_replay(flight, replay, judged) for replay in replays),
+        whatif=tuple(_steadied(model, _of_replay(flight, r, judged), judged) for r in replays),
         judged=judged,
         notes=tuple(note for replay in replays for note in _notes(model, replay)),
     )
@@ -191,6 +200,27 @@ def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) 
     values = np.geomspace(low, high, count) if low > 0 else np.linspace(low, high, count)
     values[[0, -1]] = low, high
     return [float(value) for value in values]
+
+
+def _steadied(model: Model, found: Summary, judged: Spans) -> Summary:
+    """A prediction, with whether it stays where it is when the positions are disturbed."""
+    if found.rejected_share <= FEW_REJECTED or found.changed == {}:
+        return found
+    if found.rejected_share > MOST_REJECTED:
+        return replace(found, steady=False)
+    every = [found] + [
+        _of_replay(model.flight, replay_disturbed(model, found.changed, DISTURBED_M, seed), judged)
+        for seed in range(DISTURBED_RUNS)
+    ]
+    rmse = [e for one in every if isinstance(e := one.position_rmse_to_truth_m, float)]
+    shares = [one.rejected_share for one in every]
+    steady = (
+        all(max(nis) <= STEADY_NIS * min(nis) for nis in (
+            [one.axes[axis].nis_mean for one in every] for axis in HORIZONTAL))
+        and max(shares) - min(shares) <= STEADY_REJECTED
+        and (not rmse or max(rmse) <= STEADY_RMSE * min(rmse))
+    )  # fmt: skip
+    return replace(found, steady=steady)
 
 
 def _of_replay(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from px4fuse.analysis import Counterfactual
-from px4fuse.ekf2.agreement import REJECTING_SHARE
 from px4fuse.ekf2.replay import HORIZONTAL
-from px4fuse.ekf2.whatif import Summary
+from px4fuse.ekf2.whatif import DISTURBED_M, MOST_REJECTED, Summary
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
@@ -30,6 +29,7 @@ PANEL_POINTS = 60.0
 MAX_TICKS = 10
 WIDE = 5.0  # values that span more are drawn on a logarithmic scale
 Of = Callable[[Summary, str], float | Unavailable]
+CHAOTIC = "chaotic"
 # Of each EKF2 along an axis
 AXIS_ROWS: tuple[tuple[str, Callable[[Summary, str], str]], ...] = (
     ("{}: mean NIS", lambda s, axis: number_words(s.axes[axis].nis_mean)),
@@ -68,11 +68,13 @@ def rows(made_of: Counterfactual) -> list[list[str]]:
     found = made_of.whatif
     every = [found.logged, found.replayed, *(found.whatif[:1] if made_of.changes else ())]
     made = [
-        [label.format(axis), *(cell(summary, axis) for summary in every)]
+        [label.format(axis), *(cell(s, axis) if s.steady else CHAOTIC for s in every)]
         for axis in HORIZONTAL
         for label, cell in AXIS_ROWS
     ]
-    return made + [[label, *map(cell, every)] for label, cell in ROWS]
+    return made + [
+        [label, *(cell(s) if s.steady else CHAOTIC for s in every)] for label, cell in ROWS
+    ]
 
 
 def sweep_heads(made_of: Counterfactual) -> list[str]:
@@ -86,15 +88,21 @@ def sweep_heads(made_of: Counterfactual) -> list[str]:
 def sweep_rows(made_of: Counterfactual) -> list[list[str]]:
     """One row per value of the sweep."""
     name = swept(made_of)
-    nis, _, _, sigma, rmse = (cell for _, cell in AXIS_ROWS)
     return [
         [
             number_words(summary.changed[name]),
-            "/".join(nis(summary, axis) for axis in HORIZONTAL),
-            *(cell(summary) for _, cell in ROWS[1:]),
-            *("/".join(cell(summary, axis) for axis in HORIZONTAL) for cell in (sigma, rmse)),
+            *([CHAOTIC] + [""] * 5 if not summary.steady else _sweep_cells(summary)),
         ]
         for summary in sweep_of(made_of)
+    ]
+
+
+def _sweep_cells(summary: Summary) -> list[str]:
+    nis, _, _, sigma, rmse = (cell for _, cell in AXIS_ROWS)
+    return [
+        "/".join(nis(summary, axis) for axis in HORIZONTAL),
+        *(cell(summary) for _, cell in ROWS[1:]),
+        *("/".join(cell(summary, axis) for axis in HORIZONTAL) for cell in (sigma, rmse)),
     ]
 
 
@@ -112,7 +120,7 @@ def swept(made_of: Counterfactual) -> str:
 def reading(made_of: Counterfactual) -> list[str]:
     """What to see: which value of the sweep is best by which measure, and what to keep in mind."""
     lines = []
-    if summaries := sweep_of(made_of):
+    if summaries := [one for one in sweep_of(made_of) if one.steady]:
         name = swept(made_of)
         best = min(summaries, key=lambda s: abs(math.log(s.nis_mean)))
         lines.append(
@@ -130,11 +138,11 @@ def reading(made_of: Counterfactual) -> list[str]:
                 f"The position error to the truth is least at {name} {number_words(errors[least])} "
                 f"({least:.3f} m, horizontally)."
             )
-    shares = [s.rejected_share for s in (made_of.whatif.replayed, *made_of.whatif.whatif)]
-    if max(shares) > REJECTING_SHARE:
+    if not all(one.steady for one in made_of.whatif.whatif):
         lines.append(
-            f"Where more than {REJECTING_SHARE:.0%} are rejected each rejection decides the next: "
-            "read the size of the numbers there, not their digits."
+            f"Chaotic: more than {MOST_REJECTED:.0%} would be rejected, or "
+            f"{1e3 * DISTURBED_M:.0f} mm of noise on the positions changes the answer. Each "
+            "rejection decides the next there, and nothing can be predicted."
         )
     return [*lines, *(f"{note}." for note in made_of.whatif.notes)]
 
@@ -191,7 +199,9 @@ def _tables(page: Page, made_of: Counterfactual) -> None:
 
 def _panels(page: Page, made_of: Counterfactual) -> None:
     """Mean NIS, share rejected, and error or σ_p over the values."""
-    summaries, name = sweep_of(made_of), swept(made_of)
+    summaries, name = [one for one in sweep_of(made_of) if one.steady], swept(made_of)
+    if not summaries:
+        return
     values = [summary.changed[name] for summary in summaries]
     panels: dict[str, Of] = {
         "mean NIS": lambda s, axis: s.axes[axis].nis_mean,
