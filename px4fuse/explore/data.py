@@ -78,6 +78,8 @@ def flight_data(
     return {
         "log": analysis.flight.log.name,
         "source": analysis.source.name,
+        # what innovations ask for then is no noise
+        "drifts": analysis.source.origin.may_drift,
         "shift": segment.start_s if beside else 0.0,
         "story": list(story(analysis, findings)),
         "settings": _settings(settings),

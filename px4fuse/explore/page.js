@@ -441,7 +441,7 @@ const Explore = (async () => {
         .filter(([, key, value]) => value !== null && value !== undefined && round(value, 2) !== round(settings[key], 2))
         .map(([name, key, value]) => [`${name} ${round(value, 2)}${key === "offset" ? " s" : ""}`, { [key]: round(value, 2) }]);
       const words = Story.sentence(axis, ours, ekf2Of(flight, axis))
-        + (Practice.hidden ? "" : Story.cure(ours, candidates, tried(flight, axis)));
+        + (Practice.hidden || flight.drifts ? "" : Story.cure(ours, candidates, tried(flight, axis)));
       for (const line of document.querySelectorAll(`#now-said-${flight.number}`)) {
         line.textContent = moved(flight) ? `The knobs stand elsewhere now: ${words}` : "";
         line.parentElement.classList.toggle("stale", moved(flight));

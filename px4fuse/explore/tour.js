@@ -14,9 +14,10 @@ const Tour = (() => {
         see: "σ grows again between two measurements, and the innovations come back into ±2√S." };
     },
     ({ base, tried }) => {
-      const sigmaZ = tidy(base.sigmaZ / 10), one = tried({ ...base, sigmaZ });
+      const by = [10, 30, 100].find((d) => tried({ ...base, sigmaZ: tidy(base.sigmaZ / d) }).outside > 0.1) ?? 100;
+      const sigmaZ = tidy(base.sigmaZ / by), one = tried({ ...base, sigmaZ });
       return { title: "R too small", set: { ...base, sigmaZ }, view: "innovation",
-        sentence: `SIGMA_Z is now ${sigmaZ} m, a tenth: the filter believes each position, and ${number(100 * one.outside, 2)} % `
+        sentence: `SIGMA_Z is now ${sigmaZ} m, ${by} times too small: the filter believes each position, and ${number(100 * one.outside, 2)} % `
           + "of its innovations lie outside ±2√S, where 5 % is right.",
         task: "Drag SIGMA_Z up until about one innovation in twenty lies outside.",
         see: "The band widens around the dots, and the track gets smoother." };
@@ -47,10 +48,10 @@ const Tour = (() => {
       }
       const wrong = Math.min(base.offset + 0.2, offsets[1]), late = { ...base, offset: wrong };
       const [before, now] = [tried(base), tried(late)];
-      const seen = now.nis / before.nis > 1.1, truth = now.truthP && before.truthP;
+      const seen = now.nis / before.nis > 1.1, truth = now.truthP && now.truthP > 1.1 * before.truthP;
       return { title: "Clocks", set: late, view: truth ? "error" : "innovation",
         sentence: `The stamps are now ${number(wrong - base.offset, 2)} s later: the mean NIS goes from ${number(before.nis, 2)} to `
-          + `${number(now.nis, 2)}${seen ? "" : ", so the innovations hardly tell"}, yet `
+          + `${number(now.nis, 2)}${seen ? "" : ", so the innovations hardly tell"}; `
           + (truth ? `the error against the truth goes from ${length(before.truthP)} to ${length(now.truthP)}.`
             : `the position moves by ${length(now.from(before))} (RMS).`),
         task: truth ? "Drag the clock offset to where the error is smallest."
