@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from pypdf import PdfReader
 
 from px4fuse.answers import Answers, Claim
-from px4fuse.grading.anonymous import NAME
+from px4fuse.grading.anonymous import NAME, Veil
 from px4fuse.grading.class_page import html_text
 from px4fuse.grading.model import Entry, Graded, Item, Override
 from px4fuse.verification.model import Mismatch, Verdict
@@ -444,3 +444,12 @@ def test_points_and_words_of_the_instructor_are_downloaded_as_a_table(page: Brow
     assert rows[0] == ["id", "item", "points", "comment"]
     assert ["1007", "total", "7.5", '\'=1+1, "well"'] in rows
     assert ["'" + FORMULA, BREAKOUT, "", MARKUP] in rows  # what was said before stays
+
+
+def test_a_students_own_words_keep_short_numbers_that_are_ids() -> None:
+    """Id 12 is hidden where the tool speaks of a student, not in "12 outliers"."""
+    entry = row("Ada Lovelace", 9.0, id="12", file="12.pdf", pseudonym="Student 001")
+    veil = Veil([entry])
+    assert veil.hide("12 and Ada") == f"Student 001 and {NAME}"
+    assert veil.hide("12 outliers, by Ada", own_words=True) == f"12 outliers, by {NAME}"
+    assert Veil([]).hide("12 and Ada") == "12 and Ada"

@@ -492,3 +492,10 @@ def test_counts_are_whole_numbers_also_where_some_are_missing(analysis: px4fuse.
     table = analysis.to_frame()
     assert str(table["count"].dtype) == "Int64"
     assert table["count"].notna().any()
+
+
+def test_the_parts_of_a_clock_are_numbered_from_one(analysis: px4fuse.Analysis) -> None:
+    table = analysis.clock.to_frame()
+    count = len(table) - 1
+    assert count >= 2
+    assert list(table["part"]) == ["flight", *(f"part {n}" for n in range(1, count + 1))]

@@ -23,7 +23,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.flight import Unavailable
 from px4fuse.origin import RECEIVED
 from px4fuse.recording import ClockMap
-from px4fuse.report import clock, fonts, notes
+from px4fuse.report import clock, fonts, notes, pdf
 from px4fuse.report.document import Document
 from px4fuse.report.notes import write
 from px4fuse.report.page import Block, Page, data, printable
@@ -301,3 +301,8 @@ def test_how_a_clock_was_mapped_is_told_by_its_figures_or_by_its_note() -> None:
         replace(mapped, note="over the link, at its own speed"),
     ):  # fmt: skip
         assert clock_words(by_note) == f"the sender's clock: {by_note.note}"
+
+
+def test_a_line_of_a_documents_properties_is_cut_with_a_mark() -> None:
+    assert pdf._line("so  it\nis", 8) == "so it is"
+    assert pdf._line("so it is it", 8) == "so it i…"

@@ -25,6 +25,7 @@ from px4fuse.cli.outputs import progress, terminal
 from px4fuse.cli.quantity import NAMES, in_unit
 from px4fuse.comparison.estimates import tuned
 from px4fuse.findings import find
+from px4fuse.report import screen
 from px4fuse.report.document import Document
 from px4fuse.report.screen import runnable, say
 from px4fuse.report.terminal import print_summary
@@ -403,3 +404,9 @@ def test_the_bar_shows_what_remains_on_a_terminal_only(monkeypatch, capsys) -> N
 def test_whatif_says_why_ekf2_differs(sample_log) -> None:
     (line,) = [x for x in run("whatif", sample_log).stdout.splitlines() if x.startswith("Why")]
     assert "is the process noise" in line
+
+
+def test_what_is_bold_on_a_page_is_bold_on_a_terminal() -> None:
+    for weight, bold in (("bold", True), ("regular", False)):
+        block = {"text": "so", "colour": "black", "weight": weight}
+        assert ("bold" in str(screen._styled(block).style)) is bold  # type: ignore[arg-type]
