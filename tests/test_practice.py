@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import json
 import re
+import time
 import zlib
 from collections import Counter
 from pathlib import Path
@@ -236,20 +238,22 @@ def test_nobody_reads_the_answers_by_chance(quiz: Path) -> None:
 def choose(page: Browser, *names: str) -> None:
     for name in names:
         page.click(f"[name=choice][value={name}]")
-    page.click("#quiz-check")
-    ready(page)
+    renewed(page, "#quiz-check")
 
 
-def ready(page: Browser) -> None:
-    """Until the page that loads itself anew is there."""
-    ask(page, "new Promise((r) => setTimeout(r, 300))")
-    for _ in range(100):
-        if page.ask(
-            "typeof Explore !== 'undefined' && document.querySelector('#tables table') !== null"
-            " && document.getElementById('quiz-title').textContent !== ''"
-        ):
-            break
-        ask(page, "new Promise((r) => setTimeout(r, 100))")
+def renewed(page: Browser, button: str) -> None:
+    """On what loads the page anew; until that is there."""
+    page.ask("window.before = true")
+    page.click(button)
+    end = time.monotonic() + 30.0
+    while time.monotonic() < end:
+        with contextlib.suppress(AssertionError):  # in between there is no page
+            if page.ask(
+                "window.before === undefined && document.querySelector('#tables table') !== null"
+                " && document.getElementById('quiz-title').textContent !== ''"
+            ):
+                break
+        time.sleep(0.05)
     ask(page, "Explore.then(() => 1)")
     settle(page)
 
@@ -291,14 +295,12 @@ def test_ten_flights_with_right_and_wrong_answers(browser: Browser, quiz: Path) 
         assert key["story"][0] in said(page, "found")
         assert page.ask("[...document.querySelectorAll('[name=choice]')].every((b) => b.disabled)")
         if number < 9:
-            page.click("#quiz-next")
-            ready(page)
+            renewed(page, "#quiz-next")
     assert said(page, "quiz-score") == f"{points} of 10 right: the set is done"
     assert page.ask("document.getElementById('quiz-next').hidden")
     assert page.complaints() == []
     assert page.requests() <= {"file", "data", "blob"}
-    page.click("#quiz-again")
-    ready(page)
+    renewed(page, "#quiz-again")
     assert said(page, "quiz-title") == "Flight 1 of 10"
     assert said(page, "quiz-score") == ""
 
