@@ -22,6 +22,7 @@ from px4fuse.filter.kalman import replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import within
 from px4fuse.findings import find
+from px4fuse.findings.hidden_errors import hidden_errors
 from px4fuse.findings.story import nis_with
 from px4fuse.flight import Unavailable
 from px4fuse.plain import length_words, number_words
@@ -152,6 +153,16 @@ def test_the_words_follow_the_knobs_and_their_cure_was_replayed(
     assert f"ours {number_words(nis, 2)} (understated" in text(page, "read-0")
     hand = page.ask("document.querySelector('#needle-0 .hand.ours').style.left")
     assert hand == "100%"
+
+
+def test_an_error_that_innovations_hide_is_told_by_what_the_filter_claims(
+    page: Browser, made: tuple[Path, Analysis]
+) -> None:
+    put(page, offset=0.3)
+    shifted = _shifted(made[1], 0.3)
+    hidden = next(one for one in hidden_errors(shifted) if (one.owner, one.axis) == ("kf", "aisle"))
+    error, claimed = length_words(hidden.rmse_m), length_words(hidden.claimed_m)
+    assert f"our filter is {error} from the truth (RMS) and claims {claimed};" in text(page, "live")
 
 
 def find_story(analysis: Analysis) -> str:
@@ -336,6 +347,10 @@ def test_space_plays_and_pauses(page: Browser) -> None:
     assert at >= 2
     ask(page, "new Promise((r) => setTimeout(r, 700))")
     assert ask(page, "Explore.then((e) => e.stepper.at())") == at
+    for pressed, button in (("s", "slower-0"), ("f", "faster-0")):
+        for _ in range(6):
+            page.call("Input.dispatchKeyEvent", type="keyDown", key=pressed, text=pressed)
+        assert page.ask(f"document.getElementById('{button}').disabled")
     page.click("#slower-0")
     assert not page.ask("document.getElementById('faster-0').disabled")
 

@@ -719,7 +719,7 @@ const Explore = (async () => {
   const stepper = Step.start({ flights, settings, chosen, runs, model, put, figures, isSeen,
     moved: (time) => { times.show(time); toAddress(); } });
   const keys = { n: () => stepper.go((chosen.step ?? -1) + 1), p: () => stepper.go((chosen.step ?? 1) - 1),
-    " ": () => { open("step"); stepper.play(); } };
+    " ": () => { open("step"); stepper.play(); }, s: () => stepper.faster(-1), f: () => stepper.faster(1) };
   const times = Times.start({ flights, settings, model, put, timeRange, figures, look, later, isSeen, keys, open });
   tabs();
   Grid.start(flights, arrays, () => { axisShown = null; show(); });
