@@ -372,13 +372,16 @@ def test_a_prediction_that_a_little_noise_changes_is_not_steady(
     )  # fmt: skip
     runs: list[tuple[float, int]] = []
 
-    def disturbed(model: object, change: object, sigma_m: float, seed: int) -> None:
+    def disturbed(model: object, sigma_m: float, seed: int) -> object:
         runs.append((sigma_m, seed))
+        return model
 
     def judged(changed: Summary) -> bool:
-        monkeypatch.setattr(whatif, "replay_disturbed", disturbed)
+        monkeypatch.setattr(whatif, "disturbed", disturbed)
+        monkeypatch.setattr(whatif, "replay_settings", lambda _, changes: changes)
         monkeypatch.setattr(whatif, "_of_replay", lambda *_: changed)
-        return whatif._steadied(model, base, ((0.0, 1.0),)).steady
+        (found,) = whatif._steadied(model, [base], ((0.0, 1.0),))
+        return found.steady
 
     assert judged(base)
     assert runs == [(0.002, 0), (0.002, 1), (0.002, 2), (0.002, 3)]
@@ -395,6 +398,5 @@ def test_a_prediction_that_a_little_noise_changes_is_not_steady(
     assert not judged(structs.replace(base, rejected_share=0.2301))
     few, many = (structs.replace(base, rejected_share=share) for share in (0.02, 0.351))
     runs.clear()
-    assert whatif._steadied(model, few, ()).steady
-    assert not whatif._steadied(model, many, ()).steady
+    assert [one.steady for one in whatif._steadied(model, [few, many], ())] == [True, False]
     assert runs == []  # nothing to try

@@ -17,7 +17,7 @@ from px4fuse.arrays import Array
 from px4fuse.display import Shown
 from px4fuse.ekf2.agreement import at_times, judged_from, logged_innovations, rms_to_truth, settled
 from px4fuse.ekf2.inputs import horizontal_resets_s
-from px4fuse.ekf2.model import Model, replay_disturbed, replay_settings
+from px4fuse.ekf2.model import Model, disturbed, replay_settings
 from px4fuse.ekf2.replay import HORIZONTAL, Agreement, Ekf2Replay, Spans
 from px4fuse.ekf2_parameters import check
 from px4fuse.errors import SettingsError
@@ -170,7 +170,7 @@ def what_if(model: Model, settings: Sequence[Mapping[str, float]]) -> WhatIf | U
         agreement=model.agreement,
         logged=_of_log(flight, model.flown, judged),
         replayed=_of_replay(flight, model.flown, judged),
-        whatif=tuple(_steadied(model, _of_replay(flight, r, judged), judged) for r in replays),
+        whatif=_steadied(model, [_of_replay(flight, r, judged) for r in replays], judged),
         judged=judged,
         notes=tuple(note for replay in replays for note in _notes(model, replay)),
     )
@@ -202,25 +202,36 @@ def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) 
     return [float(value) for value in values]
 
 
-def _steadied(model: Model, found: Summary, judged: Spans) -> Summary:
-    """A prediction, with whether it stays where it is when the positions are disturbed."""
-    if found.rejected_share <= FEW_REJECTED or found.changed == {}:
-        return found
-    if found.rejected_share > MOST_REJECTED:
-        return replace(found, steady=False)
-    every = [found] + [
-        _of_replay(model.flight, replay_disturbed(model, found.changed, DISTURBED_M, seed), judged)
-        for seed in range(DISTURBED_RUNS)
-    ]
-    rmse = [e for one in every if isinstance(e := one.position_rmse_to_truth_m, float)]
-    shares = [one.rejected_share for one in every]
-    steady = (
-        all(max(nis) <= STEADY_NIS * min(nis) for nis in (
-            [one.axes[axis].nis_mean for one in every] for axis in HORIZONTAL))
+def _steadied(model: Model, found: Sequence[Summary], judged: Spans) -> tuple[Summary, ...]:
+    """Predictions, with whether each stays where it is when the positions are disturbed."""
+    runs = [[one] for one in found]
+    tried = [
+        same for same in runs
+        if same[0].changed and FEW_REJECTED < same[0].rejected_share <= MOST_REJECTED
+    ]  # fmt: skip
+    for seed in range(DISTURBED_RUNS if tried else 0):
+        other = disturbed(model, DISTURBED_M, seed)
+        again = replay_settings(other, [same[0].changed for same in tried])
+        for same, replay in zip(tried, again, strict=True):
+            same.append(_of_replay(model.flight, replay, judged))
+    return tuple(
+        replace(
+            one, steady=not one.changed or (one.rejected_share <= MOST_REJECTED and _alike(same))
+        )
+        for one, same in zip(found, runs, strict=True)
+    )
+
+
+def _alike(runs: Sequence[Summary]) -> bool:
+    """Whether all say the same of consistency, rejections and error."""
+    rmse = [e for one in runs if isinstance(e := one.position_rmse_to_truth_m, float)]
+    shares = [one.rejected_share for one in runs]
+    nis = [[one.axes[axis].nis_mean for one in runs] for axis in HORIZONTAL]
+    return (
+        all(max(along) <= STEADY_NIS * min(along) for along in nis)
         and max(shares) - min(shares) <= STEADY_REJECTED
         and (not rmse or max(rmse) <= STEADY_RMSE * min(rmse))
-    )  # fmt: skip
-    return replace(found, steady=steady)
+    )
 
 
 def _of_replay(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:

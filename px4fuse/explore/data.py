@@ -30,8 +30,8 @@ from px4fuse.filter.settings import (
 )
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, along, imu_gaps, within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.findings.causes import SETTINGS
-from px4fuse.findings.hidden_errors import CONTENT_NIS, NEES_LARGE, hidden_errors
+from px4fuse.findings.causes import NOISES
+from px4fuse.findings.hidden_errors import CONTENT_NIS, NEES_LARGE, hidden_error
 from px4fuse.findings.model import Finding, by_root
 from px4fuse.findings.story import story
 from px4fuse.flight import POSITION_COLUMNS, PositionTrack, Unavailable
@@ -44,9 +44,7 @@ RUNNING = 30
 # The track on the plan is drawn with at most so many points
 MAX_PLAN_POINTS = 2000
 # Findings that other settings would take away or bring
-OF_KNOBS = SETTINGS | {
-    "kf_variance_overstated", "kf_variance_understated", "process_noise_forgotten",
-}  # fmt: skip
+OF_KNOBS = frozenset(name for name in NOISES if not name.startswith("ekf2_"))
 
 
 def flight_data(
@@ -254,9 +252,8 @@ def _ekf2(analysis: Analysis, result: AxisComparison, packer: Packer) -> dict[st
             "truthP": judged.truth.position_rmse_m,
             "truthV": judged.truth.velocity_rmse_m_s,
         }
-    for hidden in hidden_errors(analysis):
-        if (hidden.owner, hidden.axis) == ("ekf2", result.axis.name):
-            made["summary"]["claimed"] = hidden.claimed_m
+    if hidden := hidden_error(analysis, result, "ekf2"):
+        made["summary"]["claimed"] = hidden.claimed_m
     if isinstance(result.ekf2_variance, pd.DataFrame):
         sigma = result.ekf2_variance.dropna().pow(0.5)
         made["variance"] = _frame(

@@ -18,6 +18,7 @@ from px4fuse.arrays import Array
 from px4fuse.ekf2.agreement import along, judged_from, rms_to_truth, settled
 from px4fuse.ekf2.model import Model, replay_settings
 from px4fuse.ekf2.replay import HORIZONTAL, Ekf2Replay
+from px4fuse.ekf2.whatif import MOST_REJECTED
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.explore.packing import Packer
 from px4fuse.filter.consistency import Consistency, assess
@@ -59,6 +60,7 @@ def grid_data(analysis: Analysis, packer: Packer) -> dict[str, Any] | str:
         "flown": [stops[name].index(_told(flown[name])) for name in stops],
         "agreement": model.agreement.reason,
         "every": every,
+        "most": MOST_REJECTED,
         "cases": [_case(analysis, model, replay, directions, every, packer) for replay in replays],
     }
 
@@ -129,7 +131,7 @@ def _state(replay: Ekf2Replay, drawn: pd.DataFrame, packer: Packer) -> dict[str,
     times, published = drawn.index.to_numpy(), replay.published
     made: dict[str, list[int]] = {"p": [], "v": [], "sp": [], "sv": []}
     for axis, position, velocity in zip(
-        HORIZONTAL, POSITION_COLUMNS, VELOCITY_COLUMNS, strict=False
+        HORIZONTAL, POSITION_COLUMNS[:2], VELOCITY_COLUMNS[:2], strict=True
     ):
         for name, column in (("p", position), ("v", velocity)):
             state = np.interp(times, published.index, published[column])

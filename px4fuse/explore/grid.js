@@ -87,8 +87,7 @@ const Grid = (() => {
     $("grid-said").textContent = !shown ? "" : one === null ? "The model has no height: EKF2 stays as logged; choose another axis."
       : `${(100 * one.share).toFixed(1)} % rejected, ${one.resets} reset${one.resets === 1 ? "" : "s"}`
         + `${one.lost ? `, ${one.lost} samples too late for it` : ""}.`
-        // whatif.MOST_REJECTED
-        + (one.share > 0.35 ? " Chaotic: each rejection decides the next, and the numbers predict nothing." : "");
+        + (one.share > lone.grid.most ? " Chaotic: each rejection decides the next, and the numbers predict nothing." : "");
   }
 
   return { start, chosen, rows, say, toAddress, fromAddress };

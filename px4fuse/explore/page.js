@@ -133,8 +133,8 @@ const Explore = (async () => {
     Object.assign(settings, changes);
     if ($("said").textContent) say("");
     clearTimeout(rest);
-    if (dragged) rest = setTimeout(show, DRAG_ENDS_MS);
     if (!dragged) return show();
+    rest = setTimeout(show, DRAG_ENDS_MS);
     if (waiting) { again = true; return; }
     waiting = true;
     show(true);
@@ -306,7 +306,9 @@ const Explore = (async () => {
 
   /* Heights of the plots; two flights have the same, so that they can be compared */
   const heights = new Map();
-  function frame(name, flight, low, high, log = false) {
+  function frame(name, ends, log = false) {
+    if (!isSeen(name)) return;
+    const [low, high] = ends();
     const known = heights.get(name) ?? [Infinity, -Infinity, log];
     heights.set(name, [Math.min(known[0], low), Math.max(known[1], high), log]);
   }
@@ -568,22 +570,21 @@ const Explore = (async () => {
     const of = (part, column) => part?.[column] ?? EMPTY;
     const { steps, updates } = ours;
     latest[flight.number] = { ...others, ...ours };
-    if (isSeen("position")) frame("position", flight, ...extent(steps.p, of(others.state, "p"), of(others.truth_p, "p")));
-    if (isSeen("velocity")) frame("velocity", flight, ...extent(steps.v, of(others.state, "v"), of(others.truth_v, "v")));
-    if (isSeen("error")) frame("error", flight, ...extent(of(ours.error, "e"), of(others.error_ekf2, "e")));
-    // neither outliers nor a gap may flatten all the rest
-    if (isSeen("innovation")) {
-    const reach = 1.3 * Math.max(...[[updates.nu, updates.plus],
-      [of(others.fused, "nu"), of(others.limits, "plus")]].map(([nu, plus]) => {
-        const typical = quantile(plus, 0.5);
-        return Math.max(typical, Math.min(quantile(nu, 0.99), 2.5 * typical));
-      }));
-    frame("innovation", flight, -reach, reach);
-    }
-    if (isSeen("sigma_p")) frame("sigma_p", flight, ...extent(steps.sp, of(others.variance, "sp")), true);
-    if (isSeen("sigma_v")) frame("sigma_v", flight, ...extent(steps.sv, of(others.variance, "sv")), true);
-    if (isSeen("nis")) frame("nis", flight, ...extent(updates.running, of(others.running, "running"), ranges.running.slice(1)), true);
-    if (isSeen("gain")) frame("gain", flight, ...extent(updates.k0, updates.k1, [0]));
+    frame("position", () => extent(steps.p, of(others.state, "p"), of(others.truth_p, "p")));
+    frame("velocity", () => extent(steps.v, of(others.state, "v"), of(others.truth_v, "v")));
+    frame("error", () => extent(of(ours.error, "e"), of(others.error_ekf2, "e")));
+    frame("innovation", () => { // neither outliers nor a gap may flatten all the rest
+      const reach = 1.3 * Math.max(...[[updates.nu, updates.plus],
+        [of(others.fused, "nu"), of(others.limits, "plus")]].map(([nu, plus]) => {
+          const typical = quantile(plus, 0.5);
+          return Math.max(typical, Math.min(quantile(nu, 0.99), 2.5 * typical));
+        }));
+      return [-reach, reach];
+    });
+    frame("sigma_p", () => extent(steps.sp, of(others.variance, "sp")), true);
+    frame("sigma_v", () => extent(steps.sv, of(others.variance, "sv")), true);
+    frame("nis", () => extent(updates.running, of(others.running, "running"), ranges.running.slice(1)), true);
+    frame("gain", () => extent(updates.k0, updates.k1, [0]));
   }
 
   // ------------------------------------------------------------------ the map of both noises
@@ -665,23 +666,23 @@ const Explore = (async () => {
   const others = [];
   /* Replay and draw what is in view; quick leaves out what is only read, until a drag has ended */
   function show(quick = false) {
-    most = quick === true ? FEW_POINTS : MOST_POINTS;
+    most = quick ? FEW_POINTS : MOST_POINTS;
     for (const knob of KNOBS) {
       if (document.activeElement !== knob.number || !quick) knob.number.value = settings[knob.key];
-      if (quick !== true) knob.slider.value = toSlider(knob, settings[knob.key]);
+      if (!quick) knob.slider.value = toSlider(knob, settings[knob.key]);
       knob.slider.ariaValueText = `${settings[knob.key]} ${knob.unit}`;
     }
     const another = axisShown !== settings.axis;
     axisShown = settings.axis;
     for (const flight of flights) {
-      const done = runs[flight.number] = replayed(flight, quick === true);
+      const done = runs[flight.number] = replayed(flight, quick);
       if (another) others[flight.number] = drawOthers(flight, done.axis);
       if (done.run) frames(flight, drawOurs(flight, done), others[flight.number]);
       drawNeedle(flight, done.axis, done.numbers);
       if (isSeen("map")) drawMap(flight);
     }
     setHeights();
-    if (quick === true) return;
+    if (quick) return;
     clearTimeout(rest);
     for (const name of ["axis", "input"]) {
       for (const radio of document.querySelectorAll(`[name=${name}]`)) radio.checked = radio.value === settings[name];
@@ -727,8 +728,8 @@ const Explore = (async () => {
   open(view, false);
   fromAddress();
   show();
-  const shared = { recorded: times.recorded, look: times.view, settings, set, show, open, runs, flights, model, command, numbers, timeRange, chosen, stepper, axisOf,
-    mapOf, round, tried, say, Grid, ekf2Of, view: () => view };
+  const shared = { recorded: times.recorded, look: times.view, settings, set, show, open, runs, flights, model,
+    numbers, timeRange, chosen, stepper, axisOf, mapOf, ekf2Of, view: () => view };
   Tour.start(shared);
   Practice.start(shared);
   return shared;

@@ -16,12 +16,10 @@ from px4fuse.arrays import Array, BoolArray
 from px4fuse.filter.likelihood import Preintegrated, preintegrate
 from px4fuse.filter.model import INITIAL_COVARIANCE
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis, too_few
+from px4fuse.filter.signals import Axis
+from px4fuse.filter.smoothing import middle_of
 from px4fuse.flight import Unavailable
 
-MIN_MEASUREMENTS = 100
-# Longer flights are judged by their middle, which is enough
-MAX_MEASUREMENTS = 1000
 # Grid: τ, and both noises and SIGMA_A over those of greatest likelihood without a slow error
 TAUS_S = np.geomspace(0.15, 20.0, 9)
 WHITE_FACTORS = np.array([0.2, 0.4, 0.55, 0.7, 0.85, 1.0, 1.15])
@@ -83,39 +81,26 @@ def coloured(
     lag_s : float
         Of the low pass that explains the innovations most.
     """
-    if isinstance(axes[0].acceleration, Unavailable):
-        return axes[0].acceleration
-    count = len(axes[0].measurement_time_s)
-    if count < MIN_MEASUREMENTS:
-        return too_few("slow errors of the source", count, MIN_MEASUREMENTS)
-    first = max(0, (count - MAX_MEASUREMENTS) // 2)
-    middle = slice(first, first + MAX_MEASUREMENTS)
-    time = axes[0].measurement_time_s[middle]
+    middle = middle_of(axes, "slow errors of the source")
+    if isinstance(middle, Unavailable):
+        return middle
+    time = middle[0].measurement_time_s
     bad = np.isin(time, outlier_time_s)
     settings = replace(settings, input="imu")
     sigma_a = sigma_a_m_s2 * SIGMA_A_FACTORS[:, None, None, None]
     white = sigma_z_m * WHITE_FACTORS[None, :, None, None]
     slow = sigma_z_m * SLOW_FACTORS[None, None, :, None]
 
-    def legs(offset_s: float) -> list[Preintegrated]:
-        return [
-            preintegrate(
-                replace(
-                    axis,
-                    measurement_time_s=time + offset_s,
-                    measurement_m=axis.measurement_m[middle],
-                ),
-                settings,
-            )
-            for axis in axes
+    def score_at(offset_s: float, slow: Array, tau: Array) -> Array:
+        legs = [
+            preintegrate(replace(axis, measurement_time_s=time + offset_s), settings)
+            for axis in middle
         ]
+        return _score(legs, bad, sigma_a, white, slow, tau)
 
-    plain = _score(legs(0.0), bad, sigma_a, white, np.zeros(1), np.ones(1))
-    score = _score(legs(0.0), bad, sigma_a, white, slow, TAUS_S[None, None, None, :])
-    earlier = min(
-        _score(legs(-share * lag_s), bad, sigma_a, white, slow, TAUS_S[None, None, None, :]).min()
-        for share in LAGS
-    )
+    plain = score_at(0.0, np.zeros(1), np.ones(1))
+    score = score_at(0.0, slow, TAUS_S)
+    earlier = min(score_at(-share * lag_s, slow, TAUS_S).min() for share in LAGS)
     _, at_white, at_slow, at_tau = np.unravel_index(np.argmin(score), score.shape)
     return Coloured(
         tau_s=float(TAUS_S[at_tau]),

@@ -79,25 +79,16 @@ def smoothing(
     clock_offset_s : float
         What would have to be added to the stamps if there were no low pass.
     """
-    if isinstance(axes[0].acceleration, Unavailable):
-        return axes[0].acceleration
-    count = len(axes[0].measurement_time_s)
-    if count < MIN_MEASUREMENTS:
-        return too_few("low pass in the source", count, MIN_MEASUREMENTS)
-    first = max(0, (count - MAX_MEASUREMENTS) // 2)
-    middle = slice(first, first + MAX_MEASUREMENTS)
-    time = axes[0].measurement_time_s[middle]
+    middle = middle_of(axes, "low pass in the source")
+    if isinstance(middle, Unavailable):
+        return middle
+    time = middle[0].measurement_time_s
     bad = np.isin(time, outlier_time_s)
     level = sigma_a_m_s2 * SIGMA_A_FACTORS[:, None], sigma_z_m * SIGMA_Z_FACTORS[None, :]
     settings = replace(settings, input="imu")
 
     def score(correlation: float, offset_s: float) -> tuple[float, float]:
-        moved = [
-            replace(
-                axis, measurement_time_s=time + offset_s, measurement_m=axis.measurement_m[middle]
-            )
-            for axis in axes
-        ]
+        moved = [replace(axis, measurement_time_s=time + offset_s) for axis in middle]
         return _score(moved, settings, bad, correlation, level)
 
     plain = score(0.0, 0.0)[0]
@@ -119,6 +110,33 @@ def smoothing(
     best, at, noise = found
     lag = -float(np.median(np.diff(time)) / np.log(at)) if at else 0.0
     return Smoothing(at, lag, plain - best, noise)
+
+
+def middle_of(axes: tuple[Axis, ...], what: str) -> list[Axis] | Unavailable:
+    """The measurements in the middle of a flight, as many as are enough; why not where too few.
+
+    Parameters
+    ----------
+    axes : tuple of Axis
+        With the same measurement times.
+    what : str
+        What is looked for in them, with the acceleration.
+    """
+    if isinstance(axes[0].acceleration, Unavailable):
+        return axes[0].acceleration
+    count = len(axes[0].measurement_time_s)
+    if count < MIN_MEASUREMENTS:
+        return too_few(what, count, MIN_MEASUREMENTS)
+    first = max(0, (count - MAX_MEASUREMENTS) // 2)
+    part = slice(first, first + MAX_MEASUREMENTS)
+    return [
+        replace(
+            axis,
+            measurement_time_s=axis.measurement_time_s[part],
+            measurement_m=axis.measurement_m[part],
+        )
+        for axis in axes
+    ]
 
 
 def _score(

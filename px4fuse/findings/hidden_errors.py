@@ -14,7 +14,13 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison, FilterSummary
+from px4fuse.comparison.model import (
+    AgainstTruth,
+    AxisComparison,
+    Comparison,
+    FilterName,
+    FilterSummary,
+)
 from px4fuse.errors import TrajectoryError
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -70,6 +76,14 @@ def hidden_errors(comparison: Comparison) -> list[Hidden]:
             if nees >= NEES_LARGE and statement.nis_mean < CONTENT_NIS:
                 found.append(Hidden(owner, name, statement, truth.position_rmse_m, nees))
     return sorted(found, key=lambda hidden: -hidden.nees)
+
+
+def hidden_error(
+    comparison: Comparison, result: AxisComparison, owner: FilterName
+) -> Hidden | None:
+    """That of one filter along one axis, where there is one."""
+    found = hidden_errors(comparison)
+    return next((h for h in found if (h.owner, h.axis) == (owner, result.axis.name)), None)
 
 
 def detect(analysis: Analysis) -> Found:

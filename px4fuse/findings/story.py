@@ -19,7 +19,7 @@ from px4fuse.ekf2.walk import Why
 from px4fuse.filter.kalman import replay, state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.findings.causes import SETTINGS, VARIANCES
-from px4fuse.findings.hidden_errors import Hidden, hidden_errors
+from px4fuse.findings.hidden_errors import hidden_error
 from px4fuse.findings.model import Finding
 from px4fuse.findings.sigma import tuned_for
 from px4fuse.findings.source_positions import MOTION_RANGE_M, motion_range_m
@@ -104,12 +104,6 @@ def _verb(result: AxisComparison, owner: FilterName, verb: str = "is ") -> str:
     return "" if isinstance(result.filters[owner], Unavailable) else verb
 
 
-def _hidden(analysis: Analysis, result: AxisComparison, owner: FilterName) -> Hidden | None:
-    """The error of one filter that its innovations do not show, where there is one."""
-    found = hidden_errors(analysis)
-    return next((h for h in found if (h.owner, h.axis) == (owner, result.axis.name)), None)
-
-
 def _error(result: AxisComparison, owner: FilterName) -> str:
     """Error of one filter, with what joins it to the next phrase; empty without truth."""
     truth = result.filters[owner].truth
@@ -120,7 +114,7 @@ def _error(result: AxisComparison, owner: FilterName) -> str:
 
 def _knows(analysis: Analysis, result: AxisComparison, owner: FilterName) -> str:
     """Whether a filter's variance is what its innovations, and the truth, show."""
-    if hidden := _hidden(analysis, result, owner):
+    if hidden := hidden_error(analysis, result, owner):
         return f"claimed {length_words(hidden.claimed_m)}"
     statement = result.filters[owner]
     if isinstance(statement, Unavailable):
@@ -143,7 +137,7 @@ def _since(analysis: Analysis) -> str:
     settings, statement = analysis.settings, analysis.main.filters["kf"]
     if isinstance(statement, Unavailable) or statement.verdict == "consistent":
         return ""
-    if _hidden(analysis, analysis.main, "kf"):
+    if hidden_error(analysis, analysis.main, "kf"):
         return ""
     tuned, over = tuned_for(analysis, analysis.main.axis.name), statement.variance_factor > 1.0
     if analysis.source.origin.may_drift or tuned is None:
