@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.collections import Collection
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
@@ -61,7 +62,8 @@ def of_artist(artist: Any) -> Iterator[str]:
     looks = f"z {value(artist.get_zorder())} alpha {value(artist.get_alpha())}"
     match artist:
         case Line2D():
-            marks = f"{artist.get_marker()} {value(artist.get_markersize())}"
+            edge = value(artist.get_markeredgewidth())
+            marks = f"{artist.get_marker()} {value(artist.get_markersize())} {edge}"
             dashes = value(artist._unscaled_dash_pattern)
             width = f"{artist.get_linestyle()} {dashes} {value(artist.get_linewidth())}"
             x, y = (numbers(part) for part in artist.get_data())
@@ -71,6 +73,7 @@ def of_artist(artist: Any) -> Iterator[str]:
                 place = value(artist.get_position())
                 side = f"{artist.get_ha()} {artist.get_va()}"
                 letters = f"{value(artist.get_size())} {colour(artist.get_color())}"
+                letters += f" {artist.get_weight()} {value(artist.get_rotation())}"
                 yield f"Text {artist.get_text()!r} at {place} {side} {letters}"
         case AxesImage():
             yield f"{name} {value(artist.get_extent())} {value(artist.get_clim())}: " + numbers(
@@ -86,11 +89,23 @@ def of_artist(artist: Any) -> Iterator[str]:
             )
         case Patch():
             corners = artist.get_path().transformed(artist.get_patch_transform()).vertices
-            yield f"{name} {colour(artist.get_facecolor())} {looks}: {numbers(corners)}"
+            edge = f"{colour(artist.get_edgecolor())} {value(artist.get_linewidth())}"
+            faces = f"{colour(artist.get_facecolor())} {edge} {artist.get_hatch() or ''}".rstrip()
+            yield f"{name} {faces} {looks}: {numbers(corners)}"
         case Legend():
             names = [text.get_text() for text in artist.get_texts()]
             anchor = value(artist.get_bbox_to_anchor()._bbox.bounds)
             yield f"Legend {names} {anchor} {artist._loc} {value(artist.handlelength)}"
+
+
+def ticks(axis: Axis) -> str:
+    """The labels of the ticks in view, and how many small ticks there are."""
+    low, high = sorted(axis.get_view_interval())
+    places = [float(place) for place in axis.get_majorticklocs() if low <= place <= high]
+    labels = [axis.get_major_formatter()(place, at) for at, place in enumerate(places)]
+    small = sum(low <= place <= high for place in axis.get_minorticklocs())
+    size = axis.get_tick_params().get("labelsize")
+    return f"{value(places)} {[label for label in labels if label]} {small} {value(size)}"
 
 
 def of_axes(axes: Axes) -> Iterator[str]:
@@ -100,6 +115,7 @@ def of_axes(axes: Axes) -> Iterator[str]:
     yield f"axes {value(axes.get_position().bounds)} spans {spans} {scales}".rstrip()
     labels = axes.get_title(), axes.get_xlabel(), axes.get_ylabel()
     yield f"  labels {labels} ticks {axes.xaxis.get_tick_params()['labelbottom']}"
+    yield f"  x {ticks(axes.xaxis)} y {ticks(axes.yaxis)}"
     legend = axes.get_legend()
     drawn = [*axes.lines, *axes.collections, *axes.patches, *axes.images, *axes.texts]
     for artist in [*drawn, *([legend] if legend else [])]:
