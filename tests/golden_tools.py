@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import difflib
+import json
+import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,8 +24,33 @@ from matplotlib.text import Text
 
 from px4fuse.report.page import Block
 
+GOLDEN = Path(__file__).with_name("golden")
+# What is in results because of the machine, the file or the command
+NOT_KEPT = ("schema", "request", "provenance", "log", "command", "report_sha256")
 # Numbers of which only the spread is kept
 MANY = 12
+
+
+def agrees(name: str, lines: list[str]) -> None:
+    """Compare with what is kept."""
+    path = GOLDEN / f"{name}.txt"
+    text = "\n".join(lines) + "\n"
+    if os.environ.get("PX4FUSE_GOLDEN") == "write":
+        path.write_text(text, encoding="utf-8")
+    kept = path.read_text(encoding="utf-8")
+    different = difflib.unified_diff(kept.splitlines(), text.splitlines(), lineterm="", n=1)
+    assert text == kept, "\n".join(list(different)[:40])
+
+
+def rounded(text: str) -> str:
+    """Numbers with a fraction in four digits."""
+    return re.sub(r"-?\d+\.\d+(?:e[-+]?\d+)?", lambda found: value(float(found[0])), text)
+
+
+def written(path: Path) -> Iterator[str]:
+    """The numbers of results."""
+    results = json.loads(path.read_text(encoding="utf-8"))
+    yield from of_values({name: results[name] for name in results if name not in NOT_KEPT})
 
 
 def value(part: Any, digits: int = 4) -> str:
@@ -102,7 +132,7 @@ def ticks(axis: Axis) -> str:
     """The labels of the ticks in view, and how many small ticks there are."""
     low, high = sorted(axis.get_view_interval())
     places = [float(place) for place in axis.get_majorticklocs() if low <= place <= high]
-    labels = [axis.get_major_formatter()(place, at) for at, place in enumerate(places)]
+    labels = axis.get_major_formatter().format_ticks(places)
     small = sum(low <= place <= high for place in axis.get_minorticklocs())
     size = axis.get_tick_params().get("labelsize")
     return f"{value(places)} {[label for label in labels if label]} {small} {value(size)}"

@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 from browser import Browser, Elements
+from golden_tools import agrees, of_values
 from hypothesis import given
 from hypothesis import strategies as st
 from pypdf import PdfReader
@@ -108,6 +109,14 @@ def content(text: str) -> Any:
     """What the page's script reads."""
     (found,) = re.findall(r'<script type="application/json" id="content">(.*?)</script>', text)
     return json.loads(found)
+
+
+def test_the_page_holds_what_it_held() -> None:
+    text = html_text(CLASS, "Class", "px4fuse 1")
+    above = re.sub(r"<(script|style).*?</\1>", "", text, flags=re.DOTALL).splitlines()
+    lines = [line for line in above if line.strip() and "sha256" not in line]
+    lines += of_values(content(text))
+    agrees("class_page", [line[:300] for line in lines])
 
 
 def test_every_inline_block_is_what_the_policy_allows() -> None:

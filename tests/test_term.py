@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from class_tools import Reports, at_once, zipped
+from golden_tools import agrees
 
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.roster import read_people
@@ -24,6 +25,8 @@ from px4fuse.grading.rubric import read_rubric, rubric_text
 STUDENTS = range(1, 41)
 MOODLE, CANVAS, BLACKBOARD = range(1, 16), range(16, 28), range(28, 39)  # 39 and 40 hand in nothing
 LATE, RESUBMITTED, COPIED, HOSTILE, INTRUDER = 30, 31, 20, 5, 9
+# Whose feedback is kept
+SHOWN = ("0001", "0005", "0009", "0020", "0030", "0031", "0039")
 WORDS = (
     "I looked at the innovations of both axes. The source has outliers, which are rejected by the "
     "gate. The noise fits the data and the filter is consistent."
@@ -162,6 +165,7 @@ def points(outcome: GradeOutcome) -> dict[str, float | None]:
 def test_a_term(lab, monkeypatch) -> None:
     verified = at_once(monkeypatch)
     outcome = lab.grade()
+    as_it_was_written(lab.output)
     everyone_has_a_row(outcome)
     late_and_resubmitted(outcome)
     copied_and_hostile(outcome)
@@ -171,6 +175,16 @@ def test_a_term(lab, monkeypatch) -> None:
     assert len(verified) == count  # points changed, and no report was looked at again
     imported(lab, last)
     anonymous(lab, last)
+
+
+def as_it_was_written(output: Path) -> None:
+    """Tables, and what some are told, as they were looked at."""
+    lines = []
+    tables = [output / "class.csv", *sorted((output / "grades").glob("*.csv"))]
+    told = [path for path in sorted((output / "feedback").iterdir()) if path.stem in SHOWN]
+    for path in (*tables, *told):
+        lines += ["", path.name, *path.read_text(encoding="utf-8-sig").splitlines()]
+    agrees("term", lines)
 
 
 def everyone_has_a_row(outcome: GradeOutcome) -> None:
