@@ -25,7 +25,13 @@ from px4fuse.comparison.estimates import (
     turned_frame,
 )
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.preparation import Choices, no_source, prepare
+from px4fuse.comparison.preparation import (
+    Choices,
+    choose_source,
+    no_source,
+    prepare,
+    usual_sigma_z_m,
+)
 from px4fuse.comparison.remedy import asked_of_ekf2
 from px4fuse.comparison.why import why_ekf2_differs
 from px4fuse.display import brief
@@ -52,6 +58,11 @@ from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest
 if TYPE_CHECKING:
     from px4fuse.loop.loop import Loop
 
+NOT_REPLAYED = Unavailable(
+    "replay of EKF2",
+    "EKF2 flew on GNSS, and only its fusion of external vision is replayed here",
+    "What EKF2 did with each aid is in its own innovations, which are judged.",
+)
 # Noises that the report states: those of a source once. Each axis by itself is for `px4fuse tune`
 REPORTED = (HORIZONTAL, "down")
 # Gain of a low pass below which no slow error is looked for; clean flights have 0 to 2
@@ -290,16 +301,16 @@ def run_preparation(
     Arguments and errors are those of :func:`run`.
     """
     asked = request.clock_offset_s
+    _check_finite(start_s=request.start_s, end_s=request.end_s, clock_offset_s=asked)
+    flight = flight or read_flight(request, progress)
     settings = Settings(
         sigma_a_m_s2=request.sigma_a_m_s2,
-        sigma_z_m=request.sigma_z_m,
+        sigma_z_m=size_of_noise(request, flight),
         dt_s=request.dt_s,
         input=request.input or "imu",
         # that of a position file is spent on placing it
         clock_offset_s=asked if isinstance(asked, float) and request.position is None else 0.0,
     )
-    _check_finite(start_s=request.start_s, end_s=request.end_s, clock_offset_s=asked)
-    flight = flight or read_flight(request, progress)
     required = request.input == "imu"
     choices = Choices(
         axes=request.axes or None,
@@ -326,6 +337,14 @@ def run_preparation(
         return replace(prepared, notes=(*prepared.notes, note))
     settings = replace(settings, clock_offset_s=clock.offset_s)
     return prepare(flight, settings, input_required=required, **choices)
+
+
+def size_of_noise(request: ComparisonRequest, flight: Flight) -> float:
+    """SIGMA_Z (m): as asked for, or else the usual one of the source."""
+    if request.sigma_z_m is not None:
+        return request.sigma_z_m
+    track, _ = choose_source(flight, request.position_source)
+    return usual_sigma_z_m(flight, track, request.axes)
 
 
 def _check_finite(**values: float | str | None) -> None:
@@ -464,7 +483,8 @@ def explain(comparison: Comparison, progress: Progress = silent) -> Analysis:
     names = REPORTED if {"north", "east"} <= {line.name for line in comparison.lines} else None
     tuning, clock = noises_and_clock(comparison, progress, names)
     progress("replaying EKF2")
-    model = open_model(comparison.flight)
+    gnss = comparison.source.origin.is_gnss
+    model = NOT_REPLAYED if gnss else open_model(comparison.flight)
     why = why_ekf2_differs(comparison, model, tuning, clock)
     heading = turned_frame(comparison, tuning, clock, progress)
     progress("looking for a loop")

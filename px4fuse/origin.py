@@ -27,7 +27,7 @@ class Origin(Record, frozen=True):
     aid : Aid or None
         What EKF2 takes it as, with EKF2's parameters for it; None where EKF2 never fuses it.
     automatic : bool
-        Whether it may be chosen without being asked for.
+        Whether it may be chosen without being asked for: GNSS only where EKF2 fused it.
     """
 
     kind: PositionKind
@@ -59,6 +59,15 @@ class Origin(Record, frozen=True):
     def is_vision(self) -> bool:
         """Whether EKF2 takes it as external vision."""
         return self.aid == EV_POS
+
+    @property
+    def is_gnss(self) -> bool:
+        """Whether it is satellite navigation, whose errors are slow for the most part.
+
+        Multipath and the atmosphere change over seconds to minutes: what R has to cover is larger
+        than what differs from one position to the next.
+        """
+        return self.kind == "gnss"
 
     @property
     def preference(self) -> int:

@@ -79,8 +79,10 @@ class ComparisonRequest(_Asked, frozen=True, kw_only=True, tag_field="command", 
     position : PositionFile or None
     position_source : str or None
         Name of a track of the flight; None for the best.
-    sigma_a_m_s2, sigma_z_m, dt_s : float
+    sigma_a_m_s2, dt_s : float
         As :class:`px4fuse.filter.settings.Settings`.
+    sigma_z_m : float or None
+        None: 0.1, and of GNSS what EKF2 takes for its noise.
     input : {"imu", "zero"} or None
         None: the IMU where it is logged.
     axes : tuple of str
@@ -99,7 +101,7 @@ class ComparisonRequest(_Asked, frozen=True, kw_only=True, tag_field="command", 
     position: PositionFile | None = None
     position_source: str | None = None
     sigma_a_m_s2: float = 0.5
-    sigma_z_m: float = 0.10
+    sigma_z_m: float | None = None
     dt_s: float = 0.1
     input: InputName | None = None
     axes: tuple[AxisName, ...] = ()
@@ -293,7 +295,10 @@ FILTER_OPTIONS = {
     "sigma_a_m_s2": Option(
         "--sigma-a", "Process noise SIGMA_A, 0.0001 to 100.", "m/s²", 0.5
     ),
-    "sigma_z_m": Option("--sigma-z", "Measurement noise SIGMA_Z, 0.0001 to 100.", "m"),
+    "sigma_z_m": Option(
+        "--sigma-z", "Measurement noise SIGMA_Z, 0.0001 to 100.  [default: 0.1; of GNSS what EKF2 "
+        "takes]", "m", 0.1,
+    ),
     "dt_s": Option("--dt", "Prediction step DT, 0.001 to 1; Q is proportional to it.", "s"),
     "input": Option(
         "--input",
@@ -301,7 +306,8 @@ FILTER_OPTIONS = {
     ),
     "axes": Option(
         "--axis",
-        "Axis to analyse; may be repeated.  [default: all that the source supports]",
+        "Axis to analyse; may be repeated.  [default: all that the source supports; of "
+        "GNSS the horizontal ones]",
     ),
     "heading_deg": Option(
         "--heading",

@@ -5,13 +5,25 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TypedDict, Unpack
 
+import numpy as np
+
 from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.projection import GNSS_HEIGHT_SCALE
+from px4fuse.ekf2_parameters import GNSS_POS
 from px4fuse.errors import MissingDataError, SettingsError, did_you_mean
-from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import MIN_MEASUREMENTS, Segment, make_axes, within
-from px4fuse.flight import Flight, PositionTrack, Truth, Unavailable
+from px4fuse.filter.settings import SIGMA_Z_RANGE_M, Settings
+from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, make_axes, within
+from px4fuse.flight import (
+    POSITION_VARIANCE_COLUMNS,
+    Ekf2,
+    Flight,
+    PositionTrack,
+    Truth,
+    Unavailable,
+)
 from px4fuse.origin import GIVEN_FILE
 from px4fuse.readers.mavlink_messages import POSITION_INPUTS
+from px4fuse.readers.px4_innovations import with_gnss
 from px4fuse.readers.px4_topics import TOPIC_ORIGINS
 
 # Of the names under which logs have external positions, PX4's topics and MAVLink's messages
@@ -23,13 +35,18 @@ NOT_ITS_OWN_TRUTH = Unavailable(
 )
 
 
+# A receiver's height is much noisier than its position, and SIGMA_Z is one number
+GNSS_AXES = (AISLE, "north", "east")
+
+
 class Choices(TypedDict, total=False):
     """What of a flight is compared.
 
     Attributes
     ----------
     axes : tuple of str
-        From "north", "east", "down", "aisle"; by default all that the source supports.
+        From "north", "east", "down", "aisle"; by default all that the source supports, of GNSS
+        the horizontal ones.
     heading_deg : float
         Of the aisle.
     position_source : str
@@ -73,8 +90,12 @@ def prepare(
     settings = settings or Settings()
     track, reason = choose_source(flight, choices.get("position_source"))
     track = shift_clock(track, settings.clock_offset_s)
+    if track.origin.is_gnss and isinstance(flight.ekf2, Ekf2):
+        flight = replace(flight, ekf2=with_gnss(flight.ekf2))
     segment = choose_segment(flight, track, choices.get("start_s"), choices.get("end_s"))
     names, heading_deg = choices.get("axes"), choices.get("heading_deg")
+    if names is None and track.origin.is_gnss:
+        names = GNSS_AXES
     lines = make_axes(flight, track, segment, names=names, heading_deg=heading_deg)
     if isinstance(flight.truth, Truth) and flight.truth.name == track.name:
         flight = replace(flight, truth=NOT_ITS_OWN_TRUTH)
@@ -96,7 +117,7 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
     ----------
     flight : Flight
     name : str, optional
-        One of the track names; by default the best one short of GPS.
+        One of the track names; by default the best one; GNSS only where EKF2 fused it.
 
     Returns
     -------
@@ -126,6 +147,22 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
     )
 
 
+def usual_sigma_z_m(flight: Flight, track: PositionTrack, axes: tuple[str, ...] = ()) -> float:
+    """SIGMA_Z (m) where none is asked for: the lesson's, of GNSS what EKF2 takes (median √R).
+
+    √R = the accuracy that the receiver states, and EKF2_GPS_P_NOISE at least (gps_control.cpp);
+    that of its height where ``axes`` is that alone.
+    """
+    if not track.origin.is_gnss:
+        return Settings().sigma_z_m
+    least, column = flight.log.parameters.get(GNSS_POS.noise, 0.0), POSITION_VARIANCE_COLUMNS[0]
+    if axes == ("down",):
+        least, column = GNSS_HEIGHT_SCALE * least, POSITION_VARIANCE_COLUMNS[2]
+    stated = float(np.sqrt(track.samples[column].median()))
+    # nanmax: what the receiver does not state
+    return float(f"{np.nanmax([stated, least, SIGMA_Z_RANGE_M[0]]):.3g}")
+
+
 def no_source(flight: Flight) -> Unavailable:
     """Why no track of a flight is a position source by itself, and what would be one."""
     damaged = "the file is damaged, and " if flight.log.damage else ""
@@ -139,7 +176,10 @@ def no_source(flight: Flight) -> Unavailable:
         )
     hint = "S"
     if any(not track.origin.automatic for track in flight.positions):
-        hint = "Only GPS is in it: give `position_source` vehicle_gps_position to use that, or s"
+        hint = (
+            "Only GPS is in it, which EKF2 did not fuse: give `position_source` "
+            "vehicle_gps_position to use that, or s"
+        )
     return Unavailable(
         "position source",
         f"{damaged}no external position in this log (no "
@@ -152,6 +192,8 @@ def no_source(flight: Flight) -> Unavailable:
 def _why_best(flight: Flight, track: PositionTrack) -> str:
     if track.origin == GIVEN_FILE:
         return "given with --position"
+    if track.origin.is_gnss:
+        return "what EKF2 fused; no other position is in the log"
     whence = f" (from {track.log})" if track.log and track.log != flight.log.name else ""
     lacking = [
         part.source

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array
-from px4fuse.ekf2_parameters import EV_POS
+from px4fuse.ekf2_parameters import GNSS_POS
 from px4fuse.filter.signals import AISLE, Axis, Segment, along, within
 from px4fuse.flight import (
     AXIS_NAMES,
@@ -28,6 +28,8 @@ from px4fuse.flight import (
 
 # EKF2 never trusts external vision better than this (ev_pos_control.cpp, EKF2.cpp)
 EKF2_MIN_NOISE_M = 0.01
+# EKF2 takes a height of GNSS for less exact than its position (gnss_height_control.cpp)
+GNSS_HEIGHT_SCALE = 1.5
 MIN_COMMON_SAMPLES = 3
 # Undoing resets must bring EKF2 this much closer to the measurements (median squared distance);
 # below that the published output, which the vehicle flew on, stands.
@@ -164,10 +166,10 @@ def project_innovations(
     Columns as :attr:`Ekf2.innovations` plus ``prior_variance_m2`` (P⁻ = S - R) and
     ``posterior_variance_m2`` (P⁺ = P⁻R/S, or P⁻ where rejected), NaN where R is unknown.
     """
-    if not track.origin.is_vision:
+    if track.origin.aid is None:
         return Unavailable(
             "EKF2 innovations",
-            f"those in the log belong to external vision, not to {track.name}",
+            f"EKF2 never fuses {track.name}: those in the log belong to another source",
             "Choose the source that EKF2 fused (--position-source).",
         )
     frames = []
@@ -209,17 +211,19 @@ def _innovations_along(north: pd.DataFrame, east: pd.DataFrame, direction: Array
 def observation_variance(
     flight: Flight, track: PositionTrack, axis: Axis, segment: Segment
 ) -> float:
-    """R (m²) that EKF2 used for external vision where it does not log it, NaN if unknown.
+    """R (m²) that EKF2 used for the source where it does not log it, NaN if unknown.
 
     R = EKF2_EVP_NOISE², or the sender's variance if larger, unless EKF2_EV_NOISE_MD is 1
-    (EKF2.cpp, ev_pos_control.cpp).
+    (EKF2.cpp, ev_pos_control.cpp); of GNSS EKF2_GPS_P_NOISE², half as much again in σ for height,
+    or the receiver's accuracy if larger (gps_control.cpp, gnss_height_control.cpp).
     """
-    parameters = flight.log.parameters
-    if EV_POS.noise not in parameters:
+    aid, parameters = track.origin.aid, flight.log.parameters
+    if aid is None or aid.noise not in parameters:
         return float("nan")
-    r = max(parameters[EV_POS.noise], EKF2_MIN_NOISE_M) ** 2
+    scale = GNSS_HEIGHT_SCALE if aid == GNSS_POS and axis.name == "down" else 1.0
+    r = max(scale * parameters[aid.noise], EKF2_MIN_NOISE_M) ** 2
     # what a file of its own reports is not what EKF2 was sent
-    if parameters.get(EV_POS.noise_mode) == 1.0 or track.alignment is not None:
+    if parameters.get(aid.noise_mode) == 1.0 or track.alignment is not None:
         return r
     reported = within(track.samples, segment)[POSITION_VARIANCE_COLUMNS].median()
     reported_along = float(np.nansum(reported.to_numpy() * axis.direction**2))

@@ -15,7 +15,7 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import AgainstTruth, Comparison
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.whatif import Summary, what_if
-from px4fuse.ekf2_parameters import EV_POS, PARAMETERS
+from px4fuse.ekf2_parameters import EV_POS, PARAMETERS, Aid
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE
@@ -81,6 +81,11 @@ def asked_of_ekf2(
         if not low - UPDATE_MS <= flown <= high + UPDATE_MS:
             changes |= delay_change(model, -1e3 * clock.offset_s)
     return changes
+
+
+def aid_of(comparison: Comparison) -> Aid:
+    """What EKF2 takes the source as, with the names of its parameters."""
+    return comparison.source.origin.aid or EV_POS
 
 
 def vision_delay_ms(comparison: Comparison) -> float | None:
@@ -253,7 +258,9 @@ def settings_words(changes: Mapping[str, float]) -> str:
     """Parameters and the values to set."""
     parts = []
     for name, value in changes.items():
-        unit = f" {PARAMETERS[name].unit}" if PARAMETERS[name].unit else ""
+        # the model does not have the noise of GNSS, a length as that of external vision
+        unit = PARAMETERS.get(name, PARAMETERS[EV_POS.noise]).unit
+        unit = f" {unit}" if unit else ""
         parts.append(f"{name} to {value:.3g}{unit}")
     return " and ".join(parts)
 

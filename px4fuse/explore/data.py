@@ -340,7 +340,7 @@ def _command(request: ComparisonRequest, comparison: Comparison) -> dict[str, An
     """
     offset_s = None if request.position is None else request.clock_offset_s
     bare = msgspec.structs.replace(
-        request, sigma_a_m_s2=0.5, sigma_z_m=0.10, dt_s=0.1, input=None, clock_offset_s=offset_s
+        request, sigma_a_m_s2=0.5, sigma_z_m=None, dt_s=0.1, input=None, clock_offset_s=offset_s
     )
     heading = next((line.heading_deg for line in comparison.lines if line.name == AISLE), None)
     held = msgspec.structs.replace(

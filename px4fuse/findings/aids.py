@@ -20,13 +20,14 @@ JUDGED_ELSEWHERE = ("ev_pos", "ev_hgt")
 def detect(analysis: Analysis) -> Found:
     """Of a comparison."""
     if not isinstance(analysis.aids, Unavailable):
-        yield from find_in(analysis.aids)
+        own = analysis.source.origin.aid
+        yield from find_in(analysis.aids, "" if own is None else own.name)
 
 
-def find_in(aids: Mapping[str, AidResult]) -> Found:
-    """One finding for each aid that has one.
+def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
+    """One finding for each aid that has one; ``source`` is the one that our filter was given too.
 
-    What one sensor gives is missing together, and told once.
+    Its variance is judged beside ours. What one sensor gives is missing together, and told once.
     """
     judged = {name: aid for name, aid in aids.items() if name not in JUDGED_ELSEWHERE}
     starved: dict[str, list[AidResult]] = {}
@@ -48,7 +49,7 @@ def find_in(aids: Mapping[str, AidResult]) -> Found:
             (longest.longest_without_s,),
         )  # fmt: skip
     for name, aid in judged.items():
-        if aid.verdict == "variance understated":
+        if aid.verdict == "variance understated" and name != source:
             factor = aid.nis_mean**0.5
             yield warning(
                 "aid_understated",

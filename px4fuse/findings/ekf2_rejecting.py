@@ -7,17 +7,22 @@ import math
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
 from px4fuse.ekf2.whatif import what_if
-from px4fuse.ekf2_parameters import EV_POS, PARAMETERS
+from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS, Aid
 from px4fuse.findings.model import Finding, Found, finding, moments
 from px4fuse.flight import Ekf2, Unavailable
 
 REJECTED_SHARE_WARNING = 0.01  # of the innovations; 5 σ rejects 6e-7 when consistent
 REJECTED_SHARE_ERROR = 0.20  # of the innovations: one in five, R or the clock is wrong
-IN_ORDER = (
-    "First make EKF2_EVP_NOISE the source's own noise, then remove outliers (line of sight) and "
-    "check the clock; widen EKF2_EVP_GATE last."
-)
 OUTLIERS = "Remove the outliers (line of sight, anchor survey)."
+
+
+def in_order(aid: Aid) -> str:
+    """What to do where no replay tells what helps."""
+    return (
+        f"First make {aid.noise} the source's own noise, then remove outliers"
+        f"{'' if aid == GNSS_POS else ' (line of sight)'} and check the clock ({aid.delay}); widen "
+        f"{aid.gate} last."
+    )
 
 
 def detect(analysis: Analysis) -> Found:
@@ -34,15 +39,16 @@ def _narrow_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> Found:
         # both axes must be inside, each normal: erf(gate/√2)²
         must = 1.0 - math.erf(ekf2.gate / math.sqrt(2.0)) ** 2
         if must >= REJECTED_SHARE_WARNING:
-            usual = PARAMETERS[EV_POS.gate].default
+            aid = remedy.aid_of(analysis)
             yield finding(
                 rejections[0].severity,
                 "ekf2_gate_small",
-                f"{EV_POS.gate} is {ekf2.gate:g}: such a gate rejects {must:.0%} of the samples of "
+                f"{aid.gate} is {ekf2.gate:g}: such a gate rejects {must:.0%} of the samples of "
                 "a source that is as good as EKF2 expects",
                 f"; here it rejected {rejections[0].evidence['rejected_share']:.0%}, and what it "
                 "kept pulled EKF2 less than it should.",
-                f"Set {EV_POS.gate} to {usual:g}, PX4's default, and judge the rest of it then.",
+                f"Set {aid.gate} to {aid.default_gate:g}, PX4's default, and judge the rest of it "
+                "then.",
                 {"gate": ekf2.gate, "rejected_by_gate": must},
             )
 
@@ -63,7 +69,7 @@ def _rejections(analysis: Analysis) -> Found:
                 "ekf2_rejecting",
                 f"EKF2 rejected {share:.1%} of the source's samples for {what}",
                 f" (outside {ekf2.gate:g} √S): outliers, a noise set too small, or a late clock.",
-                IN_ORDER if name == "down" else _remedy(analysis),
+                in_order(remedy.aid_of(analysis)) if name == "down" else _remedy(analysis),
                 {"rejected_share": share, "count": len(frame), "axis": name},
                 moments(known.index[known > 0.0]),
             )
@@ -73,7 +79,7 @@ def _remedy(analysis: Analysis) -> str:
     """The noise or the delay that the data ask for, where that ends the rejections."""
     model = analysis.ekf2_model
     if isinstance(model, Unavailable):
-        return f"{IN_ORDER} {remedy.not_replayed(model)}"
+        return f"{in_order(remedy.aid_of(analysis))} {remedy.not_replayed(model)}"
     wanted = remedy.asked_of_ekf2(analysis, model, analysis.tuning, analysis.clock)
     flown = model.inputs.settings
     asked = {name: value for name, value in wanted.items() if value != flown[name]}
@@ -84,7 +90,7 @@ def _remedy(analysis: Analysis) -> str:
     gate = min(2.0 * flown[EV_POS.gate], PARAMETERS[EV_POS.gate].maximum)
     found = what_if(model, [*candidates, {EV_POS.gate: gate}])
     if isinstance(found, Unavailable):
-        return f"{IN_ORDER} {remedy.not_replayed(found)}"
+        return f"{in_order(EV_POS)} {remedy.not_replayed(found)}"
     before, (*tried, wider) = found.replayed, found.whatif
     for after in tried:
         if remedy.rejects_less(before, after):

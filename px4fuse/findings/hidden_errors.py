@@ -45,6 +45,8 @@ REMEDIES = {
     "delay that it takes the source to have, at its heading, and at what else it fuses.",
     "shared": "Look for an error that source and filter share: the clock (px4fuse sync LOG), a "
     "source that smooths its positions, its scale, the survey of the anchors.",
+    "gnss": "Look for an error that receiver and filter share: the age of a fix (px4fuse sync "
+    "LOG), slow errors of reception, EKF2's heading, a wrong lever arm of the antenna.",
 }
 
 
@@ -116,7 +118,8 @@ def larger(analysis: Analysis, hidden: list[Hidden]) -> Finding:
     small = worst.statement.nis_mean < SMALL_NIS
     words = "; ".join(said) + "."
     alone = all(one.owner == "ekf2" for one in hidden)
-    remedy = REMEDIES["drift" if drifts else "ekf2" if alone else "shared"]
+    shared = "gnss" if analysis.source.origin.is_gnss else "shared"
+    remedy = REMEDIES["drift" if drifts else "ekf2" if alone else shared]
     if frame := _after_turning(analysis, worst.owner):
         before, left = frame
         evidence |= {"position_rmse_horizontal_m": before, "position_rmse_aligned_m": left}

@@ -110,8 +110,8 @@ def settings_off(analysis: Analysis) -> Found:
     off = sorted(filter(None, both), key=lambda each: -each.size)
     # where a source may drift, or the truth shows it, innovations tell too little noise alone, and
     # a filter may follow such a source as closely as it likes
-    drifts = analysis.source.origin.may_drift
-    if drifts or any(one.owner == "kf" for one in hidden_errors(analysis)):
+    drifts, slow = analysis.source.origin.may_drift, analysis.source.origin.is_gnss
+    if drifts or slow or any(one.owner == "kf" for one in hidden_errors(analysis)):
         off = [e for e in off if e.chosen < e.value and not (drifts and e.severity == "info")]
     if not off:
         return

@@ -8,7 +8,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.whatif import WhatIf, what_if
-from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
 from px4fuse.findings.model import Found, error, finding, warning
 from px4fuse.findings.source_positions import low_pass
@@ -74,7 +74,14 @@ def offset(analysis: Analysis, clock: ClockOffset) -> Found:
 
 def _for_ekf2(analysis: Analysis, clock: ClockOffset) -> str:
     """What putting EKF2's delay right would do, where a replay confirms it."""
-    model = analysis.ekf2_model
+    aid, model = analysis.source.origin.aid, analysis.ekf2_model
+    taken_ms = None if aid != GNSS_POS else analysis.flight.log.parameters.get(GNSS_POS.delay)
+    if taken_ms is not None:
+        ask_ms = taken_ms - 1e3 * clock.remaining_s
+        return (
+            f"; for EKF2, which takes fixes to be {taken_ms:g} ms old ({GNSS_POS.delay}), that "
+            f"would be {max(ask_ms, 0.0):.0f} ms (not replayed)"
+        )
     if isinstance(model, Unavailable) or analysis.source.name != model.inputs.vision.source:
         return ""
     changes = remedy.delay_change(model, -1e3 * clock.offset_s)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from px4fuse.analysis import Analysis
+from px4fuse.ekf2_parameters import GNSS_POS
 from px4fuse.filter.heading import DRIFT_P, HeadingError
 from px4fuse.findings.ekf2_not_fusing import FUSING_SHARE_ERROR
 from px4fuse.findings.model import Finding, Found, Severity, finding, share_on
@@ -16,6 +17,12 @@ HEADING_ERROR_LARGE_DEG = 15.0  # a quarter of each axis goes to the other
 IN_EKF2_FRAME = "estimator_visual_odometry_aligned"
 READ = "Read 'north' as the source's x axis"
 FUSE_YAW = "EKF2 fuse the source's yaw (EKF2_EV_CTRL bit 3; EKF2_AID_MASK bit 4 before v1.14)."
+
+
+OUTDOORS = (
+    "Calibrate the magnetometer away from metal and motors, and look at the age of a fix "
+    f"({GNSS_POS.delay}): a wrong one turns the heading."
+)
 
 
 def detect(analysis: Analysis) -> Found:
@@ -60,6 +67,8 @@ def turned(analysis: Analysis, heading: HeadingError) -> Found:
     is_px4 = analysis.flight.log.has_ulog
     remedy = "calibrate the magnetometer away from metal and motors, or let "
     remedy += FUSE_YAW if is_px4 else "the autopilot fuse the source's yaw."
+    if analysis.source.origin.is_gnss:
+        remedy = OUTDOORS
     if heading.drifts:
         yield _drifting(name, heading, remedy)
         return
@@ -75,7 +84,14 @@ def turned(analysis: Analysis, heading: HeadingError) -> Found:
         f"Turn the positions by {-turn:+.0f}° before they are sent (a file: --position-yaw), or "
         "calibrate the magnetometer.",
     )
-    if name == IN_EKF2_FRAME:
+    if analysis.source.origin.is_gnss:
+        found = (
+            "ekf2_heading_wrong",
+            f"The positions of GNSS lie {stated} EKF2's heading, the same throughout",
+            ": what the IMU measures as north, they show in another direction. GNSS knows north.",
+            OUTDOORS,
+        )
+    elif name == IN_EKF2_FRAME:
         found = (
             "ekf2_heading_wrong",
             f"The positions that EKF2 fused ({name}) lie {stated} EKF2's heading, the same "

@@ -43,7 +43,9 @@ def longest_s(interval_s: float) -> float:
 
 def gaps(analysis: Analysis) -> Found:
     """The source stopped for a while."""
-    rate_hz = analysis.source.rate_hz
+    rate_hz, sight = analysis.source.rate_hz, "line of sight to the anchors and the link"
+    if analysis.source.origin.is_gnss:
+        sight = "the antenna's view of the sky, its cable, and what radiates on board"
     silent = source_gaps(analysis.lines[0].measurement_time_s, rate_hz)
     if silent:
         at, until = max(silent, key=lambda gap: gap[1] - gap[0])
@@ -52,8 +54,7 @@ def gaps(analysis: Analysis) -> Found:
             f"The source was silent {times(len(silent))} for more than "
             f"{longest_s(1.0 / rate_hz):.1f} s, the longest time {until - at:.1f} s at {at:.1f} s",
             ": only the IMU carries the position there.",
-            "Check line of sight to the anchors and the link; analyse one side with --start, "
-            "--end.",
+            f"Check {sight}; analyse one side with --start, --end.",
             {"count": len(silent), "longest_s": until - at, "at_s": at},
             silent,
         )

@@ -15,7 +15,7 @@ from px4fuse.filter.coloured import Coloured
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.signals import within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, tune
-from px4fuse.findings.model import Found, error, warning
+from px4fuse.findings.model import Found, error, info, warning
 from px4fuse.findings.source_positions import LAG_NATS, MOTION_RANGE_M, motion_range_m
 from px4fuse.flight import POSITION_COLUMNS, Unavailable
 
@@ -47,17 +47,28 @@ def slow(analysis: Analysis) -> Found:
         return
     if found.lag_nats >= LAG_NATS:
         return  # smoothed
-    yield warning(
+    gnss = analysis.source.origin.is_gnss
+    yield (info if gnss else warning)(
         "source_coloured",
         f"The errors of {analysis.source.name} hang together over about {found.tau_s:.1g} s",
         f": a slow part of about {found.slow_m:.2g} m beside white noise of {found.white_m:.2g} m. "
         "Both filters take each error for new: they follow the slow part, which shows in no "
         "innovation, and claim to be better than they are.",
         "No SIGMA_Z and no noise of EKF2 describes both parts: do not lower it to the white part. "
-        "Look for what is slow (reflections, geometry of the anchors, a filter in the sender), or "
-        "feed the filters fewer positions, further apart than that time.",
+        + (
+            "A receiver's errors are like that: let its accuracy, and R, cover both."
+            if gnss
+            else "Look for what is slow (reflections, geometry of the anchors, a filter in the "
+            "sender), or feed the filters fewer positions, further apart than that time."
+        ),
         asdict(found),
     )
+
+
+def _in_view(analysis: Analysis) -> str:
+    if analysis.source.origin.is_gnss:
+        return "satellites in view, walls and trees, what radiates on board"
+    return "anchors in view, distance, people in between"
 
 
 def repeats(analysis: Analysis) -> Found:
@@ -81,6 +92,8 @@ def repeats(analysis: Analysis) -> Found:
 
 def unequal(analysis: Analysis) -> Found:
     """North and east with noises of different size."""
+    if analysis.source.origin.is_gnss:
+        return  # its white part says nothing of its errors
     pair = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
     statements = [axis.filters["kf"] for axis in pair]
     nis = [one.nis_mean for one in statements if not isinstance(one, Unavailable)]
@@ -151,8 +164,8 @@ def levels(analysis: Analysis) -> Found:
         f"{analysis.source.name} is noisier from {start:.0f} s to {end:.0f} s: innovations are "
         f"{ratio:.1f} times as large as in the rest of the flight",
         ", most of them and not single ones. No SIGMA_Z fits all of it.",
-        "Look for what changed there (anchors in view, distance, people in between); let the "
-        "sender state its variance for each position, or analyse the parts with --start, --end.",
+        f"Look for what changed there ({_in_view(analysis)}); let the sender state its variance "
+        "for each position, or analyse the parts with --start, --end.",
         {"ratio": ratio, "first_s": start, "until_s": end},
         ((start, end),),
     )

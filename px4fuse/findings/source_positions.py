@@ -112,13 +112,23 @@ def jumps(analysis: Analysis) -> Found:
             "source_jumps",
             f"{analysis.source.name} jumps {times(len(large))} and stays there, by {size:.2f} m "
             f"(± {1.96 * sigma:.2f}) at {at_s:.1f} s, while the IMU measures no such motion",
-            ": a false match, another set of anchors or an origin that was set again. After it "
-            "both filters are wrong by that, and consistent.",
-            "Analyse one side of the jump with --start, --end; let the source keep one origin and "
-            "one set of anchors in flight.",
+            f": {_jumped(analysis)}. After it both filters are wrong by that, and consistent.",
+            f"Analyse one side of the jump with --start, --end; {_steady(analysis)} in flight.",
             {"count": len(large), "size_m": size, "at_s": at_s, "sigma_m": sigma},
             moments(jump.time_s for jump in large),
         )
+
+
+def _jumped(analysis: Analysis) -> str:
+    if analysis.source.origin.is_gnss:
+        return "another set of satellites, reflections, or RTK that was won or lost"
+    return "a false match, another set of anchors or an origin that was set again"
+
+
+def _steady(analysis: Analysis) -> str:
+    if analysis.source.origin.is_gnss:
+        return "wait for a steady fix (RTK) before take-off, and let nothing cover the antenna"
+    return "let the source keep one origin and one set of anchors"
 
 
 def scale(analysis: Analysis) -> Found:
@@ -140,8 +150,12 @@ def scale(analysis: Analysis) -> Found:
             f"{'long' if off > 0 else 'short'} (± {1.96 * sigma:.0%}) against the motion that the "
             "IMU measures",
             ": neither filter's innovations show it, since both follow the positions.",
-            "Measure a known distance with the source; survey the anchors again, and check its "
-            "unit and its calibration.",
+            "Measure a known distance with the source"
+            + (
+                "."
+                if analysis.source.origin.is_gnss
+                else "; survey the anchors again, and check its unit and its calibration."
+            ),
             {"scale": 1.0 + off, "sigma": sigma},
         )
 
@@ -164,7 +178,7 @@ def outliers(analysis: Analysis) -> Found:
     first = ", ".join(f"{time:.1f}" for time in times_s[:3])
     origin, likely = analysis.source.origin, "for UWB most likely reflections without line of sight"
     cure = "Give the tag line of sight to the anchors there, or reject them before they are sent"
-    if origin.kind == "gnss":
+    if origin.is_gnss:
         likely = "of GNSS most likely reflections, or a solution that changed"
         cure = "Give the antenna a free sky, away from walls and from what radiates"
     yield finding(

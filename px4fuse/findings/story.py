@@ -140,7 +140,8 @@ def _since(analysis: Analysis) -> str:
     if hidden_error(analysis, analysis.main, "kf"):
         return ""
     tuned, over = tuned_for(analysis, analysis.main.axis.name), statement.variance_factor > 1.0
-    if analysis.source.origin.may_drift or tuned is None:
+    origin = analysis.source.origin
+    if origin.may_drift or tuned is None or (over and origin.is_gnss):
         return ""
     causes, before = [], statement.nis_mean
     for field, unit, noise in (

@@ -7,10 +7,16 @@ from typing import TypeGuard
 import numpy as np
 from msgspec import structs
 
-from px4fuse.analysis import Analysis
+from px4fuse.analysis import NOT_REPLAYED, Analysis
 from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName
-from px4fuse.comparison.remedy import noise_helps, not_replayed, remedy_words, settings_words
-from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.comparison.remedy import (
+    aid_of,
+    noise_helps,
+    not_replayed,
+    remedy_words,
+    settings_words,
+)
+from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.fitting import SIGMA_Z_SEARCH_M
 from px4fuse.filter.settings import Settings
@@ -24,6 +30,7 @@ from px4fuse.plain import factor_words, number_words
 
 VARIANCE_FACTOR = 1.5  # times: 22 % in standard deviation; chance moves it less at n > 100
 VARIANCE_FACTOR_ERROR = 4.0  # times: a factor of two in standard deviation
+DEFAULT_GNSS_NOISE_M = 0.5  # EKF2_GPS_P_NOISE, v1.8 to main
 EKF2_NOISE_FLOOR_M = 0.01  # EKF2 never trusts external vision better, EKF2.cpp
 NOISE_FITS = 1.25  # times: the median's own scatter below n = 100 (1.17/√n, two σ)
 SMALLEST_NOISE_M = 0.001  # below what any positioning system resolves
@@ -32,12 +39,13 @@ OUTLIER_SHARE = 0.005  # outside 5√S, where 6e-7 is expected
 OWNERS = {"kf": "Our", "ekf2": "EKF2's"}
 GROUPS = {"horizontal": ("north", "east", "aisle"), "vertical": ("down",)}
 ONLY_HORIZONTAL = Unavailable("EKF2 replay", "the model of EKF2 is of horizontal position", "None.")
-LOOK_ELSEWHERE = (
-    "Look at the clock (EKF2_EV_DELAY), the outliers and EKF2's process noise (EKF2_ACC_NOISE):"
-)
 AGAINST_DRIFT = (
     "Nothing follows from innovations alone: against a source that may drift they show how well "
     "the filter follows it, not how wrong both are."
+)
+AGAINST_SLOW_ERRORS = (
+    "Lower no noise for these innovations: errors of GNSS are slow for the most part, which R has "
+    "to cover and innovations do not show."
 )
 AGAINST_TRUTH = (
     "Lower no noise for these innovations: the errors against the truth are larger than claimed."
@@ -81,6 +89,8 @@ def _of_group(analysis: Analysis, owner: FilterName, group: str, members: list[M
     tuned, stated = tuned_for(analysis, result.axis.name), "overstated" if over else "understated"
     if over and analysis.source.origin.may_drift:
         severity, remedy, cause = "info", AGAINST_DRIFT, ELSEWHERE
+    elif over and analysis.source.origin.is_gnss:
+        severity, remedy, cause = "info", AGAINST_SLOW_ERRORS, ELSEWHERE
     elif over and any(hidden.owner == owner for hidden in hidden_errors(analysis)):
         remedy, cause = AGAINST_TRUTH, ELSEWHERE
     elif tuned is None:
@@ -114,8 +124,9 @@ def _is_default(analysis: Analysis, owner: FilterName, result: AxisComparison) -
     if owner == "kf":
         chosen, own = analysis.settings, Settings()
         return (chosen.sigma_z_m, chosen.sigma_a_m_s2) == (own.sigma_z_m, own.sigma_a_m_s2)
-    default = PARAMETERS["EKF2_EVP_NOISE"].default
-    untouched = analysis.flight.log.parameters.get("EKF2_EVP_NOISE", default) == default
+    name = aid_of(analysis).noise
+    default = PARAMETERS[name].default if name in PARAMETERS else DEFAULT_GNSS_NOISE_M
+    untouched = analysis.flight.log.parameters.get(name, default) == default
     # a sender that reports a larger variance has chosen it
     return untouched and not abs(np.log(_ekf2_noise_m(result) / default)) > np.log(NOISE_FITS)
 
@@ -168,13 +179,13 @@ def _other_cause(
     if statement.variance_factor < 1.0 and _has_outliers(analysis, statement):
         return OUTLIERS, (
             f"{statement.outside_gate:.1%} lie outside the gate while the bulk fits "
-            f"{noise_m:.2g} m: remove the outliers (line of sight, anchor survey) instead of "
-            "raising the noise."
+            f"{noise_m:.2g} m: remove the outliers instead of raising the noise."
         )
     name, where = "SIGMA_Z", "SIGMA_A (--sigma-a) and the clock (--clock-offset)"
     if owner == "ekf2":
-        name = "EKF2_EVP_NOISE"
-        where = "the clock (EKF2_EV_DELAY) and at EKF2's process noise (EKF2_ACC_NOISE)"
+        aid = aid_of(analysis)
+        name = aid.noise
+        where = f"the clock ({aid.delay}) and at EKF2's process noise (EKF2_ACC_NOISE)"
     return ELSEWHERE, f"It is not {name} (the source's noise is {noise_m:.2g} m): look at {where}."
 
 
@@ -182,21 +193,29 @@ def _ekf2_remedy(
     analysis: Analysis, result: AxisComparison, noise_m: float, *, bounded: bool, over: bool
 ) -> tuple[str, str]:
     parameters, used_m = analysis.flight.log.parameters, _ekf2_noise_m(result)
-    changes = {"EKF2_EVP_NOISE": max(float(f"{noise_m:.2g}"), EKF2_NOISE_FLOOR_M)}
+    aid = aid_of(analysis)
+    changes = {aid.noise: max(float(f"{noise_m:.2g}"), EKF2_NOISE_FLOOR_M)}
     was = "" if np.isnan(used_m) else f" (√R was {used_m:.2g} m)"
     why = f"The source's noise is {'at most ' if bounded else ''}{noise_m:.2g} m{was}: "
-    reported = used_m > NOISE_FITS * parameters.get("EKF2_EVP_NOISE", np.nan)
-    if over and reported and parameters.get("EKF2_EV_NOISE_MD") != 1.0:
-        changes = {"EKF2_EV_NOISE_MD": 1.0, **changes}
+    reported = used_m > NOISE_FITS * parameters.get(aid.noise, np.nan)
+    if over and reported and aid.noise_mode and parameters.get(aid.noise_mode) != 1.0:
+        changes = {aid.noise_mode: 1.0, **changes}
         why = (
             f"R is what the sender reports ({used_m:.2g} m), since that is more than "
-            "EKF2_EVP_NOISE: correct it there, or "
+            f"{aid.noise}: correct it there, or "
+        )
+    if aid == GNSS_POS:
+        return NOISE, (
+            f"From one fix to the next the source scatters by {noise_m:.2g} m{was}, and slow "
+            f"errors come on top: set {aid.noise} above that. {not_replayed(NOT_REPLAYED)}"
         )
     if result.axis.name == "down":
         return NOISE, f"{why}set {settings_words(changes)}. {not_replayed(ONLY_HORIZONTAL)}"
     words, helps = remedy_words(
-        analysis.ekf2_model, changes, noise_helps, why=why, otherwise=LOOK_ELSEWHERE
-    )
+        analysis.ekf2_model, changes, noise_helps, why=why,
+        otherwise=f"Look at the clock ({aid.delay}), the outliers and EKF2's process noise "
+        "(EKF2_ACC_NOISE):",
+    )  # fmt: skip
     return NOISE if helps else ELSEWHERE, words
 
 

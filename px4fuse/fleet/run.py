@@ -179,7 +179,8 @@ def run(
         raise SettingsError(f"no such setting ({error}).") from error
     if request.mavlink is not None or request.position is not None:
         raise SettingsError("`mavlink` and `position` belong to one flight, not to many.")
-    Settings(request.sigma_a_m_s2, request.sigma_z_m, request.dt_s)  # refuses what is out of range
+    sigma_z_m = Settings().sigma_z_m if request.sigma_z_m is None else request.sigma_z_m
+    Settings(request.sigma_a_m_s2, sigma_z_m, request.dt_s)  # refuses what is out of range
     version, used = metadata.version("px4fuse"), command_line(request)
     job = Job("", request, reports, max_log_bytes.get(), version)
     with connected(scheduler, workers, memory) as client, opened(output, version, used) as store:

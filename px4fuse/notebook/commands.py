@@ -139,7 +139,7 @@ def compare(
         position=PositionFile(path=str(position)) if isinstance(position, str | Path) else position,
         position_source=position_source,
         sigma_a_m_s2=chosen.sigma_a_m_s2 if sigma_a_m_s2 is None else sigma_a_m_s2,
-        sigma_z_m=chosen.sigma_z_m if sigma_z_m is None else sigma_z_m,
+        sigma_z_m=settings.sigma_z_m if settings and sigma_z_m is None else sigma_z_m,
         dt_s=chosen.dt_s if dt_s is None else dt_s,
         # "imu", the default of settings, asks for the IMU where it is logged
         input=input or ("zero" if chosen.input == "zero" else None),

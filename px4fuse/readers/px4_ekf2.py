@@ -98,7 +98,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         accelerometer_bias=_read_accelerometer_bias(topics, step_s),
         step_s=step_s,
         horizon_s=_horizon_s(topics, step_s),
-        record=_read_record(topics, step_s),
+        record=_read_record(topics, step_s, local),
         aids=aids,
     )
 
@@ -262,10 +262,13 @@ def read_resets(local: pd.DataFrame) -> tuple[Reset, ...]:
     return tuple(sorted(resets, key=lambda reset: reset.time_s))
 
 
-def _read_record(topics: Topics, step_s: float) -> FusionRecord | Unavailable:
+def _read_record(
+    topics: Topics, step_s: float, local: pd.DataFrame
+) -> FusionRecord | Unavailable:
     """What the log tells of the inside of EKF2's filter, in one layout and unit for all releases.
 
-    ``step_s`` is the time between two predictions, for releases that keep biases per prediction.
+    ``step_s`` is the time between two predictions, for releases that keep biases per prediction;
+    ``local`` is the published position, with the altitude of its origin where it has one.
     """
     topic = px4.ESTIMATOR_STATES[0]
     attitude = px4.ATTITUDE_VARIANCES.get(_state_vectors(topics).get(topic, (0, 0)))
@@ -292,6 +295,9 @@ def _read_record(topics: Topics, step_s: float) -> FusionRecord | Unavailable:
     horizontal = POSITION_COLUMNS[:2]
     if not delayed[horizontal].to_numpy().any():  # from v1.16 kept as latitude and longitude
         delayed[horizontal] = np.nan
+        # and its height, where there is an origin, as altitude above the sea (ekf_helper.cpp)
+        origin_m = local["ref_alt"].dropna() if "ref_alt" in local else pd.Series(dtype=float)
+        delayed["down_m"] += float(origin_m.iloc[-1]) if len(origin_m) else 0.0
     age = _age_s(topics, VISION).sort_index()
     return FusionRecord(
         parameters=topics.ekf2_parameters,

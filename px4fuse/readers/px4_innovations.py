@@ -1,20 +1,71 @@
-"""EKF2's innovations of external vision, per axis, from what a log has of its aids."""
+"""EKF2's innovations of a position source, per axis, from what a log has of its aids."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
 
-from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Unavailable
+from px4fuse.ekf2_parameters import GNSS_POS
+from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Ekf2, Unavailable
 from px4fuse.readers.px4_topics import HOW_TO_FUSE
 
 Innovations = dict[AxisName, pd.DataFrame | Unavailable]
 
 
+@dataclass(frozen=True)
+class Fused:
+    """A position source as EKF2 knows it: its name, its aids, and what has EKF2 fuse them."""
+
+    name: str
+    horizontal: str
+    vertical: str
+    remedies: Mapping[str, str]
+    to_log: str
+
+
+VISION = Fused(
+    "external vision", "ev_pos", "ev_hgt", HOW_TO_FUSE,
+    "Record with SDLOG_PROFILE 129 (default and vision).",
+)  # fmt: skip
+_GNSS_SWITCH = f"{GNSS_POS.switch} (bit 0 of EKF2_AID_MASK before v1.14)"
+GNSS = Fused(
+    "GNSS", "gnss_pos", "gnss_hgt",
+    {"horizontal": f"Set bit 0 of {_GNSS_SWITCH}, and wait for a fix that passes EKF2's checks.",
+     "vertical": f"Set bit 1 of {GNSS_POS.switch} (EKF2_HGT_MODE 1 before v1.14) if EKF2 is to "
+                 "fuse its height."},
+    "Record with SDLOG_PROFILE bit 0 (default).",
+)  # fmt: skip
+
+
+def with_gnss(ekf2: Ekf2) -> Ekf2:
+    """EKF2 with its innovations of GNSS in place of those of external vision."""
+    meant = {
+        group: log.meant
+        for group, name in (("horizontal", "gnss_pos"), ("vertical", "gnss_hgt"))
+        if (log := ekf2.aids.get(name)) is not None and log.meant is not None
+    }
+    fusing: pd.DataFrame | Unavailable = Unavailable(
+        "EKF2 fusion flags", "the log does not tell when EKF2 fused GNSS", GNSS.to_log
+    )
+    if meant:
+        columns = ["horizontal", "vertical", "yaw"]
+        fusing = pd.DataFrame(meant).ffill().bfill().reindex(columns=columns, fill_value=0.0)
+    log = ekf2.aids.get("gnss_pos")
+    gate = GNSS_POS.default_gate if log is None else log.parameters.get(GNSS_POS.gate, 5.0)
+    innovations, topics = innovations_of(ekf2.aids, fusing, gate, GNSS)
+    return replace(
+        ekf2, innovations=innovations, innovation_topics=topics, fusing=fusing, gate=gate
+    )
+
+
 def innovations_of(
-    aids: Mapping[str, AidLog], fusing: pd.DataFrame | Unavailable, gate: float
+    aids: Mapping[str, AidLog],
+    fusing: pd.DataFrame | Unavailable,
+    gate: float,
+    source: Fused = VISION,
 ) -> tuple[Innovations, tuple[str, ...]]:
     """Innovations per axis, and their topics.
 
@@ -24,27 +75,29 @@ def innovations_of(
     fusing : DataFrame or Unavailable
         As :class:`~px4fuse.flight.Ekf2` has it.
     gate : float
-        Of external vision position, for rejections that are not logged.
+        Of the source's position, for rejections that are not logged.
+    source : Fused
     """
     found: Innovations = {}
     used: dict[str, None] = {}
     for axis in AXIS_NAMES:
         group = "vertical" if axis == "down" else "horizontal"
-        log = aids.get("ev_hgt" if axis == "down" else "ev_pos")
+        log = aids.get(source.vertical if axis == "down" else source.horizontal)
         frame = None if log is None else _along(log, axis, gate)
         if isinstance(fusing, pd.DataFrame) and not fusing[group].any():
             quantity = "height" if axis == "down" else "horizontal position"
             found[axis] = Unavailable(
                 f"EKF2 innovations, {axis}",
-                f"EKF2 never fused external vision for {quantity} in this log",
-                HOW_TO_FUSE[group],
+                f"EKF2 never fused {source.name} for {quantity} in this log",
+                source.remedies[group],
             )
         elif log is None or frame is None or frame.empty:
             found[axis] = Unavailable(
                 f"EKF2 innovations, {axis}",
-                "no usable estimator_aid_src_ev_pos, estimator_aid_src_ev_hgt, "
-                "estimator_innovations or ekf2_innovations sample while external vision was fused",
-                "Record with SDLOG_PROFILE 129 (default and vision).",
+                f"no usable estimator_aid_src_{source.horizontal}, "
+                f"estimator_aid_src_{source.vertical}, estimator_innovations or ekf2_innovations "
+                f"sample while {source.name} was fused",
+                source.to_log,
             )
         else:
             found[axis] = frame

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from msgspec import structs
 
 from px4fuse.arrays import Array
-from px4fuse.ekf2_parameters import EV_POS
+from px4fuse.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS
 from px4fuse.flight import (
     AXIS_NAMES,
     POSITION_COLUMNS,
@@ -38,6 +40,9 @@ SAME_TIME_US = 100
 ARRIVAL_SHARE = 0.9
 # Heights this far from a position may be joined to it: 2.5 cm at a climb of 0.5 m/s
 HEIGHT_TOLERANCE_S = 0.05
+# Logged no faster than this, a receiver's positions were thinned: they give 5 to 20 a second
+THINNED_HZ = 4.0
+DEFAULT_GNSS_DELAY_MS = 110.0  # EKF2_GPS_DELAY, ekf2_params.c and module.yaml, v1.8 to main
 AUTOPILOT_CLOCK = "autopilot boot clock (as PX4 mapped the sender's stamp)"
 
 
@@ -52,7 +57,7 @@ def read_positions(
         *(_read_logged(topics, source) for source in px4.TRACKS),
         _read_kept(topics, turns),
         _rebuild(topics, ekf2, turns),
-        _read_gps(topics),
+        _read_gps(topics, fuses_gnss(ekf2)),
     ]
     missing = tuple(track for track in found if isinstance(track, Unavailable))
     return best_first(track for track in found if isinstance(track, PositionTrack)), missing
@@ -276,7 +281,20 @@ def projected(geo: pd.DataFrame, origin: tuple[float, float, float] | None) -> p
     )
 
 
-def _read_gps(topics: Topics) -> PositionTrack | Unavailable:
+def fuses_gnss(ekf2: Ekf2 | Unavailable) -> bool:
+    """Whether EKF2 fused, or meant to fuse, the position of GNSS at any time."""
+    log = None if isinstance(ekf2, Unavailable) else ekf2.aids.get("gnss_pos")
+    if log is None:
+        return False
+    return bool(log.samples["fused"].any() if "fused" in log.samples else log.meant is not None)
+
+
+def _read_gps(topics: Topics, fused: bool) -> PositionTrack | Unavailable:
+    """GNSS at the times that EKF2 takes its fixes to have been measured at.
+
+    Those are the stamps less EKF2_GPS_DELAY, and since main of 2026 the driver's own times of
+    measurement where those differ (EKF2.cpp UpdateGpsSample, estimator_interface.cpp).
+    """
     layout = topics.find(px4.GPS)
     if layout is None:
         return _unavailable(GPS_POSITION, f"no topic {GPS_POSITION} in the log")
@@ -287,23 +305,49 @@ def _read_gps(topics: Topics) -> PositionTrack | Unavailable:
         return _unavailable(GPS_POSITION, "the receiver never had a 3D fix")
     samples = projected(gps, _local_origin(topics))
     if {"eph_m", "epv_m"} <= set(gps.columns):
-        samples["north_m2"] = samples["east_m2"] = gps["eph_m"].to_numpy() ** 2 / 2.0
+        # EKF2 takes the horizontal accuracy for each axis (gps_control.cpp)
+        samples["north_m2"] = samples["east_m2"] = gps["eph_m"].to_numpy() ** 2
         samples["down_m2"] = gps["epv_m"].to_numpy() ** 2
-    return _track(topics, GPS_POSITION, "GPS position", samples, (layout.topic,))
+    parameters = topics.ekf2_parameters
+    published_s = (gps["published_us"].to_numpy() - topics.zero_us) * 1e-6
+    own = GNSS_MODE in parameters and bool(np.any(published_s - gps.index > SAME_TIME_US * 1e-6))
+    delay_ms = 0.0 if own else parameters.get(GNSS_POS.delay, DEFAULT_GNSS_DELAY_MS)
+    clock = "autopilot boot clock, the receiver driver's times of measurement"
+    if not own:
+        samples = samples.set_axis(pd.Index(published_s - delay_ms * 1e-3, name="time_s"))
+        clock = f"autopilot boot clock, less {delay_ms:g} ms ({GNSS_POS.delay})"
+    found = _track(topics, GPS_POSITION, "GNSS position", samples, (layout.topic,), clock=clock)
+    if isinstance(found, Unavailable):
+        return found
+    notes: tuple[str, ...] = ()
+    if found.rate_hz < THINNED_HZ:
+        notes = (
+            f"the log holds {found.rate_hz:.1f} positions of GNSS a second, fewer than receivers "
+            "give: the logger left out the others (SDLOG_PROFILE bit 1 keeps them)",
+        )
+    return replace(
+        found, origin=structs.replace(found.origin, automatic=fused), notes=found.notes + notes
+    )
 
 
-def read_truth(topics: Topics, positions: tuple[PositionTrack, ...]) -> Truth | Unavailable:
+def read_truth(
+    topics: Topics, positions: tuple[PositionTrack, ...], ekf2: Ekf2 | Unavailable
+) -> Truth | Unavailable:
     """Simulation ground truth, or motion capture where another track feeds EKF2.
 
     Some has only latitude and longitude (v1.13 and older); its own first sample is the simulation's
-    home.
+    home. Where EKF2 fused GNSS, its origin is where its first fix put it, which the simulation's
+    is not: the truth is moved there.
     """
     attitude = attitude_of(topics.read(px4.TRUTH_ATTITUDE))
     local = topics.read(px4.TRUTH_LOCAL)
-    if local is not None and len(local := local.dropna()):
-        return Truth(px4.TRUTH_LOCAL[0].topic, local, attitude)
     geo = topics.read(px4.TRUTH_GLOBAL)
-    if geo is not None and len(geo := finite_rows(geo, GLOBAL_COLUMNS[:2])):
+    geo = None if geo is None else finite_rows(geo, GLOBAL_COLUMNS[:2])
+    if local is not None and len(local := local.dropna()):
+        if geo is not None and len(geo) and fuses_gnss(ekf2):
+            local = _about_origin(local, projected(geo, _local_origin(topics)))
+        return Truth(px4.TRUTH_LOCAL[0].topic, local, attitude)
+    if geo is not None and len(geo):
         velocity = geo.reindex(columns=VELOCITY_COLUMNS)
         samples = projected(geo, _local_origin(topics)).join(velocity)
         return Truth(px4.TRUTH_GLOBAL[0].topic, samples, attitude)
@@ -315,6 +359,16 @@ def read_truth(topics: Topics, positions: tuple[PositionTrack, ...]) -> Truth | 
             "Real flights have truth only from motion capture (send ATT_POS_MOCAP).",
         )
     return captured_truth(captured)
+
+
+def _about_origin(local: pd.DataFrame, there: pd.DataFrame) -> pd.DataFrame:
+    """Local positions about the origin of others of the same path (median of what they differ)."""
+    moved = local.copy()
+    for column in POSITION_COLUMNS:
+        at = np.interp(there.index, local.index, local[column], left=np.nan, right=np.nan)
+        shift = (there[column] - at).median()
+        moved[column] += shift if np.isfinite(shift) else 0.0
+    return moved
 
 
 def captured_truth(track: PositionTrack) -> Truth:

@@ -120,6 +120,7 @@ TRUTH_ATTITUDE = (
 
 _GPS_OPTIONAL = {
     "eph_m": "eph", "epv_m": "epv", "fix_type": "fix_type", "utc_us": "time_utc_usec",
+    "published_us": "timestamp",
 }  # fmt: skip
 GPS = (
     Layout(

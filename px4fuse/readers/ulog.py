@@ -70,7 +70,7 @@ def to_flight(topics: Topics) -> Flight:
     )
     ekf2 = read_ekf2(topics)
     positions, missing_positions = read_positions(topics, ekf2)
-    truth = read_truth(topics, positions)
+    truth = read_truth(topics, positions, ekf2)
     airborne = _read_airborne(topics)
     in_flight = ends_in_flight(airborne, topics.log.duration_s)
     dropped = tuple(
