@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 
 NOT_REPLAYED = Unavailable(
     "replay of EKF2",
-    "EKF2 flew on GNSS, and only its fusion of external vision is replayed here",
+    "EKF2 flew on GNSS, whose fusion is not replayed here",
     "What EKF2 did with each aid is in its own innovations, which are judged.",
 )
 # Noises that the report states: those of a source once. Each axis by itself is for `px4fuse tune`

@@ -52,6 +52,11 @@ class Aid:
     reported: str = ""
     default_gate: float = 5.0
 
+    @property
+    def own(self) -> frozenset[str]:
+        """Names of parameters that concern its measurements alone."""
+        return frozenset((self.noise, self.gate, self.delay, self.noise_mode))
+
     def in_log(self, logged: Mapping[str, float]) -> dict[str, float]:
         """Its parameters among those of a log, and what switches it."""
         names = (self.noise, self.delay, self.gate, self.noise_mode, self.switch, AID_MASK)

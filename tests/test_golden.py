@@ -24,8 +24,8 @@ from flights import unexplained, with_noises
 from golden_tools import agrees, numbers, of_blocks, of_values, rounded, value, written
 from made_up_fleet import made_up
 from scipy.spatial.transform import Rotation
-from test_aids import gnss_log
 from test_findings import FAULTS
+from ulog_tools import gnss_log
 
 import px4fuse
 from px4fuse.cli import COMMANDS as CLI_COMMANDS

@@ -179,6 +179,51 @@ def make_log(generation: str = "v1.16", seconds: float = 10.0, imu_hz: float = 1
     return log
 
 
+def gnss_log(generation: str) -> Log:
+    """A log in which EKF2 fuses GNSS position at 5 Hz, and external vision never."""
+    log, number = make_log(generation, seconds=20.0), int(generation.removeprefix("v1."))
+    vision = ("visual", "aid_src_ev", "innovation", "status_flags")
+    log.drop(*(name for name in log.names() if any(part in name for part in vision)))
+    at = stamps(20.0, 5.0)
+    logged = 0.3 * np.random.default_rng(3).normal(size=(len(at), 2))
+    second = stamps(20.0, 1.0)
+    if number >= 14:
+        log.add(
+            topic("estimator_aid_src_gnss_pos", at, {
+                "innovation": logged, "innovation_variance": np.full((len(at), 2), 0.25),
+                "observation_variance": np.full((len(at), 2), 0.16),
+                "test_ratio": logged**2 / (25.0 * 0.25), "fused": np.ones(len(at), np.bool_),
+                "innovation_rejected": np.zeros(len(at), np.bool_),
+            }, sampled=True),
+            topic("estimator_status_flags", second, {
+                "cs_gps" if number < 16 else "cs_gnss_pos": np.ones(len(second), np.bool_),
+                "cs_ev_pos": np.zeros(len(second), np.bool_),
+                "cs_ev_hgt": np.zeros(len(second), np.bool_),
+                "cs_ev_yaw": np.zeros(len(second), np.bool_),
+            }),
+        )  # fmt: skip
+        return log
+    if "estimator_status" not in log.names():
+        log.add(topic("estimator_status", second, {}))
+    status = log["estimator_status"]
+    status["control_mode_flags"] = np.full(len(status["timestamp"]), 1 << 2, np.uint64)
+    if number <= 10:
+        rest = np.zeros((len(at), 3))
+        log.add(topic("ekf2_innovations", at, {
+            "vel_pos_innov": np.hstack([rest, logged, rest[:, :1]]),
+            "vel_pos_innov_var": np.full((len(at), 6), 0.25),
+        }))  # fmt: skip
+        return log
+    twice = np.repeat(np.arange(len(at)), 2)
+    late = np.tile(np.array([0, 100_000], np.uint64), len(at))
+    for name, values in (("s", logged), ("_variances", np.full((len(at), 2), 0.25))):
+        log.add(topic(f"estimator_innovation{name}", at[twice] + late, {
+            "gps_hpos": values[twice], "ev_hpos": np.zeros((2 * len(at), 2)),
+            "baro_vpos": np.ones(2 * len(at)),
+        }, sampled=number >= 12))  # fmt: skip
+    return log
+
+
 def local_position(seconds: float, *, sampled: bool) -> Topic:
     measured = stamps(seconds, 10.0)
     here = position(seconds_of(measured))

@@ -90,8 +90,13 @@ def prepare(
     settings = settings or Settings()
     track, reason = choose_source(flight, choices.get("position_source"))
     track = shift_clock(track, settings.clock_offset_s)
+    missing = flight.missing
     if track.origin.is_gnss and isinstance(flight.ekf2, Ekf2):
-        flight = replace(flight, ekf2=with_gnss(flight.ekf2))
+        # what the log lacks of another source is no lack here
+        of_vision = _lacking(flight.ekf2)
+        ekf2 = with_gnss(flight.ekf2)
+        missing = tuple(part for part in missing if not part.source and part not in of_vision)
+        flight, missing = replace(flight, ekf2=ekf2), missing + _lacking(ekf2)
     segment = choose_segment(flight, track, choices.get("start_s"), choices.get("end_s"))
     names, heading_deg = choices.get("axes"), choices.get("heading_deg")
     if names is None and track.origin.is_gnss:
@@ -99,7 +104,7 @@ def prepare(
     lines = make_axes(flight, track, segment, names=names, heading_deg=heading_deg)
     if isinstance(flight.truth, Truth) and flight.truth.name == track.name:
         flight = replace(flight, truth=NOT_ITS_OWN_TRUTH)
-    notes, missing = (*flight.log.notes, *track.notes), flight.missing
+    notes = (*flight.log.notes, *track.notes)
     acceleration = lines[0].acceleration
     if settings.input == "imu" and isinstance(acceleration, Unavailable):
         if input_required:
@@ -108,6 +113,11 @@ def prepare(
         notes += (f"no acceleration input ({acceleration.reason}): constant velocity was used",)
         missing += () if acceleration in missing else (acceleration,)
     return Comparison(flight, track, reason, segment, settings, lines, notes, missing)
+
+
+def _lacking(ekf2: Ekf2) -> tuple[Unavailable, ...]:
+    """Innovations that are not there, each with the reason."""
+    return tuple(part for part in ekf2.innovations.values() if isinstance(part, Unavailable))
 
 
 def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrack, str]:

@@ -262,9 +262,7 @@ def read_resets(local: pd.DataFrame) -> tuple[Reset, ...]:
     return tuple(sorted(resets, key=lambda reset: reset.time_s))
 
 
-def _read_record(
-    topics: Topics, step_s: float, local: pd.DataFrame
-) -> FusionRecord | Unavailable:
+def _read_record(topics: Topics, step_s: float, local: pd.DataFrame) -> FusionRecord | Unavailable:
     """What the log tells of the inside of EKF2's filter, in one layout and unit for all releases.
 
     ``step_s`` is the time between two predictions, for releases that keep biases per prediction;

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
 from px4fuse.report import clock, fonts
 from px4fuse.report.document import Document, LoopDocument
 from px4fuse.report.page import Page
@@ -20,7 +21,9 @@ def draw(document: Document) -> Iterator[Page]:
     analysis, flight, source = document.analysis, document.analysis.flight, document.analysis.source
     log, placed = flight.log, source.alignment
     others = (f"{t.name} ({t.rate_hz:.1f} Hz)" for t in flight.positions if t is not source)
-    parameters = (f"{name} {value:g}" for name, value in log.parameters.items())
+    aid = source.origin.aid or EV_POS
+    unlike = set().union(*(one.own for one in (EV_POS, GNSS_POS) if one != aid))
+    parameters = (f"{n} {value:g}" for n, value in log.parameters.items() if n not in unlike)
     page = _begin("Appendix: provenance", document)
     facts: dict[str, str] = {
         "file": f"{log.name}, {log.bytes} bytes, {log.format}",

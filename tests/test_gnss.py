@@ -1,0 +1,261 @@
+"""GNSS as a position source: where, when and how exact EKF2 takes its fixes to be."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cli_tools import run
+from conftest import SHARED_LOGS
+from ulog_tools import Log, gnss_log, make_log, position, seconds_of, stamps, topic
+
+import px4fuse
+from px4fuse.analysis import size_of_noise
+from px4fuse.comparison.preparation import choose_source, prepare
+from px4fuse.comparison.projection import observation_variance
+from px4fuse.filter.signals import Segment, make_axes
+from px4fuse.findings import find
+from px4fuse.flight import POSITION_COLUMNS, Flight, PositionTrack, Truth, Unavailable
+from px4fuse.readers import read_log
+from px4fuse.request import ComparisonRequest
+
+EARTH_M = 6_371_000.0
+ORIGIN = (47.4, 8.5, 488.0)
+SECONDS = 20.0
+
+
+def geographic(local: np.ndarray, origin: tuple[float, float, float] = ORIGIN) -> np.ndarray:
+    """Degrees, degrees and metres of local positions (m) so near that the Earth is flat."""
+    north, east, down = local.T
+    latitude = origin[0] + np.degrees(north / EARTH_M)
+    longitude = origin[1] + np.degrees(east / (EARTH_M * np.cos(np.radians(origin[0]))))
+    return np.stack([latitude, longitude, origin[2] - down], axis=1)
+
+
+def outdoors(
+    generation: str = "v1.16", rate_hz: float = 5.0, late_s: float = 0.11,
+    own_s: float | None = None, eph_m: float = 0.4, fused: bool = True, **parameters: float,
+) -> Log:  # fmt: skip
+    """A flight on GNSS whose fixes are stamped ``late_s`` after they were measured.
+
+    ``own_s`` is how much earlier than the stamp the driver says that it was.
+    """
+    log = gnss_log(generation)
+    measured = stamps(SECONDS, rate_hz, 0.2)
+    places = geographic(position(seconds_of(measured)))
+    old = int(generation.removeprefix("v1.")) < 14
+    fields: dict[str, Any] = {
+        "eph": np.full(len(measured), eph_m), "epv": np.full(len(measured), 0.7),
+        "fix_type": np.full(len(measured), 3, np.uint8),
+    }  # fmt: skip
+    if old:
+        names, scales = ("lat", "lon", "alt"), (1e7, 1e7, 1e3)
+        fields |= {n: np.round(v * s).astype(np.int32)
+                   for n, v, s in zip(names, places.T, scales, strict=True)}  # fmt: skip
+    made = topic("vehicle_gps_position", measured + np.uint64(round(late_s * 1e6)), fields)
+    if not old:  # float32 is too coarse for degrees
+        for name, values in zip(("latitude_deg", "longitude_deg", "altitude_msl_m"), places.T,
+                                strict=True):  # fmt: skip
+            made.fields[name] = values.copy()
+    if own_s is not None:
+        made.fields["timestamp_sample"] = made.fields["timestamp"] - np.uint64(round(own_s * 1e6))
+    log.add(made)
+    local = log["vehicle_local_position"]
+    for name, value in zip(("ref_lat", "ref_lon", "ref_alt"), ORIGIN, strict=True):
+        local[name] = np.full(len(local["timestamp"]), value)
+    if not fused:
+        log.drop(*(name for name in log.names() if "gnss" in name))
+    log.parameters |= {"EKF2_GPS_P_NOISE": 0.5, "EKF2_GPS_DELAY": 110.0, **parameters}
+    return log
+
+
+def flight_of(log: Log, folder: Path) -> Flight:
+    return read_log(log.write(folder / "a.ulg"))
+
+
+def track_of(flight: Flight) -> PositionTrack:
+    return next(track for track in flight.positions if track.name == "vehicle_gps_position")
+
+
+@pytest.mark.parametrize("generation", ["v1.9", "v1.12", "v1.14", "v1.16"])
+def test_fixes_are_where_and_when_ekf2_takes_them_to_be(generation: str, tmp_path: Path) -> None:
+    """About EKF2's origin, and EKF2_GPS_DELAY before their stamps."""
+    track = track_of(flight_of(outdoors(generation), tmp_path))
+    times = track.samples.index.to_numpy()
+    np.testing.assert_allclose(times, seconds_of(stamps(SECONDS, 5.0, 0.2)), atol=1e-6)
+    exact_m = 0.012 if generation in ("v1.9", "v1.12") else 1e-4  # 1e-7 degrees
+    measured = track.samples[POSITION_COLUMNS].to_numpy()
+    np.testing.assert_allclose(measured, position(times), atol=exact_m)
+    assert track.clock == "autopilot boot clock, less 110 ms (EKF2_GPS_DELAY)"
+    # EKF2 takes eph for each axis
+    np.testing.assert_allclose(track.samples["east_m2"], 0.16, rtol=1e-6)
+    np.testing.assert_allclose(track.samples["down_m2"], 0.49, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "expected_s"),
+    [
+        ({"EKF2_GPS_DELAY": 0.0}, 0.11),  # the stamp
+        ({}, 0.0),  # the stamp less 110 ms, whatever the driver says
+        ({"EKF2_GPS_MODE": 0}, 0.11 - 0.03),  # main of 2026: the driver's own time
+    ],
+)
+def test_whose_time_counts(parameters: dict[str, float], expected_s: float, tmp_path: Path) -> None:
+    track = track_of(flight_of(outdoors(own_s=0.03, **parameters), tmp_path))
+    first = seconds_of(stamps(SECONDS, 5.0, 0.2))[0]
+    assert track.samples.index[0] - first == pytest.approx(expected_s, abs=1e-6)
+
+
+def test_a_driver_that_knows_no_time_of_its_own_leaves_ekf2_s_delay(tmp_path: Path) -> None:
+    track = track_of(flight_of(outdoors(own_s=0.0, EKF2_GPS_MODE=0), tmp_path))
+    first = seconds_of(stamps(SECONDS, 5.0, 0.2))[0]
+    assert track.samples.index[0] == pytest.approx(first, abs=1e-6)
+
+
+def test_it_is_chosen_by_itself_where_ekf2_fused_it_and_nothing_else_is_there(
+    tmp_path: Path,
+) -> None:
+    flight = flight_of(outdoors(), tmp_path)
+    track, reason = choose_source(flight)
+    assert track.name == "vehicle_gps_position"
+    assert reason == "what EKF2 fused; no other position is in the log"
+    prepared = prepare(flight)
+    assert [line.name for line in prepared.lines] == ["aisle", "north", "east"]
+    # nothing of external vision is missed
+    assert not [part for part in prepared.missing if "vision" in f"{part.reason} {part.remedy}"]
+    never = flight_of(outdoors(fused=False), tmp_path)
+    assert not track_of(never).origin.automatic
+
+
+def test_a_position_that_was_sent_goes_before_it(tmp_path: Path) -> None:
+    log = make_log("v1.16", seconds=SECONDS)
+    log.add(*(one for one in outdoors().topics if one.name == "vehicle_gps_position"))
+    flight = flight_of(log, tmp_path)
+    assert {"vehicle_gps_position", "vehicle_visual_odometry"} <= {t.name for t in flight.positions}
+    assert choose_source(flight)[0].name == "vehicle_visual_odometry"
+
+
+@pytest.mark.parametrize(
+    ("eph_m", "least_m", "axes", "expected_m"),
+    [
+        (0.4, 0.5, (), 0.5),
+        (0.8, 0.5, (), 0.8),
+        (0.4, 0.2, ("down",), 0.7),  # epv
+        (0.4, 0.5, ("down",), 0.75),  # 1.5 times EKF2_GPS_P_NOISE
+    ],
+)
+def test_sigma_z_is_what_ekf2_takes(
+    eph_m: float, least_m: float, axes: tuple[Any, ...], expected_m: float, tmp_path: Path
+) -> None:
+    flight = flight_of(outdoors(eph_m=eph_m, EKF2_GPS_P_NOISE=least_m), tmp_path)
+    request = ComparisonRequest(log="a.ulg", axes=axes)
+    assert size_of_noise(request, flight) == pytest.approx(expected_m)
+    asked = ComparisonRequest(log="a.ulg", axes=axes, sigma_z_m=0.3)
+    assert size_of_noise(asked, flight) == 0.3
+    track, segment = track_of(flight), Segment(1.0, 19.0, "")
+    (axis,) = make_axes(flight, track, segment, names=axes or ("north",))
+    r = observation_variance(flight, track, axis, segment)
+    assert r == pytest.approx(expected_m**2, rel=1e-3)
+
+
+def test_ekf2_s_innovations_are_those_of_gnss(tmp_path: Path) -> None:
+    flight = flight_of(outdoors(), tmp_path)
+    ekf2 = prepare(flight).flight.ekf2
+    assert not isinstance(ekf2, Unavailable)
+    north, down = ekf2.innovations["north"], ekf2.innovations["down"]
+    logged = 0.3 * np.random.default_rng(3).normal(size=(len(north), 2))
+    assert not isinstance(north, Unavailable)
+    np.testing.assert_allclose(north["innovation_m"], -logged[:, 0], rtol=1e-6)
+    np.testing.assert_allclose(north["observation_variance_m2"], 0.16, rtol=1e-6)
+    assert isinstance(down, Unavailable)
+    assert down.reason == "EKF2 never fused GNSS for height in this log"
+    assert ekf2.innovation_topics == ("estimator_aid_src_gnss_pos",)
+    assert ekf2.gate == 5.0
+    # those of the flight are as they were
+    assert isinstance(flight.ekf2.innovations["north"], Unavailable)  # type: ignore[union-attr]
+
+
+def test_positions_that_the_logger_left_out_are_told(tmp_path: Path) -> None:
+    thinned = prepare(flight_of(outdoors(rate_hz=2.0), tmp_path)).notes
+    assert any("2.0 positions of GNSS a second" in note for note in thinned)
+    assert not any("GNSS" in note for note in prepare(flight_of(outdoors(), tmp_path)).notes)
+
+
+@pytest.mark.parametrize("fused", [True, False])
+def test_the_truth_lies_about_ekf2_s_origin_where_that_is_a_fix(
+    fused: bool, tmp_path: Path
+) -> None:
+    log = outdoors(fused=fused)
+    home = (ORIGIN[0] + 1e-5, ORIGIN[1] - 2e-5, ORIGIN[2] + 0.5)
+    times = stamps(SECONDS, 20.0)
+    here = position(seconds_of(times))
+    east_m = -np.radians(2e-5) * EARTH_M * np.cos(np.radians(ORIGIN[0]))
+    shift = np.array([np.radians(1e-5) * EARTH_M, east_m, -0.5])
+    about_home = dict(zip(("x", "y", "z"), (here - shift).T, strict=True))
+    velocity = {name: np.zeros(len(times)) for name in ("vx", "vy", "vz")}
+    everywhere = topic("vehicle_global_position_groundtruth", times, {})
+    for name, values in zip(("lat", "lon", "alt"), geographic(here - shift, home).T, strict=True):
+        everywhere.fields[name] = values.copy()
+    log.add(topic("vehicle_local_position_groundtruth", times, about_home | velocity), everywhere)
+    truth = flight_of(log, tmp_path).truth
+    assert isinstance(truth, Truth)
+    expected = here if fused else here - shift
+    np.testing.assert_allclose(truth.samples[POSITION_COLUMNS], expected, atol=1e-3)
+
+
+# --------------------------------------------------------------------- flights of the real EKF2
+
+# The first finding above info, where there is one; what a flight's story has of its fault
+FLIGHTS = {
+    "main202603_gps_outage_flow": "source_gap",
+    "v1.13.3_gps_profile1": None,
+    "v1.14.4_gps_magdist": None,
+    "v1.16.1_gps_delay0": "source_clock_offset",
+    "v1.16.1_gps_fullrate": None,
+    "v1.16.1_gps_nominal": None,
+    "v1.16.1_gps_overconfident": "ekf2_variance_understated",
+    "v1.16.1_gps_stock_flow": None,
+}
+STAMP_S = 0.016  # the simulation steps by 8 ms, from a fix to its stamp and to the filter
+OF_OTHERS = ("EKF2_EV", "vision", "anchor", "UWB", "line of sight", " tag ")
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize("name", FLIGHTS)
+def test_flights_on_gnss(name: str) -> None:
+    folder = SHARED_LOGS / "gps"
+    if not folder.exists():
+        pytest.skip("../shared is absent")
+    analysis = px4fuse.compare(folder / f"{name}.ulg")
+    injected = json.loads((folder / f"{name}.json").read_text())
+    truth = injected["truth"]
+    assert analysis.source.name == "vehicle_gps_position"
+    # EKF2's distance to the truth, in flight there, from take-off to landing here
+    for axis, stated in zip(("north", "east"), truth["ekf2_rmse_m_ned"], strict=False):
+        found = analysis.axes[axis].filters["ekf2"].truth
+        assert found.position_rmse_m == pytest.approx(stated, rel=0.1, abs=0.01)  # type: ignore[union-attr]
+    # how old a fix is beyond what EKF2 takes it to be
+    parameters = analysis.flight.log.parameters
+    age_ms = injected["simulated_sensors"].get("GPS_LAT_MS", 0.0)
+    low_s, high_s = analysis.clock.interval_s  # type: ignore[union-attr]
+    left_s = 1e-3 * (parameters["EKF2_GPS_DELAY"] - age_ms)
+    assert low_s - STAMP_S <= left_s <= high_s + STAMP_S
+    findings = find(analysis)
+    loud = [one.id for one in findings if one.severity != "info"]
+    assert loud[:1] == [FLIGHTS[name]] if FLIGHTS[name] else not loud
+    said = " ".join(f"{one.message} {one.remedy}" for one in findings)
+    assert not [word for word in OF_OTHERS if word in said]
+
+
+@pytest.mark.reallogs
+def test_a_report_of_gnss_names_no_other_source(tmp_path: Path) -> None:
+    log = SHARED_LOGS / "gps" / "v1.16.1_gps_delay0.ulg"
+    if not log.exists():
+        pytest.skip("../shared is absent")
+    done = run("compare", log, "-o", tmp_path / "r.pdf")
+    assert done.exit_code == 0
+    assert "EKF2_GPS_DELAY" in done.output
+    assert not [word for word in OF_OTHERS if word in done.output]
