@@ -8,14 +8,17 @@ import numpy as np
 import pandas as pd
 import pytest
 from exchange import replace
+from msgspec import structs
 from scipy.signal import lfilter
 from scipy.special import ndtr
+from scipy.stats import chi2
 from scipy.stats import f as fisher
 from spread import NOTHING, RATES_TABLE, SETTINGS, rates, spread
 
 from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import FilterSummary
+from px4fuse.ekf2.aids import AidAxis, AidResult
 from px4fuse.filter.consistency import assess
 from px4fuse.findings import find
 from px4fuse.fleet.changes import Changes, changes, number_changes
@@ -359,6 +362,50 @@ def test_measured_rates_are_as_the_readme_says():
 def test_every_kind_that_has_an_interval_has_a_measured_spread(clean):
     found = numbers(clean.results, clean.analysis).values()
     assert {number.measure.path for number in found if number.interval} <= spreads().keys()
+
+
+def aid(*axes: AidAxis, rejected_share: float = 0.0) -> AidResult:
+    return AidResult(
+        label="GNSS velocity", unit="m/s", topic="", fused_share=1.0, fused_logged=True,
+        rejected_share=rejected_share, longest_without_s=(0.0, 0.5), resets=0, gate=5.0,
+        noise_from="", verdict="consistent",
+        axes=dict(zip(("north", "east"), axes, strict=False)),
+    )  # fmt: skip
+
+
+def aid_axis(nis_mean: float, samples: int, lag1: float = 0.0, rejected: float = 0.0) -> AidAxis:
+    return AidAxis(
+        samples=samples, innovation_mean=0.0, innovation_std=1.0, s_sqrt_median=1.0,
+        nis_mean=nis_mean, nis_band=(0.8, 1.2), sigma_factor=1.0, rejected_share=rejected,
+        lag1_autocorrelation=lag1, ljung_box_p=0.5, bias_p=0.5,
+    )  # fmt: skip
+
+
+def test_aids_are_compared_by_their_nis_and_what_was_rejected(clean):
+    axes = aid_axis(1.2, 200), aid_axis(0.9, 200, lag1=0.6)
+    judged = {"gnss_vel": aid(*axes, rejected_share=0.1), "ev_pos": aid(*axes)}
+    found = numbers(structs.replace(clean.results, aids=judged))
+    velocity = {path: n for path, n in found.items() if path.startswith("aids.")}
+    # external vision is the source itself, and among the axes
+    assert {path.split(".")[1] for path in velocity} == {"gnss_vel"}
+    north = velocity["aids.gnss_vel.axes.north.nis_mean"]
+    assert (north.measure.label, north.measure.aim) == ("NIS, GNSS velocity, north", "one")
+    assert north.interval == pytest.approx(200 * 1.2 / chi2.ppf([0.975, 0.025], 200))
+    few = 200 * (1 - 0.36) / (1 + 0.36)
+    east = velocity["aids.gnss_vel.axes.east.nis_mean"].interval
+    assert east == pytest.approx(few * 0.9 / chi2.ppf([0.975, 0.025], few))
+    share = velocity["aids.gnss_vel.rejected_share"]
+    assert share.measure.label == "share rejected, GNSS velocity"
+    assert share.interval == pytest.approx(share_interval(0.1, few))
+    assert interval_of(aid_axis(1.2, 200, rejected=0.01), "nis_mean", 1.2) is None
+    assert interval_of(aid(), "rejected_share", 0.0) is None
+
+
+def test_of_gnss_as_the_source_the_same_holds(clean):
+    source = structs.replace(clean.results.source, kind="gnss")
+    judged = {"gnss_pos": aid(aid_axis(1.0, 100)), "ev_pos": aid(aid_axis(1.0, 100))}
+    found = numbers(structs.replace(clean.results, source=source, aids=judged))
+    assert {p.split(".")[1] for p in found if p.startswith("aids.")} == {"ev_pos"}
 
 
 def test_what_one_side_lacks_is_listed(clean):

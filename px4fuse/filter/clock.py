@@ -26,13 +26,23 @@ from px4fuse.display import Shown
 from px4fuse.filter.fitting import Noises, fitted, most_likely, of_ratios
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
 from px4fuse.filter.marginal import Fitted, paired_products
-from px4fuse.filter.motion import COARSE_POINTS, SEARCH_S, PreparedMotion, SignalCache, motion
+from px4fuse.filter.motion import (
+    COARSE_POINTS,
+    CONSTANT_SIGMA,
+    SEARCH_S,
+    PreparedMotion,
+    SignalCache,
+    motion,
+)
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, within
 from px4fuse.flight import POSITION_COLUMNS, Flight, PositionTrack, Unavailable
 from px4fuse.record import Count, NotNegative, Record, Share, Span
 
 FINE_POINTS, CURVE_POINTS = 11, 121
+# EKF2 that takes fixes for younger or older than they are turns its heading until both agree, by
+# 5° for 0.2 s: a heading that is believed would hide the offset
+HEADING_RAD, WRONG_HEADING_RAD = float(CONSTANT_SIGMA[2]), 0.2
 # Enough to find the offset roughly
 COARSE_MEASUREMENTS = 600
 # A wider interval says nothing that a student could use
@@ -175,6 +185,7 @@ def estimate_clock_offset(
         directions=np.eye(3),
         dt_s=settings.dt_s,
         signals=signals,
+        heading_sigma_rad=WRONG_HEADING_RAD if track.origin.is_gnss else HEADING_RAD,
     )
     if isinstance(moved, Unavailable):
         return moved

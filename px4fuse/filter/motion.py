@@ -106,6 +106,8 @@ class PreparedMotion:
     dt_s : float
         DT, which gives SIGMA_A its meaning.
     imu_interval_s : float
+    heading_sigma_rad : float
+        Of the heading where a stretch starts.
     """
 
     time_s: Array
@@ -116,6 +118,7 @@ class PreparedMotion:
     directions: Array
     dt_s: float
     imu_interval_s: float
+    heading_sigma_rad: float = float(CONSTANT_SIGMA[2])
 
     def thinned(self, count: int) -> PreparedMotion:
         """About so many of the measurements, in the stretches that keep a few; all without one."""
@@ -166,7 +169,9 @@ class PreparedMotion:
             noise_unit=unit,
             noise_fixed=np.zeros_like(unit),
             initial=initial,
-            constant_sigma=CONSTANT_SIGMA,
+            constant_sigma=np.concatenate(
+                [CONSTANT_SIGMA[:2], [self.heading_sigma_rad], CONSTANT_SIGMA[3:]]
+            ),
             delta_position_m=dp,
             delta_velocity_m_s=dv,
         )
@@ -219,6 +224,7 @@ def motion(
     dt_s: float,
     weight: Array | None = None,
     signals: SignalCache | None = None,
+    heading_sigma_rad: float = float(CONSTANT_SIGMA[2]),
 ) -> PreparedMotion | Unavailable:
     """Cut measurements into stretches that the IMU covers without a gap.
 
@@ -227,7 +233,7 @@ def motion(
     flight : Flight
     time_s : ndarray, shape (m,)
     measurement_m : ndarray, shape (m, a)
-    directions, dt_s, weight
+    directions, dt_s, weight, heading_sigma_rad
         As :class:`PreparedMotion` has them; by default all count the same.
     signals : dict, optional
         Signals of this flight, to which new ones are added.
@@ -280,6 +286,7 @@ def motion(
         directions,
         dt_s,
         float(np.median(np.diff(imu_time))),
+        heading_sigma_rad,
     )
 
 

@@ -10,7 +10,7 @@ known.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Any, Literal
@@ -24,6 +24,8 @@ from scipy.stats import binomtest, chi2
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.comparison.model import AxisComparison, AxisResult, FilterSummary
+from px4fuse.ekf2.aids import AidAxis, AidResult
+from px4fuse.ekf2_parameters import AIDS
 from px4fuse.filter.clock import Clock
 from px4fuse.filter.heading import HeadingError
 from px4fuse.filter.kalman import state_at
@@ -52,7 +54,7 @@ class Measure:
     Attributes
     ----------
     path : str
-        Where it stands in the results; ``*`` is the name of an axis.
+        Where it stands in the results; ``*`` is any name there, of an axis or an aid.
     aim : {"low", "one", "zero", ""}
         What is better: lower, nearer to 1, nearer to 0; "" where nothing is.
     scale : {"ratio", "difference"}
@@ -122,6 +124,8 @@ MEASURES = {
         *_of_filter("kf", "ours"),
         Measure(f"{APART}position_rmse_m", "ours - EKF2", "m"),
         Measure(f"{APART}velocity_rmse_m_s", "ours - EKF2, velocity", "m/s"),
+        Measure("aids.*.axes.*.nis_mean", "NIS", aim="one"),
+        Measure("aids.*.rejected_share", "share rejected", scale="difference"),
     )
 }
 
@@ -163,12 +167,12 @@ def numbers(results: ComparisonResults, analysis: Analysis | None = None) -> dic
         for name, axis in ({} if analysis is None else analysis.axes).items()
         for path, values in errors_of(axis).items()
     }
+    # what EKF2 did with the source itself is among the axes
+    own = ("gnss_pos",) if results.source.kind == "gnss" else ("ev_pos", "ev_hgt")
     found: dict[str, Number] = {}
     for kind, measure in MEASURES.items():
-        head, several, _ = kind.partition(".*")
-        for name in (at(results, head) or ()) if several else ("",):
-            path = kind.replace("*", name)
-            value = at(results, path)
+        for path, names in _places(results, kind):
+            value, name = at(results, path), names[0] if names else ""
             parent, _, field = path.rpartition(".")
             part = at(results, parent)
             unclear = isinstance(part, Clock) and not part.determinable
@@ -177,7 +181,10 @@ def numbers(results: ComparisonResults, analysis: Analysis | None = None) -> dic
                 continue
             if kind == REJECTED and name not in (level, "down"):
                 continue
-            label = f"{measure.label}, {name}" if name else measure.label
+            if kind.startswith("aids.") and name in own:
+                continue
+            words = (AIDS[each].label if each in AIDS else each for each in names)
+            label = ", ".join((measure.label, *words))
             # where a truth judges both, their distance from each other is neither good nor bad
             aim = "" if has_truth and kind.startswith(APART) else measure.aim
             found[path] = Number(
@@ -190,6 +197,16 @@ def numbers(results: ComparisonResults, analysis: Analysis | None = None) -> dic
     return found
 
 
+def _places(results: ComparisonResults, kind: str) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Every place of a kind in the results, and the names that stand for its ``*``."""
+    head, several, tail = kind.partition(".*")
+    if not several:
+        yield kind, ()
+    for name in (at(results, head) or ()) if several else ():
+        for path, names in _places(results, f"{head}.{name}{tail}"):
+            yield path, (name, *names)
+
+
 def interval_of(part: object, field: str, value: float) -> Bounds | None:
     """95 % interval of a number in a part of the results, from the results alone."""
     match part:
@@ -200,14 +217,27 @@ def interval_of(part: object, field: str, value: float) -> Bounds | None:
             return part.interval_s
         case HeadingError():
             return value - Z95 * part.sigma_deg, value + Z95 * part.sigma_deg
-        case AxisResult():
-            judged = part.filters["ekf2"]
-            return (
-                None if isinstance(judged, Unavailable) else _of_innovations(judged, field, value)
-            )
-        case FilterSummary():
-            return _of_innovations(part, field, value)
-    return None
+        case AidAxis() | AidResult():
+            return _of_aid(part, value)
+    judged = part.filters["ekf2"] if isinstance(part, AxisResult) else part
+    return _of_innovations(judged, field, value) if isinstance(judged, FilterSummary) else None
+
+
+def _of_aid(part: AidAxis | AidResult, value: float) -> Bounds | None:
+    axes = (part,) if isinstance(part, AidAxis) else tuple(part.axes.values())
+    if not axes:
+        return None
+    count = min(_independent(axis.samples, axis.lag1_autocorrelation) for axis in axes)
+    if isinstance(part, AidResult):
+        return share_interval(value, count)
+    # innovations beyond the gate are not normal
+    return _of_normal(value, count) if part.rejected_share == 0.0 else None
+
+
+def _of_normal(mean_square: float, count: float) -> Bounds:
+    """95 % interval of a mean square of so many independent normal numbers (chi-square)."""
+    high, low = np.asarray(chi2.ppf((0.5 - LEVEL / 2, 0.5 + LEVEL / 2), count)).tolist()
+    return mean_square * count / low, mean_square * count / high
 
 
 def _of_innovations(judged: FilterSummary, field: str, value: float) -> Bounds | None:
@@ -216,9 +246,9 @@ def _of_innovations(judged: FilterSummary, field: str, value: float) -> Bounds |
         return share_interval(value, count)
     if field not in ("nis_mean", "innovation_std_m") or not _is_normal(judged, count):
         return None
-    ends = count / chi2.ppf((0.5 + LEVEL / 2, 0.5 - LEVEL / 2), count)
-    low, high = np.power(ends, 1.0 if field == "nis_mean" else 0.5).tolist()
-    return value * low, value * high
+    power = 1.0 if field == "nis_mean" else 0.5
+    low, high = _of_normal(value ** (1.0 / power), count)
+    return low**power, high**power
 
 
 def bootstrapped(errors: Array, field: str) -> Bounds | None:
@@ -234,8 +264,11 @@ def independent_count(judged: FilterSummary) -> float:
     With the autocorrelation r^k of a first-order process squares have r^2k, hence a share of
     1/(1 + 2 Σ r^2k) (Bayley and Hammersley 1946).
     """
-    squared = judged.lag1_autocorrelation**2
-    return judged.count * (1.0 - squared) / (1.0 + squared)
+    return _independent(judged.count, judged.lag1_autocorrelation)
+
+
+def _independent(count: int, lag1: float) -> float:
+    return count * (1.0 - lag1**2) / (1.0 + lag1**2)
 
 
 def _is_normal(judged: FilterSummary, count: float) -> bool:
