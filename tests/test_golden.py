@@ -158,7 +158,9 @@ def test_a_command_shows_what_it_showed(
     for path in sorted(tmp_path.rglob("*.json")):
         if path.stat().st_mtime_ns != before.get(path):
             lines += [path.name, *written(path)]
-    agrees(name, lines)
+    # byte for byte where the report was made, to the last digits elsewhere
+    again = r"the log gives (the same file again, byte for byte|all \d+ values again \(.*?\))"
+    agrees(name, [re.sub(again, "the log gives it again", line) for line in lines])
 
 
 def spread(kind: str, *mistakes: str) -> list[str]:
