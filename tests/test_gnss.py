@@ -17,7 +17,7 @@ from px4fuse.analysis import size_of_noise
 from px4fuse.comparison.preparation import choose_source, prepare
 from px4fuse.comparison.projection import observation_variance
 from px4fuse.filter.signals import Segment, make_axes
-from px4fuse.findings import find
+from px4fuse.findings import find, variance
 from px4fuse.flight import POSITION_COLUMNS, Flight, PositionTrack, Truth, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.request import ComparisonRequest
@@ -204,6 +204,24 @@ def test_the_truth_lies_about_ekf2_s_origin_where_that_is_a_fix(
     assert isinstance(truth, Truth)
     expected = here if fused else here - shift
     np.testing.assert_allclose(truth.samples[POSITION_COLUMNS], expected, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("least_m", "eph_m", "said"),
+    [(2.0, 0.3, True), (0.5, 0.45, False), (0.5, 0.9, False), (None, 0.3, False)],
+)
+def test_a_smaller_r_is_advised_only_where_the_parameter_holds_it_up(
+    least_m: float | None, eph_m: float, said: bool, tmp_path: Path
+) -> None:
+    log = outdoors(eph_m=eph_m)
+    log.parameters.pop("EKF2_GPS_P_NOISE")
+    if least_m is not None:
+        log.parameters["EKF2_GPS_P_NOISE"] = least_m
+    words = variance._above_stated(prepare(flight_of(log, tmp_path)))  # type: ignore[arg-type]
+    assert bool(words) is said
+    if said:
+        assert "EKF2_GPS_P_NOISE 2 m" in words
+        assert "(0.3 m)" in words
 
 
 # --------------------------------------------------------------------- flights of the real EKF2

@@ -20,12 +20,13 @@ from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.fitting import SIGMA_Z_SEARCH_M
 from px4fuse.filter.settings import Settings
+from px4fuse.filter.signals import within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings.causes import CAUSE, ELSEWHERE, NOISE, OUTLIERS
 from px4fuse.findings.hidden_errors import hidden_errors
 from px4fuse.findings.model import Finding, Found, Severity, finding, lowered
 from px4fuse.findings.sigma import LAG1_SLOW, SMALLEST_SIGMA_Z_M, try_out, tuned_for
-from px4fuse.flight import Unavailable
+from px4fuse.flight import POSITION_VARIANCE_COLUMNS, Unavailable
 from px4fuse.plain import factor_words, number_words
 
 VARIANCE_FACTOR = 1.5  # times: 22 % in standard deviation; chance moves it less at n > 100
@@ -90,7 +91,9 @@ def _of_group(analysis: Analysis, owner: FilterName, group: str, members: list[M
     if over and analysis.source.origin.may_drift:
         severity, remedy, cause = "info", AGAINST_DRIFT, ELSEWHERE
     elif over and analysis.source.origin.is_gnss:
-        severity, remedy, cause = "info", AGAINST_SLOW_ERRORS, ELSEWHERE
+        remedy = _above_stated(analysis) if owner == "ekf2" else ""
+        cause = NOISE if remedy else ELSEWHERE
+        severity, remedy = severity if remedy else "info", remedy or AGAINST_SLOW_ERRORS
     elif over and any(hidden.owner == owner for hidden in hidden_errors(analysis)):
         remedy, cause = AGAINST_TRUTH, ELSEWHERE
     elif tuned is None:
@@ -116,6 +119,21 @@ def _of_group(analysis: Analysis, owner: FilterName, group: str, members: list[M
         f"{group}).",
         remedy,
         evidence,
+    )
+
+
+def _above_stated(analysis: Analysis) -> str:
+    """What to set where EKF2's parameter holds R above the accuracy that a receiver states."""
+    name = aid_of(analysis).noise
+    least_m = analysis.flight.log.parameters.get(name, float("nan"))
+    stated = within(analysis.source.samples, analysis.segment)[POSITION_VARIANCE_COLUMNS[0]]
+    stated_m = float(np.sqrt(stated.median()))
+    if not least_m > NOISE_FITS * stated_m:  # false for NaN too
+        return ""
+    return (
+        f"{name} {least_m:g} m holds R above the accuracy that the receiver states "
+        f"({stated_m:.2g} m): set it to that where you trust the receiver. "
+        f"{not_replayed(NOT_REPLAYED)}"
     )
 
 

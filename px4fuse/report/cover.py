@@ -183,7 +183,9 @@ def _plan(document: Document, facts: Mapping[str, str]) -> Page:
     if is_long:
         drawn, beside, view = page, page, along
         height = float(np.clip(1.3 * high * WIDTH / (1.1 * wide), LOWEST, TALLEST))
-    _map(drawn.panel("From above", "", height, above=16.0, left=36.0), document, view, tracks)
+    # beside the facts the legend needs two lines
+    above = 16.0 if is_long else 28.0
+    _map(drawn.panel("From above", "", height, above=above, left=36.0), document, view, tracks)
     for label, text in facts.items():
         beside.labelled(label, text, size=7.0, above=-0.5)
     if not is_long:
@@ -253,4 +255,4 @@ def _map(axes: Axes, document: Document, view: MapView, tracks: Mapping[str, Pai
             textcoords="offset points", arrowprops=arrow, size=7, color=MUTED, ha="center",
             va="center",
         )  # fmt: skip
-    legend_above(axes, handlelength=1.8)
+    legend_above(axes, columns=3 if view is NORTH_UP else 9, handlelength=1.8)

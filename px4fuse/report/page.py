@@ -164,11 +164,11 @@ def appendix(title: str) -> str:
     return f"Appendix: {title[0].lower()}{title[1:]}"
 
 
-def legend_above(axes: Axes, **options: Any) -> None:
+def legend_above(axes: Axes, columns: int = 9, **options: Any) -> None:
     """Legend of a panel in the line above its axes, at the right, where nothing lies beneath."""
     axes.legend(
-        loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=9, borderaxespad=0.0, borderpad=0.1,
-        columnspacing=1.2, **options,
+        loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.0,
+        borderpad=0.1, columnspacing=1.2, **options,
     )  # fmt: skip
 
 
