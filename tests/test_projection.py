@@ -134,7 +134,7 @@ GONE = Unavailable("innovations", "none logged", "Log them.")
         (with_innovations(flight(), east=GONE), "aisle", WHOLE, "none logged"),
         # innovations are of external vision alone
         (flight(uwb=Uwb(name="vehicle_mocap_odometry", origin=MOTION_CAPTURE)), "north", WHOLE,
-         "not to vehicle_mocap_odometry"),
+         "never fuses vehicle_mocap_odometry"),
     ],
     ids=["segment", "north", "east", "mocap"],
 )  # fmt: skip
