@@ -21,6 +21,7 @@ from batch_tools import environment, started, tiny_log, tiny_logs
 from click.testing import CliRunner
 from made_up_fleet import DAMAGED, made_up
 from msgspec import structs
+from ulog_tools import gnss_log
 
 import px4fuse
 from px4fuse.cli import cli
@@ -153,15 +154,21 @@ def test_absent_numbers_are_empty_and_texts_are_no_formulas(tmp_path):
     assert "flight-?.ulg" in csv_bytes(table).decode()
 
 
-@pytest.mark.reallogs
-def test_logs_without_a_position_are_not_judged_but_known(shared_logs, client):
-    (log,) = shared_logs.glob("simulated/*no_uwb.ulg")
-    row = px4fuse.batch(log).loc[0]
+def test_logs_without_a_position_are_not_judged_but_known(client, tmp_path):
+    row = px4fuse.batch(gnss_log("v1.16").write(tmp_path / "a.ulg")).loc[0]
     assert (row["status"], row["axis"]) == ("not judged", "")
-    assert row["firmware"] == "PX4 v1.16.1"
+    assert row["firmware"] == "PX4 v1.16.0"
     assert row["duration_s"] > 10
-    assert "--position-source vehicle_gps_position" in row["remedy"]
-    assert row["aids"].startswith("gnss_pos variance overstated;gnss_vel variance overstated;")
+    assert "--position" in row["remedy"]
+    assert row["aids"].startswith("gnss_pos ")
+
+
+@pytest.mark.reallogs
+def test_a_flight_on_gnss_has_its_rows(shared_logs, client):
+    (log,) = shared_logs.glob("simulated/*no_uwb.ulg")
+    table = px4fuse.batch(log)
+    assert table["axis"].tolist() == ["aisle", "north", "east"]
+    assert table["aids"].str.startswith("gnss_pos variance overstated;gnss_vel ").all()
 
 
 # ------------------------------------------------------------------ resuming
