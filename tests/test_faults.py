@@ -141,6 +141,7 @@ def test_an_interrupted_comparison_leaves_nothing_in_part(
     if process.returncode == 0:  # it was done before
         assert left == ["r.json", "r.pdf"]
     else:
-        assert process.returncode == 130
         assert left == []
-        assert said == "px4fuse: interrupted, nothing was written.\n"
+        if process.returncode != -signal.SIGINT:  # on a busy machine Python itself is not up yet
+            assert process.returncode == 130
+            assert said == "px4fuse: interrupted, nothing was written.\n"
