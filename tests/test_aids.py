@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 import pytest
 from cli_tools import run, run_main
-from conftest import SHARED_LOGS
 from exchange import replace
 from flights import aisle_flight
 from ulog_tools import gnss_log, seconds_of, stamps
@@ -281,11 +280,9 @@ SEEN = {
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", SEEN)
-def test_flights_of_the_real_ekf2(name: str) -> None:
+def test_flights_of_the_real_ekf2(name: str, shared_logs: Path) -> None:
     """NIS as PX4's own figures have it (computed from the logs without px4fuse)."""
-    folder = SHARED_LOGS / "gps"
-    if not folder.exists():
-        pytest.skip("../shared is absent")
+    folder = shared_logs / "gps"
     found = judge_aids(read_log(folder / f"{name}.ulg"))
     assert not isinstance(found, Unavailable)
     assert SEEN[name] == {aid: found[aid].verdict for aid in SEEN[name]}
@@ -313,12 +310,10 @@ def test_flights_of_the_real_ekf2(name: str) -> None:
 @pytest.mark.parametrize("name", ["v1.16.1_gps_nominal", "v1.14.4_gps_magdist"])
 @pytest.mark.parametrize("command", ["compare", "tune", "sync"])
 def test_no_parameter_of_external_vision_is_named_for_gnss(
-    name: str, command: str, tmp_path: Path
+    name: str, command: str, tmp_path: Path, shared_logs: Path
 ) -> None:
-    if not (SHARED_LOGS / "gps").exists():
-        pytest.skip("../shared is absent")
     more = ("-o", tmp_path / "r.pdf") if command == "compare" else ()
-    log = SHARED_LOGS / "gps" / f"{name}.ulg"
+    log = shared_logs / "gps" / f"{name}.ulg"
     done = run(command, log, "--position-source", "vehicle_gps_position", *more)
     assert done.exit_code == 0, done.output
     findings = tmp_path / "r.json"

@@ -160,7 +160,7 @@ def test_logs_without_a_position_are_not_judged_but_known(client, tmp_path):
     assert row["firmware"] == "PX4 v1.16.0"
     assert row["duration_s"] > 10
     assert "--position" in row["remedy"]
-    assert row["aids"].startswith("gnss_pos ")
+    assert row["aids"].startswith("gnss_pos variance overstated")
 
 
 @pytest.mark.reallogs

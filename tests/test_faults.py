@@ -142,6 +142,8 @@ def test_an_interrupted_comparison_leaves_nothing_in_part(
         assert left == ["r.json", "r.pdf"]
     else:
         assert left == []
-        if process.returncode != -signal.SIGINT:  # on a busy machine Python itself is not up yet
+        if process.returncode == -signal.SIGINT:  # on a busy machine Python itself is not up yet
+            assert said == ""
+        else:
             assert process.returncode == 130
             assert said == "px4fuse: interrupted, nothing was written.\n"

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from cli_tools import run
-from conftest import SHARED_LOGS
 from ulog_tools import Log, gnss_log, make_log, position, seconds_of, stamps, topic
 
 import px4fuse
@@ -243,10 +242,8 @@ OF_OTHERS = ("EKF2_EV", "vision", "anchor", "UWB", "line of sight", " tag ")
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", FLIGHTS)
-def test_flights_on_gnss(name: str) -> None:
-    folder = SHARED_LOGS / "gps"
-    if not folder.exists():
-        pytest.skip("../shared is absent")
+def test_flights_on_gnss(name: str, shared_logs: Path) -> None:
+    folder = shared_logs / "gps"
     analysis = px4fuse.compare(folder / f"{name}.ulg")
     injected = json.loads((folder / f"{name}.json").read_text())
     truth = injected["truth"]
@@ -269,10 +266,8 @@ def test_flights_on_gnss(name: str) -> None:
 
 
 @pytest.mark.reallogs
-def test_a_report_of_gnss_names_no_other_source(tmp_path: Path) -> None:
-    log = SHARED_LOGS / "gps" / "v1.16.1_gps_delay0.ulg"
-    if not log.exists():
-        pytest.skip("../shared is absent")
+def test_a_report_of_gnss_names_no_other_source(tmp_path: Path, shared_logs: Path) -> None:
+    log = shared_logs / "gps" / "v1.16.1_gps_delay0.ulg"
     done = run("compare", log, "-o", tmp_path / "r.pdf")
     assert done.exit_code == 0
     assert "EKF2_GPS_DELAY" in done.output

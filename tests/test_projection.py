@@ -132,7 +132,7 @@ GONE = Unavailable("innovations", "none logged", "Log them.")
         # the aisle needs both horizontal axes
         (with_innovations(flight(), north=GONE), "aisle", WHOLE, "none logged"),
         (with_innovations(flight(), east=GONE), "aisle", WHOLE, "none logged"),
-        # innovations are of external vision alone
+        # motion capture is never fused
         (flight(uwb=Uwb(name="vehicle_mocap_odometry", origin=MOTION_CAPTURE)), "north", WHOLE,
          "never fuses vehicle_mocap_odometry"),
     ],

@@ -939,14 +939,14 @@ def test_raw_vision_of_v1_13_is_read(shared_logs):
 
 
 @pytest.mark.reallogs
-@pytest.mark.parametrize("name", [
-    "PX4_pyulog_sample_px4_events",  # EKF2_EV_CTRL is 15, yet no vision was sent: GNSS was fused
-    "Auterion_px4-ulog-rs_hist_571df892_quadrotor_local",  # nothing was
+@pytest.mark.parametrize(("name", "gnss"), [
+    ("PX4_pyulog_sample_px4_events", True),  # EKF2_EV_CTRL is 15, yet no vision was sent
+    ("Auterion_px4-ulog-rs_hist_571df892_quadrotor_local", False),
 ])  # fmt: skip
-def test_no_fusion_is_claimed_where_none_was(shared_logs, name):
+def test_no_fusion_is_claimed_where_none_was(shared_logs, name, gnss):
     flight = read_log(shared_logs / REAL.format(name))
     assert all(isinstance(part, Unavailable) for part in flight.ekf2.innovations.values())
-    if "gnss_pos" in flight.ekf2.aids:
+    if gnss:
         assert choose_source(flight)[0].name == "vehicle_gps_position"
     else:
         with pytest.raises(MissingDataError):

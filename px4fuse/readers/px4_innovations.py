@@ -54,7 +54,8 @@ def with_gnss(ekf2: Ekf2) -> Ekf2:
         columns = ["horizontal", "vertical", "yaw"]
         fusing = pd.DataFrame(meant).ffill().bfill().reindex(columns=columns, fill_value=0.0)
     log = ekf2.aids.get("gnss_pos")
-    gate = GNSS_POS.default_gate if log is None else log.parameters.get(GNSS_POS.gate, 5.0)
+    logged = {} if log is None else log.parameters
+    gate = logged.get(GNSS_POS.gate, GNSS_POS.default_gate)
     innovations, topics = innovations_of(ekf2.aids, fusing, gate, GNSS)
     return replace(
         ekf2, innovations=innovations, innovation_topics=topics, fusing=fusing, gate=gate
