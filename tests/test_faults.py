@@ -142,8 +142,7 @@ def test_an_interrupted_comparison_leaves_nothing_in_part(
         assert left == ["r.json", "r.pdf"]
     else:
         assert left == []
-        if process.returncode == -signal.SIGINT:  # on a busy machine Python itself is not up yet
-            assert said == ""
-        else:
-            assert process.returncode == 130
-            assert said == "px4fuse: interrupted, nothing was written.\n"
+        # by the signal itself where Python is not up yet, or CPython was in exec() (an import)
+        by_signal = process.returncode == -signal.SIGINT
+        assert process.returncode == 130 or by_signal
+        assert said == "px4fuse: interrupted, nothing was written.\n" or (by_signal and not said)

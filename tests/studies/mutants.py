@@ -3,9 +3,10 @@
 ``python tests/studies/mutants.py --map FOLDER`` runs every test file once by itself under coverage
 and keeps in FOLDER which lines each test covers. ``python tests/studies/mutants.py FOLDER --number
 300 --seed 1`` then draws changes from the whole package, runs for each the tests that cover its
-line (those that cover least first) until one fails, and prints the survivors, and killed and
-surviving changes by room. A change that outlives ``--seconds`` of tests counts
-as a survivor, one whose line no test covers as uncovered. Nothing in the checkout is changed.
+line (those that cover least first) until one fails, and prints each verdict, and killed and
+surviving changes by room. ``--begin 40`` goes on with a draw that was stopped after 40. A change
+that outlives ``--seconds`` of tests counts as a survivor, one whose line no test covers as
+uncovered. Nothing in the checkout is changed.
 """
 
 from __future__ import annotations
@@ -270,6 +271,7 @@ def main() -> None:
     parser.add_argument("--map", action="store_true")
     parser.add_argument("--number", type=int, default=300)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--begin", type=int, default=0, help="how many of the draw to pass over")
     parser.add_argument("--seconds", type=float, default=300.0)
     parser.add_argument(
         "--only",
@@ -284,7 +286,7 @@ def main() -> None:
     cover = Cover(given.folder)
     files = [path for path in sorted((ROOT / "px4fuse").rglob("*.py")) if given.only in str(path)]
     every = [one for path in files for one in mutants(path)]
-    drawn = random.Random(given.seed).sample(every, min(given.number, len(every)))
+    drawn = random.Random(given.seed).sample(every, min(given.number, len(every)))[given.begin :]
     verdicts: Counter[tuple[str, str]] = Counter()
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(given.workers) as pool:
         trees: Queue[Path] = Queue()
@@ -318,8 +320,7 @@ def main() -> None:
         for mutant, verdict in zip(drawn, pool.map(judge, drawn), strict=True):
             room = mutant.path.split("/")[1]
             verdicts[room, verdict] += 1
-            if verdict != "killed":
-                print(f"{verdict:9} {mutant.told()}", flush=True)
+            print(f"{verdict:9} {mutant.told()}", flush=True)
     print(f"\n{'room':22}{'killed':>8}{'survived':>10}{'uncovered':>11}")
     kinds = ("killed", "survived", "uncovered")
     for room in sorted({room for room, _ in verdicts}):
