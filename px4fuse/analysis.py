@@ -25,13 +25,7 @@ from px4fuse.comparison.estimates import (
     turned_frame,
 )
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.preparation import (
-    Choices,
-    choose_source,
-    no_source,
-    prepare,
-    usual_sigma_z_m,
-)
+from px4fuse.comparison.preparation import Choices, no_source, prepare
 from px4fuse.comparison.remedy import asked_of_ekf2
 from px4fuse.comparison.why import why_ekf2_differs
 from px4fuse.display import brief
@@ -305,21 +299,22 @@ def run_preparation(
     flight = flight or read_flight(request, progress)
     settings = Settings(
         sigma_a_m_s2=request.sigma_a_m_s2,
-        sigma_z_m=size_of_noise(request, flight),
+        sigma_z_m=Settings().sigma_z_m if request.sigma_z_m is None else request.sigma_z_m,
         dt_s=request.dt_s,
         input=request.input or "imu",
         # that of a position file is spent on placing it
         clock_offset_s=asked if isinstance(asked, float) and request.position is None else 0.0,
     )
-    required = request.input == "imu"
     choices = Choices(
+        input_required=request.input == "imu",
+        sigma_z_given=request.sigma_z_m is not None,
         axes=request.axes or None,
         heading_deg=request.heading_deg,
         position_source=request.position_source,
         start_s=request.start_s,
         end_s=request.end_s,
     )
-    prepared = prepare(flight, settings, input_required=required, **choices)
+    prepared = prepare(flight, settings, **choices)
     if asked != AUTO or request.position is not None:
         return prepared
     _, clock = noises_and_clock(prepared, progress)
@@ -336,15 +331,7 @@ def run_preparation(
         )
         return replace(prepared, notes=(*prepared.notes, note))
     settings = replace(settings, clock_offset_s=clock.offset_s)
-    return prepare(flight, settings, input_required=required, **choices)
-
-
-def size_of_noise(request: ComparisonRequest, flight: Flight) -> float:
-    """SIGMA_Z (m): as asked for, or else the usual one of the source."""
-    if request.sigma_z_m is not None:
-        return request.sigma_z_m
-    track, _ = choose_source(flight, request.position_source)
-    return usual_sigma_z_m(flight, track, request.axes)
+    return prepare(flight, settings, **choices)
 
 
 def _check_finite(**values: float | str | None) -> None:

@@ -12,10 +12,8 @@ from cli_tools import run
 from ulog_tools import Log, gnss_log, make_log, position, seconds_of, stamps, topic
 
 import px4fuse
-from px4fuse.analysis import size_of_noise
+from px4fuse.analysis import run_preparation
 from px4fuse.comparison.preparation import choose_source, prepare
-from px4fuse.comparison.projection import observation_variance
-from px4fuse.filter.signals import Segment, make_axes
 from px4fuse.findings import find, variance
 from px4fuse.flight import POSITION_COLUMNS, Flight, PositionTrack, Truth, Unavailable
 from px4fuse.readers import read_log
@@ -151,13 +149,10 @@ def test_sigma_z_is_what_ekf2_takes(
 ) -> None:
     flight = flight_of(outdoors(eph_m=eph_m, EKF2_GPS_P_NOISE=least_m), tmp_path)
     request = ComparisonRequest(log="a.ulg", axes=axes)
-    assert size_of_noise(request, flight) == pytest.approx(expected_m)
+    prepared = run_preparation(request, flight=flight)
+    assert prepared.settings.sigma_z_m == pytest.approx(expected_m, rel=1e-3)
     asked = ComparisonRequest(log="a.ulg", axes=axes, sigma_z_m=0.3)
-    assert size_of_noise(asked, flight) == 0.3
-    track, segment = track_of(flight), Segment(1.0, 19.0, "")
-    (axis,) = make_axes(flight, track, segment, names=axes or ("north",))
-    r = observation_variance(flight, track, axis, segment)
-    assert r == pytest.approx(expected_m**2, rel=1e-3)
+    assert run_preparation(asked, flight=flight).settings.sigma_z_m == 0.3
 
 
 def test_ekf2_s_innovations_are_those_of_gnss(tmp_path: Path) -> None:

@@ -5,22 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TypedDict, Unpack
 
-import numpy as np
-
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.projection import GNSS_HEIGHT_SCALE
-from px4fuse.ekf2_parameters import GNSS_POS
+from px4fuse.comparison.projection import observation_variance
 from px4fuse.errors import MissingDataError, SettingsError, did_you_mean
 from px4fuse.filter.settings import SIGMA_Z_RANGE_M, Settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, make_axes, within
-from px4fuse.flight import (
-    POSITION_VARIANCE_COLUMNS,
-    Ekf2,
-    Flight,
-    PositionTrack,
-    Truth,
-    Unavailable,
-)
+from px4fuse.flight import Ekf2, Flight, PositionTrack, Truth, Unavailable
 from px4fuse.origin import GIVEN_FILE
 from px4fuse.readers.mavlink_messages import POSITION_INPUTS
 from px4fuse.readers.px4_innovations import with_gnss
@@ -53,6 +43,11 @@ class Choices(TypedDict, total=False):
         Name of a track of the flight.
     start_s, end_s : float
         Segment, seconds from the first data.
+    input_required : bool
+        Raise instead of falling back to ``input="zero"`` where the log has no acceleration.
+    sigma_z_given : bool
+        By default. Otherwise SIGMA_Z of GNSS is what EKF2 takes, its median √R, where that is
+        known.
     """
 
     axes: tuple[str, ...] | None
@@ -60,13 +55,13 @@ class Choices(TypedDict, total=False):
     position_source: str | None
     start_s: float | None
     end_s: float | None
+    input_required: bool
+    sigma_z_given: bool
 
 
 def prepare(
     flight: Flight,
     settings: Settings | None = None,
-    *,
-    input_required: bool = False,
     **choices: Unpack[Choices],
 ) -> Comparison:
     """Choose the source, the segment and the axes.
@@ -75,8 +70,6 @@ def prepare(
     ----------
     flight : Flight
     settings : Settings, optional
-    input_required : bool
-        Raise instead of falling back to ``input="zero"`` where the log has no acceleration.
     **choices
         As :class:`Choices` has them.
 
@@ -85,7 +78,7 @@ def prepare(
     MissingDataError
         No position source, or no such axis.
     SettingsError
-        An empty segment; no acceleration while ``input_required``.
+        An empty segment; no acceleration while that is required.
     """
     settings = settings or Settings()
     track, reason = choose_source(flight, choices.get("position_source"))
@@ -105,9 +98,13 @@ def prepare(
     if isinstance(flight.truth, Truth) and flight.truth.name == track.name:
         flight = replace(flight, truth=NOT_ITS_OWN_TRUTH)
     notes = (*flight.log.notes, *track.notes)
+    if track.origin.is_gnss and not choices.get("sigma_z_given", True):
+        sigma_z_m = observation_variance(flight, track, lines[0], segment) ** 0.5
+        if sigma_z_m >= SIGMA_Z_RANGE_M[0]:  # not NaN
+            settings = replace(settings, sigma_z_m=float(f"{sigma_z_m:.3g}"))
     acceleration = lines[0].acceleration
     if settings.input == "imu" and isinstance(acceleration, Unavailable):
-        if input_required:
+        if choices.get("input_required"):
             raise SettingsError(f"{flight.log.name}: `input` imu: {acceleration}")
         settings = replace(settings, input="zero")
         notes += (f"no acceleration input ({acceleration.reason}): constant velocity was used",)
@@ -155,22 +152,6 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
         f"{flight.log.name}: position source {name}: {reasons.get(name, 'no such source')}",
         f"{did_you_mean(name, names)}This log has: {', '.join(names) or 'none'}.",
     )
-
-
-def usual_sigma_z_m(flight: Flight, track: PositionTrack, axes: tuple[str, ...] = ()) -> float:
-    """SIGMA_Z (m) where none is asked for: the lesson's, of GNSS what EKF2 takes (median √R).
-
-    √R = the accuracy that the receiver states, and EKF2_GPS_P_NOISE at least (gps_control.cpp);
-    that of its height where ``axes`` is that alone.
-    """
-    if not track.origin.is_gnss:
-        return Settings().sigma_z_m
-    least, column = flight.log.parameters.get(GNSS_POS.noise, 0.0), POSITION_VARIANCE_COLUMNS[0]
-    if axes == ("down",):
-        least, column = GNSS_HEIGHT_SCALE * least, POSITION_VARIANCE_COLUMNS[2]
-    stated = float(np.sqrt(track.samples[column].median()))
-    # nanmax: what the receiver does not state
-    return float(f"{np.nanmax([stated, least, SIGMA_Z_RANGE_M[0]]):.3g}")
 
 
 def no_source(flight: Flight) -> Unavailable:
