@@ -74,6 +74,7 @@ EV_POS = Aid(
 )  # fmt: skip
 GNSS_POS = Aid(
     "gnss_pos", "EKF2_GPS_CTRL", "EKF2_GPS_P_NOISE", "EKF2_GPS_P_GATE", "EKF2_GPS_DELAY",
+    place=("EKF2_GPS_POS_X", "EKF2_GPS_POS_Y", "EKF2_GPS_POS_Z"),
     label="GNSS position", reported=_RECEIVER,
 )  # fmt: skip
 
@@ -88,13 +89,14 @@ def _vision(name: str, label: str, noise: str, gate: str, unit: str) -> Aid:
                label=f"external vision, {label}", unit=unit, reported=_SENDER)  # fmt: skip
 
 
+GNSS_VEL = _gnss("gnss_vel", "GNSS velocity", "EKF2_GPS_V_NOISE", "EKF2_GPS_V_GATE", "m/s")
 # What EKF2 can fuse, in the order in which it is told. gate, noise and what else forms R: PX4's
 # EKF/aid_sources of v1.13 to main
 AIDS: Mapping[str, Aid] = {
     aid.name: aid
     for aid in (
         GNSS_POS,
-        _gnss("gnss_vel", "GNSS velocity", "EKF2_GPS_V_NOISE", "EKF2_GPS_V_GATE", "m/s"),
+        GNSS_VEL,
         _gnss("gnss_hgt", "GNSS height", GNSS_POS.noise, GNSS_POS.gate, "m"),
         _gnss("gnss_yaw", "GNSS yaw", "", "EKF2_HDG_GATE", "rad"),
         EV_POS,
@@ -153,8 +155,13 @@ PARAMETERS: Mapping[str, Parameter] = {
     EV_POS.noise_mode: Parameter("", 0.0, 0.0, 1.0),
     EV_POS.gate: Parameter("SD", 5.0, 1.0, 1e3),
     EV_POS.delay: Parameter("ms", 0.0, 0.0, 300.0),
+    GNSS_POS.noise: Parameter("m", 0.5, 0.01, 10.0),
+    GNSS_POS.gate: Parameter("SD", 5.0, 1.0, 1e3),
+    GNSS_POS.delay: Parameter("ms", 110.0, 0.0, 300.0),
+    GNSS_VEL.noise: Parameter("m/s", 0.3, 0.01, 5.0),
+    GNSS_VEL.gate: Parameter("SD", 5.0, 1.0, 1e3),
     "EKF2_DELAY_MAX": Parameter("ms", 200.0, 0.0, 1e3),
-    **dict.fromkeys(EV_POS.place, Parameter("m", 0.0, -math.inf, math.inf)),
+    **dict.fromkeys((*EV_POS.place, *GNSS_POS.place), Parameter("m", 0.0, -math.inf, math.inf)),
     "EKF2_ACC_NOISE": Parameter("m/s^2", 0.35, 0.01, 1.0),
     "EKF2_GYR_NOISE": Parameter("rad/s", 0.015, 0.0001, 0.1),
     "EKF2_ACC_B_NOISE": Parameter("m/s^3", 0.003, 0.0, 0.01),
@@ -174,16 +181,26 @@ REPORTED = (
 )  # fmt: skip
 
 
-def settings_in_force(logged: Mapping[str, float]) -> dict[str, float]:
+def settings_in_force(logged: Mapping[str, float], aid: Aid = EV_POS) -> dict[str, float]:
     """The model's parameters as the log has them, PX4's defaults where it has none.
 
     Parameters
     ----------
     logged : mapping
         Parameters of the log, by PX4 name.
+    aid : Aid
+        What EKF2 fused: those of other aids are left out.
     """
-    defaults = {name: parameter.default for name, parameter in PARAMETERS.items()}
-    if fuses_by_mask(logged):
+    of_others = {
+        name
+        for other in (EV_POS, GNSS_POS, GNSS_VEL)
+        if other.switch != aid.switch
+        for name in (*other.own, *other.place)
+    }
+    defaults = {
+        name: parameter.default for name, parameter in PARAMETERS.items() if name not in of_others
+    }
+    if fuses_by_mask(logged) and aid == EV_POS:
         defaults |= OLD_DEFAULTS
     return {name: float(logged.get(name, default)) for name, default in defaults.items()}
 
@@ -213,7 +230,7 @@ def check(chosen: Mapping[str, float]) -> dict[str, float]:
                 f"{name}: the model of EKF2 does not have this parameter",
                 f"{did_you_mean(name, PARAMETERS)}It knows {', '.join(PARAMETERS)}.",
             )
-        if name == EV_POS.delay and value < 0.0:
+        if name in (EV_POS.delay, GNSS_POS.delay) and value < 0.0:
             raise SettingsError(
                 f"{name} cannot be negative",
                 "Positions that are stamped later than they were measured need another clock: "

@@ -146,6 +146,11 @@ class PositionTrack:
         about the body's axes ``forward_rad2, right_rad2, down_rad2`` (NaN where none was given).
         None where the sender gave no orientation, or only ever the same one: a positioning
         system, no odometry.
+    velocity : DataFrame, shape (n, 6), or None
+        ``north_m_s, east_m_s, down_m_s`` and their variances ``north_m2_s2, …`` at the times of
+        ``samples``, where the source measures it by itself: GNSS.
+    age_s : float
+        What EKF2 takes a sample to be older than its stamp, as far as that was taken off already.
     notes : tuple of str
         Joins and what they dropped.
     """
@@ -161,6 +166,8 @@ class PositionTrack:
     clock_map: ClockMap | None = None
     alignment: Alignment | None = None
     orientation: pd.DataFrame | None = None
+    velocity: pd.DataFrame | None = None
+    age_s: float = 0.0
     notes: tuple[str, ...] = ()
 
     __repr__ = brief

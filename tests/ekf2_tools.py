@@ -72,7 +72,7 @@ def plain_replay(inputs: Inputs, stretch: Stretch, events: Events) -> tuple[np.n
             P = F @ P @ F.T + step_noise(stretch, k, gyro, force)
             P += np.diag(drift * inputs.step_s**2)
             k += 1
-        position = inputs.vision.position_m[sample]
+        position = inputs.received.position_m[sample]
         if action:
             innovations.append(position[:2] - x[6:8])
             variances.append([P[6, 6] + R, P[7, 7] + R])

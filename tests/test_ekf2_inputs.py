@@ -16,7 +16,7 @@ from findings_tools import NONE, log, made
 from scipy.spatial.transform import Rotation
 
 from px4fuse.ekf2 import inputs as inputs_module
-from px4fuse.ekf2.inputs import Inputs, Rules, Vision, _decisions, _source, prepare, read_vision
+from px4fuse.ekf2.inputs import Inputs, Rules, Received, _decisions, _source, prepare, read_vision
 from px4fuse.ekf2.stretches import (
     Stretch,
     _stretch,
@@ -106,7 +106,7 @@ def test_a_sweep_has_2_to_200_values() -> None:
 @pytest.fixture
 def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     """What is prepared of a flight of which only the parameters matter."""
-    monkeypatch.setattr(inputs_module, "read_vision", lambda *_: made(Vision, stamp_s=None))
+    monkeypatch.setattr(inputs_module, "read_vision", lambda *_: made(Received, stamp_s=None))
     monkeypatch.setattr(inputs_module, "find_stretches", lambda *_: (made(Stretch),))
 
     def prepared(
@@ -198,7 +198,7 @@ def test_a_frame_of_its_own_is_turned_with_its_variance() -> None:
             record=record, horizon_s=0.1, innovation_topics=AID,
         )  # fmt: skip
         found = read_vision(made(Flight, positions=(own,)), ekf2, record, facing(90.0))
-        assert isinstance(found, Vision)
+        assert isinstance(found, Received)
         where = [-0.5, 2.0, -1.0] if turned else [2.0, 0.5, -1.0]
         np.testing.assert_allclose(found.position_m, [where] * 30, atol=1e-12)
         spread = [0.0, 0.04, 0.09] if turned else [0.04, 0.0, 0.09]
@@ -206,7 +206,7 @@ def test_a_frame_of_its_own_is_turned_with_its_variance() -> None:
         np.testing.assert_allclose(found.arrival_s - time, np.linspace(0.05, 0.15, 30))
     copy = track("estimator_aid_src_ev_pos", KEPT)
     found = read_vision(made(Flight, positions=(copy,)), ekf2, record, facing(90.0))
-    assert isinstance(found, Vision)
+    assert isinstance(found, Received)
     assert np.all(found.arrival_s == -np.inf)
 
 

@@ -162,10 +162,10 @@ def test_several_settings_at_once_are_each_alone(model: Model) -> None:
 
 
 def test_samples_that_arrive_after_the_horizon_are_late_or_lost(model: Model) -> None:
-    vision = model.inputs.vision
+    vision = model.inputs.received
     assert (model.flown.late, model.flown.lost) == (0, 0)
     slow = replace(vision, arrival_s=vision.stamp_s + 0.02)
-    made = replace(model, inputs=replace(model.inputs, vision=slow))
+    made = replace(model, inputs=replace(model.inputs, received=slow))
     # they arrive 20 ms after their stamp; the horizon is 214 ms, and 100 ms more are forgiven
     in_time, late, lost = replay_settings(
         made, [{"EKF2_EV_DELAY": delay} for delay in (190.0, 260.0, 300.0)]

@@ -16,7 +16,7 @@ from exchange import replace
 from findings_tools import log, made
 from scipy.spatial.transform import Rotation
 
-from px4fuse.ekf2.inputs import Inputs, Rules, Vision
+from px4fuse.ekf2.inputs import Inputs, Rules, Received
 from px4fuse.ekf2.intervals import (
     FUSE,
     GRAVITY_M_S2,
@@ -81,7 +81,7 @@ def test_the_variance_of_a_bias_stays_within_px4s_limits() -> None:
 
 def test_what_counts_as_measurement_and_noise() -> None:
     vision = made(
-        Vision, position_m=np.array([[1.0, 2.0, 3.0]]), variance_m2=np.array([[0.04, 0.0001, 0.0]])
+        Received, position_m=np.array([[1.0, 2.0, 3.0]]), variance_m2=np.array([[0.04, 0.0001, 0.0]])
     )
     turned = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()
     stretch = made(Stretch, rotation=np.array([np.eye(3), turned]))
@@ -90,7 +90,7 @@ def test_what_counts_as_measurement_and_noise() -> None:
         "EKF2_EV_POS_X": np.array([0.0, 0.3]), "EKF2_EV_POS_Y": np.zeros(2),
         "EKF2_EV_POS_Z": np.zeros(2),
     }  # fmt: skip
-    inputs = made(Inputs, vision=vision, imu_offset_m=np.zeros(3))
+    inputs = made(Inputs, received=vision, imu_offset_m=np.zeros(3))
     position, noise = measurements(inputs, stretch, np.array([0]), np.array([[1]]), knob)
     # 0.3 m ahead of a body that faces east: the body is west of the sensor
     np.testing.assert_allclose(position[0], [[1.0, 2.0, 3.0], [1.0, 1.7, 3.0]], atol=1e-12)
@@ -195,7 +195,7 @@ def at_rest(
     )  # fmt: skip
     stamp = 10.105 + 0.1 * np.arange(len(measured_m))
     north = np.array(measured_m)
-    vision = Vision(
+    vision = Received(
         stamp, np.full(len(stamp), -np.inf), np.column_stack([north, 0.0 * north, 0.0 * north]),
         np.zeros((len(stamp), 3)), np.full(len(stamp), np.nan), np.zeros(len(stamp), bool), "uwb",
     )  # fmt: skip
@@ -295,9 +295,9 @@ def stretch_of(count: int, *, fusing: bool = True) -> Stretch:
     return made(Stretch, time_s=10.0 + 0.01 * np.arange(count + 1), fusing=fusing)
 
 
-def vision_of(stamps: list[float], age_s: float = 0.0) -> Vision:
+def vision_of(stamps: list[float], age_s: float = 0.0) -> Received:
     stamp = np.array(stamps)
-    return made(Vision, stamp_s=stamp, arrival_s=stamp + age_s)
+    return made(Received, stamp_s=stamp, arrival_s=stamp + age_s)
 
 
 def acting(stamps: list[float], *, fusing: bool = True, rules: Rules = RULES) -> list[int]:
@@ -324,7 +324,7 @@ def events(
     stamps: list[float], *, delay_s: float = 0.0, age_s: float = -9.0, horizon_s: float = 0.0
 ) -> Any:
     inputs = made(
-        Inputs, vision=vision_of(stamps, age_s), step_s=0.01, rules=RULES, max_interval_s=0.25
+        Inputs, received=vision_of(stamps, age_s), step_s=0.01, rules=RULES, max_interval_s=0.25
     )
     return _events(inputs, stretch_of(100), Timing(delay_s, horizon_s))
 

@@ -407,7 +407,7 @@ def test_what_a_clock_offset_asks_of_ekf2(monkeypatch: pytest.MonkeyPatch) -> No
         monkeypatch.setattr(
             remedies, "delay_helps", lambda *both, h=helps: both == (1.0, 2.0) and h
         )
-        model = made(Model, inputs=SimpleNamespace(vision=SimpleNamespace(source=fed)))
+        model = made(Model, inputs=SimpleNamespace(received=SimpleNamespace(source=fed)))
         clock = late(-0.1, applied_s=-0.05)
         one = analysis(clock=clock, settings=APPLIED, ekf2_model=model)
         remedy = only(source_clock.detect, one).remedy

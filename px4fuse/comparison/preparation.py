@@ -201,12 +201,12 @@ def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
     """The same track with ``clock_offset_s`` added to its time stamps."""
     if clock_offset_s == 0.0:
         return track
-    samples, orientation = (
-        None if frame is None else frame.set_axis(frame.index + clock_offset_s)
-        for frame in (track.samples, track.orientation)
-    )
-    assert samples is not None
-    return replace(track, samples=samples, orientation=orientation)
+    moved = {
+        name: frame.set_axis(frame.index + clock_offset_s)
+        for name in ("samples", "orientation", "velocity")
+        if (frame := getattr(track, name)) is not None
+    }
+    return replace(track, **moved)
 
 
 def choose_segment(

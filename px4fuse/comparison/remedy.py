@@ -68,7 +68,7 @@ def asked_of_ekf2(
         innovations against such a source say nothing about its error.
     """
     source = comparison.source
-    if source.name != model.inputs.vision.source or source.alignment is not None:
+    if source.name != model.inputs.received.source or source.alignment is not None:
         return {}
     changes: dict[str, float] = {}
     noise_m = tuned_noise_m(tuning)

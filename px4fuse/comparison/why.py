@@ -85,7 +85,7 @@ def why_ekf2_differs(
     if isinstance(model, Unavailable):
         return {name: Unavailable(WHAT, model.reason, model.remedy) for name in results}
     settings, asked_m = comparison.settings, tuned_noise_m(tuning)
-    if comparison.source.name != model.inputs.vision.source:
+    if comparison.source.name != model.inputs.received.source:
         settings, asked_m = replace(settings, clock_offset_s=0.0), None
     walked = walk(model, settings, {name: result.replay for name, result in results.items()})
     if isinstance(walked, Unavailable):
@@ -210,7 +210,7 @@ def _reasons(
     """What EKF2 does at each step, and what ours does."""
     settings, inputs = comparison.settings, model.inputs
     rejected = model.agreement.rejected_share_logged
-    flown, source, fused = inputs.settings, comparison.source.name, inputs.vision.source
+    flown, source, fused = inputs.settings, comparison.source.name, inputs.received.source
     samples = (
         f"ours predicts every {settings.dt_s:g} s and starts by itself, EKF2 predicts every "
         f"{inputs.step_s * 1e3:.0f} ms"

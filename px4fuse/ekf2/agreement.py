@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.ekf2.inputs import AID_SOURCE, same_sample
+from px4fuse.ekf2.inputs import aid_source, replayed_aid, same_sample
 from px4fuse.ekf2.replay import HORIZONTAL, Agreement, AxisAgreement, Ekf2Replay, Spans
 from px4fuse.ekf2.stretches import SETTLING_S
 from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Ekf2, Flight, Truth, Unavailable
@@ -106,7 +106,7 @@ def settled(times_s: ArrayLike, judged: Spans) -> BoolArray:
 
 def match(replay: Ekf2Replay, ekf2: Ekf2, times: Array) -> IntArray:
     """Row of the replay's updates of each logged innovation; -1 where there is none."""
-    if AID_SOURCE in ekf2.innovation_topics:
+    if aid_source(replayed_aid(ekf2)) in ekf2.innovation_topics:
         return same_sample(replay.updates.index.to_numpy(), times)
     fused_at = replay.updates["fused_at_s"].to_numpy()
     at = np.searchsorted(fused_at, times + 1e-4, side="right") - 1

@@ -6,7 +6,7 @@ Sources: PX4-Autopilot ``EKF/aid_sources/external_vision/ev_pos_control.cpp`` an
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -14,11 +14,21 @@ import pandas as pd
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
 from px4fuse.ekf2.stretches import MIN_STRETCH_S, Stretch, find_stretches, predict_s
-from px4fuse.ekf2_parameters import AID_MASK, EV_POS, fuses_by_mask, settings_in_force
+from px4fuse.ekf2_parameters import (
+    AID_MASK,
+    EV_POS,
+    GNSS_MODE,
+    GNSS_POS,
+    Aid,
+    fuses_by_mask,
+    settings_in_force,
+)
 from px4fuse.flight import (
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
     QUATERNION_COLUMNS,
+    VELOCITY_COLUMNS,
+    VELOCITY_VARIANCE_COLUMNS,
     Ekf2,
     Flight,
     FusionRecord,
@@ -26,6 +36,9 @@ from px4fuse.flight import (
     Unavailable,
 )
 from px4fuse.origin import GIVEN_FILE
+from px4fuse.readers.px4_innovations import with_gnss
+from px4fuse.readers.px4_positions import THINNED_HZ, fuses_gnss
+from px4fuse.readers.px4_topics import DEFAULT_PROFILE
 from px4fuse.trajectory.rotation import conjugate, interpolate, matrix, multiply
 
 WHAT = "EKF2 replay"
@@ -33,8 +46,9 @@ WHAT = "EKF2 replay"
 COPY_INTERVAL_S = {"estimator_visual_odometry_aligned": 0.2, "estimator_aid_src_ev_pos": 0.5}
 ROTATE_VISION_BIT = 64  # EKF2_AID_MASK, up to v1.13
 # The aid-source topics carry the time of measurement, as EKF2 takes it, to about a millisecond
-AID_SOURCE = "estimator_aid_src_ev_pos"
 SAME_SAMPLE_S = 0.006
+# What a log calls the aiding by GNSS
+OF_GNSS = ("GPS", "GPS position", "GPS velocity")
 # vehicle_local_position is logged every 0.1 s
 RESET_SHOWS_S = 0.2
 # Predictions of more than this lose turns and vibration inside a step; EKF2's own are 8 to 13 ms
@@ -46,8 +60,8 @@ MAX_INTERVAL_S = 0.25
 
 
 @dataclass(frozen=True)
-class Vision:
-    """External vision samples as EKF2 received them, shape (m,) or (m, ...), in time order.
+class Received:
+    """Position samples as EKF2 received them, shape (m,) or (m, ...), in time order.
 
     Attributes
     ----------
@@ -56,6 +70,8 @@ class Vision:
         NED.
     variance_m2 : ndarray, shape (m, 3)
         As reported; 0 where the sender gave none.
+    velocity_m_s, velocity_variance_m2_s2 : ndarray, shape (m, 3), or None
+        NED, where EKF2 fuses velocity with each position.
     rejected : ndarray, shape (m,)
         Whether EKF2's gate rejected it, 1 or 0; NaN where the log does not tell.
     reset : ndarray of bool, shape (m,)
@@ -71,13 +87,15 @@ class Vision:
     rejected: Array
     reset: BoolArray
     source: str
+    velocity_m_s: Array | None = None
+    velocity_variance_m2_s2: Array | None = None
 
     __repr__ = brief
 
 
 @dataclass(frozen=True)
 class Rules:
-    """What decides when EKF2 starts, stops and resets vision position, by release.
+    """What decides when EKF2 starts, stops and resets horizontal position, by release.
 
     Attributes
     ----------
@@ -89,6 +107,11 @@ class Rules:
         The position is reset to the sample after this time of rejections.
     resets : int
         So many resets in a row, then fusion stops until a sample on which it may start.
+    reset_scale : float
+        Variance of the position after a reset, in that of the sample.
+    with_velocity : bool
+        Whether velocity is reset with the position: when both, or for twice the time the position,
+        were rejected.
     bias_floor : float or None
         Least variance of the accelerometer's bias (m²/s⁴), where the release has one.
     horizon_by_delay : bool
@@ -101,6 +124,8 @@ class Rules:
     resets: int
     bias_floor: float | None
     horizon_by_delay: bool
+    reset_scale: float = 1.0
+    with_velocity: bool = False
 
 
 @dataclass(frozen=True)
@@ -112,7 +137,9 @@ class Inputs:
     settings : dict
         The model's parameters as flown, by PX4 name.
     stretches : tuple of Stretch
-    vision : Vision
+    received : Received
+    aid : Aid
+        What EKF2 fused them as.
     rules : Rules
     step_s : float
         Average prediction step.
@@ -130,13 +157,14 @@ class Inputs:
 
     settings: dict[str, float]
     stretches: tuple[Stretch, ...]
-    vision: Vision
+    received: Received
     rules: Rules
     step_s: float
     horizon_s: float
     predict_s: float
     vision_height: bool
     imu_offset_m: Array
+    aid: Aid = EV_POS
     max_interval_s: float = MAX_INTERVAL_S
 
     __repr__ = brief
@@ -156,16 +184,22 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
     assert isinstance(imu, pd.DataFrame)
     assert isinstance(attitude, pd.DataFrame)
     assert isinstance(ekf2, Ekf2)
+    aid = replayed_aid(ekf2)
+    gnss = aid == GNSS_POS
+    if gnss:
+        ekf2 = with_gnss(ekf2)
     record, horizon_s = ekf2.record, ekf2.horizon_s
     for each in (record, ekf2.innovations["north"]):
         if isinstance(each, Unavailable):
             return Unavailable(WHAT, each.reason, each.remedy)
     assert isinstance(record, FusionRecord)
-    if record.other_aiding:
+    if others := [one for one in record.other_aiding if not (gnss and one in OF_GNSS)]:
+        fused = "GNSS" if gnss else "vision position"
+        switch = EV_POS.switch if gnss else GNSS_POS.switch
         return Unavailable(
             WHAT,
-            f"EKF2 fused more than vision position horizontally ({', '.join(record.other_aiding)})",
-            "Fly with EKF2_GPS_CTRL 0, EKF2_OF_CTRL 0 and without bit 2 of EKF2_EV_CTRL.",
+            f"EKF2 fused more than {fused} horizontally ({', '.join(others)})",
+            f"Fly with {switch} 0, EKF2_OF_CTRL 0 and without bit 2 of {EV_POS.switch}.",
         )
     interval = float(np.median(np.diff(imu.index.to_numpy())))
     if interval > MAX_IMU_INTERVAL_S:
@@ -174,41 +208,97 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
             f"the IMU is logged at {1 / interval:.0f} Hz, slower than EKF2 predicts",
             "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate.",
         )
-    vision = read_vision(flight, ekf2, record, attitude)
-    if isinstance(vision, Unavailable):
-        return vision
+    read = read_gnss(flight, ekf2, record) if gnss else read_vision(flight, ekf2, record, attitude)
+    if isinstance(read, Unavailable):
+        return read
     if isinstance(horizon_s, Unavailable):
         if not flight.log.firmware.startswith(STAMPED_AT_HORIZON):
             return Unavailable(WHAT, horizon_s.reason, horizon_s.remedy)
         horizon_s = 0.0  # a buffer of one step: EKF2_EV_DELAY is at most EKF2_PREDICT_US
-    stretches = find_stretches(flight, imu, attitude, ekf2, record, vision.stamp_s)
+    stretches = find_stretches(flight, imu, attitude, ekf2, record, read.stamp_s)
     if not stretches:
         return Unavailable(
             WHAT,
-            f"no {MIN_STRETCH_S:g} s of external vision fused without a gap in IMU or vision",
-            "Record without dropouts (a faster SD card, fewer topics), and send vision steadily.",
+            f"no {MIN_STRETCH_S:g} s in flight of {aid.label.removesuffix(', position')} fused "
+            "without a gap in it or the IMU",
+            "Record without dropouts (a faster SD card, fewer topics), and send positions steadily.",
         )
     floor = 5e-8 / ekf2.step_s**2 if record.per_step_biases else None
     # EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h
-    old = fuses_by_mask(record.parameters)
+    old = gnss or fuses_by_mask(record.parameters)
     limits = (np.inf, 7.0, 7.0, NO_LIMIT) if old else (0.2, 0.4, 1.0, 5)
+    rules = Rules(*limits, floor, "EKF2_DELAY_MAX" not in record.parameters)
+    if gnss:
+        # resetHorizontalPositionTo, gps_control.cpp: from v1.16, which keeps latitude and
+        # longitude, on with twice the variance; since main of 2026 each aid by itself
+        latitude = not np.isfinite(record.delayed["north_m"]).any()
+        rules = replace(
+            rules,
+            stop_s=np.inf,
+            reset_scale=2.0 if latitude else 1.0,
+            with_velocity=GNSS_MODE not in record.parameters,
+        )
     fusing = ekf2.fusing
     return Inputs(
-        settings=settings_in_force(record.parameters),
+        settings=settings_in_force(record.parameters, aid),
         stretches=stretches,
-        vision=vision,
-        rules=Rules(*limits, floor, "EKF2_DELAY_MAX" not in record.parameters),
+        received=read,
+        rules=rules,
         step_s=ekf2.step_s,
         horizon_s=horizon_s,
         predict_s=predict_s(record),
-        vision_height=isinstance(fusing, pd.DataFrame) and bool(fusing["vertical"].mean() > 0.5),
+        vision_height=not gnss
+        and isinstance(fusing, pd.DataFrame)
+        and bool(fusing["vertical"].mean() > 0.5),
         imu_offset_m=np.array([record.parameters.get(f"EKF2_IMU_POS_{x}", 0.0) for x in "XYZ"]),
+        aid=aid,
+    )
+
+
+def replayed_aid(ekf2: Ekf2) -> Aid:
+    """What EKF2's horizontal position rests on: external vision, or GNSS where it fused that."""
+    vision = ekf2.aids.get(EV_POS.name)
+    used = vision is not None and (vision.meant is None or bool(vision.meant.any()))
+    return GNSS_POS if fuses_gnss(ekf2) and not used else EV_POS
+
+
+def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> Received | Unavailable:
+    """The fixes that EKF2 received, as :func:`read_vision` gives positions of vision."""
+    track = next((track for track in flight.positions if track.origin.is_gnss), None)
+    if track is None or track.velocity is None:
+        return Unavailable(WHAT, "no vehicle_gps_position in the log", DEFAULT_PROFILE)
+    if track.rate_hz < THINNED_HZ:
+        return Unavailable(
+            WHAT,
+            f"the log holds {track.rate_hz:.1f} positions of GNSS a second, fewer than EKF2 fused",
+            "Set bit 1 of SDLOG_PROFILE, which logs them all.",
+        )
+    parameters = record.parameters
+    switch = int(parameters.get(GNSS_POS.switch, 7.0))
+    # the stamp of a fix that has a time of its own is made up, so that its age is the delay
+    flown_s = settings_in_force(parameters, GNSS_POS)[GNSS_POS.delay] * 1e-3
+    stamp = track.samples.index.to_numpy() + flown_s
+    # EKF2 believes no fix to be worse than without aiding (gps_control.cpp)
+    worst_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
+    stated = track.samples[POSITION_VARIANCE_COLUMNS].fillna(0.0).clip(upper=worst_m**2)
+    velocity: tuple[Array | None, Array | None] = None, None
+    if fuses_by_mask(parameters) or switch & 4:
+        columns = (VELOCITY_COLUMNS, VELOCITY_VARIANCE_COLUMNS)
+        velocity = tuple(track.velocity[each].fillna(0.0).to_numpy() for each in columns)
+    return Received(
+        stamp,
+        stamp,
+        track.samples[POSITION_COLUMNS].to_numpy(),
+        stated.to_numpy(),
+        *_decisions(ekf2, record, stamp, GNSS_POS),
+        track.name,
+        *velocity,
     )
 
 
 def read_vision(
     flight: Flight, ekf2: Ekf2, record: FusionRecord, attitude: pd.DataFrame
-) -> Vision | Unavailable:
+) -> Received | Unavailable:
     """The samples that EKF2 received, in NED, or why the log does not hold them all.
 
     Parameters
@@ -249,17 +339,19 @@ def read_vision(
     if len(age) and "vehicle_visual_odometry" in track.topics:
         arrival = stamp + np.interp(stamp, age.index.to_numpy(), age.to_numpy())
     decisions = _decisions(ekf2, record, stamp)
-    return Vision(stamp, arrival, position, variance, *decisions, track.name)
+    return Received(stamp, arrival, position, variance, *decisions, track.name)
 
 
-def _decisions(ekf2: Ekf2, record: FusionRecord, stamp: Array) -> tuple[Array, BoolArray]:
+def _decisions(
+    ekf2: Ekf2, record: FusionRecord, stamp: Array, aid: Aid = EV_POS
+) -> tuple[Array, BoolArray]:
     """What EKF2 rejected and reset to, where its aid-source topic tells, by time of measurement."""
     rejected, reset = np.full(len(stamp), np.nan), np.zeros(len(stamp), dtype=bool)
     innovations, horizon_s = ekf2.innovations["north"], ekf2.horizon_s
-    known = AID_SOURCE in ekf2.innovation_topics
+    known = aid_source(aid) in ekf2.innovation_topics
     if isinstance(innovations, Unavailable) or isinstance(horizon_s, Unavailable) or not known:
         return rejected, reset
-    delay_s = settings_in_force(record.parameters)[EV_POS.delay] * 1e-3
+    delay_s = settings_in_force(record.parameters, aid)[aid.delay] * 1e-3
     taken = stamp - delay_s - 0.5 * ekf2.step_s
     row = same_sample(innovations.index.to_numpy(), taken)
     rejected[row >= 0] = innovations["rejected"].to_numpy()[row[row >= 0]]
@@ -270,6 +362,11 @@ def _decisions(ekf2: Ekf2, record: FusionRecord, stamp: Array) -> tuple[Array, B
         if len(before) and shown_s - published[before[-1]] < RESET_SHOWS_S:
             reset[before[-1]] = True
     return rejected, reset
+
+
+def aid_source(aid: Aid) -> str:
+    """The topic that has the innovations of an aid."""
+    return f"estimator_aid_src_{aid.name}"
 
 
 def same_sample(known_s: Array, wanted_s: Array) -> IntArray:

@@ -108,7 +108,7 @@ def make_intervals(inputs: Inputs, stretch: Stretch, timing: Timing) -> Interval
 
 
 def _events(inputs: Inputs, stretch: Stretch, timing: Timing) -> Events:
-    vision, time_s = inputs.vision, stretch.time_s
+    vision, time_s = inputs.received, stretch.time_s
     first, beyond = np.searchsorted(vision.stamp_s, time_s[[0, -1]])
     stamp, last = vision.stamp_s[first:beyond], len(time_s) - 1
     taken = stamp - timing.delay_s - 0.5 * inputs.step_s

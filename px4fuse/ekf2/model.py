@@ -33,9 +33,10 @@ from px4fuse.ekf2.intervals import (
 from px4fuse.ekf2.output_predictor import follow_attitude, later, publish
 from px4fuse.ekf2.recursion import Run, Variant, run, with_correlation
 from px4fuse.ekf2.replay import UPDATE_COLUMNS, Agreement, Ekf2Replay
-from px4fuse.ekf2_parameters import check
+from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS, check, settings_in_force
 from px4fuse.errors import SettingsError
-from px4fuse.flight import STATE_COLUMNS, Flight, Unavailable
+from px4fuse.flight import STATE_COLUMNS, Ekf2, Flight, Unavailable
+from px4fuse.readers.px4_innovations import with_gnss
 
 # Where a log's EKF2 is this model (simulated flights), the log says so in these words
 MODEL_NOTE = (
@@ -79,6 +80,8 @@ def open_model(flight: Flight) -> Model | Unavailable:
     inputs = prepare(flight)
     if isinstance(inputs, Unavailable):
         return inputs
+    if inputs.aid == GNSS_POS and isinstance(flight.ekf2, Ekf2):
+        flight = replace(flight, ekf2=with_gnss(flight.ekf2))
     flown = Variant(inputs.settings)
     timing = flown.timing(inputs)
     intervals = tuple(make_intervals(inputs, stretch, timing) for stretch in inputs.stretches)
@@ -97,7 +100,7 @@ def open_model(flight: Flight) -> Model | Unavailable:
     if isinstance(agreement, Unavailable):
         return agreement
     share = max(agreement.rejected_share_logged, agreement.rejected_share_replayed)
-    if share > REJECTING_SHARE and np.isfinite(inputs.vision.rejected).any():
+    if share > REJECTING_SHARE and np.isfinite(inputs.received.rejected).any():
         _, obeyed = replayed(replace(flown, as_logged=True))
         if isinstance(obeyed, Agreement):
             agreement = with_obedient(agreement, obeyed)
@@ -145,11 +148,11 @@ def disturbed(model: Model, sigma_m: float, seed: int) -> Model:
         Standard deviation of the noise (m), per axis.
     seed : int
     """
-    vision = model.inputs.vision
-    noise = np.random.default_rng(seed).normal(scale=sigma_m, size=vision.position_m.shape)
-    vision = replace(vision, position_m=vision.position_m + noise)
+    received = model.inputs.received
+    noise = np.random.default_rng(seed).normal(scale=sigma_m, size=received.position_m.shape)
+    received = replace(received, position_m=received.position_m + noise)
     # the intervals between samples hang on their times alone
-    return replace(model, inputs=replace(model.inputs, vision=vision))
+    return replace(model, inputs=replace(model.inputs, received=received))
 
 
 def delayed_variants(
@@ -203,7 +206,7 @@ def _assemble(
         delayed=pd.concat([delayed for delayed, _ in tracks]),
         published=pd.concat([published for _, published in tracks]),
         stretches_s=tuple(tuple(part.stretch.time_s[[0, -1]].tolist()) for part in runs),
-        source=inputs.vision.source,
+        source=inputs.received.source,
         late=sum(int(part.events[at].late.sum()) for part in runs),
         lost=sum(int(part.events[at].lost.sum()) for part in runs),
     )

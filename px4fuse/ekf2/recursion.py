@@ -26,11 +26,12 @@ from px4fuse.ekf2.intervals import (
     STATES,
     THETA,
     Events,
+    VELOCITY,
     Intervals,
     Timing,
 )
 from px4fuse.ekf2.stretches import Stretch
-from px4fuse.ekf2_parameters import EV_POS
+from px4fuse.ekf2_parameters import GNSS_VEL
 
 # How long the first pass runs that gives the correlations at the start
 CORRELATING_S = 8.0
@@ -40,6 +41,8 @@ TOGETHER = 64
 # Variance by which a sample is not taken at all
 NOT_TAKEN = 1e9
 MIN_POSITION_SD_M = 0.01  # ev_pos_control.cpp
+# EKF2 takes the vertical velocity of GNSS for half as exact again (gps_control.cpp)
+VERTICAL_SCALE = np.array([1.0, 1.0, 2.25])
 MIN_GATE = 1.0
 # covariance.cpp: at most 0.1 g of bias, at most a ratio of 100 between the axes
 MAX_BIAS_SD = 0.1 * 9.80665
@@ -63,6 +66,8 @@ class Variant:
         Whether the accelerometer's bias is a state; else there is none.
     attitude : bool
         Whether attitude and gyro bias are states; else the published attitude holds.
+    velocity : bool
+        Whether velocity is fused too, where EKF2 does.
     gated : bool
         Whether samples are rejected and positions reset.
     as_logged : bool
@@ -75,6 +80,7 @@ class Variant:
     settings: dict[str, float]
     biases: bool = True
     attitude: bool = True
+    velocity: bool = True
     gated: bool = True
     as_logged: bool = False
     stamp_offset_s: float | None = None
@@ -83,7 +89,7 @@ class Variant:
         """What is taken off the stamps, half a step besides, and how far fusion runs behind."""
         if self.stamp_offset_s is not None:
             return Timing(-self.stamp_offset_s - 0.5 * inputs.step_s, np.inf)
-        delay_s = self.settings[EV_POS.delay] * 1e-3
+        delay_s = self.settings[inputs.aid.delay] * 1e-3
         if inputs.rules.horizon_by_delay:  # the longest of the delays makes the buffer
             length = math.ceil(delay_s / inputs.predict_s)
             return Timing(delay_s, max(inputs.horizon_s, (length - 1) * inputs.step_s))
@@ -111,6 +117,8 @@ class Run:
         S = P + R.
     noise_m2 : ndarray, shape (E, S, 2)
         R.
+    velocity_innovation_m_s, velocity_variance_m2_s2 : ndarray, shape (E, S, 3)
+        The same of velocity, where EKF2 fuses it.
     rejected, fused, reset : ndarray of bool, shape (E, S)
     state, variance : ndarray, shape (E + 1, S, 15)
         At the start and after each event.
@@ -124,6 +132,8 @@ class Run:
     innovation_m: Array
     variance_m2: Array
     noise_m2: Array
+    velocity_innovation_m_s: Array
+    velocity_variance_m2_s2: Array
     rejected: BoolArray
     fused: BoolArray
     reset: BoolArray
@@ -155,27 +165,30 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
     now_s = stretch.time_s[end]
     sampled = np.any(action > IDLE, axis=1)
     sample = np.maximum(intervals[0].events.sample, 0)
-    logged, logged_reset = inputs.vision.rejected[sample], inputs.vision.reset[sample]
+    logged, logged_reset = inputs.received.rejected[sample], inputs.received.reset[sample]
     # every variant fuses unless its gate says otherwise
     quiet = (action == FUSE).all(axis=1) & ~logged_reset & ~(logged > 0.0)
     measured, noise = _measurements(inputs, stretch, sample, end, knob)
+    speed, speed_noise = _velocities(inputs, stretch, sample, end, knob)
+    fuses_velocity = np.array([variant.velocity for variant in variants])
+    velocity_gate2 = (np.maximum(knob.get(GNSS_VEL.gate, one := np.ones(size)), one) ** 2)[:, None]
     # height and heading are measured by EKF2's own
     own = np.stack([stretch.attitude_error_rad[end, HEADING], stretch.down_m[end]], axis=-1)
     own_variance = np.stack(
         [stretch.heading_variance_rad2[end], stretch.down_variance_m2[end]], axis=-1
     )
     heading = np.where(attitude, own[:, :, 0], 0.0)
-    gate2 = (np.maximum(knob[EV_POS.gate], MIN_GATE) ** 2)[:, None]
+    gate2 = (np.maximum(knob[inputs.aid.gate], MIN_GATE) ** 2)[:, None]
     gyro2 = np.where(attitude, knob["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
     force2 = (knob["EKF2_ACC_NOISE"] ** 2)[:, None, None]
     drift, drift_limit = _drift(inputs, knob, biases, attitude)
     steps = np.diff(end, axis=0, prepend=0)[:, :, None]
     floor = inputs.rules.bias_floor
     x, P = _start(stretch, biases, attitude)
-    fusion = _Fusion(
-        np.full(size, stretch.time_s[0]), np.zeros(size, bool), np.full(size, inputs.rules.resets)
-    )
+    began = np.full(size, stretch.time_s[0])
+    fusion = _Fusion(began, began, np.zeros(size, bool), np.full(size, inputs.rules.resets))
     innovations, variances = np.full((2, events, size, 2), np.nan)
+    velocity_innovations, velocity_variances = np.full((2, events, size, 3), np.nan)
     rejected, fused, reset = np.zeros((3, events, size), bool)
     states, spreads = np.empty((2, events + 1, size, STATES))
     states[0], spreads[0] = x, _diagonal(P)
@@ -200,11 +213,7 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
         biased += (biased < drift_limit) * drifted[within]
         if floor is not None:
             _limit_bias(P, floor, biases)
-        np.subtract(own[e], x[:, OWN], out=innovation[:, :2])
-        R[:, :2] = _down_to(spread[:, OWN], own_variance[e])
         innovation[:, 2:], R[:, 2:] = 0.0, NOT_TAKEN
-        if inputs.vision_height:
-            R[:, 1] = NOT_TAKEN
         restart = None
         if sampled[e]:
             active = action[e] > IDLE
@@ -214,8 +223,16 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
             innovations[e] = np.where(active[:, None], nu, np.nan)
             variances[e] = np.where(active[:, None], S, np.nan)
             innovation[:, 2:] = nu
+            if speed is not None:
+                nu_v = speed[e] - x[:, VELOCITY]
+                S_v = spread[:, VELOCITY] + speed_noise[e]
+                velocity_innovations[e] = np.where(active[:, None], nu_v, np.nan)
+                velocity_variances[e] = np.where(active[:, None], S_v, np.nan)
+                outside_v = (nu_v * nu_v > velocity_gate2 * S_v).any(axis=1) & gated
+                taken_v = (action[e] == FUSE) & fuses_velocity & ~outside_v
+                fusion = fusion._replace(velocity_s=np.where(taken_v, now_s[e], fusion.velocity_s))
             if quiet[e] and not (stopped or outside.any()):
-                fusion = _Fusion(now_s[e], fusion.stopped, fusion.left)
+                fusion = fusion._replace(last_s=now_s[e])
                 fused[e], R[:, 2:] = True, noise[e, :, :2]
             else:
                 known = _Sample(
@@ -226,7 +243,18 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
                 )
                 restart, stopped = reset[e], bool(fusion.stopped.any())
                 R[fused[e], 2:] = noise[e, fused[e], :2]
-            if inputs.vision_height:
+            if speed is not None:
+                if restart is not None:
+                    taken_v &= ~restart
+                x, P = _in_turn(x, P, nu_v, S_v, speed_noise[e], VELOCITY.start, taken_v)
+                x, P = _in_turn(x, P, nu, S, noise[e, :, :2], NORTH, fused[e])
+                innovation[:, 2:], R[:, 2:] = 0.0, NOT_TAKEN
+                spread = _diagonal(P)
+        np.subtract(own[e], x[:, OWN], out=innovation[:, :2])
+        R[:, :2] = _down_to(spread[:, OWN], own_variance[e])
+        if inputs.vision_height:
+            R[:, 1] = NOT_TAKEN
+            if sampled[e]:
                 innovation[:, 1] = measured[e, :, 2] - x[:, DOWN]
                 R[:, 1] = np.where(active, noise[e, :, 2], NOT_TAKEN)
         # K = PH'(HPH' + R)⁻¹, x = x + Kν, P = P - KHP
@@ -242,13 +270,38 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
             x[restart, HORIZONTAL] = measured[e, restart, :2]
             P[restart, :, HORIZONTAL] = 0.0
             P[restart, HORIZONTAL, :] = 0.0
-            P[restart, NORTH, NORTH] = noise[e, restart, 0]
-            P[restart, EAST, EAST] = noise[e, restart, 1]
+            P[restart, NORTH, NORTH] = inputs.rules.reset_scale * noise[e, restart, 0]
+            P[restart, EAST, EAST] = inputs.rules.reset_scale * noise[e, restart, 1]
+            if speed is not None and inputs.rules.with_velocity:
+                x[restart, VELOCITY] = speed[e, restart]
+                P[restart, :, VELOCITY] = 0.0
+                P[restart, VELOCITY, :] = 0.0
+                P[restart, VELOCITY, VELOCITY] = np.eye(3) * speed_noise[e, restart, :, None]
         states[e + 1], spreads[e + 1] = x, _diagonal(P)
     return Run(
         stretch, tuple(variants), tuple(each.events for each in intervals), innovations, variances,
-        noise[:, :, :2], rejected, fused, reset, states, spreads, P,
+        noise[:, :, :2], velocity_innovations, velocity_variances, rejected, fused, reset, states,
+        spreads, P,
     )  # fmt: skip
+
+
+def _in_turn(
+    x: Array, P: Array, nu: Array, S: Array, R: Array, first: int, taken: BoolArray
+) -> tuple[Array, Array]:
+    """Fuse states one after the other, by the innovations and S of before the first of them.
+
+    As fuseDirectStateMeasurement (``ekf_helper.cpp``), in Joseph's form, which bears a gain that is
+    not the optimal one.
+    """
+    for j in range(nu.shape[1]):
+        row = first + j
+        K = np.where(taken[:, None], P[:, :, row] / S[:, j, None], 0.0)
+        x = x + K * nu[:, j, None]
+        A = P - K[:, :, None] * P[:, None, row]
+        left = A[:, :, row] - R[:, j, None] * K
+        P = A - left[:, :, None] * K[:, None]
+        P = 0.5 * (P + np.swapaxes(P, 1, 2))
+    return x, P
 
 
 @dataclass(frozen=True)
@@ -265,9 +318,10 @@ class _Sample:
 
 
 class _Fusion(NamedTuple):
-    """Of each variant: time of the last fusion, whether fusion has stopped, resets left."""
+    """Of each variant: last fusion of position and of velocity, whether stopped, resets left."""
 
     last_s: Array
+    velocity_s: Array
     stopped: BoolArray
     left: IntArray
 
@@ -285,16 +339,21 @@ def _decide(
     beyond = np.where(obeys & known, sample.rejected > 0.0, outside) & gated & (action == FUSE)
     taken = (action == FUSE) & ~beyond & ~fusion.stopped
     starting = gated & ((action == START) | (fusion.stopped & sample.startable))
-    failing = beyond & ~fusion.stopped & (now - fusion.last_s > rules.reset_s)
+    silent_s = now - fusion.last_s
+    failing = beyond & ~fusion.stopped & (silent_s > rules.reset_s)
+    if rules.with_velocity:
+        both = now - fusion.velocity_s > rules.reset_s
+        failing &= both | (silent_s > 2.0 * rules.reset_s)
     restart = starting | (failing & (fusion.left > 0))
     if known or sample.reset:
         restart = np.where(obeys, gated & sample.reset, restart)
         taken &= ~restart
         failing &= ~obeys
     last_s = np.where(taken | restart, now, fusion.last_s)
+    velocity_s = np.where(restart, now, fusion.velocity_s)
     stopped = (fusion.stopped & ~starting) | (failing & (fusion.left == 0))
     left = np.where(starting, rules.resets, fusion.left - (failing & (fusion.left > 0)))
-    return beyond, taken, restart, _Fusion(last_s, stopped, left)
+    return beyond, taken, restart, _Fusion(last_s, velocity_s, stopped, left)
 
 
 def _drift(
@@ -363,12 +422,32 @@ def _measurements(
     inputs: Inputs, stretch: Stretch, sample: IntArray, end: IntArray, knob: dict[str, Array]
 ) -> tuple[Array, Array]:
     """Measured position and its variance, both of shape (E, S, 3)."""
-    vision, size = inputs.vision, len(knob[EV_POS.noise])
-    offset = np.stack([knob[name] for name in EV_POS.place], -1) - inputs.imu_offset_m
-    position = np.repeat(vision.position_m[sample][:, None], size, axis=1)
+    received, aid = inputs.received, inputs.aid
+    size = len(knob[aid.noise])
+    offset = np.stack([knob[name] for name in aid.place], -1) - inputs.imu_offset_m
+    position = np.repeat(received.position_m[sample][:, None], size, axis=1)
     if offset.any():
         position = position - (stretch.rotation[end] @ offset[:, :, None])[:, :, :, 0]
-    least = np.maximum(knob[EV_POS.noise], MIN_POSITION_SD_M)[:, None] ** 2
-    unused = knob[EV_POS.noise_mode][:, None] == 1.0
-    reported = np.where(unused, 0.0, vision.variance_m2[sample][:, None])
+    least = np.maximum(knob[aid.noise], MIN_POSITION_SD_M)[:, None] ** 2
+    reported = received.variance_m2[sample][:, None]
+    if aid.noise_mode:
+        reported = np.where(knob[aid.noise_mode][:, None] == 1.0, 0.0, reported)
     return position, np.maximum(reported, least)
+
+
+def _velocities(
+    inputs: Inputs, stretch: Stretch, sample: IntArray, end: IntArray, knob: dict[str, Array]
+) -> tuple[Array | None, Array]:
+    """Measured velocity and its variance, both of shape (E, S, 3); None where none is fused."""
+    received = inputs.received
+    if received.velocity_m_s is None or received.velocity_variance_m2_s2 is None:
+        return None, np.empty(0)
+    size = len(knob[GNSS_VEL.noise])
+    velocity = np.repeat(received.velocity_m_s[sample][:, None], size, axis=1)
+    offset = np.stack([knob[name] for name in inputs.aid.place], -1) - inputs.imu_offset_m
+    if offset.any():  # the antenna's own, as the vehicle turns
+        turned = np.diff(stretch.rotation, axis=0)[end - 1] / stretch.step_s[end - 1, None, None]
+        velocity = velocity - (turned @ offset[:, :, None])[:, :, :, 0]
+    stated = received.velocity_variance_m2_s2[sample][:, None]
+    least = np.maximum(knob[GNSS_VEL.noise], MIN_POSITION_SD_M)[:, None] ** 2
+    return velocity, np.maximum(stated, least) * VERTICAL_SCALE

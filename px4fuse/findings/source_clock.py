@@ -82,7 +82,7 @@ def _for_ekf2(analysis: Analysis, clock: ClockOffset) -> str:
             f"; for EKF2, which takes fixes to be {taken_ms:g} ms old ({GNSS_POS.delay}), that "
             f"would be {max(ask_ms, 0.0):.0f} ms (not replayed)"
         )
-    if isinstance(model, Unavailable) or analysis.source.name != model.inputs.vision.source:
+    if isinstance(model, Unavailable) or analysis.source.name != model.inputs.received.source:
         return ""
     changes = remedy.delay_change(model, -1e3 * clock.offset_s)
     found = what_if(model, [changes]) if changes else None

@@ -17,6 +17,7 @@ from px4fuse.flight import (
     POSITION_VARIANCE_COLUMNS,
     STATE_COLUMNS,
     VELOCITY_COLUMNS,
+    VELOCITY_VARIANCE_COLUMNS,
     Ekf2,
     PositionTrack,
     Truth,
@@ -316,6 +317,7 @@ def _read_gps(topics: Topics, fused: bool) -> PositionTrack | Unavailable:
     if not own:
         samples = samples.set_axis(pd.Index(published_s - delay_ms * 1e-3, name="time_s"))
         clock = f"autopilot boot clock, less {delay_ms:g} ms ({GNSS_POS.delay})"
+    velocity = _velocity(gps).set_axis(samples.index)
     found = _track(topics, GPS_POSITION, "GNSS position", samples, (layout.topic,), clock=clock)
     if isinstance(found, Unavailable):
         return found
@@ -326,8 +328,19 @@ def _read_gps(topics: Topics, fused: bool) -> PositionTrack | Unavailable:
             "give: the logger left out the others (SDLOG_PROFILE bit 1 keeps them)",
         )
     return replace(
-        found, origin=structs.replace(found.origin, automatic=fused), notes=found.notes + notes
+        found,
+        origin=structs.replace(found.origin, automatic=fused),
+        velocity=velocity[velocity.index.isin(found.samples.index)],
+        age_s=delay_ms * 1e-3,
+        notes=found.notes + notes,
     )
+
+
+def _velocity(gps: pd.DataFrame) -> pd.DataFrame:
+    """Velocity of GNSS, and the square of its accuracy as the receiver states it, on each axis."""
+    velocity = gps.reindex(columns=VELOCITY_COLUMNS)
+    accuracy = gps["speed_accuracy_m_s"] if "speed_accuracy_m_s" in gps else np.nan
+    return velocity.assign(**dict.fromkeys(VELOCITY_VARIANCE_COLUMNS, accuracy**2))
 
 
 def read_truth(

@@ -120,7 +120,8 @@ TRUTH_ATTITUDE = (
 
 _GPS_OPTIONAL = {
     "eph_m": "eph", "epv_m": "epv", "fix_type": "fix_type", "utc_us": "time_utc_usec",
-    "published_us": "timestamp",
+    "published_us": "timestamp", "north_m_s": "vel_n_m_s", "east_m_s": "vel_e_m_s",
+    "down_m_s": "vel_d_m_s", "speed_accuracy_m_s": "s_variance_m_s",
 }  # fmt: skip
 GPS = (
     Layout(

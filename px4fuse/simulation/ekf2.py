@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.ekf2.inputs import Inputs, Rules, Vision
+from px4fuse.ekf2.inputs import Inputs, Rules, Received
 from px4fuse.ekf2.intervals import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
@@ -109,7 +109,7 @@ def fly(
     inputs = Inputs(
         settings=settings,
         stretches=(stretch,),
-        vision=_vision(source),
+        received=_vision(source),
         # ev_pos_control.cpp: without bit 0 samples are only compared with the state
         rules=RULES if int(flown["EKF2_EV_CTRL"]) & 1 else replace(RULES, start_interval_s=0.0),
         step_s=step_s,
@@ -197,7 +197,7 @@ def _standing(
     return x, 0.5 * (P + P.T)
 
 
-def _vision(source: Topic) -> Vision:
+def _vision(source: Topic) -> Received:
     """The samples in the order of their arrival, without those that are older than the one before.
 
     EKF2 takes no sample that is not newer than the last (estimator_interface.cpp).
@@ -208,7 +208,7 @@ def _vision(source: Topic) -> Vision:
     )
     newest = np.maximum.accumulate(np.concatenate([[-np.inf], stamp[:-1]]))
     kept = stamp > newest
-    return Vision(
+    return Received(
         stamp_s=stamp[kept],
         arrival_s=arrival[kept],
         position_m=source.fields["position"][kept].astype(np.float64),

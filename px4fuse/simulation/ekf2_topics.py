@@ -130,7 +130,7 @@ def _aid_source(inputs: Inputs, done: Run, track: TopicTrack, rate_hz: float) ->
     horizontal = slice(NORTH, EAST + 1)
     innovation, variance = run.innovation_m[seen, 0], run.variance_m2[seen, 0]
     noise = run.noise_m2[seen, 0]
-    measured = inputs.vision.position_m[events.sample[seen], :2]
+    measured = inputs.received.position_m[events.sample[seen], :2]
     idle = np.isnan(innovation[:, 0])
     # while it is not fused, against the state that there is
     innovation = np.where(
