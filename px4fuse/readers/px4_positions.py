@@ -43,6 +43,10 @@ ARRIVAL_SHARE = 0.9
 HEIGHT_TOLERANCE_S = 0.05
 # Logged no faster than this, a receiver's positions were thinned: they give 5 to 20 a second
 THINNED_HZ = 4.0
+# Fixes are 0.05 s apart and more
+SAME_FIX_S = 0.01
+# Within 100 km
+NEAR_DEG = 1.0
 DEFAULT_GNSS_DELAY_MS = 110.0  # EKF2_GPS_DELAY, ekf2_params.c and module.yaml, v1.8 to main
 AUTOPILOT_CLOCK = "autopilot boot clock (as PX4 mapped the sender's stamp)"
 
@@ -58,7 +62,7 @@ def read_positions(
         *(_read_logged(topics, source) for source in px4.TRACKS),
         _read_kept(topics, turns),
         _rebuild(topics, ekf2, turns),
-        _read_gps(topics, fuses_gnss(ekf2)),
+        _read_gps(topics, ekf2),
     ]
     missing = tuple(track for track in found if isinstance(track, Unavailable))
     return best_first(track for track in found if isinstance(track, PositionTrack)), missing
@@ -290,7 +294,7 @@ def fuses_gnss(ekf2: Ekf2 | Unavailable) -> bool:
     return bool(log.samples["fused"].any() if "fused" in log.samples else log.meant is not None)
 
 
-def _read_gps(topics: Topics, fused: bool) -> PositionTrack | Unavailable:
+def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unavailable:
     """GNSS at the times that EKF2 takes its fixes to have been measured at.
 
     Those are the stamps less EKF2_GPS_DELAY, and since main of 2026 the driver's own times of
@@ -304,19 +308,24 @@ def _read_gps(topics: Topics, fused: bool) -> PositionTrack | Unavailable:
         gps = gps[gps["fix_type"] >= GPS_3D_FIX]
     if gps.empty:
         return _unavailable(GPS_POSITION, "the receiver never had a 3D fix")
-    samples = projected(gps, _local_origin(topics))
-    if {"eph_m", "epv_m"} <= set(gps.columns):
-        # EKF2 takes the horizontal accuracy for each axis (gps_control.cpp)
-        samples["north_m2"] = samples["east_m2"] = gps["eph_m"].to_numpy() ** 2
-        samples["down_m2"] = gps["epv_m"].to_numpy() ** 2
     parameters = topics.ekf2_parameters
     published_s = (gps["published_us"].to_numpy() - topics.zero_us) * 1e-6
     own = GNSS_MODE in parameters and bool(np.any(published_s - gps.index > SAME_TIME_US * 1e-6))
     delay_ms = 0.0 if own else parameters.get(GNSS_POS.delay, DEFAULT_GNSS_DELAY_MS)
     clock = "autopilot boot clock, the receiver driver's times of measurement"
     if not own:
-        samples = samples.set_axis(pd.Index(published_s - delay_ms * 1e-3, name="time_s"))
+        gps = gps.set_axis(pd.Index(published_s - delay_ms * 1e-3, name="time_s"))
         clock = f"autopilot boot clock, less {delay_ms:g} ms ({GNSS_POS.delay})"
+    left_out = _left_out(topics, gps, ekf2)
+    if len(left_out):
+        gps = pd.concat([gps, left_out]).sort_index()
+        # what their rows do not have is as in the fix before
+        gps = gps.assign(altitude_m=gps["altitude_m"].interpolate("index")).ffill()
+    samples = projected(gps, _local_origin(topics))
+    if {"eph_m", "epv_m"} <= set(gps.columns):
+        # EKF2 takes the horizontal accuracy for each axis (gps_control.cpp)
+        samples["north_m2"] = samples["east_m2"] = gps["eph_m"].to_numpy() ** 2
+        samples["down_m2"] = gps["epv_m"].to_numpy() ** 2
     velocity = _velocity(gps).set_axis(samples.index)
     found = _track(topics, GPS_POSITION, "GNSS position", samples, (layout.topic,), clock=clock)
     if isinstance(found, Unavailable):
@@ -327,19 +336,45 @@ def _read_gps(topics: Topics, fused: bool) -> PositionTrack | Unavailable:
             f"the log holds {found.rate_hz:.1f} positions of GNSS a second, fewer than receivers "
             "give: the logger left out the others (SDLOG_PROFILE bit 1 keeps them)",
         )
+    if len(left_out):
+        notes += (
+            f"{len(left_out)} positions of GNSS that the logger left out are from "
+            "estimator_aid_src_gnss_pos, their heights are interpolated",
+        )
     return replace(
         found,
-        origin=structs.replace(found.origin, automatic=fused),
+        origin=structs.replace(found.origin, automatic=fuses_gnss(ekf2)),
         velocity=velocity[velocity.index.isin(found.samples.index)],
         age_s=delay_ms * 1e-3,
         notes=found.notes + notes,
     )
 
 
+def _left_out(topics: Topics, gps: pd.DataFrame, ekf2: Ekf2 | Unavailable) -> pd.DataFrame:
+    """Fixes that EKF2 took and the log lacks, from the rows of its innovations (from v1.16).
+
+    The logger keeps every fix only where it comes slower than its limit of 10 a second.
+    """
+    rows = [topics.find((layout,)) for layout in px4.FUSED_FIXES]
+    if isinstance(ekf2, Unavailable) or None in rows:
+        return pd.DataFrame()
+    position, velocity = (topics.of_primary(layout) for layout in px4.FUSED_FIXES)
+    # rows are of half a prediction step before (estimator_interface.cpp)
+    fixes = position.join(velocity, how="inner").dropna()
+    fixes = fixes.set_axis(fixes.index + 0.5 * ekf2.step_s)
+    at = np.clip(np.searchsorted(gps.index, fixes.index), 1, len(gps) - 1)
+    apart = np.minimum(*(np.abs(gps.index.to_numpy()[at - k] - fixes.index) for k in (0, 1)))
+    inside = (fixes.index > gps.index[0]) & (fixes.index < gps.index[-1])
+    known, lacking = fixes[apart <= SAME_FIX_S], fixes[(apart > SAME_FIX_S) & inside]
+    # before v1.16 their position is local, in m
+    degrees = known["latitude_deg"].sub(gps["latitude_deg"].median()).abs().median() < NEAR_DEG
+    return lacking if degrees else pd.DataFrame()
+
+
 def _velocity(gps: pd.DataFrame) -> pd.DataFrame:
     """Velocity of GNSS, and the square of its accuracy as the receiver states it, on each axis."""
     velocity = gps.reindex(columns=VELOCITY_COLUMNS)
-    accuracy = gps["speed_accuracy_m_s"] if "speed_accuracy_m_s" in gps else np.nan
+    accuracy = gps.get("speed_accuracy_m_s", np.nan)
     return velocity.assign(**dict.fromkeys(VELOCITY_VARIANCE_COLUMNS, accuracy**2))
 
 

@@ -18,6 +18,7 @@ from px4fuse.flight import (
     QUATERNION_COLUMNS,
     ROTATION_VARIANCE_COLUMNS,
     SPECIFIC_FORCE_COLUMNS,
+    VELOCITY_COLUMNS,
 )
 from px4fuse.origin import ALIGNED, GNSS, KEPT, MOTION_CAPTURE, REBUILT, RECEIVED, Origin
 from px4fuse.readers.layouts import (
@@ -141,6 +142,15 @@ GPS = (
         _GPS_OPTIONAL,
         {"latitude_deg": 1e-7, "longitude_deg": 1e-7, "altitude_m": 1e-3},
     ),
+)
+
+FUSED_FIXES = (
+    Layout(
+        "estimator_aid_src_gnss_pos",
+        {"latitude_deg": "observation[0]", "longitude_deg": "observation[1]"},
+        "v1.16",
+    ),
+    Layout("estimator_aid_src_gnss_vel", elements(VELOCITY_COLUMNS, "observation"), "v1.14"),
 )
 
 
