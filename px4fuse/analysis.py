@@ -52,11 +52,6 @@ from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest
 if TYPE_CHECKING:
     from px4fuse.loop.loop import Loop
 
-NOT_REPLAYED = Unavailable(
-    "replay of EKF2",
-    "EKF2 flew on GNSS, whose fusion is not replayed here",
-    "What EKF2 did with each aid is in its own innovations, which are judged.",
-)
 # Noises that the report states: those of a source once. Each axis by itself is for `px4fuse tune`
 REPORTED = (HORIZONTAL, "down")
 # Gain of a low pass below which no slow error is looked for; clean flights have 0 to 2
@@ -427,7 +422,7 @@ def run_what_if(
     compared = None
     try:
         if model.agreement.good:
-            compared = compare(flight, axes=("north", "east", AISLE))
+            compared = compare(flight, axes=("north", "east", AISLE), sigma_z_given=False)
     except MissingDataError:  # EKF2 can be replayed all the same
         if asked:
             raise
@@ -437,7 +432,7 @@ def run_what_if(
         if asked:
             changes = asked_of_ekf2(compared, model, tuning, clock)
             if not changes:
-                raise MissingDataError(_nothing_asked(compared))
+                raise MissingDataError(_nothing_asked(compared, model))
     settings = [changes] if changes else []
     settings += [{**changes, swept.parameter: value} for value in values] if swept else []
     progress("replaying with other parameters")
@@ -447,15 +442,20 @@ def run_what_if(
     return Counterfactual(flight, found, changes, asked, why)
 
 
-def _nothing_asked(compared: Comparison) -> str:
+def _nothing_asked(compared: Comparison, model: Model) -> str:
     name, source = compared.flight.log.name, compared.source
     why = "the data do not tell the noise and the delay of what EKF2 fused"
-    if source.origin.may_drift:
+    if source.origin.is_gnss:
+        why = (
+            "the data ask for no larger noise of GNSS, whose slow errors they do not tell, and the "
+            "delay fits or is not determinable"
+        )
+    elif source.origin.may_drift:
         why = (
             f"{source.name} may drift, so that innovations do not tell its noise, and the delay is "
             "as the data ask for or not determinable"
         )
-    return f"{name}: {why}. Say what to change: `changes` EKF2_EVP_NOISE=0.1."
+    return f"{name}: {why}. Say what to change: `changes` {model.inputs.aid.noise}=0.1."
 
 
 def explain(comparison: Comparison, progress: Progress = silent) -> Analysis:
@@ -470,8 +470,7 @@ def explain(comparison: Comparison, progress: Progress = silent) -> Analysis:
     names = REPORTED if {"north", "east"} <= {line.name for line in comparison.lines} else None
     tuning, clock = noises_and_clock(comparison, progress, names)
     progress("replaying EKF2")
-    gnss = comparison.source.origin.is_gnss
-    model = NOT_REPLAYED if gnss else open_model(comparison.flight)
+    model = open_model(comparison.flight)
     why = why_ekf2_differs(comparison, model, tuning, clock)
     heading = turned_frame(comparison, tuning, clock, progress)
     progress("looking for a loop")

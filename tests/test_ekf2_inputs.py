@@ -16,7 +16,7 @@ from findings_tools import NONE, log, made
 from scipy.spatial.transform import Rotation
 
 from px4fuse.ekf2 import inputs as inputs_module
-from px4fuse.ekf2.inputs import Inputs, Rules, Received, _decisions, _source, prepare, read_vision
+from px4fuse.ekf2.inputs import Inputs, Received, Rules, _decisions, _source, prepare, read_vision
 from px4fuse.ekf2.stretches import (
     Stretch,
     _stretch,

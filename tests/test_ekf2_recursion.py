@@ -16,7 +16,7 @@ from exchange import replace
 from findings_tools import log, made
 from scipy.spatial.transform import Rotation
 
-from px4fuse.ekf2.inputs import Inputs, Rules, Received
+from px4fuse.ekf2.inputs import Inputs, Received, Rules
 from px4fuse.ekf2.intervals import (
     FUSE,
     GRAVITY_M_S2,
@@ -81,7 +81,9 @@ def test_the_variance_of_a_bias_stays_within_px4s_limits() -> None:
 
 def test_what_counts_as_measurement_and_noise() -> None:
     vision = made(
-        Received, position_m=np.array([[1.0, 2.0, 3.0]]), variance_m2=np.array([[0.04, 0.0001, 0.0]])
+        Received,
+        position_m=np.array([[1.0, 2.0, 3.0]]),
+        variance_m2=np.array([[0.04, 0.0001, 0.0]]),
     )
     turned = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()
     stretch = made(Stretch, rotation=np.array([np.eye(3), turned]))

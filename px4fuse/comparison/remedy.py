@@ -64,8 +64,8 @@ def asked_of_ekf2(
     dict
         Empty where the data tell nothing, or the source that was analysed is not the one that EKF2
         fused. The delay only where what was flown is outside its interval. The noise of a source
-        that may drift only where EKF2 trusts it even more than its short-term noise allows: small
-        innovations against such a source say nothing about its error.
+        that may drift, or of GNSS, only where EKF2 trusts it even more than its short-term noise
+        allows: small innovations against such a source say nothing about its error.
     """
     source = comparison.source
     if source.name != model.inputs.received.source or source.alignment is not None:
@@ -73,13 +73,14 @@ def asked_of_ekf2(
     changes: dict[str, float] = {}
     noise_m = tuned_noise_m(tuning)
     trusted = noise_m is not None and noise_m <= noise_used_m(model)
-    if noise_m is not None and not (trusted and source.origin.may_drift):
+    slow = source.origin.may_drift or source.origin.is_gnss
+    if noise_m is not None and not (trusted and slow):
         changes |= noise_change(model, noise_m)
     if isinstance(clock, ClockOffset) and clock.determinable:
-        flown = model.inputs.settings[EV_POS.delay]
-        high, low = (-1e3 * end for end in clock.interval_s)
+        flown = model.inputs.settings[model.inputs.aid.delay]
+        high, low = (1e3 * (source.age_s - end) for end in clock.interval_s)
         if not low - UPDATE_MS <= flown <= high + UPDATE_MS:
-            changes |= delay_change(model, -1e3 * clock.offset_s)
+            changes |= delay_change(model, 1e3 * (source.age_s - clock.offset_s))
     return changes
 
 
@@ -110,25 +111,27 @@ def noise_change(model: Model, noise_m: float) -> dict[str, float]:
 
     Two digits, within PX4's range.
     """
-    settings = model.inputs.settings
-    least = PARAMETERS[EV_POS.noise].minimum
-    changes = {EV_POS.noise: max(float(f"{noise_m:.2g}"), least)}
-    reported = noise_used_m(model) > REPORTED_TIMES * settings[EV_POS.noise]
-    if reported and noise_m < noise_used_m(model) and settings[EV_POS.noise_mode] == 0.0:
-        changes[EV_POS.noise_mode] = 1.0
+    settings, aid = model.inputs.settings, model.inputs.aid
+    least = PARAMETERS[aid.noise].minimum
+    changes = {aid.noise: max(float(f"{noise_m:.2g}"), least)}
+    reported = noise_used_m(model) > REPORTED_TIMES * settings[aid.noise]
+    may_differ = aid.noise_mode and settings[aid.noise_mode] == 0.0
+    if may_differ and reported and noise_m < noise_used_m(model):
+        changes[aid.noise_mode] = 1.0
     return changes
 
 
 def delay_change(model: Model, delay_ms: float) -> dict[str, float]:
     """What to set so that EKF2 takes positions to be this older than their stamps.
 
-    Nothing where PX4's range ends before; 0 for stamps that are early.
+    Nothing where PX4's range ends before, or no parameter tells; 0 for stamps that are early.
     """
-    known = PARAMETERS[EV_POS.delay]
-    if delay_ms > known.maximum:
+    delay = model.inputs.aid.delay
+    known = PARAMETERS[delay]
+    if delay_ms > known.maximum or model.inputs.received.own_times:
         return {}
-    changes = {EV_POS.delay: max(float(round(delay_ms)), known.minimum)}
-    needed, flown = changes[EV_POS.delay] + ARRIVAL_MS, model.inputs.settings
+    changes = {delay: max(float(round(delay_ms)), known.minimum)}
+    needed, flown = changes[delay] + ARRIVAL_MS, model.inputs.settings
     if not model.inputs.rules.horizon_by_delay and needed > flown["EKF2_DELAY_MAX"]:
         changes["EKF2_DELAY_MAX"] = DELAY_STEP_MS * math.ceil(needed / DELAY_STEP_MS)
     return {name: value for name, value in changes.items() if value != flown[name]}
@@ -258,8 +261,7 @@ def settings_words(changes: Mapping[str, float]) -> str:
     """Parameters and the values to set."""
     parts = []
     for name, value in changes.items():
-        # the model does not have the noise of GNSS, a length as that of external vision
-        unit = PARAMETERS.get(name, PARAMETERS[EV_POS.noise]).unit
+        unit = PARAMETERS[name].unit
         unit = f" {unit}" if unit else ""
         parts.append(f"{name} to {value:.3g}{unit}")
     return " and ".join(parts)

@@ -26,6 +26,7 @@ from px4fuse.ekf2.walk import (
     OUTPUT,
     PROCESS,
     SAMPLES,
+    SPEED,
     STAMPS,
     WHAT,
     Outside,
@@ -33,7 +34,6 @@ from px4fuse.ekf2.walk import (
     Why,
     walk,
 )
-from px4fuse.ekf2_parameters import EV_POS
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.tuning import AxisTuning
@@ -134,9 +134,9 @@ def with_words(
     because = _reasons(why, comparison, model, clock)
     if too_sure:
         cause = (
-            f"{EV_POS.noise} is too small: EKF2 takes the source's noise to be {used_m:.2g} m, the "
-            f"data ask for {asked_m:.2g} m, so its gate rejects {rejected:.0%} of the samples"
-            f"{_coasted(why)}"
+            f"{model.inputs.aid.noise} is too small: EKF2 takes the source's noise to be "
+            f"{used_m:.2g} m, the data ask for {asked_m:.2g} m, so its gate rejects "
+            f"{rejected:.0%} of the samples{_coasted(why)}"
         )
         more = (
             f". This noise and the rejections that follow from it are {_share(first, why)} {apart}"
@@ -209,7 +209,7 @@ def _reasons(
 ) -> dict[str, str]:
     """What EKF2 does at each step, and what ours does."""
     settings, inputs = comparison.settings, model.inputs
-    rejected = model.agreement.rejected_share_logged
+    rejected, aid = model.agreement.rejected_share_logged, model.inputs.aid
     flown, source, fused = inputs.settings, comparison.source.name, inputs.received.source
     samples = (
         f"ours predicts every {settings.dt_s:g} s and starts by itself, EKF2 predicts every "
@@ -221,7 +221,8 @@ def _reasons(
         samples = f"ours was given {source}, EKF2 {fused}"
     data = ""
     if clock is not None:
-        asked, low, high = (-1e3 * at for at in (clock.offset_s, *clock.interval_s[::-1]))
+        ends_s = (clock.offset_s, *clock.interval_s[::-1])
+        asked, low, high = (1e3 * (comparison.source.age_s - at) for at in ends_s)
         data = f", and the data ask for {asked:.0f} ms (95 % {low:.0f} to {high:.0f})"
     same = flown["EKF2_ACC_NOISE"] * np.sqrt(inputs.step_s / settings.dt_s)
     surer = same < settings.sigma_a_m_s2
@@ -229,12 +230,13 @@ def _reasons(
     return {
         SAMPLES: samples,
         STAMPS: (
-            f"EKF2 takes a position to be {flown[EV_POS.delay]:g} ms older than its stamp "
-            f"({EV_POS.delay}), ours {0.0 - settings.clock_offset_s * 1e3:.0f} ms{data}"
+            f"EKF2 takes a position to be {flown[aid.delay]:g} ms older than its stamp "
+            f"({aid.delay}), ours {1e3 * (comparison.source.age_s - settings.clock_offset_s):.0f} "
+            f"ms{data}"
         ),
         NOISE: (
             f"EKF2 takes the source's noise to be {noise_used_m(model):.2g} m "
-            f"({EV_POS.noise}), ours {settings.sigma_z_m:.2g} m"
+            f"({aid.noise}), ours {settings.sigma_z_m:.2g} m"
         ),
         BIASES: "EKF2 estimates the accelerometer's bias in flight, ours knows none",
         PROCESS: (
@@ -242,6 +244,7 @@ def _reasons(
             f"{settings.sigma_a_m_s2:.2g}, so EKF2 trusts {trusted}"
         ),
         ATTITUDE: "EKF2 lets the positions correct its attitude, ours takes it as it is",
+        SPEED: "EKF2 fuses the velocity of GNSS too, ours its position alone",
         GATE: (f"EKF2's gate rejects {rejected:.1%} of the samples, ours takes all{_coasted(why)}"),
         OUTPUT: (
             f"EKF2 filters {inputs.horizon_s * 1e3:.0f} ms behind the present, carries that to now "
@@ -289,9 +292,11 @@ def _wrong_stamps(comparison: Comparison, model: Model, clock: ClockOffset | Non
     """That the source's stamps are wrong for both filters alike, where they are."""
     if clock is None:
         return []
-    delay_s, late_s = model.inputs.settings[EV_POS.delay] * 1e-3, clock.offset_s
+    delay_s = model.inputs.settings[model.inputs.aid.delay] * 1e-3
+    late_s = clock.offset_s - comparison.source.age_s
     wrong_s = min(abs(clock.remaining_s), abs(late_s + delay_s))
-    apart_s = abs(comparison.settings.clock_offset_s + delay_s)
+    ours_s = comparison.source.age_s - comparison.settings.clock_offset_s
+    apart_s = abs(delay_s - ours_s)
     if wrong_s < max(CLOCK_S, clock.chance_s) or apart_s > CLOCK_S:
         return []
     return [

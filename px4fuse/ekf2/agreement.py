@@ -9,8 +9,17 @@ from numpy.typing import ArrayLike
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.ekf2.inputs import aid_source, replayed_aid, same_sample
-from px4fuse.ekf2.replay import HORIZONTAL, Agreement, AxisAgreement, Ekf2Replay, Spans
+from px4fuse.ekf2.replay import (
+    HORIZONTAL,
+    UPDATE_COLUMNS,
+    VELOCITY_UPDATE_COLUMNS,
+    Agreement,
+    AxisAgreement,
+    Ekf2Replay,
+    Spans,
+)
 from px4fuse.ekf2.stretches import SETTLING_S
+from px4fuse.ekf2_parameters import GNSS_POS
 from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Ekf2, Flight, Truth, Unavailable
 
 MIN_SAMPLES = 20
@@ -60,16 +69,20 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
             "the innovations do not vary, so that nothing tells whether they agree",
             "Record a flight with motion and measured positions.",
         )
-    north, east = (_axis(axis, log, model, ekf2, replay) for axis in HORIZONTAL)
-    axes = {"north": north, "east": east}
+    axes: dict[str, AxisAgreement]
+    axes = {axis: _axis(axis, log, model, ekf2, replay) for axis in HORIZONTAL}
+    north, east = axes["north"], axes["east"]
     by_log, by_model = (frame["rejected"].to_numpy() > 0 for frame in (log, model))
     shares = float(by_log.mean()), float(by_model.mean())
     good, reason = _verdict(axes, *shares)
+    on_gnss = replayed_aid(ekf2) == GNSS_POS
     apart_m = np.hypot(north.position_rms_difference_m, east.position_rms_difference_m)
     return Agreement(
         north=north,
         east=east,
-        ev_pos=axes,
+        ev_pos={} if on_gnss else axes,
+        gnss_pos=axes if on_gnss else {},
+        gnss_vel=_velocity(ekf2, replay),
         samples=len(log),
         rejected_share_logged=shares[0],
         rejected_share_replayed=shares[1],
@@ -78,6 +91,24 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
         good=good,
         reason=reason,
     )
+
+
+def _velocity(ekf2: Ekf2, replay: Ekf2Replay) -> dict[str, AxisAgreement]:
+    """Agreement of the velocity of GNSS; empty where it is not fused or not logged."""
+    log = ekf2.aids.get("gnss_vel")
+    if log is None or VELOCITY_UPDATE_COLUMNS[0] not in replay.updates:
+        return {}
+    logged = log.samples
+    matched = match(replay, ekf2, logged.index.to_numpy())
+    use = (matched >= 0) & settled(logged.index, judged_from(replay))
+    if use.sum() < MIN_SAMPLES:
+        return {}
+    # under the names of a position's
+    names = dict(zip(VELOCITY_UPDATE_COLUMNS, UPDATE_COLUMNS, strict=False))
+    model = replay.updates[VELOCITY_UPDATE_COLUMNS].rename(columns=names).iloc[matched[use]]
+    parts = ("innovation_north", "innovation_east", "variance_north", "variance_east")
+    renamed = logged[use].rename(columns=dict(zip(parts, UPDATE_COLUMNS, strict=False)))
+    return {axis: _axis(axis, renamed, model, ekf2, replay) for axis in HORIZONTAL}
 
 
 def logged_innovations(ekf2: Ekf2) -> pd.DataFrame:
@@ -213,7 +244,7 @@ def with_obedient(agreement: Agreement, obedient: Agreement) -> Agreement:
     agreement, obedient : Agreement
         Of the replay by its own gate, and of the other.
     """
-    axes = obedient.ev_pos.values()
+    axes = obedient.axes.values()
     worst = min(axis.innovation_correlation for axis in axes)
     ratio = max((axis.s_ratio_median for axis in axes), key=lambda s: abs(s - 1.0))
     off_m = max(axis.position_rms_difference_m for axis in axes)

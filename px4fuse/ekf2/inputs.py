@@ -48,6 +48,7 @@ ROTATE_VISION_BIT = 64  # EKF2_AID_MASK, up to v1.13
 # The aid-source topics carry the time of measurement, as EKF2 takes it, to about a millisecond
 SAME_SAMPLE_S = 0.006
 # What a log calls the aiding by GNSS
+GNSS_VELOCITY_BIT = 4  # of EKF2_GPS_CTRL; before v1.14 both are always fused
 OF_GNSS = ("GPS", "GPS position", "GPS velocity")
 # vehicle_local_position is logged every 0.1 s
 RESET_SHOWS_S = 0.2
@@ -78,6 +79,8 @@ class Received:
         Whether EKF2 reset its position to it, where the log tells what it rejected.
     source : str
         Name of the track.
+    own_times : bool
+        Whether EKF2 takes the sender's times of measurement as they are, whatever the delay.
     """
 
     stamp_s: Array
@@ -89,6 +92,7 @@ class Received:
     source: str
     velocity_m_s: Array | None = None
     velocity_variance_m2_s2: Array | None = None
+    own_times: bool = False
 
     __repr__ = brief
 
@@ -221,7 +225,7 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
             WHAT,
             f"no {MIN_STRETCH_S:g} s in flight of {aid.label.removesuffix(', position')} fused "
             "without a gap in it or the IMU",
-            "Record without dropouts (a faster SD card, fewer topics), and send positions steadily.",
+            "Record without dropouts (a faster SD card, fewer topics), with steady positions.",
         )
     floor = 5e-8 / ekf2.step_s**2 if record.per_step_biases else None
     # EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h
@@ -281,18 +285,21 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> Received | Un
     # EKF2 believes no fix to be worse than without aiding (gps_control.cpp)
     worst_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
     stated = track.samples[POSITION_VARIANCE_COLUMNS].fillna(0.0).clip(upper=worst_m**2)
-    velocity: tuple[Array | None, Array | None] = None, None
-    if fuses_by_mask(parameters) or switch & 4:
-        columns = (VELOCITY_COLUMNS, VELOCITY_VARIANCE_COLUMNS)
-        velocity = tuple(track.velocity[each].fillna(0.0).to_numpy() for each in columns)
-    return Received(
+    found = Received(
         stamp,
         stamp,
         track.samples[POSITION_COLUMNS].to_numpy(),
         stated.to_numpy(),
         *_decisions(ekf2, record, stamp, GNSS_POS),
         track.name,
-        *velocity,
+        own_times=track.age_s != flown_s,
+    )
+    if not fuses_by_mask(parameters) and not switch & GNSS_VELOCITY_BIT:
+        return found
+    return replace(
+        found,
+        velocity_m_s=track.velocity[VELOCITY_COLUMNS].to_numpy(),
+        velocity_variance_m2_s2=track.velocity[VELOCITY_VARIANCE_COLUMNS].fillna(0.0).to_numpy(),
     )
 
 

@@ -32,8 +32,8 @@ from px4fuse.ekf2.intervals import (
 )
 from px4fuse.ekf2.output_predictor import follow_attitude, later, publish
 from px4fuse.ekf2.recursion import Run, Variant, run, with_correlation
-from px4fuse.ekf2.replay import UPDATE_COLUMNS, Agreement, Ekf2Replay
-from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS, check, settings_in_force
+from px4fuse.ekf2.replay import UPDATE_COLUMNS, VELOCITY_UPDATE_COLUMNS, Agreement, Ekf2Replay
+from px4fuse.ekf2_parameters import GNSS_POS, check
 from px4fuse.errors import SettingsError
 from px4fuse.flight import STATE_COLUMNS, Ekf2, Flight, Unavailable
 from px4fuse.readers.px4_innovations import with_gnss
@@ -125,6 +125,17 @@ def replay_settings(
         A parameter that the model does not have, or a value outside PX4's range.
     """
     changes = [check(change) for change in settings]
+    for name in {name for change in changes for name in change}:
+        if name not in model.inputs.settings:
+            raise SettingsError(
+                f"{name}: EKF2 fused {model.inputs.aid.label} in this log, where that changes "
+                "nothing",
+                f"Here it has {', '.join(model.inputs.settings)}.",
+            )
+        if name == GNSS_POS.delay and model.inputs.received.own_times:
+            raise SettingsError(
+                f"{name} changes nothing here: EKF2 takes the receiver driver's own times."
+            )
     if model.inputs.rules.horizon_by_delay and any("EKF2_DELAY_MAX" in c for c in changes):
         raise SettingsError(
             f"EKF2_DELAY_MAX: {model.flight.log.firmware} has no such parameter; there the longest "
@@ -221,7 +232,12 @@ def _updates(part: Run, at: int) -> pd.DataFrame:
     fused_at_s = part.stretch.time_s[events.end[seen], None]
     values = np.hstack([nu, s, flags, after[:, 6:8], after[:, 3:5], r, fused_at_s])
     index = pd.Index(events.time_s[seen], name="time_s")
-    return pd.DataFrame(values, index=index, columns=UPDATE_COLUMNS)
+    columns = list(UPDATE_COLUMNS)
+    velocity = [each[seen, at, :2] for each in (part.velocity_innovation_m_s,
+                                                part.velocity_variance_m2_s2)]  # fmt: skip
+    if np.isfinite(velocity[0]).any():
+        values, columns = np.hstack([values, *velocity]), columns + VELOCITY_UPDATE_COLUMNS
+    return pd.DataFrame(values, index=index, columns=columns)
 
 
 def _tracks(inputs: Inputs, part: Run, at: int) -> tuple[pd.DataFrame, pd.DataFrame]:

@@ -25,8 +25,8 @@ from px4fuse.ekf2.intervals import (
     START,
     STATES,
     THETA,
-    Events,
     VELOCITY,
+    Events,
     Intervals,
     Timing,
 )
@@ -68,6 +68,8 @@ class Variant:
         Whether attitude and gyro bias are states; else the published attitude holds.
     velocity : bool
         Whether velocity is fused too, where EKF2 does.
+    reported : bool
+        Whether what the sender states of its noise is used, where EKF2 uses it.
     gated : bool
         Whether samples are rejected and positions reset.
     as_logged : bool
@@ -81,6 +83,7 @@ class Variant:
     biases: bool = True
     attitude: bool = True
     velocity: bool = True
+    reported: bool = True
     gated: bool = True
     as_logged: bool = False
     stamp_offset_s: float | None = None
@@ -142,7 +145,7 @@ class Run:
     covariance: Array
 
 
-def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
+def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     inputs: Inputs, stretch: Stretch, variants: Sequence[Variant], intervals: Sequence[Intervals]
 ) -> Run:
     """Run the variants through one stretch, each with its intervals."""
@@ -168,7 +171,8 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
     logged, logged_reset = inputs.received.rejected[sample], inputs.received.reset[sample]
     # every variant fuses unless its gate says otherwise
     quiet = (action == FUSE).all(axis=1) & ~logged_reset & ~(logged > 0.0)
-    measured, noise = _measurements(inputs, stretch, sample, end, knob)
+    reported = np.array([variant.reported for variant in variants])
+    measured, noise = _measurements(inputs, stretch, sample, end, knob, reported)
     speed, speed_noise = _velocities(inputs, stretch, sample, end, knob)
     fuses_velocity = np.array([variant.velocity for variant in variants])
     velocity_gate2 = (np.maximum(knob.get(GNSS_VEL.gate, one := np.ones(size)), one) ** 2)[:, None]
@@ -419,7 +423,12 @@ def _limit_bias(P: Array, floor: float, biases: BoolArray) -> None:
 
 
 def _measurements(
-    inputs: Inputs, stretch: Stretch, sample: IntArray, end: IntArray, knob: dict[str, Array]
+    inputs: Inputs,
+    stretch: Stretch,
+    sample: IntArray,
+    end: IntArray,
+    knob: dict[str, Array],
+    reported: BoolArray,
 ) -> tuple[Array, Array]:
     """Measured position and its variance, both of shape (E, S, 3)."""
     received, aid = inputs.received, inputs.aid
@@ -429,10 +438,10 @@ def _measurements(
     if offset.any():
         position = position - (stretch.rotation[end] @ offset[:, :, None])[:, :, :, 0]
     least = np.maximum(knob[aid.noise], MIN_POSITION_SD_M)[:, None] ** 2
-    reported = received.variance_m2[sample][:, None]
     if aid.noise_mode:
-        reported = np.where(knob[aid.noise_mode][:, None] == 1.0, 0.0, reported)
-    return position, np.maximum(reported, least)
+        reported = reported & (knob[aid.noise_mode] != 1.0)
+    stated = np.where(reported[:, None], received.variance_m2[sample][:, None], 0.0)
+    return position, np.maximum(stated, least)
 
 
 def _velocities(

@@ -18,6 +18,10 @@ UPDATE_COLUMNS = [
     "position_variance_east_m2", "velocity_variance_north_m2_s2", "velocity_variance_east_m2_s2",
     "observation_variance_north_m2", "observation_variance_east_m2", "fused_at_s",
 ]  # fmt: skip
+VELOCITY_UPDATE_COLUMNS = [
+    "innovation_north_m_s", "innovation_east_m_s", "innovation_variance_north_m2_s2",
+    "innovation_variance_east_m2_s2",
+]  # fmt: skip
 
 
 class AxisAgreement(Record, frozen=True, kw_only=True):
@@ -52,9 +56,11 @@ class Agreement(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     north, east : AxisAgreement
-        Of external vision's position.
-    ev_pos : mapping from "north" and "east" to AxisAgreement
-        The same by the name of the aid.
+        Of the position that EKF2 fused.
+    ev_pos, gnss_pos : mapping from "north" and "east" to AxisAgreement
+        The same by the name of the aid; empty where it is the other one.
+    gnss_vel : mapping from "north" and "east" to AxisAgreement
+        Of the velocity that is fused with it.
     samples : int
         Logged innovations compared, all but those of each stretch's first seconds
         (:data:`~px4fuse.ekf2.stretches.SETTLING_S`).
@@ -72,7 +78,9 @@ class Agreement(Record, frozen=True, kw_only=True):
 
     north: AxisAgreement
     east: AxisAgreement
-    ev_pos: Mapping[str, AxisAgreement]
+    ev_pos: Mapping[str, AxisAgreement] = {}
+    gnss_pos: Mapping[str, AxisAgreement] = {}
+    gnss_vel: Mapping[str, AxisAgreement] = {}
     samples: Count
     rejected_share_logged: Share
     rejected_share_replayed: Share
@@ -81,12 +89,18 @@ class Agreement(Record, frozen=True, kw_only=True):
     good: bool
     reason: str
 
+    @property
+    def axes(self) -> Mapping[str, AxisAgreement]:
+        """Of the position, by axis."""
+        return {"north": self.north, "east": self.east}
+
     def doubted(self, what: str) -> Unavailable:
         """What stands in for a conclusion where the replay is not good."""
         return Unavailable(
             what,
             f"the model does not reproduce what EKF2 logged: {self.reason}",
-            "Record without dropouts, with SDLOG_PROFILE 129 (default and vision).",
+            "Record without dropouts, with SDLOG_PROFILE "
+            + ("129 (default and vision)." if self.ev_pos else "3 (default and full rates)."),
         )
 
 
@@ -102,7 +116,7 @@ class Replayed(Record, frozen=True, kw_only=True, omit_defaults=False):
     settings : mapping
         All parameters of the model in force, by PX4 name, in PX4's units.
     late, lost : int
-        Vision samples that arrived after the horizon had passed them: fused late, and never.
+        Samples that arrived after the horizon had passed them: fused late, and never.
     agreement : Agreement or None
         Of the replay as flown with the log; None only while that is being made.
     """
@@ -122,11 +136,12 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
     ----------
     changed : mapping
         Parameters that differ from the log's on request.
-    updates : DataFrame, shape (m, 14)
-        Per vision sample, by the time of measurement as EKF2 takes it (stamp - delay - half a
+    updates : DataFrame, shape (m, 14), (m, 18) where velocity is fused too
+        Per sample, by the time of measurement as EKF2 takes it (stamp - delay - half a
         step): innovation (measurement minus state) and its variance S, north and east; 1 or 0
         whether it was rejected by the gate, fused, or the position reset to it; variances of
-        position and velocity after it, R, and the end of the step in which that happened.
+        position and velocity after it, R, and the end of the step in which that happened; then
+        the same innovations of velocity.
     delayed : DataFrame, shape (n, 6)
         Position and velocity at the fusion horizon at the end of each step (m, m/s, NED).
     published : DataFrame, shape (n, 6)

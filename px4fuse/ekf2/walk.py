@@ -27,7 +27,7 @@ from px4fuse.ekf2.agreement import along, at_times, judged_from, rms_to_truth, s
 from px4fuse.ekf2.model import Model, delayed_variants
 from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import Ekf2Replay, Spans
-from px4fuse.ekf2_parameters import EV_POS
+from px4fuse.ekf2_parameters import GNSS_POS
 from px4fuse.filter.kalman import Replay, state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Ekf2, Truth, Unavailable
@@ -43,9 +43,10 @@ NOISE = "measurement noise"
 BIASES = "accelerometer bias as a state"
 PROCESS = "process noise"
 ATTITUDE = "attitude and gyro bias as states"
+SPEED = "velocity of GNSS"
 GATE = "gate, missed samples, resets"
 OUTPUT = "output predictor"
-STEPS = (SAMPLES, STAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
+STEPS = (SAMPLES, STAMPS, NOISE, BIASES, PROCESS, ATTITUDE, SPEED, GATE, OUTPUT)
 
 COLUMNS = (POSITION_COLUMNS, VELOCITY_COLUMNS)
 
@@ -56,7 +57,7 @@ class Step(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     name : str
-        One of :data:`STEPS`.
+        One of :data:`STEPS`; that of velocity only where EKF2 fuses one.
     position_mean_square_m2, velocity_mean_square_m2_s2 : float
         By how much it brings the track nearer to the logged one, in mean square; below 0: farther.
     position_moved_m : float
@@ -213,14 +214,14 @@ def walk(
     ungated, stages = flown.delayed, []
     # one at a time: each is as long as the flight
     tracks = chain(delayed, (flown.delayed, flown.published, ekf2.state))
-    for stage, track in zip((*STEPS, "EKF2 as logged"), tracks, strict=True):
+    for stage, track in zip((*variants, OUTPUT, "EKF2 as logged"), tracks, strict=True):
         stages.append(
             [
                 [along(track, columns, direction, times) for columns in COLUMNS]
                 for direction in directions.values()
             ]
         )
-        if stage == ATTITUDE:
+        if stage in (ATTITUDE, SPEED):  # the last without a gate
             ungated = track
     spans = tuple((start, end) for start, end in parts if start < end)
     coast = _coast(flown, ungated, span, judged)
@@ -228,32 +229,50 @@ def walk(
     for at, (name, direction) in enumerate(directions.items()):
         ours = state_at(runs[name], times) if runs else stages[0][at]
         path = np.array([ours, *(stage[at] for stage in stages)])
-        found[name] = _axis(model, direction, times, path, spans, coast)
+        found[name] = _axis(
+            model, (*variants, OUTPUT), direction, times, path, spans, coast
+        )  # fmt: skip
     return found
 
 
 def _variants(model: Model, ours: Settings) -> dict[str, Variant]:
     """The filter after each step but the last; from one to the next, one thing changes."""
-    flown = model.inputs.settings
+    flown, aid, received = model.inputs.settings, model.inputs.aid, model.inputs.received
     spread = {"EKF2_ACC_NOISE": float(ours.sigma_a_m_s2 * np.sqrt(ours.dt_s / model.inputs.step_s))}
-    own = {**flown, **spread, EV_POS.noise: ours.sigma_z_m, EV_POS.noise_mode: 1.0}
-    unmoved = {**own, **dict.fromkeys(EV_POS.place, 0.0)}
-    bare = Variant(own, biases=False, attitude=False, gated=False)
-    return {
-        SAMPLES: replace(bare, settings=unmoved, stamp_offset_s=ours.clock_offset_s),
+    own = {**flown, **spread, aid.noise: ours.sigma_z_m}
+    # from positions of GNSS, which ours is given, the delay was taken already
+    taken_s = flown[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
+    offset_s = ours.clock_offset_s - taken_s
+    unmoved = {**own, **dict.fromkeys(aid.place, 0.0)}
+    bare = Variant(
+        own, biases=False, attitude=False, velocity=False, reported=False, gated=False
+    )  # fmt: skip
+    variants = {
+        SAMPLES: replace(bare, settings=unmoved, stamp_offset_s=offset_s),
         STAMPS: bare,
-        NOISE: replace(bare, settings={**flown, **spread}),
-        BIASES: replace(bare, settings={**flown, **spread}, biases=True),
-        PROCESS: replace(bare, settings=flown, biases=True),
-        ATTITUDE: Variant(flown, gated=False),
-        GATE: Variant(flown, as_logged=True),
+        NOISE: (noise := replace(bare, settings={**flown, **spread}, reported=True)),
+        BIASES: replace(noise, biases=True),
+        PROCESS: replace(noise, settings=flown, biases=True),
+        ATTITUDE: Variant(flown, velocity=False, gated=False),
     }
+    if received.velocity_m_s is not None:
+        variants[SPEED] = Variant(flown, gated=False)
+    return variants | {GATE: Variant(flown, as_logged=True)}
 
 
 def _axis(
-    model: Model, direction: Array, times: Array, path: Array, spans: Spans, coast: Coast | None
+    model: Model,
+    names: tuple[str, ...],
+    direction: Array,
+    times: Array,
+    path: Array,
+    spans: Spans,
+    coast: Coast | None,
 ) -> Why:
-    """Why along one axis; ``path`` is ours, after each step, and the logged EKF2, (10, 2, n)."""
+    """Why along one axis.
+
+    ``path`` is ours, after each of the named steps, and the logged EKF2, shape (k + 2, 2, n).
+    """
     apart = path - path[-1]
     errors = [rms_to_truth(model.flight, track, direction, times) for track in path[:, 0]]
     position, velocity = np.mean(apart[:-1] ** 2, axis=2).T.tolist()
@@ -268,7 +287,7 @@ def _axis(
             moved_at_s=float(times[most[at]]),
             position_rmse_to_truth_m=errors[at + 1],
         )
-        for at, name in enumerate(STEPS)
+        for at, name in enumerate(names)
     )
     lacking = OTHER_TIME if isinstance(model.flight.truth, Truth) else model.flight.truth
     ends = {"kf": errors[0], "ekf2": errors[-1]}

@@ -19,7 +19,7 @@ from px4fuse.ekf2.agreement import at_times, judged_from, logged_innovations, rm
 from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.ekf2.model import Model, disturbed, replay_settings
 from px4fuse.ekf2.replay import HORIZONTAL, Agreement, Ekf2Replay, Spans
-from px4fuse.ekf2_parameters import check
+from px4fuse.ekf2_parameters import GNSS_POS, check
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.flight import Ekf2, Flight, Unavailable
@@ -32,6 +32,10 @@ NO_TRUTH = Unavailable(
     "RMSE to truth",
     "the log holds no ground truth",
     "Record motion capture (ATT_POS_MOCAP) beside the position source, or fly in simulation.",
+)
+OWN_HEADING = (
+    "heading and height are EKF2's own as flown: what a setting of GNSS does to them, as a wrong "
+    "delay turns the heading, is not replayed"
 )
 SWEEP_VALUES = 9
 MAX_SWEEP_VALUES = 200
@@ -172,7 +176,10 @@ def what_if(model: Model, settings: Sequence[Mapping[str, float]]) -> WhatIf | U
         replayed=_of_replay(flight, model.flown, judged),
         whatif=_steadied(model, [_of_replay(flight, r, judged) for r in replays], judged),
         judged=judged,
-        notes=tuple(note for replay in replays for note in _notes(model, replay)),
+        notes=(
+            *((OWN_HEADING,) if replays and model.inputs.aid == GNSS_POS else ()),
+            *(note for replay in replays for note in _notes(model, replay)),
+        ),
     )
 
 

@@ -7,7 +7,7 @@ import math
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
 from px4fuse.ekf2.whatif import what_if
-from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS, Aid
+from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS, Aid
 from px4fuse.findings.model import Finding, Found, finding, moments
 from px4fuse.flight import Ekf2, Unavailable
 
@@ -87,10 +87,11 @@ def _remedy(analysis: Analysis) -> str:
     noise = {name: value for name, value in asked.items() if name not in delay}
     both = asked if noise and delay else {}
     candidates = [changes for changes in (noise, delay, both) if changes]
-    gate = min(2.0 * flown[EV_POS.gate], PARAMETERS[EV_POS.gate].maximum)
-    found = what_if(model, [*candidates, {EV_POS.gate: gate}])
+    aid = model.inputs.aid
+    gate = min(2.0 * flown[aid.gate], PARAMETERS[aid.gate].maximum)
+    found = what_if(model, [*candidates, {aid.gate: gate}])
     if isinstance(found, Unavailable):
-        return f"{in_order(EV_POS)} {remedy.not_replayed(found)}"
+        return f"{in_order(aid)} {remedy.not_replayed(found)}"
     before, (*tried, wider) = found.replayed, found.whatif
     for after in tried:
         if remedy.rejects_less(before, after):

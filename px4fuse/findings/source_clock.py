@@ -76,7 +76,7 @@ def _for_ekf2(analysis: Analysis, clock: ClockOffset) -> str:
     """What putting EKF2's delay right would do, where a replay confirms it."""
     aid, model = analysis.source.origin.aid, analysis.ekf2_model
     taken_ms = None if aid != GNSS_POS else analysis.flight.log.parameters.get(GNSS_POS.delay)
-    if taken_ms is not None:
+    if taken_ms is not None and isinstance(model, Unavailable):
         ask_ms = taken_ms - 1e3 * clock.remaining_s
         return (
             f"; for EKF2, which takes fixes to be {taken_ms:g} ms old ({GNSS_POS.delay}), that "
@@ -84,7 +84,7 @@ def _for_ekf2(analysis: Analysis, clock: ClockOffset) -> str:
         )
     if isinstance(model, Unavailable) or analysis.source.name != model.inputs.received.source:
         return ""
-    changes = remedy.delay_change(model, -1e3 * clock.offset_s)
+    changes = remedy.delay_change(model, 1e3 * (analysis.source.age_s - clock.offset_s))
     found = what_if(model, [changes]) if changes else None
     if not isinstance(found, WhatIf) or not remedy.delay_helps(found.replayed, *found.whatif):
         return ""

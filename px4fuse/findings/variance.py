@@ -7,7 +7,7 @@ from typing import TypeGuard
 import numpy as np
 from msgspec import structs
 
-from px4fuse.analysis import NOT_REPLAYED, Analysis
+from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName
 from px4fuse.comparison.remedy import (
     aid_of,
@@ -31,7 +31,6 @@ from px4fuse.plain import factor_words, number_words
 
 VARIANCE_FACTOR = 1.5  # times: 22 % in standard deviation; chance moves it less at n > 100
 VARIANCE_FACTOR_ERROR = 4.0  # times: a factor of two in standard deviation
-DEFAULT_GNSS_NOISE_M = 0.5  # EKF2_GPS_P_NOISE, v1.8 to main
 EKF2_NOISE_FLOOR_M = 0.01  # EKF2 never trusts external vision better, EKF2.cpp
 NOISE_FITS = 1.25  # times: the median's own scatter below n = 100 (1.17/√n, two σ)
 SMALLEST_NOISE_M = 0.001  # below what any positioning system resolves
@@ -130,11 +129,12 @@ def _above_stated(analysis: Analysis) -> str:
     stated_m = float(np.sqrt(stated.median()))
     if not least_m > NOISE_FITS * stated_m:  # false for NaN too
         return ""
-    return (
-        f"{name} {least_m:g} m holds R above the accuracy that the receiver states "
-        f"({stated_m:.2g} m): set it to that where you trust the receiver. "
-        f"{not_replayed(NOT_REPLAYED)}"
-    )
+    held = f"{name} {least_m:g} m holds R above what the receiver states ({stated_m:.2g} m)"
+    words, _ = remedy_words(
+        analysis.ekf2_model, {name: float(f"{stated_m:.2g}")}, noise_helps,
+        why=f"{held}: where you trust the receiver, ", otherwise=f"{held}.",
+    )  # fmt: skip
+    return words
 
 
 def _is_default(analysis: Analysis, owner: FilterName, result: AxisComparison) -> bool:
@@ -143,7 +143,7 @@ def _is_default(analysis: Analysis, owner: FilterName, result: AxisComparison) -
         chosen, own = analysis.settings, Settings()
         return (chosen.sigma_z_m, chosen.sigma_a_m_s2) == (own.sigma_z_m, own.sigma_a_m_s2)
     name = aid_of(analysis).noise
-    default = PARAMETERS[name].default if name in PARAMETERS else DEFAULT_GNSS_NOISE_M
+    default = PARAMETERS[name].default
     untouched = analysis.flight.log.parameters.get(name, default) == default
     # a sender that reports a larger variance has chosen it
     return untouched and not abs(np.log(_ekf2_noise_m(result) / default)) > np.log(NOISE_FITS)
@@ -223,9 +223,9 @@ def _ekf2_remedy(
             f"{aid.noise}: correct it there, or "
         )
     if aid == GNSS_POS:
-        return NOISE, (
+        why = (
             f"From one fix to the next the source scatters by {noise_m:.2g} m{was}, and slow "
-            f"errors come on top: set {aid.noise} above that. {not_replayed(NOT_REPLAYED)}"
+            "errors come on top: at least "
         )
     if result.axis.name == "down":
         return NOISE, f"{why}set {settings_words(changes)}. {not_replayed(ONLY_HORIZONTAL)}"

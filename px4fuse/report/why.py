@@ -86,7 +86,7 @@ def _believed(replay: Ekf2Replay | Unavailable) -> str:
 
 def agreement_words(agreement: Agreement) -> str:
     """How well the replay as flown agrees with the log, in numbers and in a verdict."""
-    axes = agreement.ev_pos.items()
+    axes = agreement.axes.items()
     correlation = ", ".join(f"{axis.innovation_correlation:.4f} ({name})" for name, axis in axes)
     ratio = ", ".join(
         f"{axis.s_ratio_median:.3f} (5 to 95 % {axis.s_ratio_p5:.3f} to {axis.s_ratio_p95:.3f})"

@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.ekf2.inputs import Inputs, Rules, Received
+from px4fuse.ekf2.inputs import Inputs, Received, Rules
 from px4fuse.ekf2.intervals import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
