@@ -81,7 +81,7 @@ def source(**parts: Any) -> Any:
     usual = {
         "name": "uwb", "description": "UWB", "origin": RECEIVED, "orientation": None,
         "frame": "NED",
-        "clock_map": None, "alignment": None, "rate_hz": 5.0,
+        "clock_map": None, "alignment": None, "rate_hz": 5.0, "age_s": 0.0,
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **parts})
 

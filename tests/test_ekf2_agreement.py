@@ -39,11 +39,11 @@ def replayed(fused_at: list[float], taken: list[float] | None = None) -> Any:
 def test_a_logged_innovation_belongs_to_the_sample_of_its_time() -> None:
     replay, logged = replayed([9.0, 9.0, 9.0], [1.0, 1.1, 1.2]), {"innovation_topics": AID}
     times = np.array([0.9, 0.9941, 1.0, 1.1059, 1.1061, 1.2, 1.3])
-    assert match(replay, made(Ekf2, **logged), times).tolist() == [-1, 0, 0, 1, -1, 2, -1]
+    assert match(replay, made(Ekf2, aids={}, **logged), times).tolist() == [-1, 0, 0, 1, -1, 2, -1]
 
 
 def test_an_older_topic_repeats_the_last_fusion_for_half_a_second() -> None:
-    ekf2 = made(Ekf2, innovation_topics=("ekf2_innovations",))
+    ekf2 = made(Ekf2, aids={}, innovation_topics=("ekf2_innovations",))
     times = np.array([0.9998, 0.99995, 1.0, 1.5, 1.5001, 2.0, 2.4])
     found = match(replayed([1.0, 2.0], [0.8, 1.8]), ekf2, times)
     assert found.tolist() == [-1, 0, 0, 0, -1, 1, 1]
@@ -114,7 +114,7 @@ def test_where_much_is_rejected_the_replay_that_obeys_the_log_decides(
         good=before, reason="so far",
     )  # fmt: skip
     for axes in ({"north": agreeing(), "east": axis}, {"north": axis, "east": agreeing()}):
-        found = with_obedient(one, replace(one, ev_pos=axes))
+        found = with_obedient(one, replace(one, **axes))
         assert found.good is good
         assert f"the innovations correlate by {axis.innovation_correlation:.3f}" in found.reason
         assert f"is {axis.s_ratio_median:.2f} of the logged one" in found.reason
@@ -154,7 +154,11 @@ def compared(count: int, *, varying: bool = True) -> Agreement | Unavailable:
     frame.loc[frame.index[-2:], "rejected"] = 1.0
     state = pd.DataFrame(0.0, index=time, columns=STATE_COLUMNS)
     ekf2 = made(
-        Ekf2, innovations={"north": frame, "east": frame}, innovation_topics=AID, state=state
+        Ekf2,
+        aids={},
+        innovations={"north": frame, "east": frame},
+        innovation_topics=AID,
+        state=state,
     )
     updates = pd.DataFrame({"rejected": 0.0, "fused_at_s": time}, index=time)
     for axis in ("north", "east"):

@@ -26,7 +26,7 @@ from px4fuse.ekf2.stretches import (
     step_ends,
 )
 from px4fuse.ekf2.whatif import sweep_values
-from px4fuse.ekf2_parameters import PARAMETERS, check, fuses_by_mask, settings_in_force
+from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS, check, fuses_by_mask, settings_in_force
 from px4fuse.errors import SettingsError
 from px4fuse.flight import (
     ACCELEROMETER_BIAS_COLUMNS,
@@ -67,7 +67,19 @@ def test_parameters_are_px4s() -> None:
         "EKF2_ACC_NOISE": (0.35, 0.01, 1.0), "EKF2_GYR_NOISE": (0.015, 1e-4, 0.1),
         "EKF2_ACC_B_NOISE": (0.003, 0.0, 0.01), "EKF2_GYR_B_NOISE": (0.001, 0.0, 0.01),
         "EKF2_TAU_POS": (0.25, 0.1, 1.0), "EKF2_TAU_VEL": (0.25, 0.0, 1.0),
+        "EKF2_GPS_P_NOISE": (0.5, 0.01, 10.0), "EKF2_GPS_P_GATE": (5.0, 1.0, 1e3),
+        "EKF2_GPS_DELAY": (110.0, 0.0, 300.0), "EKF2_GPS_V_NOISE": (0.3, 0.01, 5.0),
+        "EKF2_GPS_V_GATE": (5.0, 1.0, 1e3), "EKF2_GPS_POS_X": (0.0, -inf, inf),
+        "EKF2_GPS_POS_Y": (0.0, -inf, inf), "EKF2_GPS_POS_Z": (0.0, -inf, inf),
     }  # fmt: skip
+    vision, gnss = settings_in_force({}), settings_in_force({}, GNSS_POS)
+    assert {name for name in vision if name not in gnss} == {
+        name for name in PARAMETERS if name.startswith("EKF2_EV")
+    }
+    assert {name for name in gnss if name not in vision} == {
+        name for name in PARAMETERS if name.startswith("EKF2_GPS")
+    }
+    assert settings_in_force({"EKF2_AID_MASK": 1.0}, GNSS_POS)["EKF2_GPS_DELAY"] == 110.0
     assert settings_in_force({})["EKF2_EV_DELAY"] == 0.0
     assert settings_in_force({"EKF2_AID_MASK": 8.0})["EKF2_EV_DELAY"] == 175.0
     assert settings_in_force({"EKF2_AID_MASK": 8.0, "EKF2_EV_DELAY": 50.0})["EKF2_EV_DELAY"] == 50.0
@@ -118,7 +130,7 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
         )
         ekf2 = made(
             Ekf2, record=record, innovations={"north": pd.DataFrame()}, horizon_s=horizon_s,
-            step_s=0.01, fusing=fusing,
+            step_s=0.01, fusing=fusing, aids={},
         )  # fmt: skip
         imu = pd.DataFrame(index=interval_s * np.arange(2))
         return prepare(made(Flight, imu=imu, attitude=imu, ekf2=ekf2, log=log(firmware=firmware)))

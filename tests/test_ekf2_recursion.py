@@ -36,13 +36,14 @@ from px4fuse.ekf2.recursion import (
     _down_to,
     _drift,
     _Fusion,
+    _in_turn,
     _limit_bias,
     _Sample,
     run,
 )
 from px4fuse.ekf2.recursion import _measurements as measurements
 from px4fuse.ekf2.stretches import Stretch
-from px4fuse.ekf2_parameters import settings_in_force
+from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, Aid, settings_in_force
 from px4fuse.errors import SettingsError
 
 
@@ -93,17 +94,20 @@ def test_what_counts_as_measurement_and_noise() -> None:
         "EKF2_EV_POS_Z": np.zeros(2),
     }  # fmt: skip
     inputs = made(Inputs, received=vision, imu_offset_m=np.zeros(3))
-    position, noise = measurements(inputs, stretch, np.array([0]), np.array([[1]]), knob)
+    at = np.array([0]), np.array([[1]])
+    position, noise = measurements(inputs, stretch, *at, knob, np.array([True, True]))
     # 0.3 m ahead of a body that faces east: the body is west of the sensor
     np.testing.assert_allclose(position[0], [[1.0, 2.0, 3.0], [1.0, 1.7, 3.0]], atol=1e-12)
     # what is reported, EKF2_EVP_NOISE at least; or that alone, 1 cm at least
     np.testing.assert_allclose(noise[0], [[0.04, 0.01, 0.01], [1e-4, 1e-4, 1e-4]])
+    _, noise = measurements(inputs, stretch, *at, knob, np.array([False, False]))
+    np.testing.assert_allclose(noise[0], [[0.01, 0.01, 0.01], [1e-4, 1e-4, 1e-4]])
 
 
 def deciding(
     *, action: int = FUSE, startable: bool = False, gated: bool = True, obeys: bool = False,
     logged: float = np.nan, logged_reset: bool = False, outside: bool = True, silent_s: float = 0.5,
-    stopped: bool = False, left: int = 5,
+    stopped: bool = False, left: int = 5, rules: Rules = RULES, velocity_silent_s: float = 0.0,
 ) -> tuple[bool, bool, bool, float, bool, int]:  # fmt: skip
     """What is rejected, taken and reset at 10 s; then last fusion, whether stopped, resets left."""
     sample = _Sample(
@@ -111,8 +115,11 @@ def deciding(
         gated=np.array([gated]), as_logged=np.array([obeys]), rejected=logged,
         reset=logged_reset,
     )  # fmt: skip
-    before = _Fusion(np.array([10.0 - silent_s]), np.array([stopped]), np.array([left]))
-    rejected, taken, reset, after = _decide(RULES, sample, np.array([outside]), before)
+    before = _Fusion(
+        np.array([10.0 - silent_s]), np.array([10.0 - velocity_silent_s]), np.array([stopped]),
+        np.array([left]),
+    )  # fmt: skip
+    rejected, taken, reset, after = _decide(rules, sample, np.array([outside]), before)
     last, stop, rest = after.last_s[0], after.stopped[0], after.left[0]
     return bool(rejected[0]), bool(taken[0]), bool(reset[0]), float(last), bool(stop), int(rest)
 
@@ -177,9 +184,104 @@ def test_a_release_without_delay_max_has_none() -> None:
     assert replay_settings(model, []) == ()
 
 
+GNSS_RULES = replace(RULES, stop_s=math.inf, reset_s=7.0, resets=1_000_000, with_velocity=True)
+
+
+@pytest.mark.parametrize(
+    ("silent_s", "velocity_silent_s", "with_velocity", "resets"),
+    [
+        (7.1, 7.1, True, True), (6.9, 7.1, True, False), (7.1, 6.9, True, False),
+        (13.9, 0.0, True, False), (14.1, 0.0, True, True), (7.1, 0.0, False, True),
+    ],
+)  # fmt: skip
+def test_gnss_is_reset_to_without_both_for_7_s_or_position_for_14_s(
+    silent_s: float, velocity_silent_s: float, with_velocity: bool, resets: bool
+) -> None:
+    """shouldResetGpsFusion, gps_control.cpp; since main of 2026 each aid by itself."""
+    rules = replace(GNSS_RULES, with_velocity=with_velocity)
+    _, taken, reset, *_ = deciding(
+        silent_s=silent_s, velocity_silent_s=velocity_silent_s, rules=rules, left=9
+    )
+    assert (taken, reset) == (False, resets)
+
+
+def test_states_fused_in_turn_are_the_kalman_filters_where_they_do_not_share() -> None:
+    rng = np.random.default_rng(5)
+    root = rng.normal(size=(2, 15, 15))
+    P, x = root @ np.swapaxes(root, 1, 2), rng.normal(size=(2, 15))
+    nu, R = rng.normal(size=(2, 1)), np.array([[0.3], [0.7]])
+    S = P[:, 6, 6][:, None] + R
+    after, left = _in_turn(x, P, nu, S, R, 6, np.array([True, False]))
+    K = P[0, :, 6] / S[0]
+    np.testing.assert_allclose(after[0], x[0] + K * nu[0], rtol=1e-12)
+    np.testing.assert_allclose(left[0], P[0] - np.outer(K, P[0, 6]), atol=1e-9)
+    np.testing.assert_allclose(after[1], x[1])
+    np.testing.assert_allclose(left[1], P[1])
+
+
+def test_states_fused_in_turn_keep_the_innovations_of_before() -> None:
+    """As EKF2 does: the second gain has the new covariance and the old S, so it is not optimal."""
+    rng = np.random.default_rng(6)
+    root = rng.normal(size=(15, 15))
+    P, nu, R = root @ root.T, np.array([[0.4, -0.2]]), np.array([[0.5, 0.9]])
+    S = np.diagonal(P)[6:8] + R
+    x, left = _in_turn(np.zeros((1, 15)), P[None], nu, S, R, 6, np.array([True]))
+    expected, state = P, np.zeros(15)
+    for at, row in enumerate((6, 7)):
+        K = expected[:, row] / S[0, at]
+        kept = np.eye(15) - np.outer(K, np.eye(15)[row])
+        expected = kept @ expected @ kept.T + R[0, at] * np.outer(K, K)
+        state = state + K * nu[0, at]
+    np.testing.assert_allclose(x[0], state, atol=1e-9)
+    np.testing.assert_allclose(left[0], expected, atol=1e-9)
+    assert np.linalg.eigvalsh(left[0]).min() > -1e-9
+
+
+def on_gnss(north_m: list[float], north_m_s: list[float], **more: Any) -> Run:
+    """:func:`at_rest` on GNSS, with the velocity that each fix has too."""
+    speed = np.zeros((len(north_m_s), 3))
+    speed[:, 0] = north_m_s
+    return at_rest(north_m, aid=GNSS_POS, rules=GNSS_RULES, speed_m_s=speed, **more)
+
+
+def test_a_fix_at_rest_tells_the_velocity_too() -> None:
+    done = on_gnss([0.0] * 20, [0.0] * 20)
+    np.testing.assert_allclose(done.state, 0.0, atol=1e-9)
+    # EKF2_GPS_V_NOISE², half as much again in σ for the vertical one
+    r = done.velocity_variance_m2_s2[0, 0] - np.array([1e-4, 1e-4, 1e-4])
+    np.testing.assert_allclose(r, [0.09, 0.09, 0.2025], atol=3e-4)
+    with_it, without = done.variance[-1, 0, 3:5], at_rest([0.0] * 20, aid=GNSS_POS).variance
+    assert (with_it < 0.98 * without[-1, 0, 3:5]).all()
+    off = on_gnss([0.0] * 20, [0.0] * 20, velocity=False)
+    np.testing.assert_allclose(off.variance[-1, 0, 3:5], without[-1, 0, 3:5], rtol=1e-3)
+    assert not np.isfinite(at_rest([0.0] * 5, aid=GNSS_POS).velocity_innovation_m_s).any()
+
+
+@pytest.mark.parametrize(("speed_m_s", "moves"), [(1.0, True), (3.0, False)])
+def test_a_velocity_beyond_its_gate_moves_nothing(speed_m_s: float, moves: bool) -> None:
+    """Five times √(P + 0.09) is 1.5 m/s; the fix's position is fused all the same."""
+    done = on_gnss([0.0] * 20, [0.0] * 10 + [speed_m_s] + [0.0] * 9)
+    assert done.fused.all()
+    assert bool(abs(done.state[11, 0, 3]) > 1e-3) is moves
+    assert done.velocity_innovation_m_s[10, 0, 0] == pytest.approx(speed_m_s, abs=0.01)
+    wider = on_gnss([0.0] * 20, [0.0] * 10 + [3.0] + [0.0] * 9, EKF2_GPS_V_GATE=20.0)
+    assert abs(wider.state[11, 0, 3]) > 1e-3
+
+
+def test_a_reset_to_a_fix_takes_its_velocity_too() -> None:
+    """Seven seconds without both: position and velocity are the fix's, with their variances."""
+    done = on_gnss([0.0] * 5 + [300.0] * 80, [0.0] * 5 + [40.0] * 80)
+    at = int(np.flatnonzero(done.reset[:, 0])[0])
+    assert at == 5 + 70  # the 71st rejected one is the first more than 7 s after the last fusion
+    np.testing.assert_allclose(done.state[at + 1, 0, [6, 3]], [300.0, 40.0], atol=1e-9)
+    np.testing.assert_allclose(done.variance[at + 1, 0, 6:8], 0.25)
+    np.testing.assert_allclose(done.variance[at + 1, 0, 3:5], 0.09)
+
+
 def at_rest(
-    measured_m: list[float], logged: float = np.nan, down_m: float = 0.0, **settings: float
-) -> Run:
+    measured_m: list[float], logged: float = np.nan, down_m: float = 0.0, aid: Aid = EV_POS,
+    rules: Rules = RULES, speed_m_s: Any = None, velocity: bool = True, **settings: float,
+) -> Run:  # fmt: skip
     """A level vehicle that stands still at the origin, seen at 10 Hz at these places north.
 
     EKF2 itself rejected the fourth sample where that is logged.
@@ -202,12 +304,16 @@ def at_rest(
         np.zeros((len(stamp), 3)), np.full(len(stamp), np.nan), np.zeros(len(stamp), bool), "uwb",
     )  # fmt: skip
     vision.rejected[3] = logged
+    if speed_m_s is not None:
+        vision = replace(
+            vision, velocity_m_s=speed_m_s, velocity_variance_m2_s2=np.zeros_like(speed_m_s)
+        )
     inputs = Inputs(
-        settings_in_force(settings), (stretch,), vision, RULES, 0.01, 0.1, 0.01,
-        vision_height=False, imu_offset_m=np.zeros(3),
+        settings_in_force(settings, aid), (stretch,), vision, rules, 0.01, 0.1, 0.01,
+        vision_height=False, imu_offset_m=np.zeros(3), aid=aid,
     )  # fmt: skip
     intervals = make_intervals(inputs, stretch, Timing(0.0, 0.1))
-    variant = Variant(inputs.settings, as_logged=True)
+    variant = Variant(inputs.settings, velocity=velocity, as_logged=True)
     return run(inputs, stretch, [variant], [intervals])
 
 

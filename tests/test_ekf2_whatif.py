@@ -17,7 +17,7 @@ from msgspec import structs
 
 from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.agreement import along, rms_to_truth
-from px4fuse.ekf2.inputs import Inputs
+from px4fuse.ekf2.inputs import Inputs, Received
 from px4fuse.ekf2.model import Model, delayed_variants, open_model
 from px4fuse.ekf2.replay import Ekf2Replay
 from px4fuse.ekf2.walk import OUTPUT, SAMPLES, STEPS, Why, _coast, _variants, walk
@@ -30,6 +30,7 @@ from px4fuse.ekf2.whatif import (
     _of_replay,
     what_if,
 )
+from px4fuse.ekf2_parameters import GNSS_POS
 from px4fuse.filter.kalman import Replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
@@ -200,19 +201,30 @@ def test_a_slanted_axis_is_the_projection(model: Model) -> None:
 
 def test_the_walk_changes_one_thing_after_the_other() -> None:
     flown = {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_NOISE_MD": 0.0, "EKF2_ACC_NOISE": 0.35}
-    model = made(Model, inputs=made(Inputs, settings=flown, step_s=0.01))
+    received = made(Received)
+    model = made(Model, inputs=made(Inputs, settings=flown, step_s=0.01, received=received))
     ours = Settings(0.5, 0.2, 0.16, clock_offset_s=-0.05)
     found = list(_variants(model, ours).values())
     settings = [one.settings for one in found]
     assert [s["EKF2_ACC_NOISE"] for s in settings] == pytest.approx([2.0] * 4 + [0.35] * 3)
     assert [s["EKF2_EVP_NOISE"] for s in settings] == [0.2] * 2 + [0.3] * 5
-    assert [s["EKF2_EV_NOISE_MD"] for s in settings] == [1.0] * 2 + [0.0] * 5
+    assert [one.reported for one in found] == [False] * 2 + [True] * 5
     assert settings[0]["EKF2_EV_POS_X"] == 0.0
     assert [one.biases for one in found] == [False] * 3 + [True] * 4
     assert [one.attitude for one in found] == [False] * 5 + [True] * 2
     assert [one.gated for one in found] == [False] * 6 + [True]
     assert [one.as_logged for one in found] == [False] * 6 + [True]
     assert [one.stamp_offset_s for one in found] == [-0.05] + [None] * 6
+    gnss = made(
+        Inputs, aid=GNSS_POS, step_s=0.01, received=made(Received, velocity_m_s=np.zeros((1, 3))),
+        settings={"EKF2_ACC_NOISE": 0.35, "EKF2_GPS_P_NOISE": 0.5, "EKF2_GPS_DELAY": 110.0},
+    )  # fmt: skip
+    found = list(_variants(made(Model, inputs=gnss), ours).values())
+    assert [one.velocity for one in found] == [False] * 6 + [True] * 2
+    assert [one.gated for one in found] == [False] * 7 + [True]
+    # the delay was taken from the positions of GNSS that ours is given
+    assert found[0].stamp_offset_s == pytest.approx(-0.16)
+    assert [one.settings["EKF2_GPS_P_NOISE"] for one in found] == [0.2] * 2 + [0.5] * 6
 
 
 def test_the_longest_run_of_rejections_is_said_with_how_far_it_led() -> None:

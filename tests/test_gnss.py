@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
+import findings_tools
 import numpy as np
 import pytest
 from cli_tools import run
+from exchange import replace
+from findings_tools import analysis as stand_in
 from ulog_tools import Log, gnss_log, make_log, position, seconds_of, stamps, topic
 
 import px4fuse
 from px4fuse.analysis import run_preparation
 from px4fuse.comparison.preparation import choose_source, prepare
+from px4fuse.ekf2.model import Model
+from px4fuse.ekf2.walk import ATTITUDE, GATE, NOISE, SPEED, STAMPS, Why
+from px4fuse.ekf2.whatif import WhatIf, what_if
+from px4fuse.errors import SettingsError
 from px4fuse.findings import find, variance
 from px4fuse.flight import POSITION_COLUMNS, Flight, PositionTrack, Truth, Unavailable
 from px4fuse.readers import read_log
@@ -205,17 +213,29 @@ def test_the_truth_lies_about_ekf2_s_origin_where_that_is_a_fix(
     [(2.0, 0.3, True), (0.5, 0.45, False), (0.5, 0.9, False), (None, 0.3, False)],
 )
 def test_a_smaller_r_is_advised_only_where_the_parameter_holds_it_up(
-    least_m: float | None, eph_m: float, said: bool, tmp_path: Path
+    least_m: float | None,
+    eph_m: float,
+    said: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     log = outdoors(eph_m=eph_m)
     log.parameters.pop("EKF2_GPS_P_NOISE")
     if least_m is not None:
         log.parameters["EKF2_GPS_P_NOISE"] = least_m
-    words = variance._above_stated(prepare(flight_of(log, tmp_path)))  # type: ignore[arg-type]
+    prepared = prepare(flight_of(log, tmp_path))
+    monkeypatch.setattr(findings_tools, "SEGMENT", prepared.segment)
+    words = variance._above_stated(
+        stand_in(
+            source=prepared.source,
+            log=prepared.flight.log,
+            ekf2_model=Unavailable("replay", "no IMU", "Log it."),
+        )
+    )
     assert bool(words) is said
     if said:
-        assert "EKF2_GPS_P_NOISE 2 m" in words
-        assert "(0.3 m)" in words
+        assert words.startswith("EKF2_GPS_P_NOISE 2 m holds R above what the receiver states (0.3")
+        assert words.endswith("set EKF2_GPS_P_NOISE to 0.3 m. Not replayed: no IMU.")
 
 
 # --------------------------------------------------------------------- flights of the real EKF2
@@ -258,6 +278,138 @@ def test_flights_on_gnss(name: str, shared_logs: Path) -> None:
     assert loud[:1] == [FLIGHTS[name]] if FLIGHTS[name] else not loud
     said = " ".join(f"{one.message} {one.remedy}" for one in findings)
     assert not [word for word in OF_OTHERS if word in said]
+
+
+REPLAYED = ("delay0", "fullrate", "nominal", "overconfident")
+
+
+@pytest.fixture(scope="module")
+def models(shared_logs: Path) -> dict[str, Model]:
+    found = {}
+    for name in REPLAYED:
+        model = px4fuse.open_model(read_log(shared_logs / "gps" / f"v1.16.1_gps_{name}.ulg"))
+        assert isinstance(model, Model)
+        found[name] = model
+    return found
+
+
+@pytest.mark.reallogs
+def test_ekf2_on_gnss_is_replayed(models: dict[str, Model]) -> None:
+    """Where it rejects nothing; where it rejects, single samples part and the shares agree."""
+    for name in ("delay0", "fullrate", "nominal"):
+        agreement = models[name].agreement
+        assert agreement.good
+        assert agreement.ev_pos == {}
+        for axis in agreement.gnss_pos.values():
+            assert axis.innovation_correlation > 0.998
+            assert axis.s_ratio_median == pytest.approx(1.0, abs=0.004)
+            assert axis.position_rms_difference_m < 0.03
+        for axis in agreement.gnss_vel.values():
+            assert axis.innovation_correlation > 0.998
+            assert axis.s_ratio_median == pytest.approx(1.0, abs=0.011)
+        assert agreement.rejected_share_replayed == agreement.rejected_share_logged == 0.0
+    for axis in models["fullrate"].agreement.gnss_pos.values():
+        assert axis.innovation_correlation > 0.9995
+        assert axis.innovation_rms_difference < 0.012
+    rejecting = models["overconfident"].agreement
+    assert rejecting.good
+    assert rejecting.rejected_share_replayed == pytest.approx(
+        rejecting.rejected_share_logged, abs=0.05
+    )
+
+
+@pytest.mark.reallogs
+def test_what_other_settings_of_gnss_would_have_done(models: dict[str, Model]) -> None:
+    """The delay that was injected, and the noise; figures of an independent replay beside them."""
+
+    def error_m(name: str, **settings: float) -> tuple[float, float, float]:
+        found = what_if(models[name], [settings])
+        assert isinstance(found, WhatIf)
+        (after,) = found.whatif
+        error = after.position_rmse_to_truth_m
+        assert isinstance(error, float)
+        return error, after.nis_mean, after.rejected_share
+
+    assert error_m("delay0")[0] == pytest.approx(0.688, rel=0.03)
+    assert error_m("delay0", EKF2_GPS_DELAY=200.0)[0] == pytest.approx(0.233, rel=0.06)
+    assert error_m("nominal", EKF2_GPS_P_NOISE=0.8)[:2] == pytest.approx((0.193, 0.26), rel=0.05)
+    less = error_m("overconfident", EKF2_GPS_P_NOISE=0.72)
+    assert less == pytest.approx((0.737, 0.41, 0.0), rel=0.05)
+
+
+@pytest.mark.reallogs
+def test_what_changes_nothing_is_refused(models: dict[str, Model]) -> None:
+    with pytest.raises(SettingsError, match="EKF2 fused GNSS position in this log"):
+        what_if(models["nominal"], [{"EKF2_EVP_NOISE": 0.2}])
+    own = replace(models["nominal"].inputs.received, own_times=True)
+    model = replace(models["nominal"], inputs=replace(models["nominal"].inputs, received=own))
+    with pytest.raises(SettingsError, match="EKF2_GPS_DELAY changes nothing here"):
+        what_if(model, [{"EKF2_GPS_DELAY": 50.0}])
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("v1.13.3_gps_profile1", "2.0 positions of GNSS a second, fewer than EKF2 fused"),
+        ("v1.14.4_gps_magdist", "2.0 positions of GNSS a second, fewer than EKF2 fused"),
+        ("v1.16.1_gps_stock_flow", r"more than GNSS horizontally \(optical flow\)"),
+        ("main202603_gps_outage_flow", r"more than GNSS horizontally \(optical flow\)"),
+    ],
+)
+def test_a_log_that_does_not_hold_what_was_fused(name: str, reason: str, shared_logs: Path) -> None:
+    model = px4fuse.open_model(read_log(shared_logs / "gps" / f"{name}.ulg"))
+    assert isinstance(model, Unavailable)
+    assert re.search(reason, model.reason)
+
+
+@pytest.mark.reallogs
+def test_why_ekf2_differs_on_gnss(shared_logs: Path) -> None:
+    analysis = px4fuse.compare(shared_logs / "gps" / "v1.16.1_gps_nominal.ulg")
+    for axis in ("north", "east"):
+        why = analysis.why[axis]
+        assert isinstance(why, Why)
+        names = [step.name for step in why.steps]
+        assert names[names.index(SPEED) - 1 :][:3] == [ATTITUDE, SPEED, GATE]
+        total = sum(step.position_mean_square_m2 for step in why.steps)
+        assert total + why.position_left_mean_square_m2 == pytest.approx(
+            why.position_mean_square_m2
+        )
+        assert why.position_left_share < 0.1
+        steps = {step.name: step for step in why.steps}
+        # EKF2 has half a prediction step besides the delay
+        assert abs(steps[STAMPS].position_mean_square_m2) < 0.1 * total
+        assert abs(steps[NOISE].position_mean_square_m2) < 0.02 * total
+
+
+def test_fixes_that_the_logger_left_out_are_filled_in(tmp_path: Path) -> None:
+    log = outdoors(rate_hz=10.0)
+    every = log["vehicle_gps_position"]
+    rows = topic("estimator_aid_src_gnss_pos", every["timestamp"] - np.uint64(115_000), {
+        "innovation": np.zeros((len(every["timestamp"]), 2)),
+        "innovation_variance": np.ones((len(every["timestamp"]), 2)),
+        "observation_variance": np.ones((len(every["timestamp"]), 2)),
+        "test_ratio": np.zeros((len(every["timestamp"]), 2)),
+        "fused": np.ones(len(every["timestamp"]), np.bool_),
+        "innovation_rejected": np.zeros(len(every["timestamp"]), np.bool_),
+    }, sampled=True)  # fmt: skip
+    rows.fields["observation"] = np.stack([every["latitude_deg"], every["longitude_deg"]], axis=1)
+    speed = topic("estimator_aid_src_gnss_vel", every["timestamp"] - np.uint64(115_000), {
+        "observation": np.tile([1.0, 2.0, 3.0], (len(every["timestamp"]), 1)),
+    }, sampled=True)  # fmt: skip
+    log.drop("estimator_aid_src_gnss_pos")
+    log.add(rows, speed)
+    whole = track_of(flight_of(log, tmp_path)).samples
+    left = np.ones(len(every["timestamp"]), bool)
+    left[[20, 50, 51]] = False
+    for name, values in every.items():
+        every[name] = values[left]
+    found = track_of(flight_of(log, tmp_path))
+    assert "3 positions of GNSS that the logger left out are from" in " ".join(found.notes)
+    np.testing.assert_allclose(found.samples.index, whole.index, atol=1e-6)
+    np.testing.assert_allclose(found.samples[POSITION_COLUMNS], whole[POSITION_COLUMNS], atol=0.05)
+    assert found.velocity is not None
+    np.testing.assert_allclose(found.velocity.loc[found.samples.index[50], "east_m_s"], 2.0)
 
 
 @pytest.mark.reallogs

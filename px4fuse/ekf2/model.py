@@ -125,6 +125,11 @@ def replay_settings(
         A parameter that the model does not have, or a value outside PX4's range.
     """
     changes = [check(change) for change in settings]
+    if model.inputs.rules.horizon_by_delay and any("EKF2_DELAY_MAX" in c for c in changes):
+        raise SettingsError(
+            f"EKF2_DELAY_MAX: {model.flight.log.firmware} has no such parameter; there the longest "
+            "delay makes the horizon."
+        )
     for name in {name for change in changes for name in change}:
         if name not in model.inputs.settings:
             raise SettingsError(
@@ -136,11 +141,6 @@ def replay_settings(
             raise SettingsError(
                 f"{name} changes nothing here: EKF2 takes the receiver driver's own times."
             )
-    if model.inputs.rules.horizon_by_delay and any("EKF2_DELAY_MAX" in c for c in changes):
-        raise SettingsError(
-            f"EKF2_DELAY_MAX: {model.flight.log.firmware} has no such parameter; there the longest "
-            "delay makes the horizon."
-        )
     if not changes:
         return ()
     inputs = model.inputs

@@ -46,7 +46,8 @@ ATTITUDE = "attitude and gyro bias as states"
 SPEED = "velocity of GNSS"
 GATE = "gate, missed samples, resets"
 OUTPUT = "output predictor"
-STEPS = (SAMPLES, STAMPS, NOISE, BIASES, PROCESS, ATTITUDE, SPEED, GATE, OUTPUT)
+# SPEED comes before GATE, where EKF2 fuses a velocity
+STEPS = (SAMPLES, STAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
 COLUMNS = (POSITION_COLUMNS, VELOCITY_COLUMNS)
 
@@ -57,7 +58,7 @@ class Step(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     name : str
-        One of :data:`STEPS`; that of velocity only where EKF2 fuses one.
+        One of :data:`STEPS`, or :data:`SPEED`.
     position_mean_square_m2, velocity_mean_square_m2_s2 : float
         By how much it brings the track nearer to the logged one, in mean square; below 0: farther.
     position_moved_m : float
