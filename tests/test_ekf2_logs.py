@@ -20,8 +20,12 @@ pytestmark = pytest.mark.reallogs
 NOT_CARRIED = {
     "v1.16.1_aisle_2hz_stock": "never fused external vision",
     "v1.16.1_aisle_hwlog": "estimator_aid_src_ev_pos holds one sample in",
-    "v1.16.1_no_uwb": "never fused external vision",
 }
+# Why is in test_gnss.py
+GNSS_NOT_CARRIED = (
+    "main202603_gps_outage_flow", "v1.13.3_gps_profile1", "v1.14.4_gps_magdist",
+    "v1.16.1_gps_stock_flow",
+)  # fmt: skip
 REAL = {
     "vladimireganov_ROS_PX4_MOCAP_log_3_2022-6-9-13-01-36": "estimator_visual_odometry_aligned",
     "vladimireganov_ROS_PX4_MOCAP_min_snap_01": "estimator_visual_odometry_aligned",
@@ -31,9 +35,9 @@ REAL = {
 
 
 def test_the_figures_of_the_benchmark_hold_on_every_simulated_flight(shared_logs: Path) -> None:
-    paths = sorted((shared_logs / "simulated").glob("*.ulg"))
+    paths = bench_ekf2.flights([shared_logs / "simulated", shared_logs / "gps"])
     models = bench_ekf2.agreement_table(paths)
-    assert {path.stem for path in paths} - models.keys() == NOT_CARRIED.keys()
+    assert {path.stem for path in paths} - models.keys() == {*NOT_CARRIED, *GNSS_NOT_CARRIED}
     left = bench_ekf2.waterfalls(models)
     bench_ekf2.counterfactuals(models)
     assert bench_ekf2.agreement_page(models, left) == bench_ekf2.in_page()

@@ -89,15 +89,16 @@ def aid_of(comparison: Comparison) -> Aid:
     return comparison.source.origin.aid or EV_POS
 
 
-def vision_delay_ms(comparison: Comparison) -> float | None:
+def delay_ms(comparison: Comparison) -> float | None:
     """What EKF2 takes positions of the source to be older than their stamps (ms).
 
-    None where the log does not tell, or EKF2 does not take the source as external vision: GNSS has
-    a delay of its own, and stamps that EKF2 does not use.
+    None where the log does not tell, EKF2 never fuses the source, or takes the times of a receiver.
     """
-    if not comparison.source.origin.is_vision:
+    source = comparison.source
+    if source.origin.aid is None:
         return None
-    return comparison.flight.log.parameters.get(EV_POS.delay)
+    found = comparison.flight.log.parameters.get(source.origin.aid.delay)
+    return None if source.origin.is_gnss and source.age_s == 0.0 != found else found
 
 
 def tuned_noise_m(tuning: Mapping[str, AxisTuning | Unavailable]) -> float | None:

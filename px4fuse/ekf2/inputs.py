@@ -292,7 +292,7 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> Received | Un
         stated.to_numpy(),
         *_decisions(ekf2, record, stamp, GNSS_POS),
         track.name,
-        own_times=track.age_s != flown_s,
+        own_times=track.age_s == 0.0 != flown_s,
     )
     if not fuses_by_mask(parameters) and not switch & GNSS_VELOCITY_BIT:
         return found

@@ -1,7 +1,8 @@
 """EKF2 replayed from an ordinary log, as it flew and with other parameters.
 
-The model is the part of EKF2 that external vision moves: 15 error states about the published
-attitude, started from the log's own ``estimator_states`` and fed with IMU and vision as logged.
+The model is the part of EKF2 that horizontal positions move: 15 error states about the published
+attitude, started from the log's own ``estimator_states`` and fed with IMU and positions as logged,
+of GNSS with their velocities.
 It is not EKF2: what else EKF2 fuses (height, heading) is taken from its own output. How far it can
 be believed is measured on each log, see :mod:`px4fuse.ekf2.agreement`.
 """

@@ -16,6 +16,7 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.ekf2.agreement import along, judged_from, rms_to_truth, settled
+from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, replay_settings
 from px4fuse.ekf2.replay import HORIZONTAL, Ekf2Replay
 from px4fuse.ekf2.whatif import MOST_REJECTED
@@ -41,7 +42,7 @@ def grid_data(analysis: Analysis, packer: Packer) -> dict[str, Any] | str:
         return model.reason
     if not model.agreement.good:
         return model.agreement.doubted("EKF2").reason
-    stops = _stops(model.inputs.settings)
+    stops = _stops(model.inputs)
     settings = [
         dict(zip(stops, values, strict=True)) for values in itertools.product(*stops.values())
     ]
@@ -70,15 +71,16 @@ def _told(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-def _stops(flown: Mapping[str, float]) -> dict[str, list[float]]:
-    noise, delay, gate = (
-        _told(flown[name]) for name in ("EKF2_EVP_NOISE", "EKF2_EV_DELAY", "EKF2_EVP_GATE")
-    )
+def _stops(inputs: Inputs) -> dict[str, list[float]]:
+    flown, aid = inputs.settings, inputs.aid
+    noise, delay, gate = (_told(flown[name]) for name in (aid.noise, aid.delay, aid.gate))
     wanted = {
-        "EKF2_EVP_NOISE": {_told(noise * factor) for factor in NOISES},
-        "EKF2_EV_DELAY": {*DELAYS_MS, delay},
-        "EKF2_EVP_GATE": {*GATES, gate},
+        aid.noise: {_told(noise * factor) for factor in NOISES},
+        aid.delay: {*DELAYS_MS, delay},
+        aid.gate: {*GATES, gate},
     }
+    if inputs.received.own_times:  # whatever the delay
+        del wanted[aid.delay]
     return {
         name: sorted(
             value

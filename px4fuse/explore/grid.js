@@ -1,7 +1,8 @@
 /* EKF2 with other parameters: only at the stops that Python replayed, nothing between them. */
 const Grid = (() => {
   const WORDS = { EKF2_EVP_NOISE: "noise of the position", EKF2_EV_DELAY: "age of the position at its stamp",
-    EKF2_EVP_GATE: "gate of the innovation" };
+    EKF2_EVP_GATE: "gate of the innovation", EKF2_GPS_P_NOISE: "noise of the position, at least",
+    EKF2_GPS_DELAY: "age of a fix at its stamp", EKF2_GPS_P_GATE: "gate of the innovation" };
   let lone = null, stops = [], at = [], shown = false;
 
   function start(flights, arrays, redraw) {

@@ -103,7 +103,8 @@ def typed_offset_s(comparison: Comparison, clock: ClockOffset) -> float:
 
 def delay(analysis: Analysis, clock: ClockOffset) -> Found:
     """EKF2_EV_DELAY lies outside what the clock offset and EKF2's step leave open."""
-    delay_ms = remedy.vision_delay_ms(analysis)
+    # of GNSS the offset itself is what EKF2's delay is wrong by
+    delay_ms = remedy.delay_ms(analysis) if analysis.source.origin.is_vision else None
     asked_ms = -1e3 * clock.offset_s
     known_ms = 1e3 * max(clock.chance_s + EKF2_UPDATE_S, OFFSET_S)
     if delay_ms is None or abs(delay_ms - asked_ms) < known_ms:

@@ -225,7 +225,7 @@ def _ekf2_remedy(
     if aid == GNSS_POS:
         why = (
             f"From one fix to the next the source scatters by {noise_m:.2g} m{was}, and slow "
-            "errors come on top: at least "
+            "errors come on top: as a first step "
         )
     if result.axis.name == "down":
         return NOISE, f"{why}set {settings_words(changes)}. {not_replayed(ONLY_HORIZONTAL)}"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.remedy import vision_delay_ms
+from px4fuse.comparison.remedy import aid_of, delay_ms
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
 from px4fuse.findings.source_clock import typed_offset_s
 from px4fuse.flight import Unavailable
@@ -58,11 +58,12 @@ def _stamps_wrong(clock: ClockOffset) -> bool:
 
 
 def _delay_wrong(comparison: Comparison, clock: ClockOffset) -> bool:
-    """Whether PX4's EKF2_EV_DELAY is known, and not what the data ask for."""
-    delay, (low, high) = vision_delay_ms(comparison), clock.interval_s
+    """Whether EKF2's delay for the source is known, and not what the data ask for."""
+    delay = delay_ms(comparison)
     if delay is None or not clock.determinable:
         return False
-    return not -(high + NEGLIGIBLE_S) <= delay * 1e-3 <= -(low - NEGLIGIBLE_S)
+    least, most = (comparison.source.age_s - end for end in reversed(clock.interval_s))
+    return not least - NEGLIGIBLE_S <= delay * 1e-3 <= most + NEGLIGIBLE_S
 
 
 def _changes(clock: ClockOffset) -> bool:
@@ -94,15 +95,16 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
         advice["Reading"] = f"the stamps are {side} by {abs(offset):.3f} s"
         typed = typed_offset_s(comparison, clock)
         advice["Re-run"] = f"px4fuse compare LOG --clock-offset {typed:.3f}"
-    delay = vision_delay_ms(comparison)
+    delay, name = delay_ms(comparison), aid_of(comparison).delay
+    age_s = comparison.source.age_s
     if delay is not None and not _delay_wrong(comparison, clock):
-        advice["PX4"] = f"EKF2_EV_DELAY {delay:g} ms fits"
-    elif delay is not None and offset > 0.0 and delay <= 0.0:
-        advice["PX4"] = "EKF2_EV_DELAY is 0 ms and cannot be negative: correct the sender's clock"
+        advice["PX4"] = f"{name} {delay:g} ms fits"
+    elif delay is not None and offset > age_s and delay <= 0.0:
+        advice["PX4"] = f"{name} is 0 ms and cannot be negative: correct the sender's clock"
     elif delay is not None:
-        asked, least, most = (max(-s * 1e3, 0.0) for s in (offset, high, low))
+        asked, least, most = (max(1e3 * (age_s - s), 0.0) for s in (offset, high, low))
         advice["PX4"] = (
-            f"EKF2_EV_DELAY is {delay:g} ms, the data ask for {asked:.0f} ms ({least:.0f} to "
+            f"{name} is {delay:g} ms, the data ask for {asked:.0f} ms ({least:.0f} to "
             f"{most:.0f}); set it, or correct the sender's clock"
         )
     if clock.change_p is not None and _changes(clock):
