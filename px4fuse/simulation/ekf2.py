@@ -31,7 +31,6 @@ from px4fuse.ekf2.model import delayed_states, run_variants
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.recursion import EAST, HEADING, NORTH, Run, Variant
 from px4fuse.ekf2.stretches import Stretch, down_sampled, step_ends
-from px4fuse.ekf2_parameters import PARAMETERS as MODEL_PARAMETERS
 from px4fuse.ekf2_parameters import settings_in_force
 from px4fuse.simulation import sensors
 from px4fuse.simulation.ekf2_topics import TopicTrack, ekf2_topics
@@ -68,7 +67,7 @@ MAX_INTERVAL_S = 0.1
 
 def parameters(source_sigma_m: float, mistakes: Mistakes) -> dict[str, int | float]:
     """EKF2's parameters as flown: all that its model has, by PX4 name."""
-    known = {name: each.default for name, each in MODEL_PARAMETERS.items()}
+    known = settings_in_force({})
     return known | {
         "EKF2_EVP_NOISE": mistakes.ekf2_noise_m or source_sigma_m,
         "EKF2_EVP_GATE": mistakes.ekf2_gate,
