@@ -77,7 +77,7 @@ def plain_replay(inputs: Inputs, stretch: Stretch, events: Events) -> tuple[np.n
             innovations.append(position[:2] - x[6:8])
             variances.append([P[6, 6] + R, P[7, 7] + R])
         for i, value, target in (
-            (2, stretch.attitude_error_rad[end, 2], stretch.heading_variance_rad2[end]),
+            (2, stretch.attitude_error_rad[end, 2], stretch.attitude_variance_rad2[end, 2]),
             (8, stretch.down_m[end], stretch.down_variance_m2[end]),
         ):
             if P[i, i] > target:

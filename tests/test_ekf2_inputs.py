@@ -327,7 +327,7 @@ def test_a_stretch_of_a_vehicle_that_turns() -> None:
     expected = np.arange(1.0, 16.0)
     expected[DELAYED_VARIANCE_COLUMNS.index("attitude_down_rad2")] = 10.5
     np.testing.assert_allclose(found.variance, expected)
-    np.testing.assert_allclose(found.heading_variance_rad2, steps)
+    np.testing.assert_allclose(found.attitude_variance_rad2[:, 2], steps)
     np.testing.assert_allclose(found.down_m, steps)
     np.testing.assert_allclose(
         found.attitude_error_rad[:, 2], 0.05 + 0.1 * (steps - 10.5), atol=1e-6

@@ -257,6 +257,18 @@ def test_a_fix_at_rest_tells_the_velocity_too() -> None:
     assert not np.isfinite(at_rest([0.0] * 5, aid=GNSS_POS).velocity_innovation_m_s).any()
 
 
+def test_what_else_tells_of_the_tilt_makes_it_surer_and_leaves_it() -> None:
+    """Down to the logged variance, as a measurement of it would, and only with GNSS."""
+    fixes = [0.0] * 20
+    free, told = (on_gnss(fixes, fixes, tilt_rad2=tilt) for tilt in (np.inf, 2.5e-5))
+    np.testing.assert_allclose(told.variance[1:, 0, :2], 2.5e-5, rtol=0.02)
+    assert (free.variance[1:, 0, :2] > 5e-5).all()
+    np.testing.assert_allclose(told.state, free.state, atol=1e-9)
+    assert (told.variance[-1, 0, 3:5] < free.variance[-1, 0, 3:5]).all()
+    vision, with_tilt = (at_rest(fixes, tilt_rad2=tilt) for tilt in (np.inf, 2.5e-5))
+    np.testing.assert_array_equal(vision.variance, with_tilt.variance)
+
+
 @pytest.mark.parametrize(("speed_m_s", "moves"), [(1.0, True), (3.0, False)])
 def test_a_velocity_beyond_its_gate_moves_nothing(speed_m_s: float, moves: bool) -> None:
     """Five times √(P + 0.09) is 1.5 m/s; the fix's position is fused all the same."""
@@ -280,7 +292,8 @@ def test_a_reset_to_a_fix_takes_its_velocity_too() -> None:
 
 def at_rest(
     measured_m: list[float], logged: float = np.nan, down_m: float = 0.0, aid: Aid = EV_POS,
-    rules: Rules = RULES, speed_m_s: Any = None, velocity: bool = True, **settings: float,
+    rules: Rules = RULES, speed_m_s: Any = None, velocity: bool = True,
+    tilt_rad2: float = np.inf, **settings: float,
 ) -> Run:  # fmt: skip
     """A level vehicle that stands still at the origin, seen at 10 Hz at these places north.
 
@@ -293,7 +306,8 @@ def at_rest(
         rotation=np.tile(np.eye(3), (count + 1, 1, 1)), correction_rad=flat,
         force_m_s2=flat - GRAVITY_M_S2,
         accelerometer_bias_m_s2=np.zeros(3), state=np.zeros(15), variance=np.full(15, 1e-4),
-        down_m=np.full(count + 1, down_m), heading_variance_rad2=np.full(count + 1, 1e-4),
+        down_m=np.full(count + 1, down_m),
+        attitude_variance_rad2=np.tile([tilt_rad2, tilt_rad2, 1e-4], (count + 1, 1)),
         down_variance_m2=np.full(count + 1, 4e-4), attitude_error_rad=np.zeros((count + 1, 3)),
         correlation=np.eye(15),
     )  # fmt: skip

@@ -302,11 +302,11 @@ def test_ekf2_on_gnss_is_replayed(models: dict[str, Model]) -> None:
         assert agreement.ev_pos == {}
         for axis in agreement.gnss_pos.values():
             assert axis.innovation_correlation > 0.998
-            assert axis.s_ratio_median == pytest.approx(1.0, abs=0.004)
+            assert axis.s_ratio_median == pytest.approx(1.0, abs=0.0015)
             assert axis.position_rms_difference_m < 0.03
         for axis in agreement.gnss_vel.values():
             assert axis.innovation_correlation > 0.998
-            assert axis.s_ratio_median == pytest.approx(1.0, abs=0.011)
+            assert axis.s_ratio_median == pytest.approx(1.0, abs=0.006)
         assert agreement.rejected_share_replayed == agreement.rejected_share_logged == 0.0
     for axis in models["fullrate"].agreement.gnss_pos.values():
         assert axis.innovation_correlation > 0.9995
@@ -314,7 +314,7 @@ def test_ekf2_on_gnss_is_replayed(models: dict[str, Model]) -> None:
     rejecting = models["overconfident"].agreement
     assert rejecting.good
     assert rejecting.rejected_share_replayed == pytest.approx(
-        rejecting.rejected_share_logged, abs=0.05
+        rejecting.rejected_share_logged, abs=0.03
     )
 
 

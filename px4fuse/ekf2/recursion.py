@@ -178,9 +178,8 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     velocity_gate2 = (np.maximum(knob.get(GNSS_VEL.gate, one := np.ones(size)), one) ** 2)[:, None]
     # height and heading are measured by EKF2's own
     own = np.stack([stretch.attitude_error_rad[end, HEADING], stretch.down_m[end]], axis=-1)
-    own_variance = np.stack(
-        [stretch.heading_variance_rad2[end], stretch.down_variance_m2[end]], axis=-1
-    )
+    own_attitude = stretch.attitude_variance_rad2[end]
+    own_variance = np.stack([own_attitude[:, :, HEADING], stretch.down_variance_m2[end]], axis=-1)
     heading = np.where(attitude, own[:, :, 0], 0.0)
     gate2 = (np.maximum(knob[inputs.aid.gate], MIN_GATE) ** 2)[:, None]
     gyro2 = np.where(attitude, knob["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
@@ -250,6 +249,7 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
             if speed is not None:
                 if restart is not None:
                     taken_v &= ~restart
+                P = _surer(P, own_attitude[e, :, :HEADING])
                 x, P = _in_turn(x, P, nu_v, S_v, speed_noise[e], VELOCITY.start, taken_v)
                 x, P = _in_turn(x, P, nu, S, noise[e, :, :2], NORTH, fused[e])
                 innovation[:, 2:], R[:, 2:] = 0.0, NOT_TAKEN
@@ -287,6 +287,20 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
         noise[:, :, :2], velocity_innovations, velocity_variances, rejected, fused, reset, states,
         spreads, P,
     )  # fmt: skip
+
+
+def _surer(P: Array, target: Array) -> Array:
+    """Bring the variances of the tilt down to the logged ones, and with them all that they bear on.
+
+    The magnetometer tells EKF2 of the tilt too. What it tells is not in the log, so that the tilt
+    itself stays as it is.
+    """
+    for row in range(target.shape[-1]):
+        spread = P[:, row, row]
+        R = _down_to(spread, target[:, row])
+        K = P[:, :, row] / (spread + R)[:, None]
+        P = P - K[:, :, None] * P[:, None, row]
+    return P
 
 
 def _in_turn(

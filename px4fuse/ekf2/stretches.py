@@ -78,7 +78,8 @@ class Stretch:
         At the start, in the same order.
     down_m : ndarray, shape (n + 1,)
         Published height.
-    heading_variance_rad2, down_variance_m2 : ndarray, shape (n + 1,)
+    attitude_variance_rad2 : ndarray, shape (n + 1, 3)
+    down_variance_m2 : ndarray, shape (n + 1,)
         As the log has them.
     attitude_error_rad : ndarray, shape (n + 1, 3)
         Of EKF2's own filter at its horizon, against the nominal attitude.
@@ -97,7 +98,7 @@ class Stretch:
     state: Array
     variance: Array
     down_m: Array
-    heading_variance_rad2: Array
+    attitude_variance_rad2: Array
     down_variance_m2: Array
     attitude_error_rad: Array
     correlation: Array
@@ -201,7 +202,9 @@ def _stretch(
         state=np.concatenate([error[0], start[VELOCITY_COLUMNS], position, np.zeros(6)]),
         variance=np.asarray(start[DELAYED_VARIANCE_COLUMNS]),
         down_m=_at(ekf2.state["down_m"], times),
-        heading_variance_rad2=_at(record.delayed["attitude_down_rad2"], times),
+        attitude_variance_rad2=np.column_stack(
+            [_at(record.delayed[name], times) for name in DELAYED_VARIANCE_COLUMNS[:3]]
+        ),
         down_variance_m2=_at(record.delayed["down_m2"], times),
         attitude_error_rad=np.column_stack([np.interp(times, states, part) for part in error.T]),
         correlation=np.eye(15),

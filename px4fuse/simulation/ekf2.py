@@ -161,7 +161,8 @@ def _stretch(
             state=state,
             variance=variance,
             down_m=motion.at(time).position_m[:, 2] + height.at(time)[0][:, 0],
-            heading_variance_rad2=np.full(len(time), HEADING_SD_RAD**2),
+            # nothing tells of the tilt but the positions
+            attitude_variance_rad2=np.tile([np.inf, np.inf, HEADING_SD_RAD**2], (len(time), 1)),
             down_variance_m2=np.full(len(time), HEIGHT_SD_M**2),
             attitude_error_rad=error,
             correlation=covariance / deviation[:, None] / deviation,

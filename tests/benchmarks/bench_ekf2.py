@@ -76,7 +76,7 @@ def judge_agreement(name: str, model: Model) -> None:
     for axis in agreement.axes.values():
         if OVERCONFIDENT in name:
             off = agreement.rejected_share_replayed - agreement.rejected_share_logged
-            assert abs(off) < (0.05 if gnss else 0.03), name
+            assert abs(off) < 0.03, name
             assert abs(axis.nis_mean_replayed / axis.nis_mean_logged - 1.0) < 0.10, name
             continue
         least = 0.99 if OUTLIERS in name else 0.998 if gnss else 0.995
