@@ -23,7 +23,7 @@ from results_tools import SHIPPED
 import px4fuse
 from px4fuse.cli import cli
 from px4fuse.comparison.model import Comparison, UnjudgedFilter
-from px4fuse.display import Shown
+from px4fuse.display import Shown, as_html
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.heading import HeadingPart, turned
 from px4fuse.fleet.changes import changes
@@ -352,6 +352,23 @@ def test_notebooks_show_text_and_table(results, name):
     assert parser.open == []
     assert {"pre", "table", "td"} <= parser.seen
     assert len(html) < 20_000
+
+
+def test_rows_are_headed_only_by_an_index_that_says_something():
+    table = pd.DataFrame({"a": [1.0]}, index=pd.Index([77], name="time_s"))
+    assert "<th>77</th>" in as_html("", table)
+    assert "77" not in as_html("", table.rename_axis(None))
+
+
+def test_the_truth_is_a_line_and_positions_are_dots(results):
+    style = {
+        re.split("[ :,]", line.get_label())[0]: (line.get_linestyle(), line.get_color())
+        for line in results["Flight"].plot().lines
+    }
+    assert style.pop("truth") == ("-", "black")
+    assert style.pop("EKF2")[0] == "--"
+    assert style
+    assert {dots for dots, _ in style.values()} == {"None"}
 
 
 def test_names_of_files_are_no_markup(results):

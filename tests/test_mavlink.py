@@ -55,7 +55,9 @@ from px4fuse.flight import (
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
     QUATERNION_COLUMNS,
+    ROTATION_VARIANCE_COLUMNS,
     SPECIFIC_FORCE_COLUMNS,
+    STATE_COLUMNS,
     VELOCITY_COLUMNS,
     VELOCITY_VARIANCE_COLUMNS,
     Ekf2,
@@ -68,9 +70,9 @@ from px4fuse.inspect.inventory import take_inventory
 from px4fuse.origin import MOTION_CAPTURE, RECEIVED
 from px4fuse.readers import read_log
 from px4fuse.readers.mavlink_frames import read_frames
+from px4fuse.readers.mavlink_recording import _in_ned
 
 FUZZ_CASES = int(os.environ.get("PX4FUSE_FUZZ_CASES", "300"))
-STATE_COLUMNS = POSITION_COLUMNS + VELOCITY_COLUMNS
 VARIANCE_COLUMNS = POSITION_VARIANCE_COLUMNS + VELOCITY_VARIANCE_COLUMNS
 PAIRS = ("v1.13.3_aisle_hwlogvision", "v1.16.1_aisle_clock_late", "v1.16.1_aisle_clock_nosync")
 
@@ -933,3 +935,21 @@ def test_clocks_that_agree_by_chance_do_no_harm(read):
     flight = read(Aisle(seconds=20.0, clock=same, start_s=0.5, replies=False))
     assert np.isfinite(flight.positions[0].samples.index.to_numpy()).all()
     assert flight.log.boot_time_s == pytest.approx(0.5, abs=0.05)
+
+
+@pytest.mark.parametrize(("frame_id", "kept"), [(1, True), (20, True), (4, False), (21, False)])
+def test_an_orientation_is_believed_only_where_the_frame_is_ned_or_frd(
+    frame_id: int, kept: bool
+) -> None:
+    """What a sender of ENU or FLU calls its body is not known."""
+    columns = [
+        *STATE_COLUMNS, *POSITION_VARIANCE_COLUMNS, *VELOCITY_VARIANCE_COLUMNS, *QUATERNION_COLUMNS,
+        *ROTATION_VARIANCE_COLUMNS,
+    ]  # fmt: skip
+    samples = pd.DataFrame(0.5, index=[1.0, 2.0], columns=columns)
+    samples["frame_id"] = samples["child_frame_id"] = frame_id
+    made = _in_ned(samples)
+    assert np.isfinite(made[POSITION_VARIANCE_COLUMNS]).all(axis=None)
+    orientation = made[QUATERNION_COLUMNS + ROTATION_VARIANCE_COLUMNS].to_numpy()
+    assert np.isfinite(orientation).all() == kept
+    assert np.isfinite(orientation).any() == kept
