@@ -24,6 +24,7 @@ from px4fuse.ekf2.whatif import WhatIf, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.findings import find, variance
 from px4fuse.flight import POSITION_COLUMNS, Flight, PositionTrack, Truth, Unavailable
+from px4fuse.inspect.inventory import take_inventory
 from px4fuse.readers import read_log
 from px4fuse.request import ComparisonRequest
 
@@ -419,3 +420,14 @@ def test_a_report_of_gnss_names_no_other_source(tmp_path: Path, shared_logs: Pat
     assert done.exit_code == 0
     assert "EKF2_GPS_DELAY" in done.output
     assert not [word for word in OF_OTHERS if word in done.output]
+
+
+def test_info_speaks_of_the_innovations_of_gnss(tmp_path: Path) -> None:
+    inventory = take_inventory(flight_of(outdoors(), tmp_path))
+    can = {ability.name: ability for ability in inventory.abilities}
+    assert can["EKF2 innovations"].possible
+    innovations = next(one for one in inventory.sources if one.part == "innovations")
+    assert innovations.topics == ("estimator_aid_src_gnss_pos",)
+    said = " ".join(advice.remedy for advice in inventory.advice)
+    assert "EKF2_EV" not in said
+    assert "vision" not in said

@@ -174,9 +174,9 @@ def test_a_log_of_other_topics_is_described_all_the_same(tmp_path):
 @pytest.mark.parametrize(
     ("topic_", "part", "lost"),
     [
-        ("sensor_combined", "IMU", {"acceleration"}),
+        ("sensor_combined", "IMU", {"acceleration", "what if"}),
         ("vehicle_local_position", "EKF2 state",
-         {"EKF2 states", "EKF2 variances", "EKF2 innovations", "aids"}),
+         {"EKF2 states", "EKF2 variances", "EKF2 innovations", "aids", "what if"}),
     ],
 )  # fmt: skip
 def test_what_a_topic_is_needed_for(tmp_path, topic_, part, lost):
@@ -403,7 +403,7 @@ def test_every_recording_is_described_or_refused_in_one_line(shared_logs, monkey
         assert code in (0, 2), path.name
         assert len(err.splitlines()) == code // 2, path.name
         if code == 0:
-            assert len(strict(out)["abilities"]) == 7, path.name
+            assert len(strict(out)["abilities"]) == 8, path.name
 
 
 @pytest.mark.reallogs
@@ -418,7 +418,7 @@ def test_every_log_is_described_or_refused_in_one_line(shared_logs, monkeypatch,
         assert widest(out) <= WIDTH, path.name
         inventory = take_inventory(flight)
         strict(json.dumps(to_plain(inventory)))
-        assert len(inventory.abilities) == 7, path.name
+        assert len(inventory.abilities) == 8, path.name
         assert all(a.reason for a in inventory.abilities), path.name
         try:
             choose_source(flight)

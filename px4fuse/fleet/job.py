@@ -139,7 +139,8 @@ def _compared(job: Job, path: Path, sha256: str) -> Outcome:
         analysis, command = run_or_judge_aids(request, flight=flight), command_line(request)
         if isinstance(analysis, AidsAlone):
             known |= what_was_found(find_aids(analysis.aids), analysis.aids)
-            raise MissingDataError(analysis.lacking.reason, analysis.lacking.remedy)
+            lacking = MissingDataError(analysis.lacking.reason, analysis.lacking.remedy)
+            return Outcome((known | refused(lacking, NOT_JUDGED, path.name),))
         findings = find(analysis)
         found = results(request, analysis, findings, Student(), command)
         text, report = to_json(found), b""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any
 
@@ -13,6 +13,7 @@ import pandas as pd
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.aids import judge_aids
+from px4fuse.ekf2.inputs import prepare
 from px4fuse.errors import MissingDataError, Px4FuseError
 from px4fuse.filter.signals import IMU_GAP_INTERVALS, IMU_GAP_S, Segment, ned_acceleration, within
 from px4fuse.findings import ekf2_not_fusing, imu, missing, named, recording
@@ -197,6 +198,8 @@ def take_inventory(flight: Flight) -> Inventory:
         remedy = with_options(error.remedy)
         if not isinstance(error, MissingDataError):
             remedy = "Record more of the flight: the logger from arming on (SDLOG_MODE 0)."
+    if compared is not None and compared.source.origin.is_gnss:
+        flight = _on_gnss(flight, compared)
     log = flight.log
     cut = log.ends_in_flight and not log.damage
     return Inventory(
@@ -220,6 +223,14 @@ def take_inventory(flight: Flight) -> Inventory:
             *(flight.ekf2.notes if isinstance(flight.ekf2, Ekf2) else ()),
         ),
     )
+
+
+def _on_gnss(flight: Flight, compared: Comparison) -> Flight:
+    """The flight with EKF2's innovations of GNSS in place of those of external vision."""
+    ekf2, streams = compared.flight.ekf2, dict(flight.streams)
+    if isinstance(ekf2, Ekf2) and (of_state := streams.get("ekf2_state")) and ekf2.aids:
+        streams["ekf2_innovations"] = replace(of_state, topics=ekf2.innovation_topics)
+    return replace(flight, ekf2=ekf2, missing=compared.missing, streams=streams)
 
 
 def to_plain(inventory: Inventory) -> dict[str, Any]:
@@ -336,6 +347,13 @@ def _abilities(flight: Flight, compared: Comparison | None, reason: str) -> Iter
     elif isinstance(ekf2, Ekf2):
         rates = [f"{a.label} {sample_rate(ekf2.aids[n].samples):.2g} Hz" for n, a in aids.items()]
         yield Ability("aids", True, f"each judged by its own innovations: {', '.join(rates)}")
+    inputs = prepare(flight)
+    if isinstance(inputs, Unavailable):
+        yield Ability("what if", False, inputs.reason)
+    else:
+        replayed_s = sum(float(np.ptp(stretch.time_s)) for stretch in inputs.stretches)
+        said = f"EKF2 replayed on {inputs.aid.label} for {replayed_s:.0f} s, also otherwise set"
+        yield Ability("what if", True, said)
 
 
 def _done(compared: Comparison) -> dict[str, str | Unavailable]:
