@@ -16,7 +16,7 @@ from cli_tools import contents, run, run_main
 from click.testing import Result
 from conftest import REPOSITORY as ROOT
 
-from px4fuse.cli import COMMANDS
+from px4fuse.cli import COMMANDS, _flushed
 from px4fuse.results.contract import schema
 
 pytestmark = pytest.mark.usefixtures("analysed_once")
@@ -315,3 +315,16 @@ def test_no_file_is_opened_in_the_encoding_of_the_machine(
     command = [sys.executable, "-X", "warn_default_encoding", "-c", script]
     done = subprocess.run(command, capture_output=True, cwd=tmp_path, env=environment, check=False)
     assert done.returncode == 0, done.stderr.decode("cp1252")[-300:]
+
+
+@pytest.mark.parametrize(("code", "ends_with", "said"), [(0, 2, True), (1, 1, False)])
+def test_a_last_flush_that_fails_is_said_once(monkeypatch, capsys, code, ends_with, said):
+    class Full:
+        def flush(self):
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("px4fuse.cli._abandon_output", lambda: None)
+    monkeypatch.setattr("px4fuse.cli.sys.stdout", Full())
+    assert _flushed(code) == ends_with
+    err = capsys.readouterr().err
+    assert ("standard output: cannot be written (No space left on device)." in err) is said
