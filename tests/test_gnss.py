@@ -9,21 +9,32 @@ from typing import Any
 
 import findings_tools
 import numpy as np
+import pandas as pd
 import pytest
 from cli_tools import run
 from exchange import replace
 from findings_tools import analysis as stand_in
+from findings_tools import made
 from ulog_tools import Log, gnss_log, make_log, position, seconds_of, stamps, topic
 
 import px4fuse
 from px4fuse.analysis import run_preparation
 from px4fuse.comparison.preparation import choose_source, prepare
+from px4fuse.ekf2.inputs import Received, _rules, read_gnss
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.walk import ATTITUDE, GATE, NOISE, SPEED, STAMPS, Why
 from px4fuse.ekf2.whatif import WhatIf, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.findings import find, variance
-from px4fuse.flight import POSITION_COLUMNS, Flight, PositionTrack, Truth, Unavailable
+from px4fuse.flight import (
+    POSITION_COLUMNS,
+    Ekf2,
+    Flight,
+    FusionRecord,
+    PositionTrack,
+    Truth,
+    Unavailable,
+)
 from px4fuse.inspect.inventory import take_inventory
 from px4fuse.readers import read_log
 from px4fuse.request import ComparisonRequest
@@ -431,3 +442,62 @@ def test_info_speaks_of_the_innovations_of_gnss(tmp_path: Path) -> None:
     said = " ".join(advice.remedy for advice in inventory.advice)
     assert "EKF2_EV" not in said
     assert "vision" not in said
+
+
+def with_velocity(log: Log) -> Log:
+    fixes = log["vehicle_gps_position"]
+    for name, value in (("vel_n_m_s", 1.0), ("vel_e_m_s", 2.0), ("vel_d_m_s", 3.0),
+                        ("s_variance_m_s", 0.2)):  # fmt: skip
+        fixes[name] = np.full(len(fixes["timestamp"]), value, np.float32)
+    return log
+
+
+@pytest.mark.parametrize(
+    ("parameters", "fused"),
+    [({}, True), ({"EKF2_GPS_CTRL": 7.0}, True), ({"EKF2_GPS_CTRL": 3.0}, False),
+     ({"EKF2_AID_MASK": 1.0}, True)],
+)  # fmt: skip
+def test_what_ekf2_received_of_gnss(
+    parameters: dict[str, float], fused: bool, tmp_path: Path
+) -> None:
+    """Stamps and accuracies as EKF2 has them; no fix is worse than without aiding."""
+    flight = flight_of(with_velocity(outdoors(eph_m=12.0)), tmp_path)
+    assert isinstance(flight.ekf2, Ekf2)
+    record = made(FusionRecord, parameters=parameters)
+    found = read_gnss(flight, flight.ekf2, record)
+    assert isinstance(found, Received)
+    samples = track_of(flight).samples
+    np.testing.assert_allclose(found.stamp_s, samples.index + 0.11)
+    np.testing.assert_allclose(found.arrival_s, found.stamp_s)
+    np.testing.assert_allclose(found.variance_m2[:, :2], 100.0)
+    assert not found.own_times
+    assert (found.velocity_m_s is not None) is fused
+    if found.velocity_m_s is not None and found.velocity_variance_m2_s2 is not None:
+        np.testing.assert_allclose(found.velocity_m_s[0], [1.0, 2.0, 3.0])
+        np.testing.assert_allclose(found.velocity_variance_m2_s2, 0.04, rtol=1e-6)
+
+
+def test_fixes_without_a_velocity_and_those_with_a_time_of_their_own(tmp_path: Path) -> None:
+    record = made(FusionRecord, parameters={"EKF2_GPS_DELAY": 110.0, "EKF2_GPS_MODE": 0.0})
+    flight = flight_of(outdoors(own_s=0.09, EKF2_GPS_MODE=0.0), tmp_path)
+    assert isinstance(flight.ekf2, Ekf2)
+    found = read_gnss(flight, flight.ekf2, record)
+    assert isinstance(found, Received)
+    assert found.own_times
+    assert found.velocity_m_s is None
+    # the stamp is made up, so that the delay leads to the driver's own time
+    np.testing.assert_allclose(found.stamp_s - 0.11, track_of(flight).samples.index)
+
+
+@pytest.mark.parametrize(
+    ("north_m", "parameters", "scale", "with_velocity"),
+    [(0.0, {}, 1.0, True), (np.nan, {}, 2.0, True), (np.nan, {"EKF2_GPS_MODE": 0.0}, 2.0, False)],
+)  # fmt: skip
+def test_resets_to_gnss_by_release(
+    north_m: float, parameters: dict[str, float], scale: float, with_velocity: bool
+) -> None:
+    delayed = pd.DataFrame({"north_m": [north_m]})
+    record = made(FusionRecord, parameters=parameters, per_step_biases=False, delayed=delayed)
+    rules = _rules(record, 0.01, gnss=True)
+    assert (rules.reset_scale, rules.with_velocity) == (scale, with_velocity)
+    assert (rules.reset_s, rules.stop_s) == (7.0, np.inf)

@@ -47,8 +47,8 @@ COPY_INTERVAL_S = {"estimator_visual_odometry_aligned": 0.2, "estimator_aid_src_
 ROTATE_VISION_BIT = 64  # EKF2_AID_MASK, up to v1.13
 # The aid-source topics carry the time of measurement, as EKF2 takes it, to about a millisecond
 SAME_SAMPLE_S = 0.006
-# What a log calls the aiding by GNSS
 GNSS_VELOCITY_BIT = 4  # of EKF2_GPS_CTRL; before v1.14 both are always fused
+# What a log calls the aiding by GNSS
 OF_GNSS = ("GPS", "GPS position", "GPS velocity")
 # vehicle_local_position is logged every 0.1 s
 RESET_SHOWS_S = 0.2
@@ -198,13 +198,13 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
             return Unavailable(WHAT, each.reason, each.remedy)
     assert isinstance(record, FusionRecord)
     if others := [one for one in record.other_aiding if not (gnss and one in OF_GNSS)]:
-        fused = "GNSS" if gnss else "vision position"
-        switch = EV_POS.switch if gnss else GNSS_POS.switch
-        return Unavailable(
-            WHAT,
-            f"EKF2 fused more than {fused} horizontally ({', '.join(others)})",
-            f"Fly with {switch} 0, EKF2_OF_CTRL 0 and without bit 2 of {EV_POS.switch}.",
-        )
+        fused, remedy = "GNSS", "Fly with EKF2_OF_CTRL 0."
+        if not gnss:
+            fused = "vision position"
+            remedy = f"Fly with {GNSS_POS.switch} 0, EKF2_OF_CTRL 0 and without bit 2 of "
+            remedy += f"{EV_POS.switch}."
+        said = f"EKF2 fused more than {fused} horizontally ({', '.join(others)})"
+        return Unavailable(WHAT, said, remedy)
     interval = float(np.median(np.diff(imu.index.to_numpy())))
     if interval > MAX_IMU_INTERVAL_S:
         return Unavailable(
@@ -227,27 +227,12 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
             "without a gap in it or the IMU",
             "Record without dropouts (a faster SD card, fewer topics), with steady positions.",
         )
-    floor = 5e-8 / ekf2.step_s**2 if record.per_step_biases else None
-    # EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h
-    old = gnss or fuses_by_mask(record.parameters)
-    limits = (np.inf, 7.0, 7.0, NO_LIMIT) if old else (0.2, 0.4, 1.0, 5)
-    rules = Rules(*limits, floor, "EKF2_DELAY_MAX" not in record.parameters)
-    if gnss:
-        # resetHorizontalPositionTo, gps_control.cpp: from v1.16, which keeps latitude and
-        # longitude, on with twice the variance; since main of 2026 each aid by itself
-        latitude = not np.isfinite(record.delayed["north_m"]).any()
-        rules = replace(
-            rules,
-            stop_s=np.inf,
-            reset_scale=2.0 if latitude else 1.0,
-            with_velocity=GNSS_MODE not in record.parameters,
-        )
     fusing = ekf2.fusing
     return Inputs(
         settings=settings_in_force(record.parameters, aid),
         stretches=stretches,
         received=read,
-        rules=rules,
+        rules=_rules(record, ekf2.step_s, gnss=gnss),
         step_s=ekf2.step_s,
         horizon_s=horizon_s,
         predict_s=predict_s(record),
@@ -256,6 +241,26 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
         and bool(fusing["vertical"].mean() > 0.5),
         imu_offset_m=np.array([record.parameters.get(f"EKF2_IMU_POS_{x}", 0.0) for x in "XYZ"]),
         aid=aid,
+    )
+
+
+def _rules(record: FusionRecord, step_s: float, *, gnss: bool) -> Rules:
+    """What decides on starts, stops and resets, by the release's own parameters."""
+    floor = 5e-8 / step_s**2 if record.per_step_biases else None
+    # EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h
+    old = gnss or fuses_by_mask(record.parameters)
+    limits = (np.inf, 7.0, 7.0, NO_LIMIT) if old else (0.2, 0.4, 1.0, 5)
+    rules = Rules(*limits, floor, "EKF2_DELAY_MAX" not in record.parameters)
+    if not gnss:
+        return rules
+    # resetHorizontalPositionTo, gps_control.cpp: from v1.16 on, which keeps latitude and longitude,
+    # with twice the variance; since main of 2026 each aid by itself
+    latitude = not np.isfinite(record.delayed["north_m"]).any()
+    return replace(
+        rules,
+        stop_s=np.inf,
+        reset_scale=2.0 if latitude else 1.0,
+        with_velocity=GNSS_MODE not in record.parameters,
     )
 
 
@@ -294,11 +299,13 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> Received | Un
         track.name,
         own_times=track.age_s == 0.0 != flown_s,
     )
-    if not fuses_by_mask(parameters) and not switch & GNSS_VELOCITY_BIT:
+    velocity = track.velocity[VELOCITY_COLUMNS].to_numpy()
+    fused = fuses_by_mask(parameters) or switch & GNSS_VELOCITY_BIT
+    if not fused or not np.isfinite(velocity).all():
         return found
     return replace(
         found,
-        velocity_m_s=track.velocity[VELOCITY_COLUMNS].to_numpy(),
+        velocity_m_s=velocity,
         velocity_variance_m2_s2=track.velocity[VELOCITY_VARIANCE_COLUMNS].fillna(0.0).to_numpy(),
     )
 

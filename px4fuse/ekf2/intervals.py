@@ -1,4 +1,4 @@
-"""Intervals between vision samples: how state and variance go from one to the next, made once.
+"""Intervals between position samples: how state and variance go from one to the next, made once.
 
 Attitude and biases of what-if replays hardly differ from those of the log, so that transition and
 noise of an interval, taken about the nominal attitude, serve every setting. All intervals are made
@@ -48,7 +48,7 @@ Events = np.recarray[Any, Any]
 EVENT = np.dtype(
     [
         ("end", np.intp),  # step after which it is
-        ("sample", np.intp),  # its vision sample, -1 where there is none
+        ("sample", np.intp),  # its position sample, -1 where there is none
         ("action", np.intp),  # IDLE, FUSE or START
         ("usable", bool),  # has a sample that is on time, whatever EKF2 does with it
         ("startable", bool),  # fusion may start on it, had it stopped
@@ -86,7 +86,7 @@ class Intervals:
 
 @dataclass(frozen=True)
 class Timing:
-    """What the events depend on: age of vision at its stamp, and horizon (s)."""
+    """What the events depend on: age of a position at its stamp, and horizon (s)."""
 
     delay_s: float
     horizon_s: float
@@ -108,12 +108,12 @@ def make_intervals(inputs: Inputs, stretch: Stretch, timing: Timing) -> Interval
 
 
 def _events(inputs: Inputs, stretch: Stretch, timing: Timing) -> Events:
-    vision, time_s = inputs.received, stretch.time_s
-    first, beyond = np.searchsorted(vision.stamp_s, time_s[[0, -1]])
-    stamp, last = vision.stamp_s[first:beyond], len(time_s) - 1
+    received, time_s = inputs.received, stretch.time_s
+    first, beyond = np.searchsorted(received.stamp_s, time_s[[0, -1]])
+    stamp, last = received.stamp_s[first:beyond], len(time_s) - 1
     taken = stamp - timing.delay_s - 0.5 * inputs.step_s
     # what arrives after the horizon has passed it is fused late, or not at all
-    due = np.maximum(taken, vision.arrival_s[first:beyond] - timing.horizon_s)
+    due = np.maximum(taken, received.arrival_s[first:beyond] - timing.horizon_s)
     end = np.searchsorted(time_s, due - 1e-9)
     inside = (end > 0) & (end <= last)
     end = np.maximum.accumulate(np.minimum(end, last))
@@ -121,7 +121,7 @@ def _events(inputs: Inputs, stretch: Stretch, timing: Timing) -> Events:
     usable = inside & in_time
     usable[:-1] &= end[1:] > end[:-1]  # of two samples in one step the newer one is fused
     action, startable = _actions(inputs, stretch, taken, end, usable)
-    # further events where vision is silent, as many for every delay
+    # further events where the source is silent, as many for every delay
     silence = np.diff(np.concatenate([time_s[:1], stamp, time_s[-1:]]))
     more = np.maximum(np.ceil(silence / inputs.max_interval_s).astype(int) - 1, 0)
     place, total = np.cumsum(more[:-1] + 1) - 1, len(stamp) + int(more.sum())

@@ -38,8 +38,8 @@ from px4fuse.trajectory.rotation import (
     to_vector,
 )
 
-# Without vision or IMU for longer than this the model starts again from the log: other things than
-# vision then move EKF2 (gravity, fake position, zero velocity), which the model does not have
+# Without source or IMU for longer than this the model starts again from the log: other things
+# then move EKF2 (gravity, fake position, zero velocity), which the model does not have
 RESTART_GAP_S = 2.0
 # PX4 limits a prediction step to twice EKF2_PREDICT_US, so that a longer gap is lost motion
 IMU_GAP_S = 0.05
@@ -86,7 +86,7 @@ class Stretch:
     correlation : ndarray, shape (15, 15)
         Of the state at the start; the log has variances only.
     fusing : bool
-        Whether EKF2 fuses vision when it begins.
+        Whether EKF2 fuses the source when it begins.
     """
 
     time_s: Array
@@ -113,9 +113,9 @@ def find_stretches(
     attitude: pd.DataFrame,
     ekf2: Ekf2,
     record: FusionRecord,
-    vision_s: Array,
+    source_s: Array,
 ) -> tuple[Stretch, ...]:
-    """Parts of a flight without gaps in IMU and vision, from when EKF2 has fused for a while.
+    """Parts of a flight without gaps in IMU and positions, from when EKF2 has fused for a while.
 
     Parameters
     ----------
@@ -124,19 +124,19 @@ def find_stretches(
     imu, attitude : DataFrame
     ekf2 : Ekf2
     record : FusionRecord
-    vision_s : ndarray
-        Stamps of external vision.
+    source_s : ndarray
+        Stamps of the positions that EKF2 fused.
     """
     innovations = ekf2.innovations["north"]
     assert isinstance(innovations, pd.DataFrame)
     fused, states = innovations.index.to_numpy(), record.delayed.index.to_numpy()
     time = imu.index.to_numpy()
     cuts = [time[0], time[-1]]
-    for stamps, limit in ((time, IMU_GAP_S), (vision_s, RESTART_GAP_S)):
+    for stamps, limit in ((time, IMU_GAP_S), (source_s, RESTART_GAP_S)):
         gap = np.flatnonzero(np.diff(stamps) > limit)
         cuts += [*stamps[gap], *stamps[gap + 1]]
-    first = max(attitude.index[0], vision_s[0])
-    last = min(attitude.index[-1], vision_s[-1] + 1.0)
+    first = max(attitude.index[0], source_s[0])
+    last = min(attitude.index[-1], source_s[-1] + 1.0)
     airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
     found = []
     for low, high in pairwise(np.unique(np.clip(cuts, first, last))):

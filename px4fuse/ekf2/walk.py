@@ -206,7 +206,7 @@ def walk(
         return Unavailable(
             WHAT,
             "the student's filter and the replay have no time in common",
-            "Analyse the part of the flight in which EKF2 fused vision (--start, --end).",
+            "Analyse the part of the flight in which EKF2 fused the source (--start, --end).",
         )
     span = float(times[0]), float(times[-1])
     parts = ((max(start, span[0]), min(end, span[1])) for start, end in judged)
