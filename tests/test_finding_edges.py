@@ -32,6 +32,7 @@ from findings_tools import (
 
 from px4fuse.comparison import remedy as remedies
 from px4fuse.ekf2.model import Model
+from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
 from px4fuse.filter.heading import HeadingError, HeadingPart
 from px4fuse.filter.heading import turned as together
 from px4fuse.filter.signals import Segment
@@ -243,7 +244,7 @@ def test_what_ends_rejections_is_tried_in_order(
     monkeypatch.setattr(remedies, "effect_words", lambda before, _: f"effect on {before}")
     monkeypatch.setattr(remedies, "rejects_less", lambda _, after: [*after.changed] == [ends])
     flown = {"EKF2_EVP_NOISE": 0.1, "EKF2_EV_DELAY": 0.0, "EKF2_EVP_GATE": 5.0}
-    model = made(Model, inputs=SimpleNamespace(settings=flown))
+    model = made(Model, inputs=SimpleNamespace(settings=flown, aid=EV_POS))
     frame = axis("north", ekf2_innovations=rejected(5, 10))
     one = analysis(ekf2={"gate": 5.0}, axes=(frame,), ekf2_model=model)
     remedy = only(ekf2_rejecting.detect, one).remedy
@@ -252,6 +253,20 @@ def test_what_ends_rejections_is_tried_in_order(
     assert said in remedy
     assert [list(changes) for changes in seen] == tried
     assert seen[-1] == {"EKF2_EVP_GATE": 10.0}
+
+
+def test_a_wider_gate_is_that_of_what_ekf2_fused(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = SimpleNamespace(changed={"EKF2_GPS_P_GATE": 10.0}, position_rmse_to_truth_m=0.1)
+    found = SimpleNamespace(replayed="flown", whatif=[tried])
+    monkeypatch.setattr(remedies, "asked_of_ekf2", lambda *_: {})
+    monkeypatch.setattr(ekf2_rejecting, "what_if", lambda *_: found)
+    monkeypatch.setattr(remedies, "effect_words", lambda *_: "effect")
+    monkeypatch.setattr(remedies, "rejects_less", lambda *_: True)
+    inputs = SimpleNamespace(settings={"EKF2_GPS_P_GATE": 5.0}, aid=GNSS_POS)
+    frame = axis("north", ekf2_innovations=rejected(5, 10))
+    one = analysis(ekf2={"gate": 5.0}, axes=(frame,), ekf2_model=made(Model, inputs=inputs))
+    remedy = only(ekf2_rejecting.detect, one).remedy
+    assert remedy.endswith("Widen EKF2_GPS_P_GATE; at 10: effect.")
 
 
 # ---------------------------------------------------------------- errors and truth

@@ -221,7 +221,7 @@ def with_clock(found: ClockOffset | Unavailable, applied_s: float, delay_ms: flo
         flight=SimpleNamespace(
             log=SimpleNamespace(name="x.ulg", parameters={"EKF2_EV_DELAY": delay_ms})
         ),
-        source=SimpleNamespace(origin=RECEIVED),
+        source=SimpleNamespace(origin=RECEIVED, age_s=0.0),
     )
     return Document(analysis, (), Student(), "")  # type: ignore[arg-type]
 

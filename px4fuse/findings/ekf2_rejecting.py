@@ -109,5 +109,5 @@ def _remedy(analysis: Analysis) -> str:
     if isinstance(wider.position_rmse_to_truth_m, Unavailable):
         return said
     helps = remedy.rejects_less(before, wider)
-    verdict = "Widen EKF2_EVP_GATE" if helps else "A wider EKF2_EVP_GATE is no remedy"
+    verdict = f"Widen {aid.gate}" if helps else f"A wider {aid.gate} is no remedy"
     return f"{said} {verdict}; at {gate:g}: {remedy.effect_words(before, wider)}."
