@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import findings_tools
@@ -14,7 +15,7 @@ import pytest
 from cli_tools import run
 from exchange import replace
 from findings_tools import analysis as stand_in
-from findings_tools import made
+from findings_tools import late, made
 from ulog_tools import Log, gnss_log, make_log, position, seconds_of, stamps, topic
 
 import px4fuse
@@ -36,7 +37,9 @@ from px4fuse.flight import (
     Unavailable,
 )
 from px4fuse.inspect.inventory import take_inventory
+from px4fuse.origin import GNSS
 from px4fuse.readers import read_log
+from px4fuse.report.clock import clock_advice
 from px4fuse.request import ComparisonRequest
 
 EARTH_M = 6_371_000.0
@@ -501,3 +504,24 @@ def test_resets_to_gnss_by_release(
     rules = _rules(record, 0.01, gnss=True)
     assert (rules.reset_scale, rules.with_velocity) == (scale, with_velocity)
     assert (rules.reset_s, rules.stop_s) == (7.0, np.inf)
+
+
+@pytest.mark.parametrize(
+    ("delay_ms", "age_s", "remaining_s", "said"),
+    [
+        (110.0, 0.11, 0.0, "EKF2_GPS_DELAY 110 ms fits"),
+        (0.0, 0.0, -0.15, "EKF2_GPS_DELAY is 0 ms, the data ask for 150 ms (130 to 160)"),
+        (200.0, 0.2, 0.15, "EKF2_GPS_DELAY is 200 ms, the data ask for 50 ms (30 to 60)"),
+        (110.0, 0.0, -0.15, None),  # EKF2 takes the driver's own times
+    ],
+)
+def test_the_clock_speaks_of_ekf2s_delay_of_gnss(
+    delay_ms: float, age_s: float, remaining_s: float, said: str | None
+) -> None:
+    source = SimpleNamespace(origin=GNSS, age_s=age_s, alignment=None)
+    log = SimpleNamespace(name="x.ulg", parameters={"EKF2_GPS_DELAY": delay_ms})
+    comparison = SimpleNamespace(source=source, flight=SimpleNamespace(log=log))
+    clock = late(remaining_s, drift_ppm=None, drift_sigma_ppm=None)
+    advice = clock_advice(comparison, clock).get("PX4")  # type: ignore[arg-type]
+    assert (advice or "").startswith(said or "")
+    assert (advice is None) is (said is None)
