@@ -525,3 +525,14 @@ def test_the_clock_speaks_of_ekf2s_delay_of_gnss(
     advice = clock_advice(comparison, clock).get("PX4")  # type: ignore[arg-type]
     assert (advice or "").startswith(said or "")
     assert (advice is None) is (said is None)
+
+
+def test_a_damaged_fix_takes_its_velocity_with_it(tmp_path: Path) -> None:
+    """Also where another fix was published in the same microsecond."""
+    log = with_velocity(outdoors(own_s=0.0))
+    fixes = log["vehicle_gps_position"]
+    fixes["timestamp"][20] = fixes["timestamp"][21]
+    fixes["altitude_msl_m"][20] = 1e30
+    track = track_of(flight_of(log, tmp_path))
+    assert track.velocity is not None
+    assert track.velocity.index.equals(track.samples.index)

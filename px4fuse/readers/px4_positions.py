@@ -326,7 +326,9 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
         # EKF2 takes the horizontal accuracy for each axis (gps_control.cpp)
         samples["north_m2"] = samples["east_m2"] = gps["eph_m"].to_numpy() ** 2
         samples["down_m2"] = gps["epv_m"].to_numpy() ** 2
-    velocity = _velocity(gps).set_axis(samples.index)
+    # together, so that a damaged fix takes its velocity with it
+    samples = samples.assign(**_velocity(gps).set_axis(samples.index))
+    samples = finite_rows(samples, POSITION_COLUMNS)
     found = _track(topics, GPS_POSITION, "GNSS position", samples, (layout.topic,), clock=clock)
     if isinstance(found, Unavailable):
         return found
@@ -344,7 +346,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     return replace(
         found,
         origin=structs.replace(found.origin, automatic=fuses_gnss(ekf2)),
-        velocity=velocity[velocity.index.isin(found.samples.index)],
+        velocity=samples[VELOCITY_COLUMNS + VELOCITY_VARIANCE_COLUMNS],
         age_s=delay_ms * 1e-3,
         notes=found.notes + notes,
     )
