@@ -24,6 +24,7 @@ from px4fuse.comparison.estimates import (
     size,
     turned_frame,
 )
+from px4fuse.comparison.interventions import Intervention, interventions
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import Choices, no_source, prepare
 from px4fuse.comparison.remedy import asked_of_ekf2
@@ -94,6 +95,11 @@ class Analysis(Comparison):
         """EKF2 replayed as flown, with its agreement with the log."""
         model = self.ekf2_model
         return model if isinstance(model, Unavailable) else model.flown
+
+    @cached_property
+    def causes(self) -> tuple[Intervention, ...]:
+        """What was changed, each by itself, and what that explains of each discrepancy."""
+        return interventions(self, self.tuning, self.clock, self.heading, self.ekf2_model)
 
     @cached_property
     def explained(self) -> Explained | Unavailable:

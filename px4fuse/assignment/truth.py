@@ -13,6 +13,7 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import noises_and_clock
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
 from px4fuse.filter.clock import ClockOffset
+from px4fuse.filter.consistency import SIGMA_OFF
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.model import COVARIANCES, matrix, noise, transition
 from px4fuse.filter.settings import Settings
@@ -26,8 +27,6 @@ from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
 TOLERANCE = 0.15
 # What a closure error tells of where it landed
 LANDED_WITHIN_M = 0.3
-# From this factor in variance on a verdict cannot be mistaken
-CLEAR = 1.5
 # EKF2 has rejected samples from this share on
 REJECTED = 0.005
 # A reset of position that is seen, after EKF2 has found its first position
@@ -70,7 +69,7 @@ class Wrong(Record, frozen=True):
 
 
 class VerdictTruth(Record, frozen=True):
-    """What the report says of a filter's innovation variance, with the factor; "" for nothing."""
+    """What the report says of a filter's innovation variance, and its factor in σ; or ""."""
 
     verdict: str
     factor: float | None = None
@@ -78,7 +77,7 @@ class VerdictTruth(Record, frozen=True):
     @property
     def clear(self) -> bool:
         """Whether nobody can take it for another."""
-        return self.factor is None or self.factor >= CLEAR
+        return self.factor is None or self.factor >= SIGMA_OFF
 
 
 class FormTruth(Record, frozen=True):
@@ -159,7 +158,7 @@ def _verdict(comparison: Comparison, which: FilterName) -> VerdictTruth:
     word = judged.verdict.removeprefix("variance ")
     if word == "consistent":
         return VerdictTruth(word)
-    return VerdictTruth(word, max(judged.variance_factor, 1.0 / judged.variance_factor))
+    return VerdictTruth(word, judged.times_off)
 
 
 def _ekf2_did(

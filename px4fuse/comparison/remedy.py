@@ -76,12 +76,20 @@ def asked_of_ekf2(
     slow = source.origin.may_drift or source.origin.is_gnss
     if noise_m is not None and not (trusted and slow):
         changes |= noise_change(model, noise_m)
-    if isinstance(clock, ClockOffset) and clock.determinable:
-        flown = model.inputs.settings[model.inputs.aid.delay]
-        high, low = (1e3 * (source.age_s - end) for end in clock.interval_s)
-        if not low - UPDATE_MS <= flown <= high + UPDATE_MS:
-            changes |= delay_change(model, 1e3 * (source.age_s - clock.offset_s))
-    return changes
+    return changes | delay_asked(comparison, model, clock)
+
+
+def delay_asked(
+    comparison: Comparison, model: Model, clock: ClockOffset | Unavailable
+) -> dict[str, float]:
+    """EKF2's delay as the data ask for it; empty where they do not tell, or it is as flown."""
+    if isinstance(clock, Unavailable) or not clock.determinable:
+        return {}
+    age_s, flown = comparison.source.age_s, model.inputs.settings[model.inputs.aid.delay]
+    high, low = (1e3 * (age_s - end) for end in clock.interval_s)
+    if low - UPDATE_MS <= flown <= high + UPDATE_MS:
+        return {}
+    return delay_change(model, 1e3 * (age_s - clock.offset_s))
 
 
 def aid_of(comparison: Comparison) -> Aid:

@@ -15,7 +15,7 @@ import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.ekf2_parameters import AIDS, Aid
-from px4fuse.filter.consistency import assess, nis_band, verdict_of
+from px4fuse.filter.consistency import SIGMA_OFF, assess, nis_band, verdict_of
 from px4fuse.flight import AidLog, Ekf2, Flight, Unavailable, at_times
 from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
 
@@ -23,8 +23,6 @@ AidVerdict = Literal[
     "consistent", "variance overstated", "variance understated", "biased", "starved", "idle",
     "too few samples",
 ]  # fmt: skip
-# S that is wrong by less than this in σ is called consistent: R is a rule of thumb
-MATTERS = 1.25
 # An aid pulls EKF2 to one side where the mean is half of what the innovations are, root mean
 # square, and a fifth of √S: then averaging does not take it away, and EKF2 follows
 BIASED, FELT = 0.5, 0.2
@@ -283,7 +281,7 @@ def _verdict(axes: dict[str, AidAxis], longest_without: float, fused_s: Array) -
         return "biased"
     nis = _mean_nis(axes)
     said = verdict_of(nis, nis_band(sum(axis.samples for axis in axes.values())))
-    return said if max(nis, 1.0 / nis) > MATTERS**2 else "consistent"
+    return said if max(nis, 1.0 / nis) > SIGMA_OFF**2 else "consistent"
 
 
 def _mean_nis(axes: Mapping[str, AidAxis]) -> float:

@@ -15,11 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 from msgspec import structs
+from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array
 from px4fuse.display import brief
 from px4fuse.ekf2.agreement import REJECTING_SHARE, agreement_with_log, with_obedient
-from px4fuse.ekf2.inputs import Inputs, prepare
+from px4fuse.ekf2.inputs import Inputs, prepare, same_sample
 from px4fuse.ekf2.intervals import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
@@ -110,7 +111,7 @@ def open_model(flight: Flight) -> Model | Unavailable:
 
 
 def replay_settings(
-    model: Model, settings: Sequence[Mapping[str, float]]
+    model: Model, settings: Sequence[Mapping[str, float]], left_out_s: Array | None = None
 ) -> tuple[Ekf2Replay, ...]:
     """Replay with several settings at once, each a change of what was flown.
 
@@ -119,6 +120,8 @@ def replay_settings(
     model : Model
     settings : sequence of mapping
         What each changes, by PX4 name and in PX4's units.
+    left_out_s : ndarray, optional
+        Stamps of samples that are not fused, and not among the updates.
 
     Raises
     ------
@@ -144,10 +147,28 @@ def replay_settings(
             )
     if not changes:
         return ()
-    inputs = model.inputs
-    runs = _run_model(model, [Variant({**inputs.settings, **change}) for change in changes])
-    replays = (_assemble(inputs, runs, at, change) for at, change in enumerate(changes))
-    return tuple(structs.replace(replay, agreement=model.agreement) for replay in replays)
+    inputs, obeys = model.inputs, left_out_s is not None
+    if left_out_s is not None:
+        row = same_sample(inputs.received.stamp_s, left_out_s)
+        rejected = np.full(len(inputs.received.stamp_s), np.nan)
+        rejected[row[row >= 0]] = 1.0
+        never = np.zeros(len(rejected), dtype=bool)
+        inputs = replace(inputs, received=replace(inputs.received, rejected=rejected, reset=never))
+        model = replace(model, inputs=inputs)
+    variants = [Variant({**inputs.settings, **change}, as_logged=obeys) for change in changes]
+    runs = _run_model(model, variants)
+    replays = [_assemble(inputs, runs, at, change) for at, change in enumerate(changes)]
+    if left_out_s is not None:
+        replays = [_without(inputs, each, left_out_s) for each in replays]
+    return tuple(structs.replace(each, agreement=model.agreement) for each in replays)
+
+
+def _without(inputs: Inputs, replay: Ekf2Replay, left_out_s: Array) -> Ekf2Replay:
+    """A replay whose updates are not those of samples that were left out."""
+    age_s = replay.settings[inputs.aid.delay] * 1e-3 + 0.5 * inputs.step_s
+    row = same_sample(replay.updates.index.to_numpy(), left_out_s - age_s)
+    kept = np.delete(np.arange(len(replay.updates)), row[row >= 0])
+    return structs.replace(replay, updates=replay.updates.iloc[kept])
 
 
 def disturbed(model: Model, sigma_m: float, seed: int) -> Model:
@@ -165,6 +186,34 @@ def disturbed(model: Model, sigma_m: float, seed: int) -> Model:
     received = replace(received, position_m=received.position_m + noise)
     # the intervals between samples hang on their times alone
     return replace(model, inputs=replace(model.inputs, received=received))
+
+
+def moved(model: Model, turned_deg: float, later_s: float) -> Model:
+    """The same flight, with every position that EKF2 was sent turned, and stamped later.
+
+    Parameters
+    ----------
+    model : Model
+    turned_deg : float
+        Clockwise seen from above.
+    later_s : float
+    """
+    if not turned_deg and not later_s:
+        return model
+    inputs, received = model.inputs, model.inputs.received
+    turn = Rotation.from_euler("z", turned_deg, degrees=True).as_matrix().T
+    speed = received.velocity_m_s
+    received = replace(
+        received,
+        stamp_s=received.stamp_s + later_s,
+        position_m=received.position_m @ turn,
+        velocity_m_s=None if speed is None else speed @ turn,
+    )
+    inputs, intervals = replace(inputs, received=received), model.intervals
+    if later_s:
+        timing = Variant(inputs.settings).timing(inputs)
+        intervals = tuple(make_intervals(inputs, stretch, timing) for stretch in inputs.stretches)
+    return replace(model, inputs=inputs, intervals=intervals)
 
 
 def delayed_variants(

@@ -14,6 +14,7 @@ from scipy import stats
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.events import happened
+from px4fuse.comparison.interventions import CONTENT_NIS, NEES_LARGE
 from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.explore.ekf2_grid import grid_data, judged_numbers
@@ -31,7 +32,7 @@ from px4fuse.filter.settings import (
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, along, imu_gaps, within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.causes import NOISES
-from px4fuse.findings.hidden_errors import CONTENT_NIS, NEES_LARGE, hidden_error
+from px4fuse.findings.hidden_errors import hidden_error
 from px4fuse.findings.model import Finding, by_root
 from px4fuse.findings.story import story
 from px4fuse.flight import POSITION_COLUMNS, PositionTrack, Unavailable

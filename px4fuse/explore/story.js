@@ -17,13 +17,14 @@ const Story = (() => {
     if (claimed !== undefined) return `claims ${lengthWords(claimed)}`;
     if (nis === undefined) return "cannot be judged, since too few innovations are left";
     if (nis >= band[0] && nis <= band[1]) return "is honest about it";
-    return nis < band[0] ? `is ${excessWords(1 / nis)} too modest`
-      : `is ${excessWords(nis)} too sure of itself`;
+    return nis < band[0] ? `is ${excessWords(Math.sqrt(1 / nis))} too modest`
+      : `is ${excessWords(Math.sqrt(nis))} too sure of itself`;
   }
   function verdict({ nis, band }) {
     if (nis === undefined) return "not known";
     if (nis >= band[0] && nis <= band[1]) return "consistent";
-    return nis < band[0] ? `overstated ${factorWords(1 / nis)}×` : `understated ${factorWords(nis)}×`;
+    return nis < band[0] ? `overstated ${factorWords(Math.sqrt(1 / nis))}× in σ`
+      : `understated ${factorWords(Math.sqrt(nis))}× in σ`;
   }
 
   /* How well both do along the axis now */

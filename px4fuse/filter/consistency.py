@@ -21,6 +21,8 @@ Verdict = Literal["consistent", "variance overstated", "variance understated"]
 MIN_INNOVATIONS = 10
 CONFIDENCE = 0.95
 LJUNG_BOX_LAGS = 10
+# √S that is off by fewer times is no finding: R is a rule of thumb, and tracks hardly change
+SIGMA_OFF = 1.25
 GATE_SIGMA = 5.0  # EKF2_EVP_GATE's default, used where no gate is in force
 
 
@@ -47,9 +49,9 @@ class NisVerdict(Record, frozen=True, kw_only=True):
     verdict: Verdict
 
     @property
-    def variance_factor(self) -> float:
-        """How many times S is overstated (above 1) or understated (below 1)."""
-        return 1.0 / self.nis_mean
+    def times_off(self) -> float:
+        """By how many times √S is too large or too small, 1 or more."""
+        return max(self.sigma_factor, 1.0 / self.sigma_factor)
 
 
 class Consistency(Shown, NisVerdict, frozen=True, kw_only=True):

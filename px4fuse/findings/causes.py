@@ -84,7 +84,9 @@ NAMES: Mapping[str, str] = {
 }
 # In the evidence of a finding about a variance: what the detector holds it to be the effect of
 CAUSE = "cause"
-NOISE, OUTLIERS, ELSEWHERE = "measurement noise", "outliers", "elsewhere"
+NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ELSEWHERE = (
+    "measurement noise", "process noise", "outliers", "clock", "frame", "gate", "elsewhere",
+)  # fmt: skip
 
 _OVERSTATED = ("kf_variance_overstated", "ekf2_variance_overstated")
 # Cause to what it brings with it, read from above, so that a finding goes to the first cause that
@@ -92,11 +94,11 @@ _OVERSTATED = ("kf_variance_overstated", "ekf2_variance_overstated")
 # evidence names that cause
 CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
     "source_stamps_constant": ("source_receipt_jitter",),
-    "sigma_a_small": ("kf_variance_understated",),
-    "process_noise_forgotten": ("sigma_a_small", "kf_variance_understated"),
-    "sigma_z_small": ("kf_variance_understated",),
-    "sigma_a_large": ("kf_variance_overstated",),
-    "sigma_z_large": ("kf_variance_overstated",),
+    "sigma_a_small": (f"kf_variance_understated:{PROCESS}",),
+    "process_noise_forgotten": ("sigma_a_small", f"kf_variance_understated:{PROCESS}"),
+    "sigma_z_small": (f"kf_variance_understated:{NOISE}",),
+    "sigma_a_large": (f"kf_variance_overstated:{PROCESS}",),
+    "sigma_z_large": (f"kf_variance_overstated:{NOISE}",),
     # the gate is as wide as S says
     "ekf2_variance_understated": ("ekf2_rejecting",),
     "source_outliers": (
@@ -106,11 +108,14 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
     "errors_larger_than_claimed": _OVERSTATED,
     # what is rejected is not corrected: EKF2 drifts, resets, and its innovations grow
     "ekf2_gate_small": (
-        "ekf2_rejecting", "ekf2_resets", "ekf2_fusion_interrupted", "ekf2_variance_understated",
-        "errors_larger_than_claimed",
+        "ekf2_rejecting", "ekf2_resets", "ekf2_fusion_interrupted",
+        f"ekf2_variance_understated:{GATE}", f"errors_larger_than_claimed:{GATE}",
     ),
     "source_may_drift": _OVERSTATED,
-    "ekf2_ev_delay_wrong": ("errors_larger_than_claimed",),
+    "ekf2_ev_delay_wrong": (
+        f"errors_larger_than_claimed:{CLOCK}", f"ekf2_variance_understated:{CLOCK}",
+        f"ekf2_variance_overstated:{CLOCK}",
+    ),
     "source_smoothed": (
         "sigma_z_large", "sigma_z_small", "sigma_a_large", "sigma_a_small", *_OVERSTATED,
         "kf_variance_understated", "ekf2_variance_understated", "errors_larger_than_claimed",
@@ -128,9 +133,9 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
         "source_outliers", "kf_variance_overstated", "kf_variance_understated",
         "source_variance_wrong",
     ),
-    "source_jumps": ("errors_larger_than_claimed",),
-    "source_scale_wrong": ("errors_larger_than_claimed",),
-    "accelerometer_bias": ("errors_larger_than_claimed",),
+    "source_jumps": (f"errors_larger_than_claimed:{ELSEWHERE}",),
+    "source_scale_wrong": (f"errors_larger_than_claimed:{ELSEWHERE}",),
+    "accelerometer_bias": (f"errors_larger_than_claimed:{ELSEWHERE}",),
     # a step of the stamps moves positions of a vehicle that moves
     "source_clock_changes": (
         "source_jumps", "source_scale_wrong", "source_smoothed", "ekf2_ev_delay_wrong",
@@ -138,10 +143,15 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
     ),
     "source_stamps_of_arrival": ("source_clock_changes",),
     "source_clock_offset": (
-        "source_stamps_of_arrival", "ekf2_ev_delay_wrong", "errors_larger_than_claimed",
-        f"kf_variance_understated:{ELSEWHERE}", f"ekf2_variance_understated:{ELSEWHERE}",
+        "source_stamps_of_arrival", "ekf2_ev_delay_wrong", f"errors_larger_than_claimed:{CLOCK}",
+        f"kf_variance_understated:{CLOCK}", f"ekf2_variance_understated:{CLOCK}",
     ),
-    "source_frame_turned": ("errors_larger_than_claimed",),
+    "source_frame_turned": (
+        f"errors_larger_than_claimed:{FRAME}", f"kf_variance_understated:{FRAME}",
+    ),
+    "ekf2_heading_wrong": (
+        f"errors_larger_than_claimed:{FRAME}", f"kf_variance_understated:{FRAME}",
+    ),
     "source_repeats": (
         "source_smoothed", "source_coloured", "source_jumps", "source_scale_wrong",
         "source_axes_unequal", "source_noise_changes", "source_clock_offset",

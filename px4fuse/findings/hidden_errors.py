@@ -7,6 +7,7 @@ is the NEES (1 is consistent).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
+from px4fuse.comparison.interventions import Intervention, beyond_claim, cause_of
 from px4fuse.comparison.model import (
     AgainstTruth,
     AxisComparison,
@@ -24,18 +26,18 @@ from px4fuse.comparison.model import (
 from px4fuse.errors import TrajectoryError
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.findings.causes import CAUSE
 from px4fuse.findings.model import Finding, Found, finding, info
+from px4fuse.findings.since import cure_words, kind_of, since_words
 from px4fuse.flight import Unavailable
 from px4fuse.loop.loop import Loop
 from px4fuse.plain import factor_words, number_words
 from px4fuse.trajectory.alignment import fit
 
-NEES_LARGE = 4.0  # errors twice as large as σ; clean flights stay below 3
 NEES_ERROR = 16.0  # errors four times as large as σ
-CONTENT_NIS = 1.5  # above, the innovations themselves say so (variance.py)
 SMALL_NIS = 0.5  # innovations are 30 % smaller than claimed
 FRAME_SHARE = 0.5  # of the error: what is left is less than what turning took away
-FILTERS = {"kf": "our filter", "ekf2": "EKF2"}
+FILTERS: Mapping[FilterName, str] = {"kf": "our filter", "ekf2": "EKF2"}
 REMEDIES = {
     "drift": "Take no noise from these innovations: correct the drift at a loop (px4fuse loop "
     "LOG), or give the filter a second, absolute source.",
@@ -54,7 +56,7 @@ REMEDIES = {
 class Hidden:
     """One filter on one axis whose innovations hide its error."""
 
-    owner: str
+    owner: FilterName
     axis: str
     statement: FilterSummary
     rmse_m: float
@@ -72,11 +74,11 @@ def hidden_errors(comparison: Comparison) -> list[Hidden]:
     for name, result in comparison.axes.items():
         for owner, statement in result.filters.items():
             truth = statement.truth
-            if isinstance(statement, Unavailable) or not isinstance(truth, AgainstTruth):
+            if not beyond_claim(statement) or not isinstance(truth, AgainstTruth):
                 continue
+            assert isinstance(statement, FilterSummary)
             nees = truth.nees_position_mean or 0.0
-            if nees >= NEES_LARGE and statement.nis_mean < CONTENT_NIS:
-                found.append(Hidden(owner, name, statement, truth.position_rmse_m, nees))
+            found.append(Hidden(owner, name, statement, truth.position_rmse_m, nees))
     return sorted(found, key=lambda hidden: -hidden.nees)
 
 
@@ -100,7 +102,7 @@ def larger(analysis: Analysis, hidden: list[Hidden]) -> Finding:
     """Told of each filter's worst axis."""
     worst, drifts = hidden[0], analysis.source.origin.may_drift
     evidence: dict[str, float | str] = {"axis": worst.axis, "filter": worst.owner}
-    said = []
+    said, causes = [], dict[FilterName, Intervention | None]()
     for owner, name in FILTERS.items():
         for one in [each for each in hidden if each.owner == owner][:1]:
             nis = one.statement.nis_mean
@@ -114,13 +116,17 @@ def larger(analysis: Analysis, hidden: list[Hidden]) -> Finding:
                 f"{name} claims σ {one.claimed_m:.2g} m along {one.axis} and errs by "
                 f"{one.rmse_m:.2f} m RMS (mean NEES {factor_words(one.nees)}, mean NIS "
                 f"{number_words(nis, 2)}; 1 is consistent)"
+                f"{since_words(analysis, causes.setdefault(owner, _cause(analysis, one)))}"
             )
     small = worst.statement.nis_mean < SMALL_NIS
     words = "; ".join(said) + "."
     alone = all(one.owner == "ekf2" for one in hidden)
     shared = "gnss" if analysis.source.origin.is_gnss else "shared"
     remedy = REMEDIES["drift" if drifts else "ekf2" if alone else shared]
-    if frame := _after_turning(analysis, worst.owner):
+    evidence |= {CAUSE: kind_of(analysis, causes[worst.owner])}
+    if cures := {cure_words(cause): None for cause in causes.values() if cause is not None}:
+        remedy = " ".join(cures)
+    elif frame := _after_turning(analysis, worst.owner):
         before, left = frame
         evidence |= {"position_rmse_horizontal_m": before, "position_rmse_aligned_m": left}
         remain = f"of {before:.2f} m horizontally {left:.2f} m remain after the best shift and turn"
@@ -137,6 +143,11 @@ def larger(analysis: Analysis, hidden: list[Hidden]) -> Finding:
         remedy,
         evidence,
     )
+
+
+def _cause(analysis: Analysis, hidden: Hidden) -> Intervention | None:
+    """What makes the error, by a replay."""
+    return cause_of(analysis.causes, hidden.owner, hidden.axis, "nees")
 
 
 def _after_turning(comparison: Comparison, owner: str) -> tuple[float, float] | None:

@@ -17,6 +17,7 @@ import numpy as np
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.interventions import tuned_for
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import filter_words
 from px4fuse.filter.settings import Settings
@@ -46,13 +47,6 @@ READINGS = {
     "sigma_a_large": "The variance grows too much between updates, and the filter jumps to every "
     "measurement.",
 }
-
-
-def tuned_for(analysis: Analysis, axis: str) -> AxisTuning | None:
-    """What was tuned for an axis: both horizontal ones together, where there are both."""
-    names = (axis,) if axis == "down" else (HORIZONTAL, axis)
-    found = (analysis.tuning.get(name) for name in names)
-    return next((tuned for tuned in found if isinstance(tuned, AxisTuning)), None)
 
 
 def try_out(
@@ -183,7 +177,7 @@ def forgotten(analysis: Analysis) -> Found:
         after = result.replay.steps["position_variance_m2"].reindex(updates.index).to_numpy()
         before = updates["prior_position_variance_m2"].to_numpy()
         growth = float(np.median((before[1:] / after[:-1] - 1.0)[len(after) // 2 :]))
-        tuned = tuned_for(analysis, name)
+        tuned = tuned_for(analysis.tuning, name)
         needed = None if tuned is None else tuned.filter_sigma_a.value
         more = "" if needed is None else f" {try_out(analysis, {'--sigma-a': needed})}"
         yield error(

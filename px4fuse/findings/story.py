@@ -6,32 +6,37 @@ why EKF2 differs.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
-from typing import Any
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.model import AgainstTruth, AxisComparison, Difference, FilterName
+from px4fuse.comparison.interventions import (
+    SIGMA_A,
+    SIGMA_Z,
+    Intervention,
+    Of,
+    beyond_claim,
+    cause_of,
+)
+from px4fuse.comparison.model import FILTERS, AgainstTruth, AxisComparison, Difference, FilterName
 from px4fuse.ekf2.walk import Why
-from px4fuse.filter.kalman import replay, state_at
-from px4fuse.filter.settings import Settings
+from px4fuse.filter.consistency import SIGMA_OFF
+from px4fuse.filter.kalman import state_at
 from px4fuse.findings.causes import SETTINGS, VARIANCES
 from px4fuse.findings.hidden_errors import hidden_error
 from px4fuse.findings.model import Finding
-from px4fuse.findings.sigma import tuned_for
+from px4fuse.findings.since import TOLD_BY, effect_words, kind_of, since_words
 from px4fuse.findings.source_positions import MOTION_RANGE_M, motion_range_m
 from px4fuse.flight import Unavailable
 from px4fuse.loop.loop import Loop
-from px4fuse.plain import capital, excess_words, length_words, number_words
+from px4fuse.plain import capital, excess_words, length_words
 
 MOST_SENTENCES = 3
 # What the first sentence tells already
 TOLD_FIRST = VARIANCES | {"errors_larger_than_claimed", "ekf2_unavailable"}
-# Share of the logarithm of the mean NIS that a cause explains
-EXPLAINS = 0.5
+SETTING_FIELDS = frozenset((SIGMA_A, SIGMA_Z))
 # What weighs less than why EKF2 differs
 EFFECTS = frozenset({"ekf2_resets", "ekf2_rejecting", "ekf2_fusion_interrupted"})
 
@@ -50,29 +55,38 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
     tuple of str
         One to three sentences.
     """
-    since = _since(analysis)
-    known = TOLD_FIRST | (SETTINGS if since else frozenset())
+    since = {owner: _cause_of(analysis, owner) for owner in FILTERS}
+    known = TOLD_FIRST
+    for cause in filter(None, since.values()):
+        known |= TOLD_BY.get(kind_of(analysis, cause), frozenset())
+    if since["kf"] is not None and not SETTING_FIELDS.isdisjoint(since["kf"].change):
+        known |= SETTINGS
     causes = [
         one for one in findings
         if one.caused_by is None and one.severity != "info" and one.id not in known
     ]  # fmt: skip
     sentences = [
-        _verdict(analysis, since),
-        *(_cause(analysis, one) for one in causes if one.id not in EFFECTS),
+        _verdict(analysis, _judged(analysis, "kf", since), _judged(analysis, "ekf2", since)),
+        *(_told(analysis, one) for one in causes if one.id not in EFFECTS),
         *_differences(analysis),
-        *(_cause(analysis, one) for one in causes if one.id in EFFECTS),
+        *(_told(analysis, one) for one in causes if one.id in EFFECTS),
     ]
     return tuple(sentences[:MOST_SENTENCES])
 
 
-def _verdict(analysis: Analysis, since: str) -> str:
+def _cause_of(analysis: Analysis, owner: FilterName) -> Intervention | None:
+    """What makes a filter's error larger than it claims, or its variance wrong."""
+    axis = analysis.main.axis.name
+    of: Of = "nees" if beyond_claim(analysis.main.filters[owner]) else "nis"
+    return cause_of(analysis.causes, owner, axis, of)
+
+
+def _verdict(analysis: Analysis, ours: str, ekf2: str) -> str:
     """How far off both filters were, and whether they knew it."""
     result, source = analysis.main, analysis.source
     along = capital(f"{_flown(analysis)}along {result.axis.called}")
-    (ours_off, ours), (ekf2_off, ekf2) = (
-        (_error(result, owner), _knows(analysis, result, owner)) for owner in ("kf", "ekf2")
-    )
-    our_filter = f"our filter was {ours_off}{ours}{since}"
+    ours_off, ekf2_off = (_error(result, owner) for owner in FILTERS)
+    our_filter = f"our filter was {ours_off}{ours}"
     if isinstance(result.ekf2_state, Unavailable):
         return f"{along} {our_filter}; there is no EKF2 beside it: {result.ekf2_state.reason}."
     if ours_off and ekf2_off:
@@ -81,15 +95,15 @@ def _verdict(analysis: Analysis, since: str) -> str:
     if isinstance(result.difference, Difference):
         apart = f"ours and EKF2 are {length_words(result.difference.position_rmse_m)} apart (RMS)"
     if source.origin.may_drift:
-        judged = f"both follow {source.name}, which may drift"
-    elif ekf2 == ours and not since:
-        judged = f"by their own innovations both {_verb(result, 'kf', 'are ')}{ours}"
+        said = f"both follow {source.name}, which may drift"
+    elif ours == ekf2:
+        said = f"by their own innovations both {_verb(result, 'kf', 'are ')}{ours}"
     else:
-        judged = (
+        said = (
             f"by its own innovations EKF2 {_verb(result, 'ekf2')}{ekf2}, our filter "
-            f"{_verb(result, 'kf')}{ours}{since}"
+            f"{_verb(result, 'kf')}{ours}"
         )
-    return f"{along} {apart}, and the log has no truth: {judged}."
+    return f"{along} {apart}, and the log has no truth: {said}."
 
 
 def _flown(analysis: Analysis) -> str:
@@ -112,64 +126,33 @@ def _error(result: AxisComparison, owner: FilterName) -> str:
     return f"{length_words(truth.position_rmse_m)} from the truth (RMS) and "
 
 
-def _knows(analysis: Analysis, result: AxisComparison, owner: FilterName) -> str:
-    """Whether a filter's variance is what its innovations, and the truth, show."""
-    if hidden := hidden_error(analysis, result, owner):
-        return f"claimed {length_words(hidden.claimed_m)}"
-    statement = result.filters[owner]
+def _judged(
+    analysis: Analysis, owner: FilterName, causes: Mapping[FilterName, Intervention | None]
+) -> str:
+    """Whether a filter's variance is what its innovations, and the truth, show; and why not."""
+    statement, axis = analysis.main.filters[owner], analysis.main.axis.name
+    cause, of = causes[owner], "nees" if beyond_claim(statement) else "nis"
+    since = since_words(analysis, cause)
+    if owner == "kf" and cause and causes["ekf2"] and cause.change == causes["ekf2"].change:
+        since = f", for the same reason ({effect_words(cause)})"
+    drifts = analysis.source.origin.may_drift  # which is told by itself
+    tried = not drifts and any(
+        (e.of, e.filter, e.axis) == (of, owner, axis) for e in analysis.causes
+    )
+    unexplained = ", which nothing that was tried explains" if tried and cause is None else ""
+    if hidden := hidden_error(analysis, analysis.main, owner):
+        return f"claimed {length_words(hidden.claimed_m)}{since or unexplained}"
     if isinstance(statement, Unavailable):
         return "cannot be judged, since the log has no innovations or too few"
-    factor = statement.variance_factor
     if statement.verdict == "consistent":
         return "honest about it"
-    if factor > 1.0:
-        return f"{excess_words(factor)} too modest"
-    return f"{excess_words(1.0 / factor)} too sure of itself"
+    if statement.times_off < SIGMA_OFF:
+        unexplained = ""
+    how = "too modest" if statement.sigma_factor > 1.0 else "too sure of itself"
+    return f"{excess_words(statement.times_off)} {how}{since or unexplained}"
 
 
-def _since(analysis: Analysis) -> str:
-    """The setting that makes our variance too large or too small.
-
-    Where the data ask for another value, and a replay with it explains at least half of how far the
-    mean NIS is from 1 (by its logarithm), without going as far to the other side. An error beyond
-    what the filter claims has other causes than the size of S.
-    """
-    settings, statement = analysis.settings, analysis.main.filters["kf"]
-    if isinstance(statement, Unavailable) or statement.verdict == "consistent":
-        return ""
-    if hidden_error(analysis, analysis.main, "kf"):
-        return ""
-    tuned, over = tuned_for(analysis, analysis.main.axis.name), statement.variance_factor > 1.0
-    origin = analysis.source.origin
-    if origin.may_drift or tuned is None or (over and origin.is_gnss):
-        return ""
-    causes, before = [], statement.nis_mean
-    for field, unit, noise in (
-        ("sigma_a_m_s2", "m/s²", tuned.filter_sigma_a), ("sigma_z_m", "m", tuned.sigma_z)
-    ):  # fmt: skip
-        chosen = getattr(settings, field)
-        end, asked = (noise.high, noise.value or noise.high) if over else (noise.low, noise.value)
-        if end is not None and asked and (chosen > end if over else chosen < end):
-            changed: dict[str, Any] = {field: asked}
-            after = nis_with(analysis, replace(settings, **changed))
-            explained = 1.0 - float(np.log(after) / np.log(before))
-            if EXPLAINS <= explained <= 2.0 - EXPLAINS:
-                label, side = field[:7].upper(), "larger" if over else "smaller"
-                causes.append((
-                    explained, f", since {label} {chosen:g} is {side} than the {asked:.2g} {unit} "
-                    f"that this flight asks for (replayed: mean NIS {number_words(before, 2)} → "
-                    f"{number_words(after, 2)})",
-                ))  # fmt: skip
-    return min(causes, key=lambda cause: abs(cause[0] - 1.0))[1] if causes else ""
-
-
-def nis_with(analysis: Analysis, settings: Settings) -> float:
-    """Mean NIS of our filter along the axis of the lab with other settings, by a replay."""
-    updates = replay(analysis.main.axis, settings).updates
-    return float(np.mean(updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]))
-
-
-def _cause(analysis: Analysis, finding: Finding) -> str:
+def _told(analysis: Analysis, finding: Finding) -> str:
     """What a finding says is wrong, with when."""
     if finding.id == "source_gap":
         return _gap(analysis, finding)

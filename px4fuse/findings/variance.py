@@ -8,33 +8,40 @@ import numpy as np
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.interventions import SIGMA_A, SIGMA_Z, Intervention, cause_of, tuned_for
 from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName
 from px4fuse.comparison.remedy import (
     aid_of,
+    delay_helps,
     noise_helps,
     not_replayed,
+    rejects_less,
     remedy_words,
     settings_words,
 )
-from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS
-from px4fuse.filter.consistency import Consistency
-from px4fuse.filter.fitting import SIGMA_Z_SEARCH_M
+from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.filter.consistency import SIGMA_OFF, Consistency
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import within
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
-from px4fuse.findings.causes import CAUSE, ELSEWHERE, NOISE, OUTLIERS
+from px4fuse.filter.tuning import AxisTuning, Noise
+from px4fuse.findings.causes import CAUSE, ELSEWHERE, NOISE
 from px4fuse.findings.hidden_errors import hidden_errors
 from px4fuse.findings.model import Finding, Found, Severity, finding, lowered
-from px4fuse.findings.sigma import LAG1_SLOW, SMALLEST_SIGMA_Z_M, try_out, tuned_for
+from px4fuse.findings.sigma import SMALLEST_SIGMA_Z_M, try_out
+from px4fuse.findings.since import cure_words, kind_of, reason_words
 from px4fuse.flight import POSITION_VARIANCE_COLUMNS, Unavailable
-from px4fuse.plain import factor_words, number_words
+from px4fuse.plain import capital, factor_words, number_words
 
-VARIANCE_FACTOR = 1.5  # times: 22 % in standard deviation; chance moves it less at n > 100
-VARIANCE_FACTOR_ERROR = 4.0  # times: a factor of two in standard deviation
+SIGMA_OFF_ERROR = 2.0  # times, in standard deviation
 EKF2_NOISE_FLOOR_M = 0.01  # EKF2 never trusts external vision better, EKF2.cpp
 NOISE_FITS = 1.25  # times: the median's own scatter below n = 100 (1.17/√n, two σ)
-SMALLEST_NOISE_M = 0.001  # below what any positioning system resolves
-OUTLIER_SHARE = 0.005  # outside 5√S, where 6e-7 is expected
+HELPS = {"clock": delay_helps, "gate": rejects_less}
+SETTINGS = {SIGMA_Z: "--sigma-z", SIGMA_A: "--sigma-a"}
+NOT_EXPLAINED = (
+    "No change of a noise, the clock, the frame or the outliers explains half of it: look at the "
+    "acceleration input (IMU rate, gaps, vibration) and at what else the findings name."
+)
+UNKNOWN_NOISE = "Which noise the data ask for could not be told: see tuning."
 
 OWNERS = {"kf": "Our", "ekf2": "EKF2's"}
 GROUPS = {"horizontal": ("north", "east", "aisle"), "vertical": ("down",)}
@@ -73,20 +80,22 @@ def _is_off(statement: Consistency | Unavailable, *, over: bool) -> TypeGuard[Co
     """Whether a variance is over-, or else understated."""
     if isinstance(statement, Unavailable):
         return False
-    factor = statement.variance_factor if over else 1.0 / statement.variance_factor
-    return statement.verdict != "consistent" and factor >= VARIANCE_FACTOR
+    right = (statement.sigma_factor > 1.0) == over
+    return right and statement.verdict != "consistent" and statement.times_off >= SIGMA_OFF
 
 
 def _of_group(analysis: Analysis, owner: FilterName, group: str, members: list[Member]) -> Finding:
     """One finding for a group of axes, on the axis whose NIS is furthest from 1."""
     result, statement = max(members, key=lambda pair: abs(np.log(pair[1].nis_mean)))
-    over = statement.variance_factor > 1.0
-    factor = statement.variance_factor if over else 1.0 / statement.variance_factor
+    over, factor = statement.sigma_factor > 1.0, statement.times_off
     low, high = statement.nis_band
-    severity: Severity = "error" if factor >= VARIANCE_FACTOR_ERROR else "warning"
+    severity: Severity = "error" if factor >= SIGMA_OFF_ERROR else "warning"
     if _is_default(analysis, owner, result):
         severity = lowered(severity)
-    tuned, stated = tuned_for(analysis, result.axis.name), "overstated" if over else "understated"
+    tuned, stated = (
+        tuned_for(analysis.tuning, result.axis.name),
+        "overstated" if over else "understated",
+    )
     if over and analysis.source.origin.may_drift:
         severity, remedy, cause = "info", AGAINST_DRIFT, ELSEWHERE
     elif over and analysis.source.origin.is_gnss:
@@ -95,13 +104,12 @@ def _of_group(analysis: Analysis, owner: FilterName, group: str, members: list[M
         severity, remedy = severity if remedy else "info", remedy or AGAINST_SLOW_ERRORS
     elif over and any(hidden.owner == owner for hidden in hidden_errors(analysis)):
         remedy, cause = AGAINST_TRUTH, ELSEWHERE
-    elif tuned is None:
-        remedy, cause = "Which noise the data ask for could not be told: see tuning.", ELSEWHERE
     else:
-        cause, remedy = _remedy(analysis, owner, result, statement, tuned)
+        found = cause_of(analysis.causes, owner, result.axis.name)
+        cause, remedy = kind_of(analysis, found), _remedy(analysis, owner, result, tuned, found)
     evidence: dict[str, float | str] = {
         "axis": result.axis.name,
-        "variance_factor": statement.variance_factor,
+        "sigma_factor": statement.sigma_factor,
         "nis_mean": statement.nis_mean,
         "outside_gate": statement.outside_gate,
         CAUSE: cause,
@@ -113,7 +121,7 @@ def _of_group(analysis: Analysis, owner: FilterName, group: str, members: list[M
         severity,
         f"{owner}_variance_{stated}",
         f"{OWNERS[owner]} innovation variance is {stated} "
-        f"{factor_words(factor)} times along {result.axis.name}",
+        f"{factor_words(factor)} times in σ along {result.axis.name}",
         f" (mean NIS {number_words(statement.nis_mean)}, consistent is {low:.2f} to {high:.2f}; "
         f"{group}).",
         remedy,
@@ -155,107 +163,72 @@ def _asked_m(noise: Noise) -> float | None:
 
 
 def _remedy(
-    analysis: Analysis, owner: FilterName, result: AxisComparison, statement: Consistency,
-    tuned: AxisTuning,
-) -> tuple[str, str]:  # fmt: skip
-    """The cause, and the measurement noise that the data ask for, as what to type or to set.
-
-    It is a property of the source, so our estimate of it serves EKF2 as well.
-    """
-    settings, over = analysis.settings, statement.variance_factor > 1.0
-    lag1, needed = statement.lag1_autocorrelation, tuned.filter_sigma_a.value or 0.0
-    asked_m, bounded = _asked_m(tuned.sigma_z), tuned.sigma_z.value is None
-    if owner == "kf" and not over and lag1 > LAG1_SLOW and needed > settings.sigma_a_m_s2:
-        return ELSEWHERE, (
-            f"The filter follows too slowly (lag-1 correlation {lag1:+.2f}): raise SIGMA_A first. "
-            f"{try_out(analysis, {'--sigma-a': needed})}"
-        )
-    if asked_m is None:
-        return ELSEWHERE, (
-            f"No SIGMA_Z up to {SIGMA_Z_SEARCH_M[1]:g} m explains it: look at the acceleration "
-            "input (IMU rate, gaps, vibration) and at the clocks."
-        )
-    used_m = settings.sigma_z_m if owner == "kf" else _ekf2_noise_m(result)
-    if owner == "ekf2" and bounded:  # EKF2's own innovations bound it too, and less tightly
-        asked_m = float(np.hypot(statement.innovation_std_m, statement.innovation_mean_m))
-    noise_m = max(asked_m, SMALLEST_NOISE_M)
-    if not (owner == "kf" and bounded) and not _noise_helps(noise_m, used_m, over=over):
-        return _other_cause(analysis, owner, statement, noise_m)
-    if owner == "ekf2":
-        return _ekf2_remedy(analysis, result, noise_m, bounded=bounded, over=over)
-    why, more = f"The data ask for SIGMA_Z {noise_m:.2g} m.", ""
-    if bounded:
-        why = f"The source's noise is at most {noise_m:.2g} m, below what this rate can show."
-        noise_m, more = max(noise_m, SMALLEST_SIGMA_Z_M), ", and less SIGMA_A"
-    return NOISE, f"{why} {try_out(analysis, {'--sigma-z': float(f'{noise_m:.2g}')}, more)}"
-
-
-def _other_cause(
-    analysis: Analysis, owner: FilterName, statement: Consistency, noise_m: float
-) -> tuple[str, str]:
-    """Where to look when the noise is as large as the filter takes it to be."""
-    if statement.variance_factor < 1.0 and _has_outliers(analysis, statement):
-        return OUTLIERS, (
-            f"{statement.outside_gate:.1%} lie outside the gate while the bulk fits "
-            f"{noise_m:.2g} m: remove the outliers instead of raising the noise."
-        )
-    name, where = "SIGMA_Z", "SIGMA_A (--sigma-a) and the clock (--clock-offset)"
-    if owner == "ekf2":
-        aid = aid_of(analysis)
-        name = aid.noise
-        where = f"the clock ({aid.delay}) and at EKF2's process noise (EKF2_ACC_NOISE)"
-    return ELSEWHERE, f"It is not {name} (the source's noise is {noise_m:.2g} m): look at {where}."
-
-
-def _ekf2_remedy(
-    analysis: Analysis, result: AxisComparison, noise_m: float, *, bounded: bool, over: bool
-) -> tuple[str, str]:
-    parameters, used_m = analysis.flight.log.parameters, _ekf2_noise_m(result)
-    aid = aid_of(analysis)
-    changes = {aid.noise: max(float(f"{noise_m:.2g}"), EKF2_NOISE_FLOOR_M)}
-    was = "" if np.isnan(used_m) else f" (√R was {used_m:.2g} m)"
-    why = f"The source's noise is {'at most ' if bounded else ''}{noise_m:.2g} m{was}: "
-    reported = used_m > NOISE_FITS * parameters.get(aid.noise, np.nan)
-    if over and reported and aid.noise_mode and parameters.get(aid.noise_mode) != 1.0:
-        changes = {aid.noise_mode: 1.0, **changes}
-        why = (
-            f"R is what the sender reports ({used_m:.2g} m), since that is more than "
-            f"{aid.noise}: correct it there, or "
-        )
-    if aid == GNSS_POS:
-        why = (
-            f"From one fix to the next the source scatters by {noise_m:.2g} m{was}, and slow "
-            "errors come on top: as a first step "
-        )
-    if result.axis.name == "down":
-        return NOISE, f"{why}set {settings_words(changes)}. {not_replayed(ONLY_HORIZONTAL)}"
-    words, helps = remedy_words(
-        analysis.ekf2_model, changes, noise_helps, why=why,
-        otherwise=f"Look at the clock ({aid.delay}), the outliers and EKF2's process noise "
-        "(EKF2_ACC_NOISE):",
-    )  # fmt: skip
-    return NOISE if helps else ELSEWHERE, words
-
-
-def _noise_helps(noise_m: float, used_m: float, *, over: bool) -> bool:
-    """Whether another measurement noise fixes a variance that is over- or understated.
-
-    More noise fixes one that is understated, less one that is overstated; if the noise already
-    fits, or the other way round, the cause lies elsewhere.
-    """
-    ratio = noise_m / used_m
-    return not (ratio > 1.0 / NOISE_FITS if over else ratio < NOISE_FITS)
-
-
-def _has_outliers(analysis: Analysis, statement: Consistency) -> bool:
-    """Whether gross outliers explain the innovations, which the source has as well."""
-    tuned = analysis.tuning.get(HORIZONTAL)
-    if statement.outside_gate <= OUTLIER_SHARE:
-        return False
-    # where the source has none, it is the filter that is elsewhere
-    return not isinstance(tuned, AxisTuning) or (
-        len(tuned.outlier_time_s) > OUTLIER_SHARE * tuned.count
+    analysis: Analysis, owner: FilterName, result: AxisComparison, tuned: AxisTuning | None,
+    cause: Intervention | None,
+) -> str:  # fmt: skip
+    """What to type or to set against the cause; where there is none, what it is not."""
+    if cause is None:
+        return _without_cause(analysis, owner, result, tuned)
+    if owner == "ekf2" and cause.change.keys() <= PARAMETERS.keys():
+        words, _ = remedy_words(
+            analysis.ekf2_model, cause.change, HELPS.get(kind_of(analysis, cause), noise_helps),
+            otherwise=f"{capital(reason_words(analysis, cause))}.",
+        )  # fmt: skip
+        return words
+    if not cause.change.keys() <= SETTINGS.keys():
+        return cure_words(cause)
+    bounded = tuned is not None and tuned.sigma_z.value is None and SIGMA_Z in cause.change
+    values = {SETTINGS[name]: value for name, value in cause.change.items()}
+    if not bounded:
+        return try_out(analysis, values)
+    values["--sigma-z"] = max(values["--sigma-z"], SMALLEST_SIGMA_Z_M)
+    return (
+        f"The source's noise is at most {cause.change[SIGMA_Z]:.2g} m, below what this rate can "
+        f"show. {try_out(analysis, values, ', and less SIGMA_A')}"
     )
+
+
+def _without_cause(
+    analysis: Analysis, owner: FilterName, result: AxisComparison, tuned: AxisTuning | None
+) -> str:
+    """What was tried and how near it came, or that nothing could be."""
+    wanted = ("nis", owner, result.axis.name)
+    tried = [each for each in analysis.causes if (each.of, each.filter, each.axis) == wanted]
+    if tried:
+        nearest = min(tried, key=lambda each: abs(each.explains - 1.0))
+        return f"{NOT_EXPLAINED} The nearest: {reason_words(analysis, nearest)}."
+    if owner == "ekf2":
+        return _not_replayed(analysis, result, tuned)
+    return UNKNOWN_NOISE if tuned is None else NOT_EXPLAINED
+
+
+def _not_replayed(analysis: Analysis, result: AxisComparison, tuned: AxisTuning | None) -> str:
+    """What the data ask of EKF2's noise where no replay can confirm it."""
+    aid, model = aid_of(analysis), analysis.ekf2_model
+    why: Unavailable | None = model if isinstance(model, Unavailable) else None
+    if result.axis.name == "down":
+        why = ONLY_HORIZONTAL
+    elif not isinstance(model, Unavailable) and not model.agreement.good:
+        why = model.agreement.doubted("EKF2 replay")
+    asked_m = None if tuned is None else _asked_m(tuned.sigma_z)
+    if asked_m is None or why is None:
+        return UNKNOWN_NOISE if tuned is None else NOT_EXPLAINED
+    noise_m, used_m = max(asked_m, EKF2_NOISE_FLOOR_M), _ekf2_noise_m(result)
+    said = f"The source's noise is {noise_m:.2g} m, EKF2 takes it to be {used_m:.2g} m"
+    statement = result.filters["ekf2"]
+    assert not isinstance(statement, Unavailable)
+    ratio = noise_m / used_m
+    if not (ratio < 1.0 / NOISE_FITS if statement.sigma_factor > 1.0 else ratio > NOISE_FITS):
+        return (
+            f"{said}: that is not it. Look at the clock ({aid.delay}) and at EKF2's process noise "
+            f"(EKF2_ACC_NOISE). {not_replayed(why)}"
+        )
+    changes = {aid.noise: float(f"{noise_m:.2g}")}
+    if aid.noise_mode and used_m > NOISE_FITS * analysis.flight.log.parameters.get(
+        aid.noise, np.inf
+    ):
+        changes[aid.noise_mode] = 1.0
+    return f"{said}: set {settings_words(changes)}. {not_replayed(why)}"
 
 
 def _ekf2_noise_m(result: AxisComparison) -> float:

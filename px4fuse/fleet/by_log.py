@@ -16,7 +16,7 @@ from px4fuse.fleet.rows import BETWEEN_FINDINGS, DONE
 MAIN = (("aisle",), ("north", "east"), ("down",))
 
 #: One log: every column that its rows have something in, from the main axes first, and
-#: ``factors`` ("kf" and "ekf2": how many times S is overstated, 1 over the mean NIS of all updates
+#: ``factors`` ("kf" and "ekf2": how many times √S is overstated, by the mean NIS of all updates
 #: of the main axes), ``status`` (the best of its axes), ``lacking`` (why something could not be
 #: judged, and what to set), ``changes`` (what is worse than before), ``axes`` (their rows),
 #: ``findings`` (ids) and ``tags`` (what filters look for, with the words for it)
@@ -59,7 +59,7 @@ def _log(rows: Sequence[Mapping[str, Any]]) -> Log:
 def _factor(axes: Sequence[Mapping[str, Any]], name: str) -> float | None:
     judged = [(row[name], row.get("updates", 1)) for row in axes if name in row]
     total = sum(nis * updates for nis, updates in judged)
-    return sum(updates for _, updates in judged) / total if total > 0.0 else None
+    return float(sum(updates for _, updates in judged) / total) ** 0.5 if total > 0.0 else None
 
 
 def _tags(log: Log) -> dict[str, str]:

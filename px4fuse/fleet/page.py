@@ -58,7 +58,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
     names = short_names(logs)
     factors = [factor for log in logs for factor in log["factors"].values()]
     # the same to both sides of 1
-    factor = Scale.of([*factors, *(1.0 / each for each in factors)], 10.0, log=True)
+    factor = Scale.of([*factors, *(1.0 / each for each in factors)], 4.0, log=True)
     sigma_z = Scale.of([log["sigma_z_m"] for log in logs if "sigma_z_m" in log], 0.01)
     clock = Scale.of([log["clock_offset_s"] for log in logs if "clock_offset_s" in log], 0.02)
     zero = clock.share(0.0) if clock.low < 0.0 < clock.high else None

@@ -51,7 +51,7 @@ def above(
 
 
 def overstated_words(factor: float) -> str:
-    """By how much a filter's S is off.
+    """By how much a filter's √S is off.
 
     >>> [overstated_words(factor) for factor in (1.004, 3.2, 0.25)]
     ['right', '3.2 × too large', '4 × too small']

@@ -38,10 +38,10 @@ PLACES = {
     "axis": "",
     "updates": "axes.{axis}.updates.count",
     "kf_nis_mean": "axes.{axis}.filters.kf.nis_mean",
-    "kf_factor": "axes.{axis}.filters.kf.variance_factor",
+    "kf_factor": "axes.{axis}.filters.kf.sigma_factor",
     "kf_verdict": "axes.{axis}.filters.kf.verdict",
     "ekf2_nis_mean": "axes.{axis}.filters.ekf2.nis_mean",
-    "ekf2_factor": "axes.{axis}.filters.ekf2.variance_factor",
+    "ekf2_factor": "axes.{axis}.filters.ekf2.sigma_factor",
     "ekf2_verdict": "axes.{axis}.filters.ekf2.verdict",
     "position_rmse_m": "axes.{axis}.difference.position_rmse_m",
     "velocity_rmse_m_s": "axes.{axis}.difference.velocity_rmse_m_s",
@@ -71,8 +71,8 @@ Row = dict[str, Any]
 def rows_of(found: ComparisonResults) -> list[Row]:
     """Rows of one log, an axis each; columns that are not in them are absent.
 
-    A factor says how many times S is overstated (above 1) or understated (below 1), as
-    ``variance_factor`` in the results. SIGMA_Z and SIGMA_A are what the data ask for, north and
+    A factor says how many times √S is overstated (above 1) or understated (below 1), as
+    ``sigma_factor`` in the results. SIGMA_Z and SIGMA_A are what the data ask for, north and
     east together. The clock offset is there where it is determinable.
     """
     common = log_columns(found.log) | what_was_found(found.findings, found.aids)

@@ -37,7 +37,7 @@ def print_fleet(console: Console, fleet: Fleet) -> None:
         table.add_row(str(axis), *cells)
     if table.row_count:
         console.print(table)
-        say(console, Text("factor: median of how many times S is overstated (above 1)", "dim"))
+        say(console, Text("factor: median of how many times √S is overstated (above 1)", "dim"))
     found = logs["findings"].str.split(BETWEEN_FINDINGS).explode()
     for finding, count in found[found != ""].value_counts().head(SHOWN).items():
         say(console, f"{count} × {named(str(finding))}")

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 from px4fuse.comparison.model import AgainstTruth, FilterName, FilterSummary
 from px4fuse.filter.clock import Clock
-from px4fuse.filter.consistency import HorizontalNis
+from px4fuse.filter.consistency import SIGMA_OFF, HorizontalNis
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.grading.evidence import (
     NAMED,
@@ -327,11 +327,11 @@ def _error_m(comparison: ComparisonResults) -> float:
 
 
 class ConsistencyItem(RubricItem, frozen=True, kw_only=True, tag="consistent"):
-    """A filter is consistent, or no setting can make it so; none of the points from ``factor``."""
+    """A filter is consistent, or no setting makes it so; no points from ``factor`` in σ on."""
 
     filter: FilterName = "kf"
     axes: Annotated[tuple[Text, ...], Meta(min_length=1)] = (HORIZONTAL,)
-    factor: Factor = 1.5
+    factor: Factor = SIGMA_OFF
 
     def score(self, evidence: Evidence) -> Scored:
         """Mean over the axes."""
@@ -354,13 +354,12 @@ class ConsistencyItem(RubricItem, frozen=True, kw_only=True, tag="consistent"):
             return 0.0, f"there is no verdict on {owner} ({axis}){evidence.why_absent(path)}"
         if judged.verdict == "consistent":
             return 1.0, f"{owner} is consistent ({axis})"
-        off = max(judged.variance_factor, 1.0 / judged.variance_factor)
-        said = f"{judged.verdict} by a factor of {factor_words(off)} ({owner}, {axis})"
+        said = f"{judged.verdict} {factor_words(judged.times_off)} times in σ ({owner}, {axis})"
         if all(_tuned(evidence, HORIZONTAL, name, 2.0)[0] == 1.0 for name in SIGMAS):
             return 1.0, (
                 f"{said}, with the noises that the data ask for: what is left no setting fixes"
             )
-        return falling(off, self.factor), (
+        return falling(judged.times_off, self.factor), (
             f"{said}: look at what the tuning page asks for, and for what the model does not "
             "explain"
         )

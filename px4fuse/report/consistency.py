@@ -10,12 +10,13 @@ import pandas as pd
 
 from px4fuse.comparison.model import AxisComparison, FilterSummary, UnjudgedFilter
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
+from px4fuse.findings.since import change_words, share_words
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital, number_words, p_words
 from px4fuse.report import marks
 from px4fuse.report.document import Document
-from px4fuse.report.page import Page, halves, legend_above
-from px4fuse.report.style import DOTS, LINES, OURS_BAND, curve, plain_ticks
+from px4fuse.report.page import Cell, Page, halves, legend_above
+from px4fuse.report.style import DOTS, LINES, MUTED, OURS_BAND, curve, plain_ticks
 from px4fuse.report.words import VERDICT_HEAD, filters, verdict_rows, verdict_words
 
 if TYPE_CHECKING:
@@ -73,7 +74,30 @@ def draw(document: Document) -> Iterator[Page]:
     page.heading("All axes", above=12.0)
     head = [*VERDICT_HEAD, "n", "beyond\n2√S", "t of\nmean", "lag 1", "Ljung-\nBox"]
     page.table(head, verdict_rows(document.analysis.axes.values(), _cells), right=(2, 5, 6, 7, 8))
+    _tried(page, document)
     yield page
+
+
+def _tried(page: Page, document: Document) -> None:
+    """Write what each change would make of both filters along the axis of the lab."""
+    analysis, axis = document.analysis, document.analysis.main.axis
+    rows: list[list[Cell]] = []
+    for one in analysis.causes:
+        if one.axis == axis.name:
+            owner = "ours" if one.filter == "kf" else "EKF2"
+            what, power = ("mean NIS", 1.0) if one.of == "nis" else ("error (σ)", 0.5)
+            ends = (number_words(number**power, 2) for number in (one.before, one.after))
+            rows.append([owner, change_words(analysis, one), what, *ends, share_words(one)])
+    if not rows:
+        return
+    page.heading(f"Causes that were tried along {axis.called}", above=12.0)
+    page.table(["filter", "cause", "number", "flown", "put right", "explains"], rows,
+               right=(3, 4))  # fmt: skip
+    page.write(
+        "Each row is a replay with that one thing put right. It explains all where it brings the "
+        "number into its band, else the share of its logarithm; what explains half or more is "
+        "called the cause.", size=7.5, colour=MUTED,
+    )  # fmt: skip
 
 
 def _series(result: AxisComparison) -> list[Series]:

@@ -9,11 +9,13 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array
-from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.model import Comparison, FilterName
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.signals import AISLE, Axis, within
 from px4fuse.findings import Finding, by_root
+from px4fuse.findings.hidden_errors import hidden_error
 from px4fuse.flight import Ekf2, Truth, Unavailable
+from px4fuse.plain import length_words
 from px4fuse.recording import LogInfo
 from px4fuse.report.document import Document, who
 from px4fuse.report.marks import LANDING, TAKE_OFF
@@ -79,8 +81,13 @@ def _verdict(page: Page, document: Document) -> None:
         judged = isinstance(one, Consistency)
         column, _ = halves()
         owner = "our filter" if name == "ours" else name
-        column.write(f"Along {along} {owner}'s variance is")
-        column.write(verdict_words(one), size=16.0, bold=True, colour=colour if judged else MUTED,
+        what, large = "variance is", verdict_words(one)
+        which: FilterName = "kf" if name == "ours" else "ekf2"
+        if hidden := hidden_error(document.analysis, result, which):
+            what, claimed = "error is", length_words(hidden.claimed_m)
+            large = f"{length_words(hidden.rmse_m)}, claimed {claimed}"
+        column.write(f"Along {along} {owner}'s {what}")
+        column.write(large, size=16.0, bold=True, colour=colour if judged else MUTED,
                      above=1.0)  # fmt: skip
         if isinstance(one, Unavailable):
             column.write(f"{one.reason}.", above=1.0)

@@ -6,15 +6,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import permutations
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from px4fuse.comparison.model import AxisComparison, Comparison, Difference, FilterSummary
 from px4fuse.comparison.model import UnjudgedFilter as Unjudged
-from px4fuse.filter.consistency import Consistency, verdict_of
+from px4fuse.filter.consistency import SIGMA_OFF, Consistency, verdict_of
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings import Finding
-from px4fuse.findings.variance import VARIANCE_FACTOR
 from px4fuse.flight import Alignment, Unavailable
 from px4fuse.plain import factor_words, number_words, p_words
 from px4fuse.recording import ClockMap
@@ -44,7 +41,7 @@ def verdict_words(statement: Consistency | Unavailable) -> str:
         return "not available"
     if statement.verdict == "consistent":
         return "consistent"
-    return f"{_side(statement)} {factor_words(_factor(statement))}×"
+    return f"{_side(statement)} {factor_words(statement.times_off)}× in σ"
 
 
 def filters(result: AxisComparison) -> dict[str, FilterSummary | Unjudged]:
@@ -109,10 +106,6 @@ def _side(statement: Consistency) -> str:
     return statement.verdict.removeprefix("variance ")
 
 
-def _factor(statement: Consistency) -> float:
-    return max(statement.variance_factor, 1.0 / statement.variance_factor)
-
-
 def verdict_notes(comparison: Comparison) -> list[str]:
     """What the verdicts mean where they could be misread, a sentence each.
 
@@ -134,12 +127,12 @@ def verdict_notes(comparison: Comparison) -> list[str]:
     small = [
         f"{owner} {axis} {verdict_words(statement)}"
         for axis, owner, statement in stated
-        if statement.verdict != "consistent" and _factor(statement) < VARIANCE_FACTOR
+        if statement.verdict != "consistent" and statement.times_off < SIGMA_OFF
     ]
     if small:
         notes.append(
-            f"{', '.join(small)}: more than chance, but less than {VARIANCE_FACTOR:g}× "
-            f"({np.sqrt(VARIANCE_FACTOR) - 1.0:.0%} in σ), from where it is a finding."
+            f"{', '.join(small)}: more than chance, but less than {SIGMA_OFF:g}×, from "
+            "where it is a finding."
         )
     notes += _same_nis(stated)
     coloured = [

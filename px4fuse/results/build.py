@@ -48,6 +48,7 @@ def results(
         heading=analysis.heading,
         ekf2_replay=written(analysis.ekf2_replay),
         why=written(analysis.why),
+        causes=analysis.causes,
         aids={} if isinstance(analysis.aids, Unavailable) else dict(analysis.aids),
         loop=written(analysis.loop),
         story=story(analysis, findings),

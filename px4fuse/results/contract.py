@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
+from px4fuse.comparison.interventions import Intervention
 from px4fuse.comparison.model import AxisResult, FilterName
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.replay import Agreement, Replayed
@@ -74,6 +75,8 @@ class ComparisonResults(_OfFlight, frozen=True):
         EKF2 replayed from the log, and how well that agrees with what was logged.
     why : mapping of axis name to WhySteps
         Why EKF2 differs.
+    causes : tuple of Intervention
+        What was changed, each by a replay, and what that explains of what is not consistent.
     aids : mapping of PX4's name to AidResult
         What EKF2 fused in flight, each judged by its own innovations; empty where none can be.
     loop : LoopPart
@@ -96,6 +99,7 @@ class ComparisonResults(_OfFlight, frozen=True):
     heading: Maybe[HeadingError]
     ekf2_replay: Maybe[Replayed]
     why: dict[str, Maybe[WhySteps]]
+    causes: tuple[Intervention, ...]
     aids: dict[str, AidResult]
     loop: Maybe[LoopPart]
     story: tuple[str, ...]

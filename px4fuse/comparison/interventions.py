@@ -1,0 +1,385 @@
+"""Causes by intervention: each thing that may make a filter inconsistent is changed, and replayed.
+
+A discrepancy is a mean NIS outside its band, or an error beyond what a filter claims (NEES). Each
+candidate is tried alone, then with what the best one leaves. A cause is the smallest change that
+brings the number into its band, or else explains at least half of its logarithm; "since" stands
+before nothing else. Where a fault of the source explains as much as a setting, it comes first: a
+setting would only hide it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from px4fuse.comparison.comparison import kf_against_truth
+from px4fuse.comparison.estimates import Tuning
+from px4fuse.comparison.model import (
+    AgainstTruth,
+    AxisComparison,
+    Comparison,
+    FilterName,
+    FilterSummary,
+    UnjudgedFilter,
+)
+from px4fuse.comparison.remedy import delay_asked, noise_change, noise_used_m
+from px4fuse.ekf2.agreement import judged_from, settled
+from px4fuse.ekf2.model import Model, moved, replay_settings
+from px4fuse.ekf2.replay import HORIZONTAL as LEVEL
+from px4fuse.ekf2.replay import UPDATE_COLUMNS, Ekf2Replay
+from px4fuse.ekf2_parameters import GNSS_VEL, PARAMETERS
+from px4fuse.filter.clock import ClockOffset
+from px4fuse.filter.consistency import nis_band
+from px4fuse.filter.heading import HeadingError
+from px4fuse.filter.kalman import replay
+from px4fuse.filter.likelihood import innovations, preintegrate
+from px4fuse.filter.settings import Settings
+from px4fuse.filter.signals import along, within
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.flight import POSITION_COLUMNS, Unavailable
+from px4fuse.record import Positive, Record
+
+Of = Literal["nis", "nees"]
+Change = Mapping[str, float]
+# Squared errors of so many times what is claimed are beyond it: twice σ; clean flights stay below 3
+NEES_LARGE = 4.0
+# Mean NIS above which the innovations themselves say so
+CONTENT_NIS = 1.5
+# Of the logarithm, and as far above 1 as below
+EXPLAINS = 0.5
+# Of the logarithm, for what is tried together with the best of the others
+HELPS = 0.1
+CLOCK, TURN, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
+# What is wrong with the source itself
+OF_SOURCE = frozenset((OUTLIERS, CLOCK, TURN))
+SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
+# What EKF2 has besides the aid's own; PX4's default is tried where something else was flown
+NOT_OF_AID = frozenset((
+    "EKF2_ACC_NOISE", "EKF2_GYR_NOISE", "EKF2_ACC_B_NOISE", "EKF2_GYR_B_NOISE", GNSS_VEL.noise,
+    GNSS_VEL.gate,
+))  # fmt: skip
+INNOVATION_COLUMNS, INNOVATION_VARIANCE_COLUMNS = UPDATE_COLUMNS[:2], UPDATE_COLUMNS[2:4]
+POSITION_VARIANCES = [f"position_variance_{axis}_m2" for axis in LEVEL]
+HEADING_SIGMAS = 3.0
+
+
+class Intervention(Record, frozen=True, kw_only=True):
+    """One change, and what it makes of a number that should be 1.
+
+    Attributes
+    ----------
+    of : {"nis", "nees"}
+        Mean NIS, or mean NEES of position.
+    filter : {"kf", "ekf2"}
+    axis : str
+    change : mapping from name to value
+        Fields of the settings, PX4's parameters, ``turned_deg`` (of the positions, clockwise seen
+        from above) and ``outliers_left_out`` (how many).
+    before, after : float
+        The number by a replay without the change, and with it.
+    explains : float
+        Share of its logarithm that the change takes away; above 1 it goes to the other side.
+    brings_into_band : bool
+        Of a NIS its 95 % band; an error is beyond a claim from a NEES of :data:`NEES_LARGE` on.
+    """
+
+    of: Of
+    filter: FilterName
+    axis: str
+    change: Change
+    before: Positive
+    after: Positive
+    explains: float
+    brings_into_band: bool
+
+    @property
+    def is_cause(self) -> bool:
+        """Whether it explains enough of it, and not so much that it is something else."""
+        return EXPLAINS <= self.explains <= 2.0 - EXPLAINS
+
+
+def cause_of(
+    causes: Iterable[Intervention], owner: FilterName, axis: str, of: Of = "nis"
+) -> Intervention | None:
+    """The cause of one discrepancy, by all that was tried; None where nothing explains it."""
+    tried = [each for each in causes if (each.of, each.filter, each.axis) == (of, owner, axis)]
+    return min(
+        (each for each in tried if each.is_cause),
+        key=lambda each: (
+            not each.brings_into_band, len(each.change), OF_SOURCE.isdisjoint(each.change),
+            abs(each.explains - 1.0),
+        ),
+        default=None,
+    )  # fmt: skip
+
+
+def beyond_claim(statement: FilterSummary | UnjudgedFilter) -> bool:
+    """Whether the error to the truth is larger than claimed, and no innovation says so."""
+    truth = statement.truth
+    if isinstance(statement, Unavailable) or not isinstance(truth, AgainstTruth):
+        return False
+    return (truth.nees_position_mean or 0.0) >= NEES_LARGE and statement.nis_mean < CONTENT_NIS
+
+
+def interventions(
+    comparison: Comparison,
+    tuning: Tuning,
+    clock: ClockOffset | Unavailable,
+    heading: HeadingError | Unavailable,
+    model: Model | Unavailable,
+) -> tuple[Intervention, ...]:
+    """Try every candidate on every discrepancy.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    tuning : mapping from axis name, or "horizontal", to AxisTuning or Unavailable
+    clock : ClockOffset or Unavailable
+    heading : HeadingError or Unavailable
+    model : Model or Unavailable
+        Of EKF2.
+    """
+    filters: dict[FilterName, _Ours | _Ekf2 | None] = {
+        "kf": _Ours(comparison, tuning, clock, heading),
+        "ekf2": _Ekf2.of(comparison, tuning, clock, heading, model),
+    }
+    return tuple(
+        tried
+        for owner, changed in filters.items()
+        for result in comparison.axes.values()
+        if changed is not None and (owner == "kf" or result.axis.name != "down")
+        for of in _discrepancies(result.filters[owner])
+        for tried in _tried(owner, result, of, changed.candidates(result, of), changed.number)
+    )
+
+
+def _discrepancies(statement: FilterSummary | UnjudgedFilter) -> list[Of]:
+    """What of a filter is not as it should be."""
+    found: list[Of] = ["nees"] if beyond_claim(statement) else []
+    if not isinstance(statement, Unavailable) and statement.verdict != "consistent":
+        found.append("nis")
+    return found
+
+
+Number = Callable[[AxisComparison, Of, Change], tuple[float, int] | None]
+
+
+def _tried(
+    owner: FilterName, result: AxisComparison, of: Of, candidates: Sequence[Change], number: Number
+) -> list[Intervention]:
+    """All candidates alone; where the best leaves the number outside its band, with the others."""
+    found = number(result, of, {}) if candidates else None
+    if found is None:
+        return []
+    before = found[0]
+
+    def tried(change: Change) -> list[Intervention]:
+        found = number(result, of, change)
+        if found is None or found[0] <= 0.0:
+            return []
+        after, count = found
+        low, high = nis_band(count) if of == "nis" else (0.0, NEES_LARGE)
+        return [
+            Intervention(
+                of=of, filter=owner, axis=result.axis.name, change=change, before=before,
+                after=after, explains=1.0 - float(np.log(after) / np.log(before)),
+                brings_into_band=low <= after <= high,
+            )
+        ]  # fmt: skip
+
+    alone = [each for change in candidates for each in tried(change)]
+    helping = sorted((e for e in alone if e.explains > HELPS), key=lambda e: abs(e.explains - 1.0))
+    if not helping or any(each.brings_into_band for each in helping):
+        return alone
+    best, *others = helping
+    return alone + [e for other in others for e in tried({**best.change, **other.change})]
+
+
+def tuned_for(tuning: Tuning, axis: str) -> AxisTuning | None:
+    """What was tuned for an axis: both horizontal ones together, where there are both."""
+    names = (axis,) if axis == "down" else (HORIZONTAL, axis)
+    found = (tuning.get(name) for name in names)
+    return next((tuned for tuned in found if isinstance(tuned, AxisTuning)), None)
+
+
+def _of_clock(comparison: Comparison, clock: ClockOffset | Unavailable) -> list[Change]:
+    """The offset of the stamps, where it is beyond chance."""
+    if isinstance(clock, Unavailable) or not clock.determinable:
+        return []
+    if abs(clock.remaining_s) <= clock.chance_s:
+        return []
+    return [{CLOCK: round(comparison.settings.clock_offset_s + clock.remaining_s, 3)}]
+
+
+def _of_frame(heading: HeadingError | Unavailable) -> list[Change]:
+    """How the positions are turned, where it is beyond chance."""
+    if isinstance(heading, Unavailable):
+        return []
+    if abs(heading.turn_deg) <= HEADING_SIGMAS * heading.sigma_deg:
+        return []
+    return [{TURN: -round(heading.turn_deg, 1)}]
+
+
+def _is_over(result: AxisComparison, owner: FilterName, of: Of) -> bool:
+    """Whether the variance is larger than what is shown."""
+    statement = result.filters[owner]
+    return of == "nis" and not isinstance(statement, Unavailable) and statement.nis_mean < 1.0
+
+
+def _hides_noise(comparison: Comparison) -> bool:
+    """Whether small innovations against the source say too little of its errors."""
+    return comparison.source.origin.may_drift or comparison.source.origin.is_gnss
+
+
+@dataclass(frozen=True)
+class _Ours:
+    """Our filter with changes; those of the settings only where the data's interval excludes it."""
+
+    comparison: Comparison
+    tuning: Tuning
+    clock: ClockOffset | Unavailable
+    heading: HeadingError | Unavailable
+
+    def candidates(self, result: AxisComparison, of: Of) -> list[Change]:
+        """What to try along an axis."""
+        settings, tuned = self.comparison.settings, tuned_for(self.tuning, result.axis.name)
+        over, found = _is_over(result, "kf", of), list[Change]()
+        if tuned is not None and not (over and _hides_noise(self.comparison)):
+            for name, noise in ((SIGMA_A, tuned.filter_sigma_a), (SIGMA_Z, tuned.sigma_z)):
+                chosen, asked = getattr(settings, name), noise.value or (noise.high if over else 0)
+                end = noise.high if over else noise.low
+                if asked and end is not None and (chosen > end if over else chosen < end):
+                    found.append({name: float(f"{asked:.3g}")})
+        if tuned is not None and not over and len(tuned.outlier_time_s):
+            found.append({OUTLIERS: float(len(tuned.outlier_time_s))})
+        found += _of_clock(self.comparison, self.clock)
+        return found if result.axis.name == "down" else found + _of_frame(self.heading)
+
+    def number(self, result: AxisComparison, of: Of, change: Change) -> tuple[float, int] | None:
+        """Mean NIS or NEES along an axis with a change, and of how many."""
+        source, segment, axis = self.comparison.source, self.comparison.segment, result.axis
+        named: dict[str, Any] = {name: change[name] for name in change if name in vars(Settings())}
+        settings = replace(self.comparison.settings, **named)
+        if TURN in change:
+            turned = Rotation.from_euler("z", -change[TURN], degrees=True).apply(axis.direction)
+            measured_m = along(within(source.samples, segment), POSITION_COLUMNS, turned)
+            axis = replace(axis, measurement_m=measured_m[np.isfinite(measured_m)])
+        time_s, tuned = axis.measurement_time_s, tuned_for(self.tuning, axis.name)
+        kept = np.ones(len(time_s), dtype=bool)
+        if OUTLIERS in change and tuned is not None:
+            kept = ~np.isin(time_s, tuned.outlier_time_s)
+        shift_s = settings.clock_offset_s - self.comparison.settings.clock_offset_s
+        axis = replace(
+            axis, measurement_time_s=time_s[kept] + shift_s, measurement_m=axis.measurement_m[kept]
+        )
+        if of == "nis":
+            legs = preintegrate(axis, settings)
+            nu, s = innovations(legs, settings.sigma_a_m_s2, settings.sigma_z_m)
+            return float(np.mean(nu**2 / s)), len(nu)
+        run = replay(axis, settings)
+        truth = kf_against_truth(run, result.truth, run.steps.index.to_numpy())
+        if isinstance(truth, Unavailable) or truth.nees_position_mean is None:
+            return None
+        return truth.nees_position_mean, truth.count
+
+
+@dataclass(frozen=True)
+class _Ekf2:
+    """EKF2 with changes, where the model agrees with the log and fused what was analysed."""
+
+    comparison: Comparison
+    tuning: Tuning
+    clock: ClockOffset | Unavailable
+    heading: HeadingError | Unavailable
+    model: Model
+    replays: dict[tuple[tuple[str, float], ...], Ekf2Replay] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls, comparison: Comparison, tuning: Tuning, clock: ClockOffset | Unavailable,
+        heading: HeadingError | Unavailable, model: Model | Unavailable,
+    ) -> _Ekf2 | None:  # fmt: skip
+        """None where EKF2 cannot be replayed, or fused something else."""
+        source = comparison.source
+        if isinstance(model, Unavailable) or not model.agreement.good:
+            return None
+        if source.name != model.inputs.received.source or source.alignment is not None:
+            return None
+        return cls(comparison, tuning, clock, heading, model)
+
+    def candidates(self, result: AxisComparison, of: Of) -> list[Change]:
+        """What to try along a horizontal axis."""
+        aid, flown = self.model.inputs.aid, self.model.inputs.settings
+        over, tuned = _is_over(result, "ekf2", of), tuned_for(self.tuning, result.axis.name)
+        found = list[Change]()
+        if tuned is not None and not (over and _hides_noise(self.comparison)):
+            found.append(self._noise(result, tuned))
+        if tuned is not None and not over and len(tuned.outlier_time_s):
+            found.append({OUTLIERS: float(len(tuned.outlier_time_s))})
+        # a delay is EKF2's own to set; there is none for stamps that are early
+        if delay := delay_asked(self.comparison, self.model, self.clock):
+            found.append(delay)
+        else:
+            found += _of_clock(self.comparison, self.clock)
+        found += _of_frame(self.heading)
+        if flown[aid.gate] < PARAMETERS[aid.gate].default:
+            found.append({aid.gate: PARAMETERS[aid.gate].default})
+        found += [
+            {name: PARAMETERS[name].default}
+            for name in flown.keys() & NOT_OF_AID
+            if not np.isclose(flown[name], PARAMETERS[name].default, rtol=1e-3)
+        ]
+        return [change for change in found if change]
+
+    def _noise(self, result: AxisComparison, tuned: AxisTuning) -> Change:
+        """The source's noise, where EKF2 takes another than the data's interval allows."""
+        used_m, noise, statement = noise_used_m(self.model), tuned.sigma_z, result.filters["ekf2"]
+        if (noise.low or 0.0) <= used_m <= (noise.high or np.inf):
+            return {}
+        if noise.value is not None:
+            return noise_change(self.model, noise.value)
+        if isinstance(statement, Unavailable):
+            return {}
+        # EKF2's own innovations bound it too, and less tightly
+        bound_m = np.hypot(statement.innovation_std_m, statement.innovation_mean_m)
+        return noise_change(self.model, float(bound_m))
+
+    def number(self, result: AxisComparison, of: Of, change: Change) -> tuple[float, int] | None:
+        """Mean NIS or NEES along a horizontal axis with a change, and of how many."""
+        made, direction = self._replayed(change), result.axis.direction
+        updates = made.updates[settled(made.updates.index, judged_from(self.model.flown))]
+        if of == "nis":
+            nu = along(updates, INNOVATION_COLUMNS, direction[:2])
+            s = along(updates, INNOVATION_VARIANCE_COLUMNS, direction[:2] ** 2)
+            return (float(np.mean(nu**2 / s)), len(nu)) if len(nu) else None
+        if isinstance(result.truth, Unavailable):
+            return None
+        at_s, truth = updates["fused_at_s"].to_numpy(), result.truth
+        track = np.array([np.interp(at_s, made.delayed.index, made.delayed[column])
+                          for column in POSITION_COLUMNS])  # fmt: skip
+        error = direction @ track - np.interp(
+            at_s, truth.index, truth["position_m"], np.nan, np.nan
+        )
+        variance = along(updates, POSITION_VARIANCES, direction[:2] ** 2)
+        nees = (error**2 / variance)[np.isfinite(error)]
+        return (float(np.mean(nees)), len(nees)) if len(nees) else None
+
+    def _replayed(self, change: Change) -> Ekf2Replay:
+        """EKF2 with a change, each replayed once."""
+        key = tuple(sorted(change.items()))
+        if key not in self.replays:
+            settings = {name: value for name, value in change.items() if name in PARAMETERS}
+            shift_s = change.get(CLOCK, applied_s := self.comparison.settings.clock_offset_s)
+            model = moved(self.model, change.get(TURN, 0.0), shift_s - applied_s)
+            left_out_s, tuned = None, tuned_for(self.tuning, HORIZONTAL)
+            if OUTLIERS in change and tuned is not None:
+                stamp = 1e-3 * self.model.inputs.settings[self.model.inputs.aid.delay]
+                of_source = self.comparison.source.origin.is_gnss
+                left_out_s = tuned.outlier_time_s - self.comparison.settings.clock_offset_s
+                left_out_s = left_out_s + (stamp if of_source else 0.0)
+            (self.replays[key],) = replay_settings(model, [settings], left_out_s)
+        return self.replays[key]

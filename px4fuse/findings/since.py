@@ -1,0 +1,115 @@
+"""A cause that a replay has shown, in words: what it is, what it does, and what puts it right."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from px4fuse.analysis import Analysis
+from px4fuse.comparison.interventions import (
+    CLOCK,
+    OUTLIERS,
+    SIGMA_A,
+    SIGMA_Z,
+    TURN,
+    Change,
+    Intervention,
+)
+from px4fuse.comparison.remedy import COMMAND, aid_of, settings_words
+from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.flight import Unavailable
+from px4fuse.plain import capital, number_words
+
+Kind = Literal[
+    "outliers", "clock", "frame", "measurement noise", "process noise", "gate", "elsewhere"
+]
+# Findings that say the same as the first sentence does, by what is changed
+TOLD_BY: dict[Kind, frozenset[str]] = {
+    "outliers": frozenset(("source_outliers",)),
+    "clock": frozenset(("source_clock_offset", "ekf2_ev_delay_wrong")),
+    "frame": frozenset(("source_frame_turned", "ekf2_heading_wrong")),
+    "gate": frozenset(("ekf2_gate_small",)),
+}
+OPTIONS = {SIGMA_Z: "--sigma-z", SIGMA_A: "--sigma-a", CLOCK: "--clock-offset"}
+UNITS = {SIGMA_A: "m/s²", SIGMA_Z: "m"}
+# What a change of another parameter needs along with it
+ALONG = frozenset(("EKF2_DELAY_MAX", "EKF2_EV_NOISE_MD"))
+
+
+def kind_of(analysis: Analysis, cause: Intervention | None) -> Kind:
+    """What sort of cause it is: the fault of the source where there are two."""
+    if cause is None:
+        return "elsewhere"
+    aid = aid_of(analysis)
+    kinds: dict[str, Kind] = {
+        OUTLIERS: "outliers", CLOCK: "clock", aid.delay: "clock", TURN: "frame",
+        SIGMA_Z: "measurement noise", aid.noise: "measurement noise", aid.gate: "gate",
+    }  # fmt: skip
+    return next((kind for name, kind in kinds.items() if name in cause.change), "process noise")
+
+
+def since_words(analysis: Analysis, cause: Intervention | None) -> str:
+    """What stands behind a verdict: its cause, and the replay that shows it; or nothing."""
+    return "" if cause is None else f", since {reason_words(analysis, cause)}"
+
+
+def reason_words(analysis: Analysis, cause: Intervention) -> str:
+    """A cause as a clause, and the replay that shows it."""
+    return f"{change_words(analysis, cause)} ({effect_words(cause)})"
+
+
+def change_words(analysis: Analysis, cause: Intervention) -> str:
+    """What is wrong, as a clause: what was changed to see what it does."""
+    said = [_one(analysis, cause.change, name) for name in cause.change if name not in ALONG]
+    return " and ".join(said)
+
+
+def share_words(cause: Intervention) -> str:
+    """How much of a discrepancy a change explains."""
+    if cause.brings_into_band:
+        return "all"
+    if cause.explains > 1.0:
+        return "too much"
+    return f"{cause.explains:.0%}" if cause.explains > 0.0 else "nothing"
+
+
+def cure_words(cause: Intervention) -> str:
+    """What to do about a cause."""
+    parts, change = [], dict(cause.change)
+    if change.pop(OUTLIERS, None):
+        parts.append("remove the outliers (line of sight, anchor survey), raise no noise")
+    if turn_deg := change.pop(TURN, None):
+        parts.append(f"turn the positions by {turn_deg:+.0f}° before they are sent")
+    typed = [f"{option} {change.pop(name):g}" for name, option in OPTIONS.items() if name in change]
+    if change:
+        parts.append(f"set {settings_words(change)}")
+    if typed:
+        parts.append(f"type {COMMAND} {' '.join(typed)}")
+    return f"{capital(', and '.join(parts))}."
+
+
+def effect_words(cause: Intervention) -> str:
+    """What a change does to the number in question, by the replay."""
+    if cause.of == "nis":
+        before, after = (number_words(nis, 2) for nis in (cause.before, cause.after))
+        return f"replayed: mean NIS {before} → {after}"
+    before, after = (number_words(nees**0.5, 2) for nees in (cause.before, cause.after))
+    return f"replayed: errors of {before} → {after} σ"
+
+
+def _one(analysis: Analysis, change: Change, name: str) -> str:
+    """What is wrong, for one of the things that were changed."""
+    value, settings = change[name], analysis.settings
+    match name:
+        case "outliers_left_out":
+            return f"{value:.0f} position{'s are outliers' if value > 1 else ' is an outlier'}"
+        case "clock_offset_s":
+            missing_s = value - settings.clock_offset_s
+            return f"the stamps are {abs(missing_s):.2g} s {'late' if missing_s < 0 else 'early'}"
+        case "turned_deg":
+            return f"the positions are turned by {-value:+.0f}°"
+        case "sigma_a_m_s2" | "sigma_z_m":
+            label = name[:7].upper()
+            return f"{label} is {getattr(settings, name):g} instead of {value:.2g} {UNITS[name]}"
+    assert not isinstance(analysis.ekf2_model, Unavailable)  # it was replayed
+    flown, unit = analysis.ekf2_model.inputs.settings[name], PARAMETERS[name].unit
+    return f"{name} is {flown:g} instead of {value:.3g} {unit}".rstrip()
