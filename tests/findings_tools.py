@@ -13,6 +13,7 @@ import pandas as pd
 from exchange import replace
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.interventions import Intervention
 from px4fuse.comparison.model import FILTERS, AgainstTruth, FilterSummary, UnjudgedFilter
 from px4fuse.filter.causes import Explained, Jump
 from px4fuse.filter.clock import ClockOffset, PartOffset
@@ -109,7 +110,7 @@ def analysis(
     return SimpleNamespace(  # type: ignore[return-value]
         flight=SimpleNamespace(log=log, ekf2=ekf2, **flown), source=source, axes=by_name,
         lines=tuple(axis.axis for axis in axes), segment=SEGMENT, settings=settings, notes=notes,
-        missing=missing, **{"tuning": {}, "why": {}, **usual, **parts},
+        missing=missing, **{"tuning": {}, "why": {}, "causes": (), **usual, **parts},
     )  # fmt: skip
 
 
@@ -132,12 +133,29 @@ def _with_truth(one: Any, truth: Any) -> Any:
     return made(FilterSummary, **known, sigma_p_median_m=None, truth=truth)
 
 
+def tried(
+    owner: Any, change: dict[str, float], axis: str = "north", of: Any = "nis",
+    before: float = 9.0, explains: float = 1.0,
+) -> Intervention:  # fmt: skip
+    """What a change explained."""
+    after = before ** (1.0 - explains)
+    return Intervention(
+        of=of, filter=owner, axis=axis, change=change, before=before, after=after,
+        explains=explains, brings_into_band=explains == 1.0,
+    )  # fmt: skip
+
+
 def statement(nis: float = 1.0, verdict: str = "consistent", **parts: Any) -> Any:
     """A filter with this mean NIS."""
     usual = {"lag1_autocorrelation": 0.0, "outside_gate": 0.0, "innovation_std_m": 0.3,
              "innovation_mean_m": 0.4}  # fmt: skip
     return made(
-        Consistency, nis_mean=nis, nis_band=(0.8, 1.2), verdict=verdict, **{**usual, **parts}
+        Consistency,
+        nis_mean=nis,
+        nis_band=(0.8, 1.2),
+        sigma_factor=nis**-0.5,
+        verdict=verdict,
+        **{**usual, **parts},
     )
 
 

@@ -62,7 +62,12 @@ def test_consequences_of_consequences_are_told_too() -> None:
 
 
 def test_the_size_of_our_variance_does_not_make_advice_an_error() -> None:
-    cause, _ = by_cause([one("sigma_z_large", "info"), one("kf_variance_overstated", "error")])
+    cause, _ = by_cause(
+        [
+            one("sigma_z_large", "info"),
+            one("kf_variance_overstated", "error", cause="measurement noise"),
+        ]
+    )
     assert cause.severity == "info"
 
 
@@ -104,7 +109,7 @@ def comparison(sample_flight: Flight) -> Comparison:
 
 def test_verdicts_that_could_be_misread_have_a_sentence(comparison: Comparison) -> None:
     small, same, white = verdict_notes(comparison)
-    assert "ours aisle overstated 1.18×" in small
+    assert "ours aisle overstated 1.09× in σ" in small
     assert "EKF2 has nearly the same mean NIS (0.84, 0.86)" in same
     assert "with 624 samples against 250" in same
     assert "ours down p < 0.001" in white

@@ -185,7 +185,7 @@ def test_ekf2_overstates_its_variance_in_real_flights(
 ) -> None:
     flight = read_log(shared_logs / "real" / f"{name}.ulg")
     whole = compare(flight, start_s=0.0, end_s=flight.log.duration_s)
-    assert whole.horizontal.get("ekf2").variance_factor == pytest.approx(factor, rel=0.10)
+    assert whole.horizontal.get("ekf2").sigma_factor == pytest.approx(factor**0.5, rel=0.05)
     assert compare(flight).horizontal.get("ekf2").verdict == "variance overstated"
 
 
@@ -199,9 +199,9 @@ class TestMadeFlight:
             assert result.filters["kf"].truth.nees_velocity_mean == pytest.approx(1.0, abs=0.3)
 
     @pytest.mark.parametrize("nis", [0.01, 1.0, 20.0])
-    def test_ekf2s_variance_factor_is_the_one_injected(self, nis: float) -> None:
+    def test_ekf2s_sigma_factor_is_the_one_injected(self, nis: float) -> None:
         comparison = compare(aisle_flight(ekf2=Estimator(nis=nis)))
-        assert comparison.horizontal.get("ekf2").variance_factor == pytest.approx(1 / nis, rel=0.1)
+        assert comparison.horizontal.get("ekf2").sigma_factor == pytest.approx(nis**-0.5, rel=0.05)
 
     def test_ekf2s_errors_and_sigmas_are_those_injected(self, made: Comparison) -> None:
         """P⁻ = S - R and P⁺ = P⁻R/S, with P⁻ = (0.06 m)² and R = (0.10 m)²."""

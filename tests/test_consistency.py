@@ -81,8 +81,9 @@ def test_95_percent_of_white_flights_are_consistent_and_white() -> None:
 def test_a_wrong_variance_is_recovered_as_its_factor(factor: float) -> None:
     variance = np.random.default_rng(2).uniform(0.5, 2.0, 2000)
     result = assessed(white(1, 2000) * np.sqrt(variance), factor * variance)
-    assert result.variance_factor == pytest.approx(factor, rel=0.08)
-    assert result.variance_factor * result.nis_mean == pytest.approx(1.0)
+    assert result.sigma_factor == pytest.approx(factor**0.5, rel=0.04)
+    assert result.sigma_factor**2 * result.nis_mean == pytest.approx(1.0)
+    assert result.times_off == max(result.sigma_factor, 1.0 / result.sigma_factor) > 1.0
     assert result.verdict == f"variance {'overstated' if factor > 1 else 'understated'}"
 
 
@@ -151,7 +152,7 @@ def test_horizontal_nis_is_the_mean_of_both_axes_with_the_narrower_band() -> Non
     both = (assessed(north).nis_mean + assessed(east).nis_mean) / 2
     assert result.count == 200
     assert result.nis_mean == pytest.approx(both)
-    assert result.variance_factor == pytest.approx(1 / both)
+    assert result.sigma_factor == pytest.approx(both**-0.5)
     assert result.nis_band == nis_band(200, 2)
     assert result.verdict == "variance overstated"
 

@@ -171,9 +171,9 @@ FAULTS = [
     # EKF2's
     Fault("accelerometer_bias", "warning", {"bias_m_s2": about(0.3, 0.01)}, change=biased,
           says="+0.20 forward, -0.10 right, +0.20 down"),
-    Fault("ekf2_variance_overstated", "error", {"variance_factor": about(50, 0.3), **ASKED},
+    Fault("ekf2_variance_overstated", "error", {"sigma_factor": about(7.1, 0.15), **ASKED},
           ekf2(nis=0.02, noise_m=0.7)),
-    Fault("ekf2_variance_overstated", "warning", {"variance_factor": about(2.5, 0.3)},
+    Fault("ekf2_variance_overstated", "warning", {"sigma_factor": about(1.6, 0.15)},
           ekf2(nis=0.4, noise_m=0.15)),
     Fault("ekf2_variance_understated", "error", {"nis_mean": about(22, 0.2), **ASKED},
           ekf2(nis=22.0, noise_m=0.02)),
@@ -391,7 +391,7 @@ REAL_LOGS = [
      {"fusing_share": 0.0, "source_interval_s": about(0.5, 0.05)}, "10 Hz"),
     ("simulated/*_aisle_nlos.ulg", "source_gap", "warning", {"longest_s": about(8.0, 0.04)}, ""),
     ("simulated/*_aisle_nlos.ulg", "ekf2_resets", "warning", {"at_s": about(64.0, 0.03)}, ""),
-    ("simulated/*_aisle_nlos.ulg", "kf_variance_understated", None, {}, "remove the outliers"),
+    ("simulated/*_aisle_nlos.ulg", "kf_variance_understated", None, {}, "Remove the outliers"),
     ("simulated/*_aisle_hwlog.ulg", "source_not_logged", "warning", {}, "SDLOG_PROFILE to 129"),
     ("simulated/*_aisle_hwlog.ulg", "source_decimated", "warning", {"logger_limit_hz": 2.0}, ""),
     ("real/mengchaoheng*test3.ulg", "logger_dropouts", "warning", {"total_s": about(0.82)}, ""),
@@ -429,5 +429,5 @@ def test_motion_capture_flights_overstate_the_variance_and_nobody_is_blamed(
     assert [finding.id for finding in behind] == (
         ["kf_variance_overstated"] * 2 + ["ekf2_variance_overstated"] * 2
     )
-    assert behind[2].evidence["variance_factor"] > 4.0
+    assert behind[2].evidence["sigma_factor"] > 2.0
     assert not [f for f in findings if f.severity == "error" and f.caused_by is None]

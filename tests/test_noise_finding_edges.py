@@ -27,18 +27,20 @@ from findings_tools import (
     severity,
     source,
     statement,
+    tried,
     tuned,
 )
 
 from px4fuse.comparison.model import Difference
 from px4fuse.ekf2.walk import Why
+from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HeldOut, Noise
 from px4fuse.findings import Finding, hidden_errors, loops, sigma, variance
-from px4fuse.findings import story as telling
+from px4fuse.findings import story as narration
 from px4fuse.findings.causes import by_cause
 from px4fuse.findings.story import story
-from px4fuse.findings.variance import _has_outliers, _is_default, _noise_helps
+from px4fuse.findings.variance import _is_default
 from px4fuse.loop.loop import Loop
 from px4fuse.loop.model import Closure
 
@@ -201,8 +203,8 @@ def kf(nis: float, name: str = "north", **parts: Any) -> Any:
 
 @pytest.mark.parametrize(
     ("nis", "expected"),
-    [(1.5, "warning"), (1.49, None), (3.99, "warning"), (4.0, "error"), (0.25, "error"),
-     (0.251, "warning"), (0.67, None), (0.66, "warning")],
+    [(1.563, "warning"), (1.56, None), (3.99, "warning"), (4.0, "error"), (0.25, "error"),
+     (0.251, "warning"), (0.641, None), (0.639, "warning")],
 )  # fmt: skip
 def test_a_variance_that_is_off(nis: float, expected: str | None) -> None:
     assert severity(variance.detect, analysis(axes=(kf(nis),))) == expected
@@ -216,8 +218,8 @@ def test_one_finding_for_the_horizontal_axes_with_the_vertical_one_behind() -> N
         ("kf_variance_overstated", None, "aisle"), ("kf_variance_understated", None, "east"),
         ("kf_variance_understated", "kf_variance_understated", "down"),
     ]  # fmt: skip
-    said = "variance is understated 3 times along east (mean NIS 3, consistent is 0.80 to 1.20; "
-    assert found[1].message == f"Our innovation {said}horizontal)."
+    said = "variance is understated 1.73 times in σ along east (mean NIS 3, consistent is 0.80 to "
+    assert found[1].message == f"Our innovation {said}1.20; horizontal)."
     assert found[2].message.endswith("vertical).")
     assert by_cause(found) == found
 
@@ -263,101 +265,96 @@ def test_ekf2s_noise_is_the_programs_unless_the_sender_chose_another(
 
 
 @pytest.mark.parametrize(
-    ("noise", "over", "helps"),
+    ("owner", "change", "kind", "says"),
     [
-        (2.0, False, True), (0.5, False, False), (0.5, True, True), (2.0, True, False),
-        (1.25, False, True), (1.249, False, False), (0.8, True, True), (0.801, True, False),
-        (np.nan, False, True), (np.nan, True, True),
+        ("kf", {"sigma_z_m": 2.0}, "measurement noise", "[--sigma-z 2|2|1|None]."),
+        ("kf", {"sigma_a_m_s2": 0.3}, "process noise", "[--sigma-a 0.3|1|0.3|None]."),
+        ("kf", {"sigma_a_m_s2": 0.3, "sigma_z_m": 2.0}, "measurement noise",
+         "[--sigma-a 0.3 --sigma-z 2|2|0.3|None]."),
+        ("kf", {"outliers_left_out": 9.0}, "outliers",
+         "Remove the outliers (line of sight, anchor survey), raise no noise."),
+        ("kf", {"outliers_left_out": 9.0, "sigma_z_m": 2.0}, "outliers",
+         "raise no noise, and type px4fuse compare LOG --sigma-z 2."),
+        ("kf", {"clock_offset_s": -0.25}, "clock", "Type px4fuse compare LOG --clock-offset -0.2"),
+        ("kf", {"turned_deg": -20.0}, "frame",
+         "Turn the positions by -20° before they are sent."),
+        ("ekf2", {"outliers_left_out": 9.0}, "outliers", "Remove the outliers"),
+        ("ekf2", {"EKF2_EV_DELAY": 90.0}, "clock", "{EKF2_EV_DELAY: 90 ms|delay_helps}"),
+        ("ekf2", {"EKF2_EVP_NOISE": 0.3}, "measurement noise", "NOISE: 0.3 m|noise_helps}"),
+        ("ekf2", {"EKF2_EVP_GATE": 5.0}, "gate", "{EKF2_EVP_GATE: 5 SD|rejects_less}"),
+        ("ekf2", {"EKF2_ACC_NOISE": 0.35}, "process noise",
+         "{EKF2_ACC_NOISE: 0.35 m/s^2|noise_helps}"),
     ],
 )  # fmt: skip
-def test_which_noise_fixes_a_variance(noise: float, over: bool, helps: bool) -> None:
-    assert _noise_helps(noise, 1.0, over=over) is helps
+def test_what_a_cause_asks_for(
+    owner: Any, change: dict[str, float], kind: str, says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def words(_: Any, changes: Any, helps: Any, *, otherwise: str) -> tuple[str, bool]:
+        ((name, value),) = changes.items()
+        return f"{{{name}: {value:g} {PARAMETERS[name].unit}|{helps.__name__}}}", True
 
-
-@pytest.mark.parametrize(
-    ("outside", "of_source", "there"),
-    [(0.0051, 6, True), (0.005, 6, False), (0.02, 5, False), (0.0051, None, True)],
-)
-def test_outliers_explain_a_variance(outside: float, of_source: int | None, there: bool) -> None:
-    noises = {} if of_source is None else tuned(outlier_time_s=np.zeros(of_source), count=1000)
-    one = statement(5.0, outside_gate=outside)
-    assert _has_outliers(analysis(tuning=noises), one) is there
-
-
-SLOWLY = {"lag1_autocorrelation": 0.31}
-RAISE = "(lag-1 correlation +0.31): raise SIGMA_A first. [--sigma-a 2|1|2|None]."
-
-
-@pytest.mark.parametrize(
-    ("one", "noises", "says", "cause"),
-    [
-        # more SIGMA_Z where S is too small, less where it is too large
-        (kf(5.0), (Noise(2.0, 1.9, 2.1),), "ask for SIGMA_Z 2 m. [--sigma-z 2|2|1|None].",
-         "measurement noise"),
-        (kf(0.2), (Noise(0.25, 0.2, 0.3),), "[--sigma-z 0.25|0.25|1|None].", "measurement noise"),
-        (kf(5.0), (Noise(0.25, 0.2, 0.3),), "It is not SIGMA_Z (the source's noise is 0.25 m)",
-         "elsewhere"),
-        (kf(5.0, outside_gate=0.1), (Noise(0.25, 0.2, 0.3),),
-         "10.0% lie outside the gate while the bulk fits 0.25 m: remove the outliers", "outliers"),
-        (kf(0.2, outside_gate=0.1), (Noise(2.0, 1.9, 2.1),), "It is not SIGMA_Z", "elsewhere"),
-        (kf(0.2), (Noise(1e-5, 0.0, 2e-5),), "ask for SIGMA_Z 0.001 m. [--sigma-z 0.001|",
-         "measurement noise"),
-        (kf(0.2), (Noise(None, None, 0.0001),),
-         "at most 0.001 m, below what this rate can show. [--sigma-z 0.005, and less SIGMA_A|",
-         "measurement noise"),
-        (kf(0.2), (Noise(None, None, 0.02),), "at most 0.02 m, below what this rate can show. "
-         "[--sigma-z 0.02, and less SIGMA_A|0.02|", "measurement noise"),
-        (kf(5.0), (Noise(None, None, None),), "No SIGMA_Z up to ", "elsewhere"),
-        # a filter that follows too slowly needs more SIGMA_A first
-        (kf(5.0, **SLOWLY), (Noise(2.0, 1.9, 2.1), Noise(2.0, 0.1, 9.0)), RAISE, "elsewhere"),
-        (kf(5.0, lag1_autocorrelation=0.3), (Noise(2.0, 1.9, 2.1), Noise(2.0, 0.1, 9.0)),
-         "ask for SIGMA_Z 2 m.", "measurement noise"),
-        (kf(0.2, **SLOWLY), (Noise(0.2, 0.1, 0.3), Noise(2.0, 0.1, 9.0)), "ask for SIGMA_Z 0.2 m.",
-         "measurement noise"),
-        *((kf(5.0, **SLOWLY), (Noise(2.0, 1.9, 2.1), Noise(needed, 0.1, 9.0)),
-           "ask for SIGMA_Z 2 m.", "measurement noise") for needed in (1.0, None)),
-    ],
-)  # fmt: skip
-def test_what_our_variance_asks_for(one: Any, noises: Any, says: str, cause: str) -> None:
-    tuning = tuned(*noises, outlier_time_s=np.zeros(9), count=10)
-    finding = only(variance.detect, analysis(axes=(one,), tuning=tuning))
+    monkeypatch.setattr(variance, "remedy_words", words)
+    model = SimpleNamespace(inputs=SimpleNamespace(settings=dict.fromkeys(PARAMETERS, 1.0)))
+    # what explains less, and what explains the other way, is none
+    causes = (tried(owner, {"sigma_z_m": 7.0}, explains=0.4), tried(owner, change),
+              tried(owner, {"sigma_z_m": 7.0}, explains=1.6))  # fmt: skip
+    one = axis("north", **{owner: statement(9.0, "variance understated")})
+    finding = only(variance.detect, analysis(axes=(one,), causes=causes, ekf2_model=model))
     assert says in finding.remedy
-    assert finding.evidence["cause"] == cause
-    asked = noises[0]
-    if asked.high is not None:
-        bounded = asked.value is None
-        assert finding.evidence["sigma_z_asked_m"] == (asked.high if bounded else asked.value)
-        assert finding.evidence["sigma_z_asked_is_upper_bound"] == float(bounded)
+    assert finding.evidence["cause"] == kind
+
+
+def test_without_a_cause_what_was_tried_is_said() -> None:
+    little = tried("kf", {"sigma_z_m": 7.0}, explains=0.4)
+    causes = (little, tried("kf", {"sigma_z_m": 2.0}, "east"),
+              tried("kf", {"clock_offset_s": 0.2}, explains=0.1))  # fmt: skip
+    finding = only(variance.detect, analysis(axes=(kf(9.0),), causes=causes))
+    assert finding.evidence["cause"] == "elsewhere"
+    assert finding.remedy == (
+        f"{variance.NOT_EXPLAINED} The nearest: SIGMA_Z is 1 instead of 7 m (replayed: mean NIS 9 "
+        "→ 3.7)."
+    )
+    assert only(variance.detect, analysis(axes=(kf(9.0),))).remedy == variance.UNKNOWN_NOISE
+    known = analysis(axes=(kf(9.0),), tuning=tuned())
+    assert only(variance.detect, known).remedy == variance.NOT_EXPLAINED
+
+
+def test_a_noise_below_what_the_rate_can_show_is_a_bound() -> None:
+    for high, typed in ((0.0001, "0.005"), (0.02, "0.02")):
+        one = analysis(
+            axes=(kf(0.2),), tuning=tuned(Noise(None, None, high)),
+            causes=(tried("kf", {"sigma_z_m": high}, before=0.2),),
+        )  # fmt: skip
+        finding = only(variance.detect, one)
+        assert f"[--sigma-z {typed}, and less SIGMA_A|{typed}|" in finding.remedy
+        assert finding.evidence["sigma_z_asked_m"] == high
+        assert finding.evidence["sigma_z_asked_is_upper_bound"] == 1.0
 
 
 @pytest.mark.parametrize(
     ("one", "asked", "parameters", "says"),
     [
         (fused(0.1), Noise(0.3, 0.2, 0.4), {},
-         "The source's noise is 0.3 m (√R was 0.1 m): set EKF2_EVP_NOISE to 0.3 m."),
+         "EKF2 takes it to be 0.1 m: set EKF2_EVP_NOISE to 0.3 m. Not replayed: no topic for it."),
         (fused(0.1, name="down"), Noise(0.3, 0.2, 0.4), {}, "is of horizontal position."),
-        (fused(0.1), Noise(0.09, 0.08, 0.1), {}, "It is not EKF2_EVP_NOISE"),
+        (fused(0.1), Noise(0.124, 0.12, 0.13), {}, "0.1 m: that is not it. Look at the clock (E"),
+        (fused(0.1, 0.2), Noise(0.081, 0.08, 0.09), {}, "0.1 m: that is not it. Look at the clock"),
         # less noise where the sender reports more: its variances must not be used
         (fused(0.3, 0.2), Noise(0.1, 0.09, 0.11), {"EKF2_EVP_NOISE": 0.1},
-         "R is what the sender reports (0.3 m), since that is more than EKF2_EVP_NOISE: correct it "
-         "there, or set EKF2_EV_NOISE_MD to 1 and EKF2_EVP_NOISE to 0.1 m."),
+         "set EKF2_EVP_NOISE to 0.1 m and EKF2_EV_NOISE_MD to 1."),
         (fused(0.3, 0.2), Noise(0.1, 0.09, 0.11), {"EKF2_EVP_NOISE": 0.25},
-         "set EKF2_EVP_NOISE to 0.1 m."),
-        (fused(0.3, 0.2), Noise(0.1, 0.09, 0.11), {"EKF2_EVP_NOISE": 0.1, "EKF2_EV_NOISE_MD": 1.0},
-         "(√R was 0.3 m): set EKF2_EVP_NOISE to 0.1 m."),
-        (fused(0.1), Noise(0.3, 0.2, 0.4), {"EKF2_EVP_NOISE": 0.05},
-         "(√R was 0.1 m): set EKF2_EVP_NOISE to 0.3 m."),
-        # PX4's least, and of a bound the innovations' own size: 0.5 m of 0.3 and 0.4 m
-        (fused(0.3, 0.2), Noise(0.002, 0.001, 0.003), {}, "set EKF2_EVP_NOISE to 0.01 m."),
-        (fused(0.1), Noise(None, None, 0.2), {}, "noise is at most 0.5 m (√R was 0.1 m): set "),
+         "set EKF2_EVP_NOISE to 0.1 m. Not"),
+        # PX4's least, and a bound
+        (fused(0.3, 0.2), Noise(0.002, 0.001, 0.003), {}, "set EKF2_EVP_NOISE to 0.01 m. Not"),
+        (fused(0.1), Noise(None, None, 0.2), {}, "noise is 0.2 m, EKF2 takes it to be 0.1 m: set"),
     ],
 )  # fmt: skip
-def test_what_ekf2s_variance_asks_for(
+def test_what_is_asked_of_an_ekf2_that_cannot_be_replayed(
     one: Any, asked: Noise, parameters: dict[str, float], says: str
 ) -> None:
     tuning = {**tuned(asked), "down": tuned(asked)["horizontal"]}
     flown = analysis(axes=(one,), log=log(parameters=parameters), tuning=tuning)
-    assert says.lower() in only(variance.detect, flown).remedy.lower()
+    assert says in only(variance.detect, flown).remedy
 
 
 # ---------------------------------------------------------------- the loop and the drift
@@ -465,7 +462,7 @@ def test_without_truth_both_are_judged_by_their_innovations() -> None:
     )
     (said,) = story(flight_of(along(0.25, 4.0, difference=difference)), ())
     assert said.endswith(
-        "by its own innovations EKF2 is 4 times too modest, our filter is 4 times too sure of "
+        "by its own innovations EKF2 is 2 times too modest, our filter is 2 times too sure of "
         "itself."
     )
     mute = axis(
@@ -481,46 +478,61 @@ def test_without_truth_both_are_judged_by_their_innovations() -> None:
     assert said.endswith("both follow uwb, which may drift.")
 
 
-@pytest.mark.parametrize(
-    ("nis", "noises", "since"),
-    [
-        # S too large: what was chosen beyond its interval, the further the worse
-        (0.2, (Noise(0.5, 0.4, 0.6), Noise(0.1, 0.05, 0.2)),
-         "SIGMA_A 1 is larger than the 0.1 m/s²"),
-        (0.2, (Noise(0.05, 0.04, 0.06), Noise(0.1, 0.05, 0.2)),
-         "SIGMA_Z 1 is larger than the 0.05 m"),
-        (0.2, (Noise(None, None, 0.5), RIGHT), "SIGMA_Z 1 is larger than the 0.5 m"),
-        (5.0, (Noise(3.0, 2.0, 4.0), RIGHT), "SIGMA_Z 1 is smaller than the 3 m"),
-        *((nis, (noise, RIGHT), None) for nis, noise in (
-            (5.0, Noise(0.5, 0.4, 0.6)), (0.2, Noise(3.0, 2.0, 4.0)), (5.0, Noise(3.0, None, 4.0)),
-            (5.0, Noise(3.0, 1.0, 4.0)), (0.2, Noise(0.5, 0.4, 1.0)), (1.0, Noise(3.0, 2.0, 4.0)),
-        )),
-    ],
-)  # fmt: skip
-def test_a_setting_is_blamed_only_for_what_it_does(
-    nis: float, noises: Any, since: str | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ours = along(1.0, nis, ekf2_truth=against_truth(1.0), kf_truth=against_truth(1.0))
-    one = flight_of(ours, tuning=tuned(*noises), settings=CHOSEN)
+def judged(nis: float, **parts: Any) -> Any:
+    return along(1.0, nis, ekf2_truth=against_truth(1.0), kf_truth=against_truth(1.0), **parts)
 
-    def told(explained: float) -> str:
-        """With replays that explain so much by the one setting, and nothing by the other."""
 
-        def after(_: Any, settings: Settings) -> float:
-            changed = "SIGMA_A" if settings.sigma_a_m_s2 != 1.0 else "SIGMA_Z"
-            share = explained if since and since.startswith(changed) else 0.0
-            return float(nis ** (1.0 - share))
+def test_since_is_said_of_a_cause_alone() -> None:
+    change = {"sigma_z_m": 3.0}
+    for explains, told in ((1.0, True), (0.5, True), (1.5, True), (0.49, False), (1.51, False)):
+        causes = (tried("kf", change, "aisle", explains=explains),)
+        said = story(flight_of(judged(9.0), causes=causes), ())[0]
+        assert (", since SIGMA_Z is 1 instead of 3 m (replayed: mean NIS 9 → " in said) is told
+        assert (
+            said.endswith("too sure of itself, which nothing that was tried explains.") is not told
+        )
+    # of another axis, another filter, or another number
+    for other in (tried("kf", change), tried("ekf2", change, "aisle"),
+                  tried("kf", change, "aisle", "nees")):  # fmt: skip
+        said = story(flight_of(judged(9.0), causes=(other,)), ())[0]
+        assert said.endswith("3 times too sure of itself.")
 
-        monkeypatch.setattr(telling, "nis_with", after)
-        return story(one, ())[0]
 
-    said = f", since {since} that this flight asks for (replayed: mean NIS {nis:g} → 1)."
-    assert told(1.0).endswith(said) is (since is not None)
-    assert ("since" in told(0.62)) is (since is not None)
-    for too_little_or_beyond in (0.0, 0.45, -1.0, 1.6, 2.7):
-        assert "since" not in told(too_little_or_beyond)
-    for silent in (flight_of(ours), flight_of(ours, tuning=tuned(*noises), source=ODOMETRY)):
-        assert "since" not in story(silent, ())[0]
+def test_what_brings_a_number_into_its_band_comes_first_and_the_sources_fault_before_settings() -> (
+    None
+):
+    nearer, clock, both = {"sigma_a_m_s2": 3.0}, {"clock_offset_s": 0.25}, {"sigma_z_m": 2.0}
+    causes = (
+        tried("kf", nearer, "aisle", explains=0.99), tried("kf", both, "aisle"),
+        tried("kf", clock, "aisle"), tried("kf", {**clock, **both}, "aisle"),
+    )  # fmt: skip
+    assert (
+        ", since the stamps are 0.25 s early ("
+        in story(flight_of(judged(9.0), causes=causes), ())[0]
+    )
+    assert (
+        ", since SIGMA_Z is 1 instead of 2 m ("
+        in story(flight_of(judged(9.0), causes=causes[:2]), ())[0]
+    )
+
+
+def test_the_same_cause_of_both_is_told_once_and_its_finding_is_not_repeated() -> None:
+    change = {"outliers_left_out": 38.0}
+    causes = (tried("kf", change, "aisle"), tried("ekf2", change, "aisle", before=4.0))
+    both = along(4.0, 9.0, ekf2_truth=against_truth(1.0), kf_truth=against_truth(1.0))
+    one = flight_of(both, causes=causes)
+    outliers = Finding("source_outliers", "error", "So.", "Do.", headline="Outliers")
+    first, *more = story(one, (outliers,))
+    assert "since 38 positions are outliers (replayed: mean NIS 4 → 1); our filter was" in first
+    assert first.endswith("too sure of itself, for the same reason (replayed: mean NIS 9 → 1).")
+    assert more == []
+
+
+def test_an_error_beyond_its_claim_has_its_own_causes() -> None:
+    hides = along(1.0, 1.0, ekf2_truth=against_truth(1.0), kf_truth=against_truth(16.0))
+    causes = (tried("kf", {"clock_offset_s": -0.25}, "aisle", "nees", before=16.0),)
+    said = story(flight_of(hides, causes=causes), ())[0]
+    assert said.endswith(", since the stamps are 0.25 s late (replayed: errors of 4 → 1 σ).")
 
 
 def test_what_was_no_flight_is_said_first() -> None:
@@ -568,7 +580,7 @@ def test_what_weighs_most_is_told_in_order() -> None:
 def test_the_longest_silence_is_told_with_where_it_left_both(
     monkeypatch: pytest.MonkeyPatch, truth: Any, said: str
 ) -> None:
-    monkeypatch.setattr(telling, "state_at", lambda *_: (np.array([0.0, 3.0]), None))
+    monkeypatch.setattr(narration, "state_at", lambda *_: (np.array([0.0, 3.0]), None))
     ekf2 = pd.DataFrame({"position_m": [0.0, 4.0, 9.0]}, index=[20.0, 57.9, 58.1])
     main = along(1.0, 1.0, ekf2_state=ekf2, truth=truth, replay=None)
     main.axis.measurement_time_s = np.array([20.0, 50.0, 58.0, 58.2])

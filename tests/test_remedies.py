@@ -393,10 +393,10 @@ def test_without_a_replay_the_order_of_doing_is_given() -> None:
     ("log", "name", "said"),
     [
         ("v1.16.1_aisle_overconfident", "ekf2_variance_understated",
-         "set EKF2_EVP_NOISE to 0.098 m: rejected 53% → 0%, mean NIS 22 → 1.0, position error 0.31 "
+         "Set EKF2_EVP_NOISE to 0.098 m: rejected 53% → 0%, mean NIS 22 → 1.0, position error 0.31 "
          "→ 0.11 m (replayed)"),
         ("v1.16.1_aisle_overconfident", "ekf2_rejecting", "Set EKF2_EVP_NOISE to 0.098 m"),
-        ("v1.16.1_aisle_nlos", "ekf2_variance_understated", "remove the outliers"),
+        ("v1.16.1_aisle_nlos", "ekf2_variance_understated", "Remove the outliers"),
         ("v1.16.1_aisle_nlos", "ekf2_rejecting", "A wider EKF2_EVP_GATE is no remedy; at 10"),
         ("v1.16.1_aisle_clock_late", "ekf2_ev_delay_wrong", "position error 0.34 → 0.11 m"),
         ("v1.16.1_aisle_clock_late", "source_clock_offset", "for EKF2 set EKF2_EV_DELAY to 264 ms"),

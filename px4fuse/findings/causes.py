@@ -109,7 +109,8 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
     # what is rejected is not corrected: EKF2 drifts, resets, and its innovations grow
     "ekf2_gate_small": (
         "ekf2_rejecting", "ekf2_resets", "ekf2_fusion_interrupted",
-        f"ekf2_variance_understated:{GATE}", f"errors_larger_than_claimed:{GATE}",
+        f"ekf2_variance_understated:{GATE}",
+        f"ekf2_variance_understated:{ELSEWHERE}", f"errors_larger_than_claimed:{GATE}",
     ),
     "source_may_drift": _OVERSTATED,
     "ekf2_ev_delay_wrong": (

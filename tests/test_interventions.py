@@ -1,0 +1,204 @@
+"""Causes by intervention: each number is that of a replay, and the right cause is found."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from exchange import replace
+
+from px4fuse.analysis import Analysis, explain
+from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.interventions import (
+    CLOCK,
+    EXPLAINS,
+    OUTLIERS,
+    TURN,
+    Intervention,
+    cause_of,
+    interventions,
+)
+from px4fuse.comparison.model import FilterSummary
+from px4fuse.ekf2.model import Model, moved, replay_settings
+from px4fuse.ekf2.whatif import WhatIf, what_if
+from px4fuse.filter.heading import HeadingError
+from px4fuse.filter.settings import Settings
+from px4fuse.findings import find
+from px4fuse.findings.story import story
+from px4fuse.flight import Unavailable
+from px4fuse.simulation.flights import simulate_flight
+from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.scenario import Scenario
+
+RIGHT = Settings(0.27, 0.10)
+
+
+@cache
+def flown(*mistakes: str, sigma_a: float = 0.27, sigma_z: float = 0.10) -> Analysis:
+    flight = simulate_flight(Scenario(seed=5), parse(mistakes))
+    return explain(compare(flight, Settings(sigma_a, sigma_z)))
+
+
+def cause(analysis: Analysis, owner: Any, of: Any = "nis") -> Intervention:
+    found = cause_of(analysis.causes, owner, "aisle", of)
+    assert found is not None
+    return found
+
+
+def statement(analysis: Analysis, owner: Any, axis: str = "aisle") -> FilterSummary:
+    found = analysis.axes[axis].filters[owner]
+    assert isinstance(found, FilterSummary)
+    return found
+
+
+def test_nothing_is_tried_where_nothing_is_wrong() -> None:
+    assert flown().causes == ()
+
+
+@pytest.mark.parametrize(
+    ("mistake", "settings", "owner", "of", "change"),
+    [
+        ("", {"sigma_z": 0.03}, "kf", "nis", {"sigma_z_m": (0.1, 0.01)}),
+        ("", {"sigma_z": 0.4}, "kf", "nis", {"sigma_z_m": (0.1, 0.01)}),
+        ("", {"sigma_a": 0.02}, "kf", "nis", {"sigma_a_m_s2": (0.27, 0.05)}),
+        ("nlos=7%", {}, "kf", "nis", {OUTLIERS: (38, 4)}),
+        ("nlos=7%", {}, "ekf2", "nis", {OUTLIERS: (38, 4)}),
+        ("nlos=7%", {"sigma_z": 0.05}, "kf", "nis", {OUTLIERS: (38, 4), "sigma_z_m": (0.1, 0.01)}),
+        ("clock-offset=0.25", {}, "kf", "nees", {CLOCK: (-0.25, 0.06)}),
+        ("clock-offset=0.25", {}, "ekf2", "nees",
+         {"EKF2_EV_DELAY": (250, 60), "EKF2_DELAY_MAX": (300, 0)}),
+        # no parameter of EKF2 has positions count earlier than they are stamped
+        ("clock-offset=-0.19", {}, "ekf2", "nees", {CLOCK: (0.19, 0.06)}),
+        ("yaw=20", {}, "kf", "nees", {TURN: (-20, 4)}),
+        ("yaw=20", {}, "ekf2", "nees", {TURN: (-20, 4)}),
+        ("ekf2-noise=0.03", {}, "ekf2", "nis", {"EKF2_EVP_NOISE": (0.1, 0.01)}),
+        ("ekf2-noise=0.5", {}, "ekf2", "nis", {"EKF2_EVP_NOISE": (0.1, 0.01)}),
+        ("ekf2-gate=1", {}, "ekf2", "nis", {"EKF2_EVP_GATE": (5, 0)}),
+        ("ekf2-delay=0.175", {}, "ekf2", "nees", {"EKF2_EV_DELAY": (0, 0)}),
+    ],
+)  # fmt: skip
+def test_the_cause_is_what_was_made_wrong(
+    mistake: str, settings: dict[str, float], owner: Any, of: Any, change: Any
+) -> None:
+    analysis = flown(*filter(None, (mistake,)), **settings)
+    found = cause(analysis, owner, of)
+    assert found.change.keys() == change.keys()
+    for name, (value, within) in change.items():
+        assert found.change[name] == pytest.approx(value, abs=within)
+    assert found.brings_into_band
+    # and the story says so, of this filter
+    told = story(analysis, find(analysis))[0]
+    ekf2, ours = told.split("; our filter")
+    assert "replayed: " in (ours if owner == "kf" else ekf2)
+
+
+def test_a_number_of_our_filter_is_that_of_a_comparison_with_the_change() -> None:
+    for analysis in (flown(sigma_z=0.03), flown("clock-offset=0.25")):
+        for of in ("nis", "nees"):
+            found = cause_of(analysis.causes, "kf", "north", of)  # type: ignore[arg-type]
+            if found is None:
+                continue
+            again = compare(analysis.flight, replace(analysis.settings, **found.change))
+            for number, summary in (
+                (found.before, statement(analysis, "kf", "north")),
+                (found.after, again.axes["north"].filters["kf"]),
+            ):
+                assert isinstance(summary, FilterSummary)
+                if of == "nis":
+                    assert number == pytest.approx(summary.nis_mean, rel=1e-6)
+                else:
+                    assert not isinstance(summary.truth, Unavailable)
+                    # at the filter's own steps, where the comparison takes EKF2's times
+                    assert number == pytest.approx(summary.truth.nees_position_mean, rel=0.1)
+            share = 1.0 - np.log(found.after) / np.log(found.before)
+            assert found.explains == pytest.approx(share)
+
+
+def test_a_number_of_ekf2_is_that_of_a_what_if() -> None:
+    analysis = flown("ekf2-noise=0.03")
+    assert isinstance(analysis.ekf2_model, Model)
+    found = [cause_of(analysis.causes, "ekf2", axis) for axis in ("north", "east")]
+    asked = what_if(analysis.ekf2_model, [found[0].change])  # type: ignore[union-attr]
+    assert isinstance(asked, WhatIf)
+    for one, axis in zip(found, ("north", "east"), strict=True):
+        assert one is not None
+        assert one.before == pytest.approx(asked.replayed.axes[axis].nis_mean, rel=1e-9)
+        assert one.after == pytest.approx(asked.whatif[0].axes[axis].nis_mean, rel=1e-9)
+
+
+def test_what_explains_too_little_or_too_much_is_no_cause() -> None:
+    def one(change: Any, explains: float, *, into: bool = False) -> Intervention:
+        return Intervention(
+            of="nis", filter="kf", axis="aisle", change=change, before=9.0,
+            after=9.0 ** (1.0 - explains), explains=explains, brings_into_band=into,
+        )  # fmt: skip
+
+    for explains in (EXPLAINS - 0.01, 1.51, -1.0):
+        assert cause_of([one({"sigma_z_m": 1.0}, explains)], "kf", "aisle") is None
+    part, whole = one({CLOCK: 0.1}, 0.99), one({"sigma_z_m": 1.0}, 0.9, into=True)
+    assert cause_of([part, whole], "kf", "aisle") is whole  # into the band before near to it
+    both = one({CLOCK: 0.1, "sigma_z_m": 1.0}, 1.0, into=True)
+    assert cause_of([both, whole], "kf", "aisle") is whole  # fewer changes
+    fault = one({CLOCK: 0.1}, 0.9, into=True)
+    assert cause_of([whole, fault], "kf", "aisle") is fault  # what is wrong with the source
+    assert cause_of([whole], "ekf2", "aisle") is cause_of([whole], "kf", "north") is None
+
+
+def test_without_what_it_needs_a_candidate_is_not_tried() -> None:
+    analysis = flown("nlos=7%", sigma_z=0.05)
+    missing = Unavailable("it", "not known", "None.")
+
+    def tried(**parts: Any) -> set[tuple[str, str]]:
+        known: dict[str, Any] = {
+            "tuning": analysis.tuning, "clock": analysis.clock, "heading": analysis.heading,
+            "model": analysis.ekf2_model,
+        }  # fmt: skip
+        rows = interventions(analysis, **{**known, **parts})
+        return {(row.filter, name) for row in rows for name in row.change}
+
+    assert tried() == {("kf", "sigma_z_m"), ("kf", OUTLIERS), ("ekf2", OUTLIERS)}
+    assert tried(model=missing) == {("kf", "sigma_z_m"), ("kf", OUTLIERS)}
+    assert tried(tuning={}) == set()
+    turned = HeadingError(
+        turn_deg=2.9, sigma_deg=1.0, drifts=False, parts=(), drift_p=1.0, by="positions"
+    )
+    assert tried(heading=turned, tuning={}) == set()
+    turned = replace(turned, turn_deg=3.1)
+    assert tried(heading=turned, tuning={}) == {("kf", TURN), ("ekf2", TURN)}
+
+
+def test_positions_are_moved_as_they_are_said_to_be() -> None:
+    analysis = flown()
+    assert isinstance(analysis.ekf2_model, Model)
+    model = analysis.ekf2_model
+    assert moved(model, 0.0, 0.0) is model
+    before, after = model.inputs.received, moved(model, 90.0, 0.1).inputs.received
+    # clockwise seen from above, north becomes east
+    assert after.position_m[:, 1] == pytest.approx(before.position_m[:, 0])
+    assert after.position_m[:, 0] == pytest.approx(-before.position_m[:, 1])
+    assert after.stamp_s == pytest.approx(before.stamp_s + 0.1)
+    # positions stamped 0.1 s later are those of a delay of 0.1 s more
+    (later,) = replay_settings(moved(model, 0.0, 0.1), [{"EKF2_EV_DELAY": 100.0}])
+    flown_m = model.flown.updates["innovation_north_m"].to_numpy()
+    assert len(later.updates) == pytest.approx(len(flown_m), abs=2)
+    shared = later.updates["innovation_north_m"].to_numpy()[: len(flown_m)]
+    assert np.corrcoef(shared, flown_m[: len(shared)])[0, 1] > 0.99
+
+
+def test_a_sample_that_is_left_out_is_not_fused_and_not_judged() -> None:
+    analysis = flown()
+    assert isinstance(analysis.ekf2_model, Model)
+    model, stamps = analysis.ekf2_model, analysis.ekf2_model.inputs.received.stamp_s
+    out = stamps[100:140]
+    (without,) = replay_settings(model, [{}], out)
+    (whole,) = replay_settings(model, [{}])
+    assert len(without.updates) == len(whole.updates) - 40
+    gap = whole.updates.index.difference(without.updates.index)
+    late = without.updates["innovation_variance_north_m2"].loc[gap[-1] :].iloc[0]
+    usual = whole.updates["innovation_variance_north_m2"].median()
+    assert late > 2.0 * usual  # it coasted for 8 s
+    before = whole.updates.index < gap[0]
+    same = without.updates["innovation_north_m"].loc[: gap[0]].to_numpy()
+    assert same == pytest.approx(whole.updates["innovation_north_m"][before].to_numpy())
