@@ -192,7 +192,9 @@ def _tried(
         ]  # fmt: skip
 
     alone = [each for change in candidates for each in tried(change)]
-    helping = sorted((e for e in alone if e.explains > HELPS), key=lambda e: abs(e.explains - 1.0))
+    helping = sorted(
+        (e for e in alone if HELPS < e.explains < 2.0 - HELPS), key=lambda e: abs(e.explains - 1.0)
+    )
     if not helping or any(each.brings_into_band for each in helping):
         return alone
     best, *others = helping
