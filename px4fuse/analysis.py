@@ -312,6 +312,7 @@ def run_preparation(
         axes=request.axes or None,
         heading_deg=request.heading_deg,
         position_source=request.position_source,
+        source_kind=request.source_kind,
         start_s=request.start_s,
         end_s=request.end_s,
     )

@@ -61,6 +61,11 @@ class Origin(Record, frozen=True):
         return self.aid == EV_POS
 
     @property
+    def by_gnss(self) -> bool:
+        """Whether EKF2 takes it as GNSS."""
+        return self.aid == GNSS_POS
+
+    @property
     def is_gnss(self) -> bool:
         """Whether it is satellite navigation, whose errors are slow for the most part.
 

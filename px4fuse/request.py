@@ -19,6 +19,8 @@ import msgspec
 AUTO: Literal["auto"] = "auto"
 AxisName = Literal["north", "east", "down", "aisle"]
 InputName = Literal["imu", "zero"]
+# What a log does not tell of a position source
+SourceKind = Literal["uwb", "vio", "mocap", "gnss"]
 # What a trajectory file's axes may be said to be
 FrameName = Literal["NED", "FRD", "ENU", "camera"]
 System = Annotated[int, msgspec.Meta(ge=0, le=255)]
@@ -79,6 +81,8 @@ class ComparisonRequest(_Asked, frozen=True, kw_only=True, tag_field="command", 
     position : PositionFile or None
     position_source : str or None
         Name of a track of the flight; None for the best.
+    source_kind : {"uwb", "vio", "mocap", "gnss"} or None
+        What the source is; None for what its messages make of it.
     sigma_a_m_s2, dt_s : float
         As :class:`px4fuse.filter.settings.Settings`.
     sigma_z_m : float or None
@@ -100,6 +104,7 @@ class ComparisonRequest(_Asked, frozen=True, kw_only=True, tag_field="command", 
     system: System | None = None
     position: PositionFile | None = None
     position_source: str | None = None
+    source_kind: SourceKind | None = None
     sigma_a_m_s2: float = 0.5
     sigma_z_m: float | None = None
     dt_s: float = 0.1
@@ -321,6 +326,12 @@ FILTER_OPTIONS = {
         "--position-source",
         "Position source, for example vehicle_gps_position.  [default: the best logged]",
         metavar="NAME",
+    ),
+    "source_kind": Option(
+        "--source-kind",
+        "What the position source is, where its messages do not tell: odometry (vio) drifts, "
+        "motion capture that is sent in the same messages does not.  [default: vio with an "
+        "orientation that turns]",
     ),
 }  # fmt: skip
 CLOCK_OPTION = {

@@ -189,6 +189,20 @@ def test_ekf2_overstates_its_variance_in_real_flights(
     assert compare(flight).horizontal.get("ekf2").verdict == "variance overstated"
 
 
+def test_what_no_log_tells_of_a_source_can_be_said(sample_flight: Flight) -> None:
+    plain = compare(sample_flight)
+    for kind, drifts, slow in (
+        ("uwb", False, False), ("vio", True, False), ("mocap", False, False), ("gnss", False, True),
+    ):  # fmt: skip
+        said = compare(sample_flight, source_kind=kind)
+        origin = said.source.origin
+        assert (origin.kind, origin.may_drift, origin.is_gnss) == (kind, drifts, slow)
+        # it is still what EKF2 took as external vision, with the same numbers
+        assert origin.is_vision
+        assert not origin.by_gnss
+        assert said.horizontal == plain.horizontal
+
+
 class TestMadeFlight:
     def test_our_filter_is_consistent_where_its_noise_is_the_flights(
         self, made: Comparison

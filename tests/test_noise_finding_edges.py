@@ -320,13 +320,13 @@ def test_without_a_cause_what_was_tried_is_said() -> None:
 
 
 def test_a_noise_below_what_the_rate_can_show_is_a_bound() -> None:
-    for high, typed in ((0.0001, "0.005"), (0.02, "0.02")):
+    for high, typed in ((0.0001, 0.005), (0.02, 0.02)):
         one = analysis(
             axes=(kf(0.2),), tuning=tuned(Noise(None, None, high)),
-            causes=(tried("kf", {"sigma_z_m": high}, before=0.2),),
+            causes=(tried("kf", {"sigma_z_m": typed}, before=0.2),),
         )  # fmt: skip
         finding = only(variance.detect, one)
-        assert f"[--sigma-z {typed}, and less SIGMA_A|{typed}|" in finding.remedy
+        assert f"rate can show. [--sigma-z {typed}, and less SIGMA_A|{typed}|" in finding.remedy
         assert finding.evidence["sigma_z_asked_m"] == high
         assert finding.evidence["sigma_z_asked_is_upper_bound"] == 1.0
 

@@ -50,6 +50,7 @@ COMPARISONS = st.builds(
         )
     ),
     position_source=maybe(NAMES),
+    source_kind=maybe(st.sampled_from(["uwb", "vio", "mocap", "gnss"])),
     sigma_a_m_s2=POSITIVE,
     sigma_z_m=POSITIVE,
     dt_s=POSITIVE,

@@ -56,6 +56,9 @@ HELPS = 0.1
 CLOCK, TURN, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
 # What is wrong with the source itself
 OF_SOURCE = frozenset((OUTLIERS, CLOCK, TURN))
+# What a filter is run with where the source is better than its rate can show (m): what motion
+# capture resolves in flight
+SMALLEST_SIGMA_Z_M = 0.005
 SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
 # What EKF2 has besides the aid's own; PX4's default is tried where something else was flown
 NOT_OF_AID = frozenset((
@@ -252,8 +255,11 @@ class _Ours:
         over, found = _is_over(result, "kf", of), list[Change]()
         if tuned is not None and not (over and _hides_noise(self.comparison)):
             for name, noise in ((SIGMA_A, tuned.filter_sigma_a), (SIGMA_Z, tuned.sigma_z)):
-                chosen, asked = getattr(settings, name), noise.value or (noise.high if over else 0)
+                chosen = getattr(settings, name)
+                asked = noise.value or (noise.high if over else None) or 0.0
                 end = noise.high if over else noise.low
+                if noise.value is None and name == SIGMA_Z:
+                    asked = max(asked, SMALLEST_SIGMA_Z_M)
                 if asked and end is not None and (chosen > end if over else chosen < end):
                     found.append({name: float(f"{asked:.3g}")})
         if tuned is not None and not over and len(tuned.outlier_time_s):
@@ -380,7 +386,7 @@ class _Ekf2:
             left_out_s, tuned = None, tuned_for(self.tuning, HORIZONTAL)
             if OUTLIERS in change and tuned is not None:
                 stamp = 1e-3 * self.model.inputs.settings[self.model.inputs.aid.delay]
-                of_source = self.comparison.source.origin.is_gnss
+                of_source = self.comparison.source.origin.by_gnss
                 left_out_s = tuned.outlier_time_s - self.comparison.settings.clock_offset_s
                 left_out_s = left_out_s + (stamp if of_source else 0.0)
             (self.replays[key],) = replay_settings(model, [settings], left_out_s)

@@ -5,13 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TypedDict, Unpack
 
+from msgspec import structs
+
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.projection import observation_variance
 from px4fuse.errors import MissingDataError, SettingsError, did_you_mean
 from px4fuse.filter.settings import SIGMA_Z_RANGE_M, Settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, make_axes, within
 from px4fuse.flight import Ekf2, Flight, PositionTrack, Truth, Unavailable
-from px4fuse.origin import GIVEN_FILE
+from px4fuse.origin import GIVEN_FILE, PositionKind
 from px4fuse.readers.mavlink_messages import POSITION_INPUTS
 from px4fuse.readers.px4_innovations import with_gnss
 from px4fuse.readers.px4_topics import TOPIC_ORIGINS
@@ -41,6 +43,8 @@ class Choices(TypedDict, total=False):
         Of the aisle.
     position_source : str
         Name of a track of the flight.
+    source_kind : {"uwb", "vio", "mocap", "gnss"}
+        What it is; by default what its messages make of it.
     start_s, end_s : float
         Segment, seconds from the first data.
     input_required : bool
@@ -53,6 +57,7 @@ class Choices(TypedDict, total=False):
     axes: tuple[str, ...] | None
     heading_deg: float | None
     position_source: str | None
+    source_kind: PositionKind | None
     start_s: float | None
     end_s: float | None
     input_required: bool
@@ -82,9 +87,11 @@ def prepare(
     """
     settings = settings or Settings()
     track, reason = choose_source(flight, choices.get("position_source"))
+    if kind := choices.get("source_kind"):
+        track = replace(track, origin=structs.replace(track.origin, kind=kind))
     track = shift_clock(track, settings.clock_offset_s)
     missing = flight.missing
-    if track.origin.is_gnss and isinstance(flight.ekf2, Ekf2):
+    if track.origin.by_gnss and isinstance(flight.ekf2, Ekf2):
         # what the log lacks of another source is no lack here
         of_vision = _lacking(flight.ekf2)
         ekf2 = with_gnss(flight.ekf2)
@@ -92,13 +99,13 @@ def prepare(
         flight, missing = replace(flight, ekf2=ekf2), missing + _lacking(ekf2)
     segment = choose_segment(flight, track, choices.get("start_s"), choices.get("end_s"))
     names, heading_deg = choices.get("axes"), choices.get("heading_deg")
-    if names is None and track.origin.is_gnss:
+    if names is None and track.origin.by_gnss:
         names = GNSS_AXES
     lines = make_axes(flight, track, segment, names=names, heading_deg=heading_deg)
     if isinstance(flight.truth, Truth) and flight.truth.name == track.name:
         flight = replace(flight, truth=NOT_ITS_OWN_TRUTH)
     notes = (*flight.log.notes, *track.notes)
-    if track.origin.is_gnss and not choices.get("sigma_z_given", True):
+    if track.origin.by_gnss and not choices.get("sigma_z_given", True):
         sigma_z_m = observation_variance(flight, track, lines[0], segment) ** 0.5
         if sigma_z_m >= SIGMA_Z_RANGE_M[0]:  # not NaN
             settings = replace(settings, sigma_z_m=float(f"{sigma_z_m:.3g}"))
@@ -183,7 +190,7 @@ def no_source(flight: Flight) -> Unavailable:
 def _why_best(flight: Flight, track: PositionTrack) -> str:
     if track.origin == GIVEN_FILE:
         return "given with --position"
-    if track.origin.is_gnss:
+    if track.origin.by_gnss:
         return "what EKF2 fused; no other position is in the log"
     whence = f" (from {track.log})" if track.log and track.log != flight.log.name else ""
     lacking = [

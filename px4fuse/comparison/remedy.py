@@ -106,7 +106,7 @@ def delay_ms(comparison: Comparison) -> float | None:
     if source.origin.aid is None:
         return None
     found = comparison.flight.log.parameters.get(source.origin.aid.delay)
-    return None if source.origin.is_gnss and source.age_s == 0.0 != found else found
+    return None if source.origin.by_gnss and source.age_s == 0.0 != found else found
 
 
 def tuned_noise_m(tuning: Mapping[str, AxisTuning | Unavailable]) -> float | None:

@@ -202,6 +202,6 @@ def drift(analysis: Analysis) -> Finding:
         "Innovations say how well a filter follows its source, not where the vehicle was."
         f"{more}",
         "Judge it by a loop (px4fuse loop LOG) or by a truth (ATT_POS_MOCAP). Only if it is motion "
-        "capture, which does not drift, do its innovations tell its noise.",
+        "capture, which does not drift, do its innovations tell its noise (--source-kind mocap).",
         evidence,
     )

@@ -17,7 +17,7 @@ import numpy as np
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.interventions import tuned_for
+from px4fuse.comparison.interventions import SMALLEST_SIGMA_Z_M, tuned_for
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import filter_words
 from px4fuse.filter.settings import Settings
@@ -33,9 +33,6 @@ NOISE_OFF_ERROR = 4.0  # times: the gain is a different one
 RESPONSE_TIME_S = 2.5  # five times the lesson's; a vehicle turns around in less
 BEYOND = 1.5  # times the 95 % interval's reach; 0.3 % of clean flights lie beyond
 LAG1_SLOW = 0.3  # correlation; white innovations stay below 2/√n, 0.2 at n = 100
-# What a filter is run with where the source is better than its rate can show (m): what motion
-# capture resolves in flight
-SMALLEST_SIGMA_Z_M = 0.005
 # Options to type, and their fields of Settings
 OPTIONS = {"--sigma-z": "sigma_z_m", "--sigma-a": "sigma_a_m_s2"}
 # What such a setting does

@@ -27,7 +27,7 @@ from px4fuse.filter.tuning import AxisTuning, Noise
 from px4fuse.findings.causes import CAUSE, ELSEWHERE, NOISE
 from px4fuse.findings.hidden_errors import hidden_errors
 from px4fuse.findings.model import Finding, Found, Severity, finding, lowered
-from px4fuse.findings.sigma import SMALLEST_SIGMA_Z_M, try_out
+from px4fuse.findings.sigma import try_out
 from px4fuse.findings.since import cure_words, kind_of, reason_words
 from px4fuse.flight import POSITION_VARIANCE_COLUMNS, Unavailable
 from px4fuse.plain import capital, factor_words, number_words
@@ -181,10 +181,9 @@ def _remedy(
     values = {SETTINGS[name]: value for name, value in cause.change.items()}
     if not bounded:
         return try_out(analysis, values)
-    values["--sigma-z"] = max(values["--sigma-z"], SMALLEST_SIGMA_Z_M)
     return (
-        f"The source's noise is at most {cause.change[SIGMA_Z]:.2g} m, below what this rate can "
-        f"show. {try_out(analysis, values, ', and less SIGMA_A')}"
+        "The source's noise is below what this rate can show. "
+        f"{try_out(analysis, values, ', and less SIGMA_A')}"
     )
 
 

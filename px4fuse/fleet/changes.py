@@ -225,8 +225,9 @@ def _change(
 def _rank(change: NumberChange, found: Contrast | None) -> tuple[int, bool, float]:
     is_cause = change.path.startswith(_CAUSES)
     # what is the same differs by the last digits of a machine, if at all
-    still = found is None or change.status == "same"
-    moved = 0.0 if still else found.z or abs(found.delta)
+    moved = 0.0
+    if found is not None and change.status != "same":
+        moved = found.z or abs(found.delta)
     return _ORDER.index(change.judgement), not is_cause, -moved
 
 

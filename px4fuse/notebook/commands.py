@@ -29,6 +29,7 @@ from px4fuse.request import (
     GivenClosure,
     InputName,
     PositionFile,
+    SourceKind,
     WhatIfRequest,
     command_line,
 )
@@ -73,6 +74,7 @@ def compare(
     start_s: float | None = None,
     end_s: float | None = None,
     position_source: str | None = None,
+    source_kind: SourceKind | None = None,
     position: Pathlike | PositionFile | None = None,
     mavlink: Pathlike | None = None,
     system: int | None = None,
@@ -98,6 +100,8 @@ def compare(
         Segment, seconds from the first data.
     position_source : str, optional
         Name of a track of the flight.
+    source_kind : {"uwb", "vio", "mocap", "gnss"}, optional
+        What the source is, where its messages do not tell.
     position : str, Path or PositionFile, optional
         The positioning system's own recording.
     mavlink : str or Path, optional
@@ -138,6 +142,7 @@ def compare(
         system=system,
         position=PositionFile(path=str(position)) if isinstance(position, str | Path) else position,
         position_source=position_source,
+        source_kind=source_kind,
         sigma_a_m_s2=chosen.sigma_a_m_s2 if sigma_a_m_s2 is None else sigma_a_m_s2,
         sigma_z_m=settings.sigma_z_m if settings and sigma_z_m is None else sigma_z_m,
         dt_s=chosen.dt_s if dt_s is None else dt_s,
