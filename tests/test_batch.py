@@ -96,7 +96,7 @@ def test_every_log_is_in_the_table_with_its_numbers_or_its_line(client, tmp_path
     assert list(first["kf_nis_mean"]) == [
         axis.filters["kf"].nis_mean for axis in analysis.axes.values()
     ]
-    assert list(first["kf_factor"] * first["kf_nis_mean"]) == pytest.approx([1.0] * 4)
+    assert list(first["kf_factor"] ** 2 * first["kf_nis_mean"]) == pytest.approx([1.0] * 4)
     tuned = analysis.tuning["horizontal"].sigma_z
     assert first.loc[0, ["sigma_z_m", "sigma_z_low_m", "sigma_z_high_m"]].tolist() == [
         tuned.value, tuned.low, tuned.high,

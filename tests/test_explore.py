@@ -208,7 +208,7 @@ def test_dragging_gives_what_the_command_on_the_page_gives(
     assert shown != before
     told = cells(north)
     assert {name: shown[name] for name in told} == told
-    assert re.fullmatch(r"understated [\d,]+(\.\d+)?×", shown["Verdict"][0])
+    assert re.fullmatch(r"understated [\d,]+(\.\d+)?× in σ", shown["Verdict"][0])
 
 
 def test_as_it_opens_it_says_what_the_report_says(

@@ -85,13 +85,13 @@ def test_what_speaks_for_a_log_is_its_horizontal_axes() -> None:
 
     first = made_up(3).iloc[:3].copy()
     north, east, _ = first["kf_nis_mean"]
-    assert ours(first) == pytest.approx(2.0 / (north + east))  # both have as many updates
+    assert ours(first) == pytest.approx((2.0 / (north + east)) ** 0.5)  # both have as many updates
     # weighted by how many updates there are
     first["updates"] *= pd.Series((3, 1, 1))
-    assert ours(first) == pytest.approx(4.0 / (3.0 * north + east))
+    assert ours(first) == pytest.approx((4.0 / (3.0 * north + east)) ** 0.5)
     aisle = first.iloc[:1].assign(axis="aisle", kf_nis_mean=4.0, position_rmse_m=9.0)
     both = pd.concat([aisle, first])
-    assert ours(both) == pytest.approx(0.25)
+    assert ours(both) == pytest.approx(0.5)
     assert logs_of(both)[0]["position_rmse_m"] == 9.0
 
 
