@@ -3,7 +3,8 @@
 A discrepancy is a mean NIS outside its band, or an error beyond what a filter claims (NEES). Each
 candidate is tried alone, then with what the best one leaves. A cause is the smallest change that
 brings the number into its band, or else explains at least half of its logarithm; "since" stands
-before nothing else. Where a fault of the source explains as much as a setting, it comes first: a
+before nothing else. A smaller noise by which the filter would claim less than its errors against
+the truth is none. Where a fault of the source explains as much as a setting, it comes first: a
 setting would only hide it.
 """
 
@@ -33,7 +34,7 @@ from px4fuse.ekf2.replay import HORIZONTAL as LEVEL
 from px4fuse.ekf2.replay import UPDATE_COLUMNS, Ekf2Replay
 from px4fuse.ekf2_parameters import GNSS_VEL, PARAMETERS
 from px4fuse.filter.clock import ClockOffset
-from px4fuse.filter.consistency import nis_band
+from px4fuse.filter.consistency import SIGMA_OFF, nis_band
 from px4fuse.filter.heading import HeadingError
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.likelihood import innovations, preintegrate
@@ -88,6 +89,8 @@ class Intervention(Record, frozen=True, kw_only=True):
         Share of its logarithm that the change takes away; above 1 it goes to the other side.
     brings_into_band : bool
         Of a NIS its 95 % band; an error is beyond a claim from a NEES of :data:`NEES_LARGE` on.
+    denied_by_truth : bool
+        Whether the filter would then claim less than its errors.
     """
 
     of: Of
@@ -98,11 +101,12 @@ class Intervention(Record, frozen=True, kw_only=True):
     after: Positive
     explains: float
     brings_into_band: bool
+    denied_by_truth: bool = False
 
     @property
     def is_cause(self) -> bool:
         """Whether it explains enough of it, and not so much that it is something else."""
-        return EXPLAINS <= self.explains <= 2.0 - EXPLAINS
+        return EXPLAINS <= self.explains <= 2.0 - EXPLAINS and not self.denied_by_truth
 
 
 def cause_of(
@@ -161,11 +165,11 @@ def interventions(
 
 
 def _discrepancies(statement: FilterSummary | UnjudgedFilter) -> list[Of]:
-    """What of a filter is not as it should be."""
+    """What of a filter is not as it should be, by more than chance and by enough to matter."""
     found: list[Of] = ["nees"] if beyond_claim(statement) else []
-    if not isinstance(statement, Unavailable) and statement.verdict != "consistent":
-        found.append("nis")
-    return found
+    if isinstance(statement, Unavailable) or statement.verdict == "consistent":
+        return found
+    return [*found, "nis"] if statement.times_off >= SIGMA_OFF else found
 
 
 Number = Callable[[AxisComparison, Of, Change], tuple[float, int] | None]
@@ -186,11 +190,13 @@ def _tried(
             return []
         after, count = found
         low, high = nis_band(count) if of == "nis" else (0.0, NEES_LARGE)
+        claimed = number(result, "nees", change) if of == "nis" and before < 1.0 else None
         return [
             Intervention(
                 of=of, filter=owner, axis=result.axis.name, change=change, before=before,
                 after=after, explains=1.0 - float(np.log(after) / np.log(before)),
                 brings_into_band=low <= after <= high,
+                denied_by_truth=claimed is not None and claimed[0] >= NEES_LARGE,
             )
         ]  # fmt: skip
 

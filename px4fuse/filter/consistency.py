@@ -51,7 +51,7 @@ class NisVerdict(Record, frozen=True, kw_only=True):
     @property
     def times_off(self) -> float:
         """By how many times √S is too large or too small, 1 or more."""
-        return max(self.nis_mean, 1.0 / self.nis_mean) ** 0.5
+        return float(max(self.nis_mean, 1.0 / self.nis_mean) ** 0.5)
 
 
 class Consistency(Shown, NisVerdict, frozen=True, kw_only=True):

@@ -65,6 +65,8 @@ def change_words(analysis: Analysis, cause: Intervention) -> str:
 
 def share_words(cause: Intervention) -> str:
     """How much of a discrepancy a change explains."""
+    if cause.denied_by_truth:
+        return "denied by the truth"
     if cause.brings_into_band:
         return "all"
     if cause.explains > 1.0:

@@ -22,7 +22,6 @@ from px4fuse.comparison.interventions import (
 )
 from px4fuse.comparison.model import FILTERS, AgainstTruth, AxisComparison, Difference, FilterName
 from px4fuse.ekf2.walk import Why
-from px4fuse.filter.consistency import SIGMA_OFF
 from px4fuse.filter.kalman import state_at
 from px4fuse.findings.causes import SETTINGS, VARIANCES
 from px4fuse.findings.hidden_errors import hidden_error
@@ -37,6 +36,11 @@ MOST_SENTENCES = 3
 # What the first sentence tells already
 TOLD_FIRST = VARIANCES | {"errors_larger_than_claimed", "ekf2_unavailable"}
 SETTING_FIELDS = frozenset((SIGMA_A, SIGMA_Z))
+# What a source can have that no setting and no outlier stands for
+SHAPED = frozenset((
+    "source_axes_unequal", "source_clock_changes", "source_coloured", "source_jumps",
+    "source_noise_changes", "source_repeats", "source_scale_wrong", "source_smoothed",
+))  # fmt: skip
 # What weighs less than why EKF2 differs
 EFFECTS = frozenset({"ekf2_resets", "ekf2_rejecting", "ekf2_fusion_interrupted"})
 
@@ -56,6 +60,10 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
         One to three sentences.
     """
     since = {owner: _cause_of(analysis, owner) for owner in FILTERS}
+    shaped = any(one.id in SHAPED and one.severity != "info" for one in findings)
+    for owner, cause in since.items():
+        if shaped and kind_of(analysis, cause) not in ("clock", "frame"):
+            since[owner] = None
     known = TOLD_FIRST
     for cause in filter(None, since.values()):
         known |= TOLD_BY.get(kind_of(analysis, cause), frozenset())
@@ -66,7 +74,11 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
         if one.caused_by is None and one.severity != "info" and one.id not in known
     ]  # fmt: skip
     sentences = [
-        _verdict(analysis, _judged(analysis, "kf", since), _judged(analysis, "ekf2", since)),
+        _verdict(
+            analysis,
+            _judged(analysis, "kf", since, shaped),
+            _judged(analysis, "ekf2", since, shaped),
+        ),
         *(_told(analysis, one) for one in causes if one.id not in EFFECTS),
         *_differences(analysis),
         *(_told(analysis, one) for one in causes if one.id in EFFECTS),
@@ -127,27 +139,27 @@ def _error(result: AxisComparison, owner: FilterName) -> str:
 
 
 def _judged(
-    analysis: Analysis, owner: FilterName, causes: Mapping[FilterName, Intervention | None]
-) -> str:
+    analysis: Analysis, owner: FilterName, causes: Mapping[FilterName, Intervention | None],
+    named: bool,
+) -> str:  # fmt: skip
     """Whether a filter's variance is what its innovations, and the truth, show; and why not."""
     statement, axis = analysis.main.filters[owner], analysis.main.axis.name
     cause, of = causes[owner], "nees" if beyond_claim(statement) else "nis"
     since = since_words(analysis, cause)
     if owner == "kf" and cause and causes["ekf2"] and cause.change == causes["ekf2"].change:
         since = f", for the same reason ({effect_words(cause)})"
-    drifts = analysis.source.origin.may_drift  # which is told by itself
-    tried = not drifts and any(
-        (e.of, e.filter, e.axis) == (of, owner, axis) for e in analysis.causes
-    )
-    unexplained = ", which nothing that was tried explains" if tried and cause is None else ""
+    # a drift, and what no setting stands for, are told by themselves
+    told = named or analysis.source.origin.may_drift
+    tried = [e for e in analysis.causes if (e.of, e.filter, e.axis) == (of, owner, axis)]
+    unexplained = ", which nothing that was tried explains" if tried and not told else ""
+    if any(each.denied_by_truth for each in tried):
+        unexplained = ", as its errors against the truth ask for"
     if hidden := hidden_error(analysis, analysis.main, owner):
         return f"claimed {length_words(hidden.claimed_m)}{since or unexplained}"
     if isinstance(statement, Unavailable):
         return "cannot be judged, since the log has no innovations or too few"
     if statement.verdict == "consistent":
         return "honest about it"
-    if statement.times_off < SIGMA_OFF:
-        unexplained = ""
     how = "too modest" if statement.sigma_factor > 1.0 else "too sure of itself"
     return f"{excess_words(statement.times_off)} {how}{since or unexplained}"
 

@@ -55,7 +55,8 @@ AGAINST_SLOW_ERRORS = (
     "to cover and innovations do not show."
 )
 AGAINST_TRUTH = (
-    "Lower no noise for these innovations: the errors against the truth are larger than claimed."
+    "Lower no noise for these innovations: the filter would claim less than its errors against the "
+    "truth."
 )
 
 Member = tuple[AxisComparison, Consistency]
@@ -107,6 +108,7 @@ def _of_group(analysis: Analysis, owner: FilterName, group: str, members: list[M
     else:
         found = cause_of(analysis.causes, owner, result.axis.name)
         cause, remedy = kind_of(analysis, found), _remedy(analysis, owner, result, tuned, found)
+        severity = "info" if remedy == AGAINST_TRUTH else severity
     evidence: dict[str, float | str] = {
         "axis": result.axis.name,
         "sigma_factor": statement.sigma_factor,
@@ -193,6 +195,8 @@ def _without_cause(
     """What was tried and how near it came, or that nothing could be."""
     wanted = ("nis", owner, result.axis.name)
     tried = [each for each in analysis.causes if (each.of, each.filter, each.axis) == wanted]
+    if any(each.denied_by_truth for each in tried):
+        return AGAINST_TRUTH
     if tried:
         nearest = min(tried, key=lambda each: abs(each.explains - 1.0))
         return f"{NOT_EXPLAINED} The nearest: {reason_words(analysis, nearest)}."

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -28,6 +29,7 @@ from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
+from px4fuse.findings.story import story
 from px4fuse.flight import POSITION_COLUMNS, POSITION_VARIANCE_COLUMNS, Flight, Unavailable
 from px4fuse.readers import read_log
 
@@ -183,7 +185,9 @@ def told(job: tuple[str, str, float, int]) -> tuple[str, tuple[str, ...]]:
     flight = read_log(Path(log))
     flight = laid_over(flight, truth_of(Path(log), flight), MODELS[name][0], rate_hz, seed)
     analysis = explain(compare(flight, Settings(0.27, SIGMA_M), axes=("north", "east")))
-    return name, tuple(
+    told = story(analysis, find(analysis))[0].partition(", since ")[2]
+    since = (f"since: {re.sub(r'[-+0-9.]+', '#', told.partition(' (')[0])}",) if told else ()
+    return name, since + tuple(
         f"{one.id}{'!' if one.severity == 'error' else ''}"
         for one in find(analysis)
         if one.severity != "info" and one.caused_by is None
