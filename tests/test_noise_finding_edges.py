@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from exchange import replace
 from findings_tools import (
     CHOSEN,
     DRIFTING,
@@ -593,3 +594,29 @@ def test_the_longest_silence_is_told_with_where_it_left_both(
             f"From 50 s to 58 s the source was silent{more}: both filters coasted on the IMU; at "
             f"the end {said}"
         )
+
+
+def test_a_smaller_noise_that_the_truth_denies_is_no_cause() -> None:
+    denied = replace(tried("kf", {"sigma_z_m": 0.5}, "aisle", before=0.2), denied_by_truth=True)
+    one = flight_of(judged(0.2), causes=(denied,))
+    assert story(one, ())[0].endswith("too modest, as its errors against the truth ask for.")
+    finding = only(variance.detect, analysis(axes=(kf(0.2, "aisle"),), causes=(denied,)))
+    assert (finding.remedy, finding.severity) == (variance.AGAINST_TRUTH, "info")
+    assert finding.evidence["cause"] == "elsewhere"
+
+
+def test_of_noise_that_no_setting_stands_for_no_setting_is_the_cause() -> None:
+    causes = (tried("kf", {"sigma_z_m": 3.0}, "aisle"),)
+    one = flight_of(judged(9.0), causes=causes)
+    for name, level, told in (
+        ("source_coloured", "warning", False), ("source_coloured", "info", True),
+        ("source_outliers", "warning", True),
+    ):  # fmt: skip
+        found = Finding(name, level, "So.", "Do.", headline="It is so")  # type: ignore[arg-type]
+        said = story(one, (found,))[0]
+        assert (", since SIGMA_Z" in said) is told
+        assert told or said.endswith("3 times too sure of itself.")
+    # a clock that is off stays one
+    clock = (tried("kf", {"clock_offset_s": 0.25}, "aisle"),)
+    shaped = Finding("source_coloured", "warning", "So.", "Do.", headline="It is so")
+    assert ", since the stamps" in story(flight_of(judged(9.0), causes=clock), (shaped,))[0]
