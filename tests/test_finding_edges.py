@@ -28,11 +28,11 @@ from findings_tools import (
     severity,
     source,
     statement,
+    tried,
 )
 
-from px4fuse.comparison import remedy as remedies
 from px4fuse.ekf2.model import Model
-from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
+from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.heading import HeadingError, HeadingPart
 from px4fuse.filter.heading import turned as together
 from px4fuse.filter.signals import Segment
@@ -46,6 +46,7 @@ from px4fuse.findings import (
     imu,
     missing,
     recording,
+    since,
     source_frame,
     source_intervals,
     source_positions,
@@ -214,59 +215,23 @@ def test_rejections(count: int, of: int, expected: str | None) -> None:
             assert finding.remedy.endswith(remedy)
 
 
-@pytest.mark.parametrize(
-    ("wanted", "ends", "tried", "said"),
-    [
-        # by name, noise first, then the delay, then both; the wider gate always last
-        ({"EKF2_EVP_NOISE": 0.3, "EKF2_EV_DELAY": 90.0}, "EKF2_EV_DELAY",
-         [["EKF2_EVP_NOISE"], ["EKF2_EV_DELAY"], ["EKF2_EVP_NOISE", "EKF2_EV_DELAY"],
-          ["EKF2_EVP_GATE"]], "Set EKF2_EV_DELAY to 90 ms: effect on flown."),
-        ({"EKF2_EVP_NOISE": 0.3, "EKF2_EV_DELAY": 0.0}, "nothing",
-         [["EKF2_EVP_NOISE"], ["EKF2_EVP_GATE"]],
-         "With what the data ask for (EKF2_EVP_NOISE to 0.3 m) the rejections remain: effect on"),
-        ({"EKF2_EVP_NOISE": 0.1}, "nothing", [["EKF2_EVP_GATE"]],
-         "EKF2's parameters are what the data ask for."),
-        ({}, "nothing", [["EKF2_EVP_GATE"]], "What EKF2 fused does not tell its noise here."),
-    ],
-)  # fmt: skip
-def test_what_ends_rejections_is_tried_in_order(
-    monkeypatch: pytest.MonkeyPatch, wanted: Any, ends: str, tried: list[list[str]], said: str
+def test_what_ends_rejections_is_the_cause_of_the_innovations(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    seen: list[dict[str, float]] = []
-
-    def replayed(_model: Model, candidates: list[dict[str, float]]) -> SimpleNamespace:
-        seen.extend(candidates)
-        tried = [SimpleNamespace(changed=each, position_rmse_to_truth_m=0.1) for each in candidates]
-        return SimpleNamespace(replayed="flown", whatif=tried)
-
-    monkeypatch.setattr(remedies, "asked_of_ekf2", lambda *_: wanted)
-    monkeypatch.setattr(ekf2_rejecting, "what_if", replayed)
-    monkeypatch.setattr(remedies, "effect_words", lambda before, _: f"effect on {before}")
-    monkeypatch.setattr(remedies, "rejects_less", lambda _, after: [*after.changed] == [ends])
-    flown = {"EKF2_EVP_NOISE": 0.1, "EKF2_EV_DELAY": 0.0, "EKF2_EVP_GATE": 5.0}
-    model = made(Model, inputs=SimpleNamespace(settings=flown, aid=EV_POS))
+    monkeypatch.setattr(since, "remedy_words", lambda _, changes, helps, **__: (f"{changes}", True))
     frame = axis("north", ekf2_innovations=rejected(5, 10))
-    one = analysis(ekf2={"gate": 5.0}, axes=(frame,), ekf2_model=model)
-    remedy = only(ekf2_rejecting.detect, one).remedy
-    if ends == "nothing":
-        assert remedy.endswith("A wider EKF2_EVP_GATE is no remedy; at 10: effect on flown.")
-    assert said in remedy
-    assert [list(changes) for changes in seen] == tried
-    assert seen[-1] == {"EKF2_EVP_GATE": 10.0}
+    model = made(Model, inputs=SimpleNamespace(settings=dict.fromkeys(PARAMETERS, 1.0)))
 
+    def remedy(*causes: Any) -> str:
+        one = analysis(ekf2={"gate": 5.0}, axes=(frame,), ekf2_model=model, causes=causes)
+        return only(ekf2_rejecting.detect, one).remedy
 
-def test_a_wider_gate_is_that_of_what_ekf2_fused(monkeypatch: pytest.MonkeyPatch) -> None:
-    tried = SimpleNamespace(changed={"EKF2_GPS_P_GATE": 10.0}, position_rmse_to_truth_m=0.1)
-    found = SimpleNamespace(replayed="flown", whatif=[tried])
-    monkeypatch.setattr(remedies, "asked_of_ekf2", lambda *_: {})
-    monkeypatch.setattr(ekf2_rejecting, "what_if", lambda *_: found)
-    monkeypatch.setattr(remedies, "effect_words", lambda *_: "effect")
-    monkeypatch.setattr(remedies, "rejects_less", lambda *_: True)
-    inputs = SimpleNamespace(settings={"EKF2_GPS_P_GATE": 5.0}, aid=GNSS_POS)
-    frame = axis("north", ekf2_innovations=rejected(5, 10))
-    one = analysis(ekf2={"gate": 5.0}, axes=(frame,), ekf2_model=made(Model, inputs=inputs))
-    remedy = only(ekf2_rejecting.detect, one).remedy
-    assert remedy.endswith("Widen EKF2_GPS_P_GATE; at 10: effect.")
+    noise, delay = {"EKF2_EVP_NOISE": 0.3}, {"EKF2_EV_DELAY": 90.0}
+    assert remedy(tried("ekf2", noise), tried("ekf2", delay, explains=0.4)) == str(noise)
+    assert remedy(tried("ekf2", delay)) == str(delay)
+    assert remedy(tried("ekf2", {"outliers_left_out": 5.0})).startswith("Remove the outliers")
+    for none in ((), (tried("ekf2", noise, explains=0.4),), (tried("kf", {"sigma_z_m": 1.0}),)):
+        assert remedy(*none).endswith("widen EKF2_EVP_GATE last.")
 
 
 # ---------------------------------------------------------------- errors and truth

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 from typing import Any
 
@@ -92,6 +93,18 @@ def test_the_cause_is_what_was_made_wrong(
     told = story(analysis, find(analysis))[0]
     ekf2, ours = told.split("; our filter")
     assert "replayed: " in (ours if owner == "kf" else ekf2)
+
+
+def test_an_offset_that_was_applied_to_ours_is_still_missing_to_ekf2() -> None:
+    bare = flown("clock-offset=-0.19")
+    offset_s = cause(bare, "kf", "nees").change[CLOCK]
+    analysis = explain(compare(bare.flight, replace(RIGHT, clock_offset_s=offset_s)))
+    assert {row.filter for row in analysis.causes} == {"ekf2"}
+    again, before = cause(analysis, "ekf2", "nees"), cause(bare, "ekf2", "nees")
+    assert again.change == pytest.approx(before.change, abs=0.01)
+    assert again.after == pytest.approx(before.after, rel=0.05)
+    told = f"EKF2 was .* since the stamps are {offset_s:.2g} s early"
+    assert re.search(told, story(analysis, find(analysis))[0])
 
 
 def test_a_number_of_our_filter_is_that_of_a_comparison_with_the_change() -> None:

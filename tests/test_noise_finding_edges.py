@@ -37,7 +37,7 @@ from px4fuse.ekf2.walk import Why
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HeldOut, Noise
-from px4fuse.findings import Finding, hidden_errors, loops, sigma, variance
+from px4fuse.findings import Finding, hidden_errors, loops, sigma, since, variance
 from px4fuse.findings import story as narration
 from px4fuse.findings.causes import by_cause
 from px4fuse.findings.story import story
@@ -294,7 +294,7 @@ def test_what_a_cause_asks_for(
         ((name, value),) = changes.items()
         return f"{{{name}: {value:g} {PARAMETERS[name].unit}|{helps.__name__}}}", True
 
-    monkeypatch.setattr(variance, "remedy_words", words)
+    monkeypatch.setattr(since, "remedy_words", words)
     model = SimpleNamespace(inputs=SimpleNamespace(settings=dict.fromkeys(PARAMETERS, 1.0)))
     # what explains less, and what explains the other way, is none
     causes = (tried(owner, {"sigma_z_m": 7.0}, explains=0.4), tried(owner, change),

@@ -217,13 +217,14 @@ def tuned_for(tuning: Tuning, axis: str) -> AxisTuning | None:
     return next((tuned for tuned in found if isinstance(tuned, AxisTuning)), None)
 
 
-def _of_clock(comparison: Comparison, clock: ClockOffset | Unavailable) -> list[Change]:
-    """The offset of the stamps, where it is beyond chance."""
+def _of_clock(
+    comparison: Comparison, clock: ClockOffset | Unavailable, taken_s: float
+) -> list[Change]:
+    """The offset of the stamps, where what a filter has not taken of it is beyond chance."""
     if isinstance(clock, Unavailable) or not clock.determinable:
         return []
-    if abs(clock.remaining_s) <= clock.chance_s:
-        return []
-    return [{CLOCK: round(comparison.settings.clock_offset_s + clock.remaining_s, 3)}]
+    offset_s = comparison.settings.clock_offset_s + clock.remaining_s
+    return [{CLOCK: round(offset_s, 3)}] if abs(offset_s - taken_s) > clock.chance_s else []
 
 
 def _of_frame(heading: HeadingError | Unavailable) -> list[Change]:
@@ -270,7 +271,7 @@ class _Ours:
                     found.append({name: float(f"{asked:.3g}")})
         if tuned is not None and not over and len(tuned.outlier_time_s):
             found.append({OUTLIERS: float(len(tuned.outlier_time_s))})
-        found += _of_clock(self.comparison, self.clock)
+        found += _of_clock(self.comparison, self.clock, settings.clock_offset_s)
         return found if result.axis.name == "down" else found + _of_frame(self.heading)
 
     def number(self, result: AxisComparison, of: Of, change: Change) -> tuple[float, int] | None:
@@ -338,7 +339,7 @@ class _Ekf2:
         if delay := delay_asked(self.comparison, self.model, self.clock):
             found.append(delay)
         else:
-            found += _of_clock(self.comparison, self.clock)
+            found += _of_clock(self.comparison, self.clock, 0.0)
         found += _of_frame(self.heading)
         if flown[aid.gate] < PARAMETERS[aid.gate].default:
             found.append({aid.gate: PARAMETERS[aid.gate].default})
@@ -387,8 +388,7 @@ class _Ekf2:
         key = tuple(sorted(change.items()))
         if key not in self.replays:
             settings = {name: value for name, value in change.items() if name in PARAMETERS}
-            shift_s = change.get(CLOCK, applied_s := self.comparison.settings.clock_offset_s)
-            model = moved(self.model, change.get(TURN, 0.0), shift_s - applied_s)
+            model = moved(self.model, change.get(TURN, 0.0), change.get(CLOCK, 0.0))
             left_out_s, tuned = None, tuned_for(self.tuning, HORIZONTAL)
             if OUTLIERS in change and tuned is not None:
                 stamp = 1e-3 * self.model.inputs.settings[self.model.inputs.aid.delay]

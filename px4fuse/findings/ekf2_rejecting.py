@@ -6,14 +6,14 @@ import math
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
-from px4fuse.ekf2.whatif import what_if
-from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS, Aid
+from px4fuse.comparison.interventions import cause_of
+from px4fuse.ekf2_parameters import GNSS_POS, Aid
 from px4fuse.findings.model import Finding, Found, finding, moments
+from px4fuse.findings.since import ekf2_cure_words
 from px4fuse.flight import Ekf2, Unavailable
 
 REJECTED_SHARE_WARNING = 0.01  # of the innovations; 5 σ rejects 6e-7 when consistent
 REJECTED_SHARE_ERROR = 0.20  # of the innovations: one in five, R or the clock is wrong
-OUTLIERS = "Remove the outliers (line of sight, anchor survey)."
 
 
 def in_order(aid: Aid) -> str:
@@ -69,45 +69,16 @@ def _rejections(analysis: Analysis) -> Found:
                 "ekf2_rejecting",
                 f"EKF2 rejected {share:.1%} of the source's samples for {what}",
                 f" (outside {ekf2.gate:g} √S): outliers, a noise set too small, or a late clock.",
-                in_order(remedy.aid_of(analysis)) if name == "down" else _remedy(analysis),
+                in_order(remedy.aid_of(analysis)) if name == "down" else _remedy(analysis, name),
                 {"rejected_share": share, "count": len(frame), "axis": name},
                 moments(known.index[known > 0.0]),
             )
 
 
-def _remedy(analysis: Analysis) -> str:
-    """The noise or the delay that the data ask for, where that ends the rejections."""
-    model = analysis.ekf2_model
+def _remedy(analysis: Analysis, axis: str) -> str:
+    """What puts the cause of the innovations right, which the gate is there for."""
+    order, model = in_order(remedy.aid_of(analysis)), analysis.ekf2_model
     if isinstance(model, Unavailable):
-        return f"{in_order(remedy.aid_of(analysis))} {remedy.not_replayed(model)}"
-    wanted = remedy.asked_of_ekf2(analysis, model, analysis.tuning, analysis.clock)
-    flown = model.inputs.settings
-    asked = {name: value for name, value in wanted.items() if value != flown[name]}
-    delay = {name: value for name, value in asked.items() if "DELAY" in name}
-    noise = {name: value for name, value in asked.items() if name not in delay}
-    both = asked if noise and delay else {}
-    candidates = [changes for changes in (noise, delay, both) if changes]
-    aid = model.inputs.aid
-    gate = min(2.0 * flown[aid.gate], PARAMETERS[aid.gate].maximum)
-    found = what_if(model, [*candidates, {aid.gate: gate}])
-    if isinstance(found, Unavailable):
-        return f"{in_order(aid)} {remedy.not_replayed(found)}"
-    before, (*tried, wider) = found.replayed, found.whatif
-    for after in tried:
-        if remedy.rejects_less(before, after):
-            effect = remedy.effect_words(before, after)
-            return f"Set {remedy.settings_words(after.changed)}: {effect}."
-    said = f"{OUTLIERS} What EKF2 fused does not tell its noise here."
-    if tried:
-        asked_for = remedy.settings_words(tried[-1].changed)
-        remain = remedy.effect_words(before, tried[-1])
-        said = (
-            f"With what the data ask for ({asked_for}) the rejections remain: {remain}. {OUTLIERS}"
-        )
-    elif wanted:
-        said = f"{OUTLIERS} EKF2's parameters are what the data ask for."
-    if isinstance(wider.position_rmse_to_truth_m, Unavailable):
-        return said
-    helps = remedy.rejects_less(before, wider)
-    verdict = f"Widen {aid.gate}" if helps else f"A wider {aid.gate} is no remedy"
-    return f"{said} {verdict}; at {gate:g}: {remedy.effect_words(before, wider)}."
+        return f"{order} {remedy.not_replayed(model)}"
+    cause = cause_of(analysis.causes, "ekf2", axis)
+    return order if cause is None else ekf2_cure_words(analysis, cause)

@@ -11,10 +11,17 @@ from px4fuse.comparison.interventions import (
     SIGMA_A,
     SIGMA_Z,
     TURN,
-    Change,
     Intervention,
 )
-from px4fuse.comparison.remedy import COMMAND, aid_of, settings_words
+from px4fuse.comparison.remedy import (
+    COMMAND,
+    aid_of,
+    delay_helps,
+    noise_helps,
+    rejects_less,
+    remedy_words,
+    settings_words,
+)
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital, number_words
@@ -31,6 +38,8 @@ TOLD_BY: dict[Kind, frozenset[str]] = {
 }
 OPTIONS = {SIGMA_Z: "--sigma-z", SIGMA_A: "--sigma-a", CLOCK: "--clock-offset"}
 UNITS = {SIGMA_A: "m/s²", SIGMA_Z: "m"}
+# What a change of a kind is there for; else to bring the mean NIS nearer to 1
+HELPS = {"clock": delay_helps, "gate": rejects_less}
 # What a change of another parameter needs along with it
 ALONG = frozenset(("EKF2_DELAY_MAX", "EKF2_EV_NOISE_MD"))
 
@@ -59,7 +68,7 @@ def reason_words(analysis: Analysis, cause: Intervention) -> str:
 
 def change_words(analysis: Analysis, cause: Intervention) -> str:
     """What is wrong, as a clause: what was changed to see what it does."""
-    said = [_one(analysis, cause.change, name) for name in cause.change if name not in ALONG]
+    said = [_one(analysis, cause, name) for name in cause.change if name not in ALONG]
     return " and ".join(said)
 
 
@@ -98,14 +107,25 @@ def effect_words(cause: Intervention) -> str:
     return f"replayed: errors of {before} → {after} σ"
 
 
-def _one(analysis: Analysis, change: Change, name: str) -> str:
+def ekf2_cure_words(analysis: Analysis, cause: Intervention) -> str:
+    """What to do about a cause of EKF2's, with what a parameter would do to all of the flight."""
+    if not cause.change.keys() <= PARAMETERS.keys():
+        return cure_words(cause)
+    words, _ = remedy_words(
+        analysis.ekf2_model, cause.change, HELPS.get(kind_of(analysis, cause), noise_helps),
+        otherwise=f"{capital(reason_words(analysis, cause))}.",
+    )  # fmt: skip
+    return words
+
+
+def _one(analysis: Analysis, cause: Intervention, name: str) -> str:
     """What is wrong, for one of the things that were changed."""
-    value, settings = change[name], analysis.settings
+    value, settings = cause.change[name], analysis.settings
     match name:
         case "outliers_left_out":
             return f"{value:.0f} position{'s are outliers' if value > 1 else ' is an outlier'}"
         case "clock_offset_s":
-            missing_s = value - settings.clock_offset_s
+            missing_s = value - (settings.clock_offset_s if cause.filter == "kf" else 0.0)
             return f"the stamps are {abs(missing_s):.2g} s {'late' if missing_s < 0 else 'early'}"
         case "turned_deg":
             return f"the positions are turned by {-value:+.0f}°"

@@ -12,10 +12,8 @@ from px4fuse.comparison.interventions import SIGMA_A, SIGMA_Z, Intervention, cau
 from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName
 from px4fuse.comparison.remedy import (
     aid_of,
-    delay_helps,
     noise_helps,
     not_replayed,
-    rejects_less,
     remedy_words,
     settings_words,
 )
@@ -28,14 +26,13 @@ from px4fuse.findings.causes import CAUSE, ELSEWHERE, NOISE
 from px4fuse.findings.hidden_errors import hidden_errors
 from px4fuse.findings.model import Finding, Found, Severity, finding, lowered
 from px4fuse.findings.sigma import try_out
-from px4fuse.findings.since import cure_words, kind_of, reason_words
+from px4fuse.findings.since import cure_words, ekf2_cure_words, kind_of, reason_words
 from px4fuse.flight import POSITION_VARIANCE_COLUMNS, Unavailable
-from px4fuse.plain import capital, factor_words, number_words
+from px4fuse.plain import factor_words, number_words
 
 SIGMA_OFF_ERROR = 2.0  # times, in standard deviation
 EKF2_NOISE_FLOOR_M = 0.01  # EKF2 never trusts external vision better, EKF2.cpp
 NOISE_FITS = 1.25  # times: the median's own scatter below n = 100 (1.17/√n, two σ)
-HELPS = {"clock": delay_helps, "gate": rejects_less}
 SETTINGS = {SIGMA_Z: "--sigma-z", SIGMA_A: "--sigma-a"}
 NOT_EXPLAINED = (
     "No change of a noise, the clock, the frame or the outliers explains half of it: look at the "
@@ -171,12 +168,8 @@ def _remedy(
     """What to type or to set against the cause; where there is none, what it is not."""
     if cause is None:
         return _without_cause(analysis, owner, result, tuned)
-    if owner == "ekf2" and cause.change.keys() <= PARAMETERS.keys():
-        words, _ = remedy_words(
-            analysis.ekf2_model, cause.change, HELPS.get(kind_of(analysis, cause), noise_helps),
-            otherwise=f"{capital(reason_words(analysis, cause))}.",
-        )  # fmt: skip
-        return words
+    if owner == "ekf2":
+        return ekf2_cure_words(analysis, cause)
     if not cause.change.keys() <= SETTINGS.keys():
         return cure_words(cause)
     bounded = tuned is not None and tuned.sigma_z.value is None and SIGMA_Z in cause.change
