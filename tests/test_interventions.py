@@ -114,10 +114,11 @@ def test_a_number_of_our_filter_is_that_of_a_comparison_with_the_change() -> Non
             if found is None:
                 continue
             again = compare(analysis.flight, replace(analysis.settings, **found.change))
-            for number, summary in (
-                (found.before, statement(analysis, "kf", "north")),
-                (found.after, again.axes["north"].filters["kf"]),
-            ):
+            before = statement(analysis, "kf", "north")
+            assert not isinstance(before.truth, Unavailable)
+            stated = before.nis_mean if of == "nis" else before.truth.nees_position_mean
+            assert found.before == stated
+            for number, summary in ((found.after, again.axes["north"].filters["kf"]),):
                 assert isinstance(summary, FilterSummary)
                 if of == "nis":
                     assert number == pytest.approx(summary.nis_mean, rel=1e-6)
@@ -137,8 +138,37 @@ def test_a_number_of_ekf2_is_that_of_a_what_if() -> None:
     assert isinstance(asked, WhatIf)
     for one, axis in zip(found, ("north", "east"), strict=True):
         assert one is not None
-        assert one.before == pytest.approx(asked.replayed.axes[axis].nis_mean, rel=1e-9)
+        assert one.before == statement(analysis, "ekf2", axis).nis_mean
         assert one.after == pytest.approx(asked.whatif[0].axes[axis].nis_mean, rel=1e-9)
+
+
+def test_a_cause_says_how_far_it_keeps_both_filters_apart() -> None:
+    ours = flown(sigma_a=0.02)
+    right = compare(ours.flight, replace(ours.settings, **cause(ours, "kf").change))
+    (row,) = [one for one in ours.causes if (one.of, one.axis) == ("apart", "aisle")]
+    for number, comparison in ((row.before, ours), (row.after, right)):
+        apart = comparison.main.difference
+        assert not isinstance(apart, Unavailable)
+        assert number == pytest.approx(apart.position_rmse_m)
+    assert row.change == cause(ours, "kf").change
+    assert row.explains == pytest.approx(1.0 - (row.after / row.before) ** 2)
+    assert row.explains > 0.8
+    _, second, *_ = story(ours, find(ours))
+    assert (
+        second
+        == "Put right in our filter, that brings both from 21 cm to 8 cm apart (RMS, replayed)."
+    )
+    # of EKF2 what is put right is its own track, where the replay is judged
+    theirs = flown("ekf2-gate=1")
+    (row,) = [one for one in theirs.causes if (one.of, one.axis) == ("apart", "aisle")]
+    apart = theirs.main.difference
+    assert not isinstance(apart, Unavailable)
+    assert row.before == pytest.approx(apart.position_rmse_m, rel=0.1)
+    # what is right in EKF2 is as near to ours as EKF2 in the same flight without the mistake
+    well = flown().main.difference
+    assert not isinstance(well, Unavailable)
+    assert row.after == pytest.approx(well.position_rmse_m, rel=0.1)
+    assert "Put right in EKF2, that brings both from" in story(theirs, find(theirs))[1]
 
 
 def test_what_explains_too_little_or_too_much_is_no_cause() -> None:

@@ -529,6 +529,22 @@ def test_the_same_cause_of_both_is_told_once_and_its_finding_is_not_repeated() -
     assert more == []
 
 
+def test_why_ekf2_differs_is_told_where_no_cause_explains_it() -> None:
+    change = {"sigma_z_m": 3.0}
+    why = made(Why, cause="The rest is the noise.")
+    for share, owner, told in ((0.5, "kf", True), (0.49, "kf", False), (0.9, "ekf2", False)):
+        apart = replace(
+            tried(owner, change, "aisle", "apart"), before=0.5, after=0.2, explains=share
+        )
+        one = flight_of(judged(9.0), causes=(tried("kf", change, "aisle"), apart),
+                        why={"aisle": why})  # fmt: skip
+        _, second = story(one, ())
+        wanted = (
+            "Put right in our filter, that brings both from 50 cm to 20 cm apart (RMS, replayed)."
+        )
+        assert second == (wanted if told else "The rest is the noise.")
+
+
 def test_an_error_beyond_its_claim_has_its_own_causes() -> None:
     hides = along(1.0, 1.0, ekf2_truth=against_truth(1.0), kf_truth=against_truth(16.0))
     causes = (tried("kf", {"clock_offset_s": -0.25}, "aisle", "nees", before=16.0),)

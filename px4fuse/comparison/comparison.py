@@ -95,17 +95,17 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, run: Replay) -
     state: Frame
     variance: Frame
     innovations: Frame
-    difference: Difference | Unavailable
+    apart: Difference | Unavailable
     horizon = None
     if isinstance(ekf2, Unavailable):
-        state = variance = innovations = difference = ekf2
+        state = variance = innovations = apart = ekf2
         times, gate = run.steps.index.to_numpy(), GATE_SIGMA
     else:
         state = project_state(ekf2.state, axis, segment)
         variance = project_variance(ekf2, axis, segment)
         horizon = project_horizon(ekf2, axis, segment)
         innovations = project_innovations(flight, ekf2, prepared.source, axis, segment)
-        difference = _difference(run, state)
+        apart = difference(run, state)
         times, gate = state.index.to_numpy(), ekf2.gate
     updates = run.updates.assign(
         prior_variance_m2=run.updates["prior_position_variance_m2"],
@@ -129,7 +129,7 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, run: Replay) -
                 innovations, variance, against_truth(state, variance, truth, horizon), gate
             ),
         },
-        difference=difference,
+        difference=apart,
         rejected_share=float(rejected.mean()) if len(rejected) else None,
         axis=axis,
         replay=run,
@@ -167,7 +167,8 @@ def _known(frame: Frame, column: str) -> pd.Series:
     return pd.Series(dtype=float) if isinstance(frame, Unavailable) else frame[column].dropna()
 
 
-def _difference(run: Replay, ekf2_state: pd.DataFrame) -> Difference | Unavailable:
+def difference(run: Replay, ekf2_state: pd.DataFrame) -> Difference | Unavailable:
+    """Our filter minus EKF2 along one axis, at EKF2's own sample times."""
     apart = np.array(state_at(run, ekf2_state.index.to_numpy())) - ekf2_state[[*STATE]].to_numpy().T
     position, velocity = apart[:, np.isfinite(apart).all(axis=0)]
     if len(position) < MIN_COMMON_SAMPLES:

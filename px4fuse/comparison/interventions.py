@@ -15,9 +15,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
+from msgspec import structs
 from scipy.spatial.transform import Rotation
 
-from px4fuse.comparison.comparison import kf_against_truth
+from px4fuse.comparison.comparison import difference, kf_against_truth
 from px4fuse.comparison.estimates import Tuning
 from px4fuse.comparison.model import (
     AgainstTruth,
@@ -36,15 +38,15 @@ from px4fuse.ekf2_parameters import GNSS_VEL, PARAMETERS
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.consistency import SIGMA_OFF, nis_band
 from px4fuse.filter.heading import HeadingError
-from px4fuse.filter.kalman import replay
+from px4fuse.filter.kalman import Replay, replay
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import along, within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.flight import POSITION_COLUMNS, Unavailable
+from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Unavailable
 from px4fuse.record import Positive, Record
 
-Of = Literal["nis", "nees"]
+Of = Literal["nis", "nees", "apart"]
 Change = Mapping[str, float]
 # Squared errors of so many times what is claimed are beyond it: twice σ; clean flights stay below 3
 NEES_LARGE = 4.0
@@ -72,21 +74,23 @@ HEADING_SIGMAS = 3.0
 
 
 class Intervention(Record, frozen=True, kw_only=True):
-    """One change, and what it makes of a number that should be 1.
+    """One change, and what it makes of a number that should be 1, or of a distance.
 
     Attributes
     ----------
-    of : {"nis", "nees"}
-        Mean NIS, or mean NEES of position.
+    of : {"nis", "nees", "apart"}
+        Mean NIS, mean NEES of position, or how far both filters are apart (m, RMS), which is asked
+        of causes alone.
     filter : {"kf", "ekf2"}
     axis : str
     change : mapping from name to value
         Fields of the settings, PX4's parameters, ``turned_deg`` (of the positions, clockwise seen
         from above) and ``outliers_left_out`` (how many).
     before, after : float
-        The number by a replay without the change, and with it.
+        The number without the change, of EKF2 by the log, and by a replay with it.
     explains : float
-        Share of its logarithm that the change takes away; above 1 it goes to the other side.
+        Share of its logarithm that the change takes away; above 1 it goes to the other side. Of a
+        distance the share of its mean square.
     brings_into_band : bool
         Of a NIS its 95 % band; an error is beyond a claim from a NEES of :data:`NEES_LARGE` on.
     denied_by_truth : bool
@@ -154,14 +158,29 @@ def interventions(
         "kf": _Ours(comparison, tuning, clock, heading),
         "ekf2": _Ekf2.of(comparison, tuning, clock, heading, model),
     }
-    return tuple(
-        tried
-        for owner, changed in filters.items()
-        for result in comparison.axes.values()
-        if changed is not None and (owner == "kf" or result.axis.name != "down")
-        for of in _discrepancies(result.filters[owner])
-        for tried in _tried(owner, result, of, changed.candidates(result, of), changed.number)
-    )
+    rows: list[Intervention] = []
+    for owner, changed in filters.items():
+        for result in comparison.axes.values():
+            if changed is None or (owner == "ekf2" and result.axis.name == "down"):
+                continue
+            for of in _discrepancies(result.filters[owner]):
+                tried = _tried(owner, result, of, changed.candidates(result, of), changed.number)
+                rows += tried
+                if cause := cause_of(tried, owner, result.axis.name, of):
+                    rows += _apart(cause, result, changed.number)
+    return tuple(rows)
+
+
+def _apart(cause: Intervention, result: AxisComparison, number: Number) -> list[Intervention]:
+    """How far a cause keeps both filters apart."""
+    before, after = (number(result, "apart", change) for change in ({}, cause.change))
+    if before is None or after is None:
+        return []
+    share = 1.0 - (after[0] / before[0]) ** 2
+    return [
+        structs.replace(cause, of="apart", before=before[0], after=after[0], explains=share,
+                        brings_into_band=False)
+    ]  # fmt: skip
 
 
 def _discrepancies(statement: FilterSummary | UnjudgedFilter) -> list[Of]:
@@ -172,6 +191,14 @@ def _discrepancies(statement: FilterSummary | UnjudgedFilter) -> list[Of]:
     return [*found, "nis"] if statement.times_off >= SIGMA_OFF else found
 
 
+def _stated(statement: FilterSummary | UnjudgedFilter, of: Of) -> float | None:
+    """The number as it is without a change: of EKF2 that of the log."""
+    if of == "nis":
+        return None if isinstance(statement, Unavailable) else statement.nis_mean
+    truth = statement.truth
+    return None if isinstance(truth, Unavailable) else truth.nees_position_mean
+
+
 Number = Callable[[AxisComparison, Of, Change], tuple[float, int] | None]
 
 
@@ -179,10 +206,9 @@ def _tried(
     owner: FilterName, result: AxisComparison, of: Of, candidates: Sequence[Change], number: Number
 ) -> list[Intervention]:
     """All candidates alone; where the best leaves the number outside its band, with the others."""
-    found = number(result, of, {}) if candidates else None
-    if found is None:
+    before = _stated(result.filters[owner], of)
+    if before is None or not candidates:
         return []
-    before = found[0]
 
     def tried(change: Change) -> list[Intervention]:
         found = number(result, of, change)
@@ -208,6 +234,12 @@ def _tried(
         return alone
     best, *others = helping
     return alone + [e for other in others for e in tried({**best.change, **other.change})]
+
+
+def _rms_apart(run: Replay, state: pd.DataFrame) -> tuple[float, int] | None:
+    """Root mean square of ours - EKF2 in position (m), and of how many."""
+    found = difference(run, state)
+    return None if isinstance(found, Unavailable) else (found.position_rmse_m, found.count)
 
 
 def tuned_for(tuning: Tuning, axis: str) -> AxisTuning | None:
@@ -275,7 +307,7 @@ class _Ours:
         return found if result.axis.name == "down" else found + _of_frame(self.heading)
 
     def number(self, result: AxisComparison, of: Of, change: Change) -> tuple[float, int] | None:
-        """Mean NIS or NEES along an axis with a change, and of how many."""
+        """Mean NIS or NEES along an axis with a change, or how far apart; and of how many."""
         source, segment, axis = self.comparison.source, self.comparison.segment, result.axis
         named: dict[str, Any] = {name: change[name] for name in change if name in vars(Settings())}
         settings = replace(self.comparison.settings, **named)
@@ -296,6 +328,9 @@ class _Ours:
             nu, s = innovations(legs, settings.sigma_a_m_s2, settings.sigma_z_m)
             return float(np.mean(nu**2 / s)), len(nu)
         run = replay(axis, settings)
+        if of == "apart":
+            state = result.ekf2_state
+            return None if isinstance(state, Unavailable) else _rms_apart(run, state)
         truth = kf_against_truth(run, result.truth, run.steps.index.to_numpy())
         if isinstance(truth, Unavailable) or truth.nees_position_mean is None:
             return None
@@ -364,13 +399,21 @@ class _Ekf2:
         return noise_change(self.model, float(bound_m))
 
     def number(self, result: AxisComparison, of: Of, change: Change) -> tuple[float, int] | None:
-        """Mean NIS or NEES along a horizontal axis with a change, and of how many."""
+        """As of :class:`_Ours`, along a horizontal axis; unchanged how far apart by the log."""
         made, direction = self._replayed(change), result.axis.direction
         updates = made.updates[settled(made.updates.index, judged_from(self.model.flown))]
         if of == "nis":
             nu = along(updates, INNOVATION_COLUMNS, direction[:2])
             s = along(updates, INNOVATION_VARIANCE_COLUMNS, direction[:2] ** 2)
             return (float(np.mean(nu**2 / s)), len(nu)) if len(nu) else None
+        if of == "apart":
+            state = result.ekf2_state
+            if change or isinstance(state, Unavailable):
+                columns = {"position_m": POSITION_COLUMNS, "velocity_m_s": VELOCITY_COLUMNS}
+                parts = {name: along(made.published, of, direction) for name, of in columns.items()}
+                state = pd.DataFrame(parts, index=made.published.index)
+            inside = settled(state.index, judged_from(self.model.flown))
+            return _rms_apart(result.replay, state[inside])
         if isinstance(result.truth, Unavailable):
             return None
         at_s, truth = updates["fused_at_s"].to_numpy(), result.truth

@@ -24,7 +24,7 @@ from px4fuse.comparison.remedy import (
 )
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.flight import Unavailable
-from px4fuse.plain import capital, number_words
+from px4fuse.plain import capital, length_words, number_words
 
 Kind = Literal[
     "outliers", "clock", "frame", "measurement noise", "process noise", "gate", "elsewhere"
@@ -78,6 +78,8 @@ def share_words(cause: Intervention) -> str:
         return "denied by the truth"
     if cause.brings_into_band:
         return "all"
+    if cause.of == "apart" and cause.explains > 0.0:
+        return f"{cause.explains:.0%}"
     if cause.explains > 1.0:
         return "too much"
     return f"{cause.explains:.0%}" if cause.explains > 0.0 else "nothing"
@@ -103,6 +105,9 @@ def effect_words(cause: Intervention) -> str:
     if cause.of == "nis":
         before, after = (number_words(nis, 2) for nis in (cause.before, cause.after))
         return f"replayed: mean NIS {before} → {after}"
+    if cause.of == "apart":
+        before, after = (length_words(metres) for metres in (cause.before, cause.after))
+        return f"replayed: {before} → {after} apart"
     before, after = (number_words(nees**0.5, 2) for nees in (cause.before, cause.after))
     return f"replayed: errors of {before} → {after} σ"
 

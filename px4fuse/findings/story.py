@@ -13,6 +13,7 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.interventions import (
+    EXPLAINS,
     SIGMA_A,
     SIGMA_Z,
     Intervention,
@@ -79,8 +80,9 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
             _judged(analysis, "kf", since, shaped),
             _judged(analysis, "ekf2", since, shaped),
         ),
+        *(closer := tuple(_closer(analysis, since))),
         *(_told(analysis, one) for one in causes if one.id not in EFFECTS),
-        *_differences(analysis),
+        *_differences(analysis, told=bool(closer)),
         *(_told(analysis, one) for one in causes if one.id in EFFECTS),
     ]
     return tuple(sentences[:MOST_SENTENCES])
@@ -195,7 +197,25 @@ def _gap(analysis: Analysis, finding: Finding) -> str:
     )
 
 
-def _differences(analysis: Analysis) -> Iterator[str]:
+def _closer(analysis: Analysis, causes: Mapping[FilterName, Intervention | None]) -> Iterator[str]:
+    """What putting the cause right does to how far both filters are apart."""
+    told = [
+        each
+        for each in analysis.causes
+        if (each.of, each.axis) == ("apart", analysis.main.axis.name)
+        and each.explains >= EXPLAINS
+        and causes[each.filter] is not None
+    ]
+    if told:
+        most = max(told, key=lambda each: each.explains)
+        owner = "our filter" if most.filter == "kf" else "EKF2"
+        yield (
+            f"Put right in {owner}, that brings both from {length_words(most.before)} to "
+            f"{length_words(most.after)} apart (RMS, replayed)."
+        )
+
+
+def _differences(analysis: Analysis, *, told: bool) -> Iterator[str]:
     """Why EKF2 differs, and what a loop shows."""
     loop, why = analysis.loop, analysis.why.get(analysis.main.axis.name)
     if isinstance(loop, Loop) and (gap := loop.closure_error_m) is not None:
@@ -204,5 +224,5 @@ def _differences(analysis: Analysis) -> Iterator[str]:
             f"The odometry fails to close its loop by {length_words(gap)} after "
             f"{length_words(length)} ({gap / length:.1%})."
         )
-    if isinstance(why, Why):
+    if isinstance(why, Why) and not told:
         yield why.cause  # wrong stamps are a finding of their own

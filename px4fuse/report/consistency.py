@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
+from px4fuse.comparison.interventions import Of
 from px4fuse.comparison.model import AxisComparison, FilterSummary, UnjudgedFilter
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
 from px4fuse.findings.since import change_words, share_words
@@ -32,6 +33,10 @@ LARGE_T, SMALL_P = 2.0, 0.01
 # Heights of the axes in points
 RUNNING, BELOW, LEGEND = 140.0, 150.0, 14.0
 GREY = "#dcdcdc"
+# What a cause explains: its name, and the power that is shown
+NUMBERS: Mapping[Of, tuple[str, float]] = {
+    "nis": ("mean NIS", 1.0), "nees": ("error (σ)", 0.5), "apart": ("apart (m)", 1.0),
+}  # fmt: skip
 
 
 class Series(NamedTuple):
@@ -85,7 +90,7 @@ def _tried(page: Page, document: Document) -> None:
     for one in analysis.causes:
         if one.axis == axis.name:
             owner = "ours" if one.filter == "kf" else "EKF2"
-            what, power = ("mean NIS", 1.0) if one.of == "nis" else ("error (σ)", 0.5)
+            what, power = NUMBERS[one.of]
             ends = (number_words(number**power, 2) for number in (one.before, one.after))
             rows.append([owner, change_words(analysis, one), what, *ends, share_words(one)])
     if not rows:
@@ -96,7 +101,7 @@ def _tried(page: Page, document: Document) -> None:
     page.write(
         "Each row is a replay with that one thing put right. It explains all where it brings the "
         "number into its band, else the share of its logarithm; what explains half or more is "
-        "called the cause.", size=7.5, colour=MUTED,
+        "called the cause; of a distance the share of its mean square.", size=7.5, colour=MUTED,
     )  # fmt: skip
 
 
