@@ -26,6 +26,7 @@ from px4fuse.ekf2.model import Model, moved, replay_settings
 from px4fuse.ekf2.whatif import WhatIf, what_if
 from px4fuse.filter.heading import HeadingError
 from px4fuse.filter.settings import Settings
+from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import find
 from px4fuse.findings.story import story
 from px4fuse.flight import Unavailable
@@ -169,6 +170,37 @@ def test_a_cause_says_how_far_it_keeps_both_filters_apart() -> None:
     assert not isinstance(well, Unavailable)
     assert row.after == pytest.approx(well.position_rmse_m, rel=0.1)
     assert "Put right in EKF2, that brings both from" in story(theirs, find(theirs))[1]
+
+
+def test_outliers_are_left_out_of_stamps_that_are_moved() -> None:
+    analysis = flown("clock-offset=-0.19", "nlos=7%")
+    count = cause(analysis, "ekf2").change[OUTLIERS]
+    rows = [one for one in analysis.causes if one.filter == "ekf2" and one.axis == "aisle"]
+    alone = next(one for one in rows if one.change == {OUTLIERS: count})
+    assert alone.of == "nis"
+    assert alone.brings_into_band
+    assert isinstance(analysis.ekf2_model, Model)
+    model, out = analysis.ekf2_model, analysis.tuning["horizontal"]
+    assert isinstance(out, AxisTuning)
+    (bare,) = replay_settings(model, [{}], out.outlier_time_s)
+    (late,) = replay_settings(moved(model, 0.0, 0.19), [{}], out.outlier_time_s + 0.19)
+    assert len(late.updates) == pytest.approx(len(bare.updates), abs=2)
+    # both are without their outliers
+    for each in (bare, late):
+        nis = each.updates["innovation_north_m"] ** 2 / each.updates["innovation_variance_north_m2"]
+        assert nis.mean() < 1.3
+
+
+def test_a_parameter_that_is_not_px4s_is_tried() -> None:
+    analysis = flown("ekf2-noise=0.03")
+    assert isinstance(analysis.ekf2_model, Model)
+    settings = {**analysis.ekf2_model.inputs.settings, "EKF2_ACC_NOISE": 0.5, "EKF2_GYR_NOISE": 0.1}
+    model = replace(
+        analysis.ekf2_model, inputs=replace(analysis.ekf2_model.inputs, settings=settings)
+    )
+    rows = interventions(analysis, analysis.tuning, analysis.clock, analysis.heading, model)
+    tried = [one.change for one in rows if (one.axis, one.of) == ("aisle", "nis")]
+    assert tried[1:] == [{"EKF2_ACC_NOISE": 0.35}, {"EKF2_GYR_NOISE": 0.015}]
 
 
 def test_what_explains_too_little_or_too_much_is_no_cause() -> None:

@@ -64,10 +64,10 @@ OF_SOURCE = frozenset((OUTLIERS, CLOCK, TURN))
 SMALLEST_SIGMA_Z_M = 0.005
 SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
 # What EKF2 has besides the aid's own; PX4's default is tried where something else was flown
-NOT_OF_AID = frozenset((
+NOT_OF_AID = (
     "EKF2_ACC_NOISE", "EKF2_GYR_NOISE", "EKF2_ACC_B_NOISE", "EKF2_GYR_B_NOISE", GNSS_VEL.noise,
     GNSS_VEL.gate,
-))  # fmt: skip
+)  # fmt: skip
 INNOVATION_COLUMNS, INNOVATION_VARIANCE_COLUMNS = UPDATE_COLUMNS[:2], UPDATE_COLUMNS[2:4]
 POSITION_VARIANCES = [f"position_variance_{axis}_m2" for axis in LEVEL]
 HEADING_SIGMAS = 3.0
@@ -380,8 +380,8 @@ class _Ekf2:
             found.append({aid.gate: PARAMETERS[aid.gate].default})
         found += [
             {name: PARAMETERS[name].default}
-            for name in flown.keys() & NOT_OF_AID
-            if not np.isclose(flown[name], PARAMETERS[name].default, rtol=1e-3)
+            for name in NOT_OF_AID
+            if name in flown and not np.isclose(flown[name], PARAMETERS[name].default, rtol=1e-3)
         ]
         return [change for change in found if change]
 
@@ -437,6 +437,6 @@ class _Ekf2:
                 stamp = 1e-3 * self.model.inputs.settings[self.model.inputs.aid.delay]
                 of_source = self.comparison.source.origin.by_gnss
                 left_out_s = tuned.outlier_time_s - self.comparison.settings.clock_offset_s
-                left_out_s = left_out_s + (stamp if of_source else 0.0)
+                left_out_s = left_out_s + (stamp if of_source else 0.0) + change.get(CLOCK, 0.0)
             (self.replays[key],) = replay_settings(model, [settings], left_out_s)
         return self.replays[key]

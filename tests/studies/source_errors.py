@@ -147,6 +147,29 @@ MODELS: dict[str, tuple[Model, str]] = {
 }  # fmt: skip
 
 
+# Two at once: errors of both, with the white noise of both
+PAIRS = (
+    ("outliers 5 %", "clock 0.3 s late"), ("outliers 5 %", "scale 20 %"),
+    ("outliers 5 %", "jump 1 m"), ("clock 0.3 s late", "scale 20 %"),
+    ("clock 0.3 s late", "jump 1 m"), ("held 30 %", "outliers 5 %"), ("scale 20 %", "jump 1 m"),
+    ("AR(1) 1 s", "outliers 5 %"),
+)  # fmt: skip
+BOTH = " + "
+
+
+def model_of(name: str) -> Model:
+    """The model of that name, or of two."""
+    models = [MODELS[each][0] for each in name.split(BOTH)]
+
+    def added(
+        rng: np.random.Generator, time: Values, true: Values
+    ) -> tuple[Values, Values | float]:
+        made = [model(rng, time, true) for model in models]
+        return sum(error for error, _ in made), sum(late for _, late in made)
+
+    return added
+
+
 def truth_of(log: Path, flight: Flight) -> CubicSpline:
     """True positions (m, NED) over the flight's time, from where the tag was at each sample."""
     rows = json.loads(log.with_suffix(".json").read_text())["uwb"]
@@ -183,8 +206,9 @@ def told(job: tuple[str, str, float, int]) -> tuple[str, tuple[str, ...]]:
     """Findings of one flight that are no information, causes only."""
     log, name, rate_hz, seed = job
     flight = read_log(Path(log))
-    flight = laid_over(flight, truth_of(Path(log), flight), MODELS[name][0], rate_hz, seed)
-    analysis = explain(compare(flight, Settings(0.27, SIGMA_M), axes=("north", "east")))
+    flight = laid_over(flight, truth_of(Path(log), flight), model_of(name), rate_hz, seed)
+    sigma_z_m = SIGMA_M * np.sqrt(len(name.split(BOTH)))
+    analysis = explain(compare(flight, Settings(0.27, sigma_z_m), axes=("north", "east")))
     told = story(analysis, find(analysis))[0].partition(", since ")[2]
     since = (f"since: {re.sub(r'[-+0-9.]+', '#', told.partition(' (')[0])}",) if told else ()
     return name, since + tuple(
@@ -194,9 +218,11 @@ def told(job: tuple[str, str, float, int]) -> tuple[str, tuple[str, ...]]:
     )
 
 
-def jobs(logs: list[str], flights: int, only: str) -> Iterator[tuple[str, str, float, int]]:
+def jobs(
+    logs: list[str], flights: int, only: str, *, pairs: bool
+) -> Iterator[tuple[str, str, float, int]]:
     rates = (5.0, 10.0, 20.0, 2.0)
-    for name in MODELS:
+    for name in map(BOTH.join, PAIRS) if pairs else MODELS:
         if only in name:
             for seed in range(flights):
                 yield logs[seed % len(logs)], name, rates[seed // len(logs) % len(rates)], seed
@@ -207,15 +233,19 @@ def main() -> None:
     parser.add_argument("logs", nargs="+")
     parser.add_argument("--flights", type=int, default=8)
     parser.add_argument("--only", default="")
+    parser.add_argument("--pairs", action="store_true", help="two models at once")
     given = parser.parse_args()
     found: dict[str, Counter[str]] = {}
     counts: Counter[str] = Counter()
     with ProcessPoolExecutor() as pool:
-        for name, ids in pool.map(told, jobs(given.logs, given.flights, given.only)):
+        for name, ids in pool.map(
+            told, jobs(given.logs, given.flights, given.only, pairs=given.pairs)
+        ):
             counts[name] += 1
             found.setdefault(name, Counter()).update(ids or ["nothing"])
     for name, ids in found.items():
-        print(f"{name} ({counts[name]} flights; {MODELS[name][1] or 'nothing'} expected)")
+        wanted = " and ".join(MODELS[each][1] or "nothing" for each in name.split(BOTH))
+        print(f"{name} ({counts[name]} flights; {wanted} expected)")
         for finding, count in ids.most_common():
             print(f"    {count:3d}  {finding}")
 
