@@ -632,7 +632,9 @@ def test_of_noise_that_no_setting_stands_for_no_setting_is_the_cause() -> None:
         said = story(one, (found,))[0]
         assert (", since SIGMA_Z" in said) is told
         assert told or said.endswith("3 times too sure of itself.")
-    # a clock that is off stays one
+    # a clock that is off stays one, unless what smooths makes it late
     clock = (tried("kf", {"clock_offset_s": 0.25}, "aisle"),)
     shaped = Finding("source_coloured", "warning", "So.", "Do.", headline="It is so")
     assert ", since the stamps" in story(flight_of(judged(9.0), causes=clock), (shaped,))[0]
+    smoothed = Finding("source_smoothed", "warning", "So.", "Do.", headline="It is so")
+    assert "since" not in story(flight_of(judged(9.0), causes=clock), (smoothed,))[0]

@@ -120,6 +120,7 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
     "source_smoothed": (
         "sigma_z_large", "sigma_z_small", "sigma_a_large", "sigma_a_small", *_OVERSTATED,
         "kf_variance_understated", "ekf2_variance_understated", "errors_larger_than_claimed",
+        "ekf2_ev_delay_wrong",
     ),
     # R describes none of these three
     "source_coloured": (

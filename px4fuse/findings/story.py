@@ -61,9 +61,11 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
         One to three sentences.
     """
     since = {owner: _cause_of(analysis, owner) for owner in FILTERS}
-    shaped = any(one.id in SHAPED and one.severity != "info" for one in findings)
+    shapes = {one.id for one in findings if one.id in SHAPED and one.severity != "info"}
+    # what smooths makes positions late, which is no clock
+    own = ("frame",) if "source_smoothed" in shapes else ("clock", "frame")
     for owner, cause in since.items():
-        if shaped and kind_of(analysis, cause) not in ("clock", "frame"):
+        if shapes and kind_of(analysis, cause) not in own:
             since[owner] = None
     known = TOLD_FIRST
     for cause in filter(None, since.values()):
@@ -77,8 +79,8 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
     sentences = [
         _verdict(
             analysis,
-            _judged(analysis, "kf", since, shaped),
-            _judged(analysis, "ekf2", since, shaped),
+            _judged(analysis, "kf", since, bool(shapes)),
+            _judged(analysis, "ekf2", since, bool(shapes)),
         ),
         *(closer := tuple(_closer(analysis, since))),
         *(_told(analysis, one) for one in causes if one.id not in EFFECTS),
