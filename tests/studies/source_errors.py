@@ -3,7 +3,7 @@
 ``python tests/studies/source_errors.py LOG … --flights 8`` takes IMU and attitude of logs (flown by
 the real EKF2) and the truth of the JSON file beside each, lays simulated errors of a positioning
 system over the truth, at several rates, and prints for each model of errors how often each finding
-was told. It is
+was told, and each "since" of the story. ``--pairs`` lays two models over the truth at once. It is
 independent of ``px4fuse.simulation``: it shares no line with it. EKF2's own record is left out,
 since it fused other positions.
 """
