@@ -179,7 +179,12 @@ def truth_of(log: Path, flight: Flight) -> CubicSpline:
 
 
 def laid_over(
-    flight: Flight, known: CubicSpline, model: Model, rate_hz: float, seed: int, sigma_m: float
+    flight: Flight,
+    known: CubicSpline,
+    model: Model,
+    rate_hz: float,
+    seed: int,
+    sigma_m: float = SIGMA_M,
 ) -> Flight:
     """The flight with a source of such errors, and without EKF2."""
     rng = np.random.default_rng(seed)
