@@ -638,3 +638,45 @@ def test_of_noise_that_no_setting_stands_for_no_setting_is_the_cause() -> None:
     assert ", since the stamps" in story(flight_of(judged(9.0), causes=clock), (shaped,))[0]
     smoothed = Finding("source_smoothed", "warning", "So.", "Do.", headline="It is so")
     assert "since" not in story(flight_of(judged(9.0), causes=clock), (smoothed,))[0]
+
+
+@pytest.mark.parametrize(
+    ("explains", "parts", "said"),
+    [
+        (1.0, {}, "all"), (0.9, {"brings_into_band": True}, "all"), (0.62, {}, "62%"),
+        (0.05, {}, "5%"), (0.0, {}, "nothing"), (-0.4, {}, "nothing"), (1.01, {}, "too much"),
+        (1.0, {"denied_by_truth": True}, "denied by the truth"),
+        (0.86, {"of": "apart", "brings_into_band": False}, "86%"),
+        (-0.2, {"of": "apart", "brings_into_band": False}, "nothing"),
+    ],
+)  # fmt: skip
+def test_how_much_a_change_explains_in_words(explains: float, parts: Any, said: str) -> None:
+    row = replace(tried("kf", {"sigma_z_m": 1.0}, explains=explains), **parts)
+    assert since.share_words(row) == said
+
+
+@pytest.mark.parametrize(
+    ("owner", "change", "said"),
+    [
+        ("kf", {"outliers_left_out": 1.0}, "1 position is an outlier"),
+        ("kf", {"outliers_left_out": 2.0}, "2 positions are outliers"),
+        # what was applied to ours is still missing to EKF2
+        ("kf", {"clock_offset_s": 0.25}, "the stamps are 0.15 s early"),
+        ("kf", {"clock_offset_s": 0.05}, "the stamps are 0.05 s late"),
+        ("ekf2", {"clock_offset_s": 0.25}, "the stamps are 0.25 s early"),
+        ("kf", {"turned_deg": -20.0}, "the positions are turned by +20°"),
+        ("kf", {"sigma_a_m_s2": 0.3, "sigma_z_m": 0.2},
+         "SIGMA_A is 1 instead of 0.3 m/s² and SIGMA_Z is 1 instead of 0.2 m"),
+        ("ekf2", {"EKF2_EV_DELAY": 90.0, "EKF2_DELAY_MAX": 250.0},
+         "EKF2_EV_DELAY is 7 instead of 90 ms"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_in_words(owner: Any, change: dict[str, float], said: str) -> None:
+    model = SimpleNamespace(inputs=SimpleNamespace(settings=dict.fromkeys(PARAMETERS, 7.0)))
+    one = analysis(settings=replace(CHOSEN, clock_offset_s=0.1), ekf2_model=model)
+    assert since.change_words(one, tried(owner, change)) == said
+
+
+def test_an_effect_in_words_has_two_digits() -> None:
+    row = replace(tried("kf", {"sigma_z_m": 1.0}, of="nees"), before=18.37, after=1.1)
+    assert since.effect_words(row) == "replayed: errors of 4.3 → 1 σ"
