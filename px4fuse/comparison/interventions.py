@@ -63,6 +63,7 @@ OF_SOURCE = frozenset((OUTLIERS, CLOCK, TURN))
 # capture resolves in flight
 SMALLEST_SIGMA_Z_M = 0.005
 SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
+OF_SETTINGS = frozenset((SIGMA_A, SIGMA_Z))
 # What EKF2 has besides the aid's own; PX4's default is tried where something else was flown
 NOT_OF_AID = (
     "EKF2_ACC_NOISE", "EKF2_GYR_NOISE", "EKF2_ACC_B_NOISE", "EKF2_GYR_B_NOISE", GNSS_VEL.noise,
@@ -113,13 +114,19 @@ class Intervention(Record, frozen=True, kw_only=True):
         return EXPLAINS <= self.explains <= 2.0 - EXPLAINS and not self.denied_by_truth
 
 
+def tried_on(
+    causes: Iterable[Intervention], owner: FilterName, axis: str, of: Of = "nis"
+) -> list[Intervention]:
+    """What was tried on one discrepancy."""
+    return [each for each in causes if (each.of, each.filter, each.axis) == (of, owner, axis)]
+
+
 def cause_of(
     causes: Iterable[Intervention], owner: FilterName, axis: str, of: Of = "nis"
 ) -> Intervention | None:
     """The cause of one discrepancy, by all that was tried; None where nothing explains it."""
-    tried = [each for each in causes if (each.of, each.filter, each.axis) == (of, owner, axis)]
     return min(
-        (each for each in tried if each.is_cause),
+        (each for each in tried_on(causes, owner, axis, of) if each.is_cause),
         key=lambda each: (
             not each.brings_into_band, len(each.change), OF_SOURCE.isdisjoint(each.change),
             abs(each.explains - 1.0),
@@ -209,6 +216,7 @@ def _tried(
     before = _stated(result.filters[owner], of)
     if before is None or not candidates:
         return []
+    deniable = of == "nis" and before < 1.0 and not isinstance(result.truth, Unavailable)
 
     def tried(change: Change) -> list[Intervention]:
         found = number(result, of, change)
@@ -216,7 +224,7 @@ def _tried(
             return []
         after, count = found
         low, high = nis_band(count) if of == "nis" else (0.0, NEES_LARGE)
-        claimed = number(result, "nees", change) if of == "nis" and before < 1.0 else None
+        claimed = number(result, "nees", change) if deniable else None
         return [
             Intervention(
                 of=of, filter=owner, axis=result.axis.name, change=change, before=before,
@@ -428,6 +436,8 @@ class _Ekf2:
 
     def _replayed(self, change: Change) -> Ekf2Replay:
         """EKF2 with a change, each replayed once."""
+        if not change:
+            return self.model.flown
         key = tuple(sorted(change.items()))
         if key not in self.replays:
             settings = {name: value for name, value in change.items() if name in PARAMETERS}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.interventions import (
@@ -22,38 +22,36 @@ from px4fuse.comparison.remedy import (
     remedy_words,
     settings_words,
 )
-from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.ekf2_parameters import EV_POS, PARAMETERS
+from px4fuse.findings import causes as kinds
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital, length_words, number_words
 
-Kind = Literal[
-    "outliers", "clock", "frame", "measurement noise", "process noise", "gate", "elsewhere"
-]
 # Findings that say the same as the first sentence does, by what is changed
-TOLD_BY: dict[Kind, frozenset[str]] = {
-    "outliers": frozenset(("source_outliers",)),
-    "clock": frozenset(("source_clock_offset", "ekf2_ev_delay_wrong")),
-    "frame": frozenset(("source_frame_turned", "ekf2_heading_wrong")),
-    "gate": frozenset(("ekf2_gate_small",)),
+TOLD_BY: Mapping[str, frozenset[str]] = {
+    kinds.OUTLIERS: frozenset(("source_outliers",)),
+    kinds.CLOCK: frozenset(("source_clock_offset", "ekf2_ev_delay_wrong")),
+    kinds.FRAME: frozenset(("source_frame_turned", "ekf2_heading_wrong")),
+    kinds.GATE: frozenset(("ekf2_gate_small",)),
 }
 OPTIONS = {SIGMA_Z: "--sigma-z", SIGMA_A: "--sigma-a", CLOCK: "--clock-offset"}
 UNITS = {SIGMA_A: "m/s²", SIGMA_Z: "m"}
 # What a change of a kind is there for; else to bring the mean NIS nearer to 1
-HELPS = {"clock": delay_helps, "gate": rejects_less}
+HELPS = {kinds.CLOCK: delay_helps, kinds.GATE: rejects_less}
 # What a change of another parameter needs along with it
-ALONG = frozenset(("EKF2_DELAY_MAX", "EKF2_EV_NOISE_MD"))
+ALONG = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode))
 
 
-def kind_of(analysis: Analysis, cause: Intervention | None) -> Kind:
-    """What sort of cause it is: the fault of the source where there are two."""
+def kind_of(analysis: Analysis, cause: Intervention | None) -> str:
+    """What sort of cause it is, as findings name it: of the source where there are two."""
     if cause is None:
-        return "elsewhere"
+        return kinds.ELSEWHERE
     aid = aid_of(analysis)
-    kinds: dict[str, Kind] = {
-        OUTLIERS: "outliers", CLOCK: "clock", aid.delay: "clock", TURN: "frame",
-        SIGMA_Z: "measurement noise", aid.noise: "measurement noise", aid.gate: "gate",
+    of = {
+        OUTLIERS: kinds.OUTLIERS, CLOCK: kinds.CLOCK, aid.delay: kinds.CLOCK, TURN: kinds.FRAME,
+        SIGMA_Z: kinds.NOISE, aid.noise: kinds.NOISE, aid.gate: kinds.GATE,
     }  # fmt: skip
-    return next((kind for name, kind in kinds.items() if name in cause.change), "process noise")
+    return next((kind for name, kind in of.items() if name in cause.change), kinds.PROCESS)
 
 
 def since_words(analysis: Analysis, cause: Intervention | None) -> str:

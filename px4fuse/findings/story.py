@@ -14,17 +14,17 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.interventions import (
     EXPLAINS,
-    SIGMA_A,
-    SIGMA_Z,
+    OF_SETTINGS,
     Intervention,
     Of,
     beyond_claim,
     cause_of,
+    tried_on,
 )
 from px4fuse.comparison.model import FILTERS, AgainstTruth, AxisComparison, Difference, FilterName
 from px4fuse.ekf2.walk import Why
 from px4fuse.filter.kalman import state_at
-from px4fuse.findings.causes import SETTINGS, VARIANCES
+from px4fuse.findings.causes import CLOCK, FRAME, SETTINGS, VARIANCES
 from px4fuse.findings.hidden_errors import hidden_error
 from px4fuse.findings.model import Finding
 from px4fuse.findings.since import TOLD_BY, effect_words, kind_of, since_words
@@ -36,7 +36,6 @@ from px4fuse.plain import capital, excess_words, length_words
 MOST_SENTENCES = 3
 # What the first sentence tells already
 TOLD_FIRST = VARIANCES | {"errors_larger_than_claimed", "ekf2_unavailable"}
-SETTING_FIELDS = frozenset((SIGMA_A, SIGMA_Z))
 # What a source can have that no setting and no outlier stands for
 SHAPED = frozenset((
     "source_axes_unequal", "source_clock_changes", "source_coloured", "source_jumps",
@@ -60,17 +59,20 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
     tuple of str
         One to three sentences.
     """
-    since = {owner: _cause_of(analysis, owner) for owner in FILTERS}
+    axis = analysis.main.axis.name
+    since = {
+        owner: cause_of(analysis.causes, owner, axis, _wrong(analysis, owner)) for owner in FILTERS
+    }
     shapes = {one.id for one in findings if one.id in SHAPED and one.severity != "info"}
     # what smooths makes positions late, which is no clock
-    own = ("frame",) if "source_smoothed" in shapes else ("clock", "frame")
+    own = (FRAME,) if "source_smoothed" in shapes else (CLOCK, FRAME)
     for owner, cause in since.items():
         if shapes and kind_of(analysis, cause) not in own:
             since[owner] = None
     known = TOLD_FIRST
     for cause in filter(None, since.values()):
         known |= TOLD_BY.get(kind_of(analysis, cause), frozenset())
-    if since["kf"] is not None and not SETTING_FIELDS.isdisjoint(since["kf"].change):
+    if since["kf"] is not None and not OF_SETTINGS.isdisjoint(since["kf"].change):
         known |= SETTINGS
     causes = [
         one for one in findings
@@ -90,11 +92,9 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
     return tuple(sentences[:MOST_SENTENCES])
 
 
-def _cause_of(analysis: Analysis, owner: FilterName) -> Intervention | None:
-    """What makes a filter's error larger than it claims, or its variance wrong."""
-    axis = analysis.main.axis.name
-    of: Of = "nees" if beyond_claim(analysis.main.filters[owner]) else "nis"
-    return cause_of(analysis.causes, owner, axis, of)
+def _wrong(analysis: Analysis, owner: FilterName) -> Of:
+    """What of a filter asks for a cause: an error larger than it claims, or its variance."""
+    return "nees" if beyond_claim(analysis.main.filters[owner]) else "nis"
 
 
 def _verdict(analysis: Analysis, ours: str, ekf2: str) -> str:
@@ -130,7 +130,7 @@ def _flown(analysis: Analysis) -> str:
 
 
 def _verb(result: AxisComparison, owner: FilterName, verb: str = "is ") -> str:
-    """What stands before words of :func:`_knows`; "cannot be judged" has a verb of its own."""
+    """What stands before words of :func:`_judged`; "cannot be judged" has a verb of its own."""
     return "" if isinstance(result.filters[owner], Unavailable) else verb
 
 
@@ -147,14 +147,14 @@ def _judged(
     named: bool,
 ) -> str:  # fmt: skip
     """Whether a filter's variance is what its innovations, and the truth, show; and why not."""
-    statement, axis = analysis.main.filters[owner], analysis.main.axis.name
-    cause, of = causes[owner], "nees" if beyond_claim(statement) else "nis"
+    statement, cause = analysis.main.filters[owner], causes[owner]
     since = since_words(analysis, cause)
     if owner == "kf" and cause and causes["ekf2"] and cause.change == causes["ekf2"].change:
         since = f", for the same reason ({effect_words(cause)})"
     # a drift, and what no setting stands for, are told by themselves
     told = named or analysis.source.origin.may_drift
-    tried = [e for e in analysis.causes if (e.of, e.filter, e.axis) == (of, owner, axis)]
+    axis = analysis.main.axis.name
+    tried = tried_on(analysis.causes, owner, axis, _wrong(analysis, owner))
     unexplained = ", which nothing that was tried explains" if tried and not told else ""
     if any(each.denied_by_truth for each in tried):
         unexplained = ", as its errors against the truth ask for"
@@ -203,10 +203,9 @@ def _closer(analysis: Analysis, causes: Mapping[FilterName, Intervention | None]
     """What putting the cause right does to how far both filters are apart."""
     told = [
         each
-        for each in analysis.causes
-        if (each.of, each.axis) == ("apart", analysis.main.axis.name)
-        and each.explains >= EXPLAINS
-        and causes[each.filter] is not None
+        for owner, cause in causes.items()
+        for each in tried_on(analysis.causes, owner, analysis.main.axis.name, "apart")
+        if cause is not None and each.explains >= EXPLAINS
     ]
     if told:
         most = max(told, key=lambda each: each.explains)

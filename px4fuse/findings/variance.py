@@ -8,7 +8,14 @@ import numpy as np
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.interventions import SIGMA_A, SIGMA_Z, Intervention, cause_of, tuned_for
+from px4fuse.comparison.interventions import (
+    OF_SETTINGS,
+    SIGMA_Z,
+    Intervention,
+    cause_of,
+    tried_on,
+    tuned_for,
+)
 from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName
 from px4fuse.comparison.remedy import (
     aid_of,
@@ -26,14 +33,13 @@ from px4fuse.findings.causes import CAUSE, ELSEWHERE, NOISE
 from px4fuse.findings.hidden_errors import hidden_errors
 from px4fuse.findings.model import Finding, Found, Severity, finding, lowered
 from px4fuse.findings.sigma import try_out
-from px4fuse.findings.since import cure_words, ekf2_cure_words, kind_of, reason_words
+from px4fuse.findings.since import OPTIONS, cure_words, ekf2_cure_words, kind_of, reason_words
 from px4fuse.flight import POSITION_VARIANCE_COLUMNS, Unavailable
 from px4fuse.plain import factor_words, number_words
 
 SIGMA_OFF_ERROR = 2.0  # times, in standard deviation
 EKF2_NOISE_FLOOR_M = 0.01  # EKF2 never trusts external vision better, EKF2.cpp
 NOISE_FITS = 1.25  # times: the median's own scatter below n = 100 (1.17/√n, two σ)
-SETTINGS = {SIGMA_Z: "--sigma-z", SIGMA_A: "--sigma-a"}
 NOT_EXPLAINED = (
     "No change of a noise, the clock, the frame or the outliers explains half of it: look at the "
     "acceleration input (IMU rate, gaps, vibration) and at what else the findings name."
@@ -90,10 +96,8 @@ def _of_group(analysis: Analysis, owner: FilterName, group: str, members: list[M
     severity: Severity = "error" if factor >= SIGMA_OFF_ERROR else "warning"
     if _is_default(analysis, owner, result):
         severity = lowered(severity)
-    tuned, stated = (
-        tuned_for(analysis.tuning, result.axis.name),
-        "overstated" if over else "understated",
-    )
+    tuned = tuned_for(analysis.tuning, result.axis.name)
+    stated = "overstated" if over else "understated"
     if over and analysis.source.origin.may_drift:
         severity, remedy, cause = "info", AGAINST_DRIFT, ELSEWHERE
     elif over and analysis.source.origin.is_gnss:
@@ -170,10 +174,10 @@ def _remedy(
         return _without_cause(analysis, owner, result, tuned)
     if owner == "ekf2":
         return ekf2_cure_words(analysis, cause)
-    if not cause.change.keys() <= SETTINGS.keys():
+    if not cause.change.keys() <= OF_SETTINGS:
         return cure_words(cause)
     bounded = tuned is not None and tuned.sigma_z.value is None and SIGMA_Z in cause.change
-    values = {SETTINGS[name]: value for name, value in cause.change.items()}
+    values = {OPTIONS[name]: value for name, value in cause.change.items()}
     if not bounded:
         return try_out(analysis, values)
     return (
@@ -186,8 +190,7 @@ def _without_cause(
     analysis: Analysis, owner: FilterName, result: AxisComparison, tuned: AxisTuning | None
 ) -> str:
     """What was tried and how near it came, or that nothing could be."""
-    wanted = ("nis", owner, result.axis.name)
-    tried = [each for each in analysis.causes if (each.of, each.filter, each.axis) == wanted]
+    tried = tried_on(analysis.causes, owner, result.axis.name)
     if any(each.denied_by_truth for each in tried):
         return AGAINST_TRUTH
     if tried:
@@ -220,9 +223,8 @@ def _not_replayed(analysis: Analysis, result: AxisComparison, tuned: AxisTuning 
             f"(EKF2_ACC_NOISE). {not_replayed(why)}"
         )
     changes = {aid.noise: float(f"{noise_m:.2g}")}
-    if aid.noise_mode and used_m > NOISE_FITS * analysis.flight.log.parameters.get(
-        aid.noise, np.inf
-    ):
+    set_m = analysis.flight.log.parameters.get(aid.noise, np.inf)
+    if aid.noise_mode and used_m > NOISE_FITS * set_m:
         changes[aid.noise_mode] = 1.0
     return f"{said}: set {settings_words(changes)}. {not_replayed(why)}"
 
