@@ -259,6 +259,25 @@ def project(
     return north * EARTH_RADIUS_M, east * EARTH_RADIUS_M
 
 
+def unproject(
+    north_m: Array, east_m: Array, origin: tuple[float, float]
+) -> tuple[Array, Array]:
+    """Latitude and longitude (degrees) of what :func:`project` gives.
+
+    Source: PX4 ``MapProjection::reproject``, src/lib/geo/geo.cpp (Snyder 1987, equation 20-14).
+    """
+    x, y = north_m / EARTH_RADIUS_M, east_m / EARTH_RADIUS_M
+    latitude_0, longitude_0 = np.radians(origin[0]), np.radians(origin[1])
+    c = np.hypot(x, y)
+    # sin(c)/c, which is 1 at the origin
+    share = np.sinc(c / np.pi)
+    latitude = np.arcsin(np.cos(c) * np.sin(latitude_0) + x * share * np.cos(latitude_0))
+    longitude = longitude_0 + np.arctan2(
+        y * share, np.cos(latitude_0) * np.cos(c) - x * np.sin(latitude_0) * share
+    )
+    return np.degrees(latitude), np.degrees(longitude)
+
+
 def _local_origin(topics: Topics) -> tuple[float, float, float] | None:
     """EKF2's geographic origin (degrees, degrees, m), where it had one."""
     local = topics.read(px4.LOCAL_POSITION)

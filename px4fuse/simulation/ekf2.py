@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.ekf2.inputs import Inputs, Received, Rules
+from px4fuse.ekf2.inputs import NO_LIMIT, Inputs, Received, Rules
 from px4fuse.ekf2.intervals import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
@@ -31,7 +31,8 @@ from px4fuse.ekf2.model import delayed_states, run_variants
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.recursion import EAST, HEADING, NORTH, Run, Variant
 from px4fuse.ekf2.stretches import Stretch, down_sampled, step_ends
-from px4fuse.ekf2_parameters import settings_in_force
+from px4fuse.ekf2_parameters import GNSS_POS, GNSS_VEL, settings_in_force
+from px4fuse.readers.px4_topics import GPS_POSITION
 from px4fuse.simulation import sensors
 from px4fuse.simulation.ekf2_topics import TopicTrack, ekf2_topics
 from px4fuse.simulation.mistakes import Mistakes
@@ -50,6 +51,8 @@ from px4fuse.trajectory.rotation import (
 PREDICT_US = 10_000  # EKF2_PREDICT_US
 # v1.14 to main: EV_MAX_INTERVAL (ev_control.cpp), reset_timeout_max (common.h)
 RULES = Rules(0.2, 0.4, 1.0, 5, None, horizon_by_delay=False)
+# v1.16: gps_control.cpp, and no_aid_timeout_max (common.h)
+GNSS_RULES = Rules(np.inf, np.inf, 7.0, NO_LIMIT, None, False, reset_scale=2.0, with_velocity=True)
 # EKF2_NOAID_TOUT: without aiding for longer EKF2 stays where it is (fake_pos_control.cpp)
 NO_AIDING_S = 5.0
 # EKF2_ANGERR_INIT, _GPS_V_NOISE, _GPS_P_NOISE, _GBIAS_INIT and _ABIAS_INIT (covariance.cpp)
@@ -65,14 +68,18 @@ HEIGHT_ERROR_M = 0.03
 MAX_INTERVAL_S = 0.1
 
 
-def parameters(source_sigma_m: float, mistakes: Mistakes) -> dict[str, int | float]:
+def parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]:
     """EKF2's parameters as flown: all that its model has, by PX4 name."""
-    known = settings_in_force({})
-    return known | {
-        "EKF2_EVP_NOISE": mistakes.ekf2_noise_m or source_sigma_m,
-        "EKF2_EVP_GATE": mistakes.ekf2_gate,
-        "EKF2_EV_DELAY": mistakes.ekf2_delay_s * 1e3,
-        "EKF2_EV_NOISE_MD": 1,
+    aid = scenario.aid
+    known = settings_in_force({}, aid)
+    delay_ms = known[aid.delay] if mistakes.ekf2_delay_s is None else 1e3 * mistakes.ekf2_delay_s
+    of_aid = (
+        {GNSS_VEL.noise: scenario.sigma_gnss_m_s} if aid == GNSS_POS else {aid.noise_mode: 1}
+    )
+    return known | of_aid | {
+        aid.noise: mistakes.ekf2_noise_m or sensors.reported_sigma_m(scenario, mistakes),
+        aid.gate: mistakes.ekf2_gate,
+        aid.delay: delay_ms,
         # a source that is slow to arrive has been allowed for
         "EKF2_DELAY_MAX": max(known["EKF2_DELAY_MAX"], 100.0 + 1e3 * mistakes.clock_jump_s),
         "EKF2_PREDICT_US": PREDICT_US,
@@ -81,9 +88,10 @@ def parameters(source_sigma_m: float, mistakes: Mistakes) -> dict[str, int | flo
 
 def fly(
     scenario: Scenario,
+    mistakes: Mistakes,
     motion: Motion,
     imu: Topic,
-    source: Topic,
+    source: sensors.SensedPositions,
     flown: Mapping[str, int | float],
     at_rest: tuple[Array, Array],
     aid_source_hz: float = 0.0,
@@ -92,7 +100,7 @@ def fly(
 
     Parameters
     ----------
-    imu, source : Topic
+    imu, source : Topic, SensedPositions
         As EKF2 received them, whatever of them is logged.
     flown : mapping
         Parameters of the log.
@@ -101,21 +109,24 @@ def fly(
     aid_source_hz : float
         To what estimator_aid_src_ev_pos is thinned; 0 leaves it.
     """
-    stretch, time_us, nominal = _stretch(scenario, motion, imu, at_rest)
-    settings = settings_in_force({name: float(np.float32(v)) for name, v in flown.items()})
+    aid = scenario.aid
+    stretch, time_us, nominal = _stretch(scenario, mistakes, motion, imu, at_rest)
+    settings = settings_in_force({name: float(np.float32(v)) for name, v in flown.items()}, aid)
+    rules = GNSS_RULES if aid == GNSS_POS else RULES
     step_s = float(np.median(stretch.step_s))
     length = int(np.ceil(settings["EKF2_DELAY_MAX"] * 1e3 / PREDICT_US))
     inputs = Inputs(
         settings=settings,
         stretches=(stretch,),
-        received=_vision(source),
+        received=_received(source),
         # ev_pos_control.cpp: without bit 0 samples are only compared with the state
-        rules=RULES if int(flown["EKF2_EV_CTRL"]) & 1 else replace(RULES, start_interval_s=0.0),
+        rules=rules if int(flown[aid.switch]) & 1 else replace(rules, start_interval_s=0.0),
         step_s=step_s,
         horizon_s=(length - 1) * step_s,
         predict_s=PREDICT_US * 1e-6,
         vision_height=False,
         imu_offset_m=np.zeros(3),
+        aid=aid,
         max_interval_s=MAX_INTERVAL_S,
     )
     done = run_variants(inputs, [Variant(settings)], {})[0]
@@ -124,7 +135,11 @@ def fly(
 
 
 def _stretch(
-    scenario: Scenario, motion: Motion, imu: Topic, at_rest: tuple[Array, Array]
+    scenario: Scenario,
+    mistakes: Mistakes,
+    motion: Motion,
+    imu: Topic,
+    at_rest: tuple[Array, Array],
 ) -> tuple[Stretch, IntArray, Array]:
     """The whole flight in prediction steps about the true attitude, and that attitude."""
     time_us = imu.fields["timestamp"].astype(np.int64) - sensors.START_US
@@ -146,7 +161,7 @@ def _stretch(
         rng, np.array([HEIGHT_ERROR_M]), sensors.ATTITUDE_PERIODS_S, sensors.ATTITUDE_SINES
     )
     error = np.zeros((len(time), 3))
-    error[:, HEADING] = sensors.attitude_error(scenario, time).as_rotvec()[:, HEADING]
+    error[:, HEADING] = sensors.attitude_error(scenario, mistakes, time).as_rotvec()[:, HEADING]
     state, covariance = _standing(rotation[0], *at_rest, float(error[0, HEADING]))
     variance = np.diagonal(covariance).copy()
     deviation = np.sqrt(variance)
@@ -197,25 +212,34 @@ def _standing(
     return x, 0.5 * (P + P.T)
 
 
-def _vision(source: Topic) -> Received:
+def _received(source: sensors.SensedPositions) -> Received:
     """The samples in the order of their arrival, without those that are older than the one before.
 
     EKF2 takes no sample that is not newer than the last (estimator_interface.cpp).
     """
+    fields = source.topic.fields
     stamp, arrival = (
-        sensors.seconds(source.fields[name].astype(np.int64) - sensors.START_US)
+        sensors.seconds(fields[name].astype(np.int64) - sensors.START_US)
         for name in ("timestamp_sample", "timestamp")
     )
     newest = np.maximum.accumulate(np.concatenate([[-np.inf], stamp[:-1]]))
     kept = stamp > newest
+    gnss = source.topic.name == GPS_POSITION
+    if gnss:
+        accuracy = np.stack([fields["eph"], fields["eph"], fields["epv"]], axis=1)[kept] ** 2
+        speed = np.repeat(fields["s_variance_m_s"][kept, None] ** 2, 3, axis=1)
+    else:
+        accuracy, speed = fields["position_variance"][kept], None
     return Received(
         stamp_s=stamp[kept],
         arrival_s=arrival[kept],
-        position_m=source.fields["position"][kept].astype(np.float64),
-        variance_m2=source.fields["position_variance"][kept].astype(np.float64),
+        position_m=source.position_m[kept].astype(np.float32).astype(np.float64),
+        variance_m2=accuracy.astype(np.float64),
         rejected=np.full(int(kept.sum()), np.nan),
         reset=np.zeros(int(kept.sum()), dtype=bool),
-        source=source.name,
+        source=source.topic.name,
+        velocity_m_s=source.velocity_m_s[kept] if gnss else None,
+        velocity_variance_m2_s2=speed,
     )
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +12,9 @@ from numpy.typing import NDArray
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.intervals import POSITION, STATES
-from px4fuse.ekf2.recursion import EAST, NORTH, Run
+from px4fuse.ekf2.recursion import EAST, NORTH, VERTICAL_SCALE, Run
+from px4fuse.ekf2_parameters import GNSS_POS, GNSS_VEL, Aid
+from px4fuse.readers.px4_positions import unproject
 from px4fuse.simulation import sensors
 from px4fuse.simulation.ulog_writer import Topic
 
@@ -65,15 +69,15 @@ def ekf2_topics(
         To what estimator_aid_src_ev_pos is thinned; 0 leaves it.
     """
     topics = (
-        _local_position(track),
+        _local_position(track, gnss=inputs.aid == GNSS_POS),
         _states(done, track),
-        _aid_source(inputs, done, track, aid_source_hz),
+        *_aid_sources(inputs, done, track, aid_source_hz),
         _flags(inputs, done, track),
     )
     return tuple(topic for topic in topics if len(topic.fields["timestamp"]))
 
 
-def _local_position(track: TopicTrack) -> Topic:
+def _local_position(track: TopicTrack, *, gnss: bool) -> Topic:
     rows = np.flatnonzero(sensors.thinned(sensors.seconds(track.time_us), LOCAL_POSITION_HZ))
     steps = np.array([step for step, _ in track.resets], dtype=np.intp)
     jumps = np.array([[0.0, 0.0], *(jump for _, jump in track.resets)])
@@ -84,8 +88,10 @@ def _local_position(track: TopicTrack) -> Topic:
     fields["delta_z"] = np.zeros(len(rows), np.float32)
     fields["delta_vxy"] = np.zeros((len(rows), 2), np.float32)
     fields["delta_vz"] = np.zeros(len(rows), np.float32)
-    unknown = np.full(len(rows), np.nan)
-    fields |= {"ref_lat": unknown, "ref_lon": unknown, "ref_alt": unknown.astype(np.float32)}
+    latitude, longitude, altitude = (
+        np.full(len(rows), value if gnss else np.nan) for value in sensors.HOME
+    )
+    fields |= {"ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude.astype(np.float32)}
     aided = track.aided[np.maximum(rows - track.lag, 0)]
     for name in ("xy_valid", "v_xy_valid"):
         fields[name] = aided
@@ -121,40 +127,65 @@ def _states(done: Run, track: TopicTrack) -> Topic:
     )
 
 
-def _aid_source(inputs: Inputs, done: Run, track: TopicTrack, rate_hz: float) -> Topic:
-    """estimator_aid_src_ev_pos: a message for every sample that came in time."""
-    events, run = done.events[0], done
+def _aid_sources(
+    inputs: Inputs, done: Run, track: TopicTrack, rate_hz: float
+) -> tuple[Topic, ...]:
+    """estimator_aid_src_*: a message for every sample that came in time."""
+    events, run, aid = done.events[0], done, inputs.aid
     seen = np.flatnonzero(events.usable & (events.end < len(track.time_us) - track.lag))
     seen = seen[sensors.thinned(sensors.seconds(track.time_us[events.end[seen]]), rate_hz)]
-    rows = events.end[seen]
-    horizontal = slice(NORTH, EAST + 1)
-    innovation, variance = run.innovation_m[seen, 0], run.variance_m2[seen, 0]
-    noise = run.noise_m2[seen, 0]
-    measured = inputs.received.position_m[events.sample[seen], :2]
-    idle = np.isnan(innovation[:, 0])
-    # while it is not fused, against the state that there is
-    innovation = np.where(
-        idle[:, None], measured - track.delayed[rows][:, POSITION][:, :2], innovation
-    )
-    variance = np.where(idle[:, None], run.variance[seen + 1, 0, horizontal] + noise, variance)
-    gate = max(inputs.settings["EKF2_EVP_GATE"], 1.0)
-    used = np.where(run.fused[seen, 0] | run.reset[seen, 0], track.time_us[rows], -1)
-    last = np.maximum.accumulate(used)
+    rows, sample, received = events.end[seen], events.sample[seen], inputs.received
     taken_us = np.rint(events.time_s[seen] * 1e6).astype(np.int64)
     later_us = track.time_us[rows] + _horizon_us(track, rows) - taken_us
+    shown = sensors.stamps(taken_us, later_us)
+    measured = received.position_m[sample, :2]
+    innovation, variance = run.innovation_m[seen, 0], run.variance_m2[seen, 0]
+    noise = run.noise_m2[seen, 0]
+    idle = np.isnan(innovation[:, :1])
+    # while it is not fused, against the state that there is
+    innovation = np.where(idle, measured - track.delayed[rows][:, POSITION][:, :2], innovation)
+    variance = np.where(idle, run.variance[seen + 1, 0, NORTH : EAST + 1] + noise, variance)
+    used = np.where(run.fused[seen, 0] | run.reset[seen, 0], track.time_us[rows], -1)
+    last = np.maximum.accumulate(used)
+    last_us = np.where(last >= 0, sensors.START_US + last, 0).astype(np.uint64)
+    position = _aid_source(
+        aid, inputs.settings, shown | {"time_last_fuse": last_us}, innovation, variance, noise
+    )
+    position.fields["innovation_rejected"] = run.rejected[seen, 0]
+    position.fields["fused"] = run.fused[seen, 0]
+    if received.velocity_m_s is None:
+        position.fields["observation"] = measured.astype(np.float32)
+        return (position,)
+    position.fields["observation"] = np.stack(unproject(*measured.T, sensors.HOME[:2]), axis=1)
+    moving, spread = run.velocity_innovation_m_s[seen, 0], run.velocity_variance_m2_s2[seen, 0]
+    assert received.velocity_variance_m2_s2 is not None
+    stated = received.velocity_variance_m2_s2[sample]
+    speed_noise = VERTICAL_SCALE * np.maximum(stated, inputs.settings[GNSS_VEL.noise] ** 2)
+    velocity = _aid_source(GNSS_VEL, inputs.settings, shown, moving, spread, speed_noise)
+    outside = (velocity.fields["test_ratio"] > 1.0).any(axis=1)
+    velocity.fields["innovation_rejected"] = outside
+    velocity.fields["fused"] = ~outside & np.isfinite(moving).all(axis=1)
+    velocity.fields["observation"] = received.velocity_m_s[sample].astype(np.float32)
+    return position, velocity
+
+
+def _aid_source(
+    aid: Aid,
+    settings: Mapping[str, float],
+    fields: dict[str, NDArray[Any]],
+    innovation: Array,
+    variance: Array,
+    noise: Array,
+) -> Topic:
+    """What every aid's message has in common."""
+    ratio = innovation**2 / (max(settings[aid.gate], 1.0) ** 2 * variance)
+    numbers = {
+        "observation_variance": noise, "innovation": -innovation,
+        "innovation_variance": variance, "test_ratio": ratio,
+    }  # fmt: skip
     return Topic(
-        "estimator_aid_src_ev_pos",
-        {
-            **sensors.stamps(taken_us, later_us),
-            "time_last_fuse": np.where(last >= 0, sensors.START_US + last, 0).astype(np.uint64),
-            "observation": measured.astype(np.float32),
-            "observation_variance": noise.astype(np.float32),
-            "innovation": (-innovation).astype(np.float32),
-            "innovation_variance": variance.astype(np.float32),
-            "test_ratio": (innovation**2 / (gate**2 * variance)).astype(np.float32),
-            "innovation_rejected": run.rejected[seen, 0],
-            "fused": run.fused[seen, 0],
-        },
+        f"estimator_aid_src_{aid.name}",
+        fields | {name: values.astype(np.float32) for name, values in numbers.items()},
     )
 
 
@@ -171,6 +202,7 @@ def _flags(inputs: Inputs, done: Run, track: TopicTrack) -> Topic:
     kept = changed | sensors.thinned(time, FLAGS_HZ)
     rows = np.flatnonzero(kept[: len(time) - track.lag])
     always, never = np.ones(len(rows), np.bool_), np.zeros(len(rows), np.bool_)
+    gnss = np.bool_(inputs.aid == GNSS_POS)
     return Topic(
         "estimator_status_flags",
         {
@@ -178,11 +210,12 @@ def _flags(inputs: Inputs, done: Run, track: TopicTrack) -> Topic:
             "control_status_changes": np.cumsum(changed)[rows].astype(np.uint32),
             "cs_tilt_align": always,
             "cs_yaw_align": always,
-            "cs_gnss_pos": never,
+            "cs_gnss_pos": on[rows] & gnss,
+            "cs_gnss_vel": on[rows] & gnss,
             "cs_opt_flow": never,
             "cs_mag_hdg": always,
             "cs_baro_hgt": always,
-            "cs_ev_pos": on[rows],
+            "cs_ev_pos": on[rows] & ~gnss,
             "cs_ev_yaw": never,
             "cs_ev_hgt": never,
             "cs_ev_vel": never,

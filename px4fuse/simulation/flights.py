@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from px4fuse.ekf2.model import MODEL_NOTE
-from px4fuse.ekf2_parameters import REPORTED
+from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, REPORTED
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Flight
 from px4fuse.plain import plain
@@ -26,6 +26,8 @@ from px4fuse.simulation.scenario import Scenario
 from px4fuse.simulation.ulog_writer import Topic, encode
 
 NO_MISTAKES = Mistakes()
+# Horizontal position of vision, or of GNSS with its velocity (bit 2)
+SWITCHED_ON = {EV_POS.switch: 1, GNSS_POS.switch: 5}
 PROFILE_WITH_VISION, PROFILE_DEFAULT = 129, 1
 RELEASE = 1 << 24 | 16 << 16 | 255  # v1.16.0, whose topics and fields these are
 HARDWARE = "px4fuse simulation"
@@ -66,8 +68,8 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
         A mistake does not fit the scenario.
     """
     for name in made(mistakes):
-        if MISTAKES[name].kind not in ("", scenario.kind):
-            raise SettingsError(f"--mistake {name} requires --kind {MISTAKES[name].kind}.")
+        if scenario.kind not in (kinds := MISTAKES[name].kinds):
+            raise SettingsError(f"--mistake {name} requires --kind {' or '.join(kinds)}.")
         if MISTAKES[name].of_ekf2 and not scenario.ekf2:
             raise SettingsError(f"--mistake {name} is one of EKF2's: leave out --no-ekf2.")
     motion = plan(scenario, mistakes, sensors.stream(scenario, sensors.Stream.WANDER))
@@ -76,7 +78,7 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
     parameters = _parameters(scenario, mistakes)
     topics = [
         sensors.logged_imu(imu, mistakes, motion),
-        sensors.logged_attitude(scenario, motion),
+        sensors.logged_attitude(scenario, mistakes, motion),
         sensors.land_detector(motion),
     ]
     if not mistakes.no_vvo:
@@ -90,7 +92,7 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
         standing = sensors.at_rest(scenario, mistakes, motion, ekf2.REST_S)
         aid_source_hz = VEHICLE_AID_SOURCE_HZ if mistakes.no_vvo else 0.0
         topics += ekf2.fly(
-            scenario, motion, imu, positions.topic, parameters, standing, aid_source_hz
+            scenario, mistakes, motion, imu, positions, parameters, standing, aid_source_hz
         )
     return Simulation(scenario, mistakes, motion, positions, tuple(topics), parameters)
 
@@ -147,13 +149,16 @@ def to_flight(simulation: Simulation, name: str = "simulation.ulg") -> Flight:
 
 
 def _parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]:
+    used = 0 if mistakes.ekf2_off else SWITCHED_ON[scenario.aid.switch]
     return {
-        **ekf2.parameters(sensors.reported_sigma_m(scenario, mistakes), mistakes),
+        **ekf2.parameters(scenario, mistakes),
         "EKF2_EN": int(scenario.ekf2),
-        "EKF2_EV_CTRL": 0 if mistakes.ekf2_off else 1,
-        "EKF2_GPS_CTRL": 0,
+        **dict.fromkeys(SWITCHED_ON, 0),
+        scenario.aid.switch: used,
         "EKF2_HGT_REF": 0,
-        "SDLOG_PROFILE": PROFILE_DEFAULT if mistakes.no_vvo else PROFILE_WITH_VISION,
+        "SDLOG_PROFILE": PROFILE_DEFAULT
+        if mistakes.no_vvo or scenario.aid == GNSS_POS
+        else PROFILE_WITH_VISION,
     }
 
 

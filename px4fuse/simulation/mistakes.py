@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 from px4fuse.errors import SettingsError, did_you_mean
+from px4fuse.simulation.scenario import KINDS, Kind
 
 _Units = Mapping[str, float]
 SECONDS: _Units = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6}
@@ -32,8 +33,8 @@ class Mistakes:
 
     :data:`MISTAKES` says what each is. Besides: outliers come in bursts, each in one horizontal
     direction, and ``nlos_size_m`` is their mean size. A drop-out without a time lies around the
-    middle, a jump at two thirds. A rate of 0 leaves the rate as it is, an EKF2 noise of 0 what the
-    source reports. ``r_scale`` is a factor on the variance. A yaw is about the start, clockwise
+    middle, a jump at two thirds; a wrong heading is wrong from the start. A rate of 0 leaves the
+    rate as it is, an EKF2 noise of 0 what the source reports, an EKF2 delay of None the right one. ``r_scale`` is a factor on the variance. A yaw is about the start, clockwise
     seen from above. ``vibration_m_s2`` is the standard deviation of the noise's mean over 0.1 s.
     """
 
@@ -53,6 +54,10 @@ class Mistakes:
     jump_m: float = 0.0
     jump_at_s: float | None = None
     smoothed_s: float = 0.0
+    slow_error_m: float = 0.0
+    slow_error_s: float = 30.0
+    heading_deg: float = 0.0
+    heading_at_s: float | None = None
     accel_bias_m_s2: float = 0.0
     vibration_m_s2: float = 0.0
     imu_rate_hz: float = 0.0
@@ -60,7 +65,7 @@ class Mistakes:
     open_end_m: float = 0.0
     no_vvo: bool = False
     ekf2_noise_m: float = 0.0
-    ekf2_delay_s: float = 0.0
+    ekf2_delay_s: float | None = None
     ekf2_gate: float = 5.0
     ekf2_off: bool = False
 
@@ -92,8 +97,8 @@ class Mistake:
         What a student should find.
     switch : str
         The field that a mistake without arguments sets.
-    kind : str
-        The only kind of flight that it applies to, empty for both.
+    kinds : tuple of str
+        The kinds of flight that it applies to.
     of_ekf2 : bool
         Whether it is in EKF2's own parameters.
     """
@@ -103,7 +108,7 @@ class Mistake:
     help: str
     finding: str
     switch: str = ""
-    kind: str = ""
+    kinds: tuple[Kind, ...] = KINDS
     of_ekf2: bool = False
 
     @property
@@ -119,6 +124,10 @@ def _at(name: str) -> Argument:
     return Argument(name, "AT", SECONDS, 0.0, 1e4)
 
 
+# Of a source in a frame and with a clock of its own, which the log may lack
+INDOORS: tuple[Kind, ...] = ("aisle", "loop")
+
+
 MISTAKES: Mapping[str, Mistake] = MappingProxyType({
     "clock-offset": Mistake(
         (Argument("clock_offset_s", "SECONDS", SECONDS, -5.0, 5.0),),
@@ -132,12 +141,14 @@ MISTAKES: Mapping[str, Mistake] = MappingProxyType({
         2000.0,
         "The clock of the positions runs fast by this many parts per million.",
         "The clock offset grows through the flight: the two halves give different offsets.",
+        kinds=INDOORS,
     ),
     "clock-jump": Mistake(
         (Argument("clock_jump_s", "SECONDS", SECONDS, 0.0, 5.0),),
         0.25,
         "Until TIMESYNC converges at 50 s, stamps are times of arrival, late by this.",
         "timestamp equals timestamp_sample for 50 s and not after; analyse the rest (--start 50).",
+        kinds=INDOORS,
     ),
     "nlos": Mistake(
         (
@@ -169,7 +180,7 @@ MISTAKES: Mapping[str, Mistake] = MappingProxyType({
     "r-scale": Mistake(
         (Argument("r_scale", "FACTOR", NUMBER, 1e-4, 1e4),),
         0.1,
-        "The reported variance and EKF2_EVP_NOISE² are this factor times the truth.",
+        "The reported variance and EKF2's noise² for the source are this factor times the truth.",
         "The data ask for the true SIGMA_Z, not for the reported one: below 1 trusts the source "
         "too much.",
     ),
@@ -178,17 +189,19 @@ MISTAKES: Mapping[str, Mistake] = MappingProxyType({
         20.0,
         "The position frame is turned against north, clockwise.",
         "Innovations grow at every start and stop; the track's heading is off by this.",
+        kinds=INDOORS,
     ),
     "scale": Mistake(
         (Argument("scale_percent", "PERCENT", PERCENT, -50.0, 50.0),),
         5.0,
         "Distances of the position source are too long: anchors surveyed wrongly.",
         "NIS hardly shows it; a tape measure or the truth does.",
+        kinds=INDOORS,
     ),
     "jump": Mistake(
         (Argument("jump_m", "METRES", METRES, -100.0, 100.0), _at("jump_at_s")),
         1.0,
-        "Positions jump by this along the aisle at AT (two thirds) and stay: a false match.",
+        "Positions jump by this along the first leg at AT (two thirds) and stay: a false match.",
         "One burst of innovations of the same sign; around a loop a closure error that is no "
         "drift.",
     ),
@@ -197,6 +210,23 @@ MISTAKES: Mapping[str, Mistake] = MappingProxyType({
         0.5,
         "The positioning system low-pass filters its positions with this time constant.",
         "Innovations are correlated, and positions look late by this without a clock error.",
+    ),
+    "slow-error": Mistake(
+        (
+            Argument("slow_error_m", "METRES", METRES, 0.0, 100.0),
+            Argument("slow_error_s", "TIME", SECONDS, 0.1, 1e4),
+        ),
+        0.5,
+        "A further error of the positions changes slowly, over about TIME (30 s): multipath.",
+        "Innovations hardly show it, and both filters claim less than they err: R describes "
+        "independent errors only.",
+    ),
+    "heading": Mistake(
+        (Argument("heading_deg", "DEG", DEGREES, -180.0, 180.0), _at("heading_at_s")),
+        20.0,
+        "EKF2's heading is too large by this, from AT on (the start): a disturbed compass.",
+        "Innovations grow at every start, stop and corner; the positions are turned against the "
+        "attitude.",
     ),
     "accel-bias": Mistake(
         (Argument("accel_bias_m_s2", "M/S2", ACCELERATION, -5.0, 5.0),),
@@ -228,7 +258,7 @@ MISTAKES: Mapping[str, Mistake] = MappingProxyType({
         3.0,
         "The loop ends this far before its start (loop only).",
         "A false loop closure: forcing the end onto the start bends the whole path.",
-        kind="loop",
+        kinds=("loop",),
     ),
     "no-vvo": Mistake(
         (),
@@ -237,11 +267,12 @@ MISTAKES: Mapping[str, Mistake] = MappingProxyType({
         "The position source is not in the log, and what EKF2 kept of it stands in, thinned: set "
         "SDLOG_PROFILE to 129.",
         switch="no_vvo",
+        kinds=INDOORS,
     ),
     "ekf2-noise": Mistake(
         (Argument("ekf2_noise_m", "METRES", METRES, 0.01, 100.0),),
         0.02,
-        "EKF2_EVP_NOISE is this.",
+        "EKF2_EVP_NOISE (outdoors EKF2_GPS_P_NOISE) is this.",
         "Below the source's noise EKF2's NIS is far above 1 and it rejects good samples; above it "
         "NIS is far below 1.",
         of_ekf2=True,
@@ -249,23 +280,25 @@ MISTAKES: Mapping[str, Mistake] = MappingProxyType({
     "ekf2-delay": Mistake(
         (Argument("ekf2_delay_s", "SECONDS", SECONDS, 0.0, 0.3),),
         0.175,
-        "EKF2_EV_DELAY is this, while the stamps are right.",
+        "EKF2_EV_DELAY is this, while the stamps are right (outdoors EKF2_GPS_DELAY, where fixes "
+        "are 110 ms old).",
         "EKF2 takes positions for older than they are, so that its track runs ahead of the truth; "
-        "set EKF2_EV_DELAY to 0.",
+        "set EKF2_EV_DELAY to 0 (EKF2_GPS_DELAY to 110).",
         of_ekf2=True,
     ),
     "ekf2-gate": Mistake(
         (Argument("ekf2_gate", "SD", NUMBER, 1.0, 1000.0),),
         1.0,
-        "EKF2_EVP_GATE is this: samples further off than so many √S are rejected.",
+        "EKF2_EVP_GATE (EKF2_GPS_P_GATE) is this: samples further off than so many √S are rejected.",
         "EKF2 rejects good samples, loses its track and resets to a sample now and then.",
         of_ekf2=True,
     ),
     "ekf2-off": Mistake(
         (),
         0.0,
-        "EKF2_EV_CTRL is 0.",
-        "EKF2 never fuses the positions and does not know where it is; set EKF2_EV_CTRL to 1.",
+        "EKF2_EV_CTRL (EKF2_GPS_CTRL) is 0.",
+        "EKF2 never fuses the positions and does not know where it is; set EKF2_EV_CTRL to 1 "
+        "(EKF2_GPS_CTRL to 5).",
         switch="ekf2_off",
         of_ekf2=True,
     ),

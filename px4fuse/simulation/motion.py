@@ -255,7 +255,7 @@ def attitude(state: State) -> Attitude:
 
 
 def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Motion:
-    """Plan a flight: ground, climb, hover, aisle or loop, hover, descent, ground.
+    """Plan a flight: ground, climb, hover, aisle or square, hover, descent, ground.
 
     Raises
     ------
@@ -268,10 +268,10 @@ def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Mo
     up = np.array([0.0, 0.0, -climb])
     ramps.change(up, CLIMB_RAMP_S, rise_s)
     ramps.change(-up, CLIMB_RAMP_S, CLIMB_RAMP_S / 2.0 + scenario.pause_s)
-    if scenario.kind == "loop":
-        _fly_loop(ramps, scenario, mistakes)
-    else:
+    if scenario.kind == "aisle":
         _fly_aisle(ramps, scenario, 0.0 if mistakes.no_motion else scenario.speed_m_s)
+    else:
+        _fly_loop(ramps, scenario, mistakes)
     ramps.change(-up, CLIMB_RAMP_S, rise_s)
     touch_down_s = ramps.centre_s + CLIMB_RAMP_S / 2.0
     if touch_down_s > LONGEST_S:

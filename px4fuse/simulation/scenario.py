@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
+from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, Aid
 from px4fuse.errors import SettingsError
 
-Kind = Literal["aisle", "loop"]
+Kind = Literal["aisle", "loop", "outdoor"]
 Yaw = Literal["fixed", "follow"]
-KINDS: tuple[Kind, Kind] = ("aisle", "loop")
+KINDS: tuple[Kind, ...] = ("aisle", "loop", "outdoor")
 YAWS: tuple[Yaw, Yaw] = ("fixed", "follow")
 
 # DT to which SIGMA_A refers, the lesson's (px4fuse.filter.kalman)
@@ -18,6 +20,12 @@ DT_S = 0.1
 # How long it takes to start or stop along the aisle, and to turn a corner of the loop
 START_STOP_S = 1.5
 CORNER_S = 2.0
+# What a kind of flight has where nothing is chosen, beside the defaults of all
+OF_KIND: Mapping[Kind, Mapping[str, float]] = {
+    "aisle": {},
+    "loop": {"passes": 1},
+    "outdoor": {"passes": 3, "length_m": 30.0, "speed_m_s": 4.0, "altitude_m": 8.0},
+}
 # Range of each number beyond which it is a slip of the keyboard, with its option and unit
 _RANGES: dict[str, tuple[str, float, float, str]] = {
     "passes": ("--passes", 1, 100, ""),
@@ -31,6 +39,9 @@ _RANGES: dict[str, tuple[str, float, float, str]] = {
     "sigma_vio_m": ("sigma_vio_m", 0.0, 10.0, "m"),
     "vio_drift": ("--vio-drift", 0.0, 0.5, "of the path"),
     "vio_walk_m": ("vio_walk_m", 0.0, 1.0, "m/√m"),
+    "gnss_rate_hz": ("gnss_rate_hz", 1.0, 10.0, "Hz"),
+    "sigma_gnss_m": ("--sigma-gnss", 0.0, 10.0, "m"),
+    "sigma_gnss_m_s": ("sigma_gnss_m_s", 0.0, 5.0, "m/s"),
     "sigma_a_m_s2": ("--sigma-a", 0.0, 20.0, "m/s²"),
     "accel_bias_sigma_m_s2": ("--accel-bias-sigma", 0.0, 2.0, "m/s²"),
     "gyro_bias_sigma_rad_s": ("gyro_bias_sigma_rad_s", 0.0, 0.5, "rad/s"),
@@ -52,10 +63,11 @@ class Scenario:
 
     Attributes
     ----------
-    kind : {"aisle", "loop"}
-        Passes back and forth along a straight line with UWB, or laps around a square with VIO.
+    kind : {"aisle", "loop", "outdoor"}
+        Passes back and forth along a straight line with UWB, or laps around a square with VIO or,
+        outdoors, with GNSS.
     passes : int
-        Passes of the aisle, or laps of the loop.
+        Passes of the aisle, or laps of the square.
     length_m : float
         Of the aisle, or of a side of the square.
     speed_m_s : float
@@ -64,7 +76,7 @@ class Scenario:
     altitude_m : float
     yaw : {"fixed", "follow"} or None
         Whether the nose keeps its heading or turns into the direction of flight; None is fixed
-        in the aisle and following around the loop.
+        in the aisle and following around the square.
     pause_s : float
         Hover at either end of the aisle.
     wander_m : float
@@ -77,6 +89,9 @@ class Scenario:
         Drift of the VIO in one horizontal direction, as a share of the distance flown.
     vio_walk_m : float
         And its random part, m per square root of the distance in m, on each axis.
+    gnss_rate_hz, sigma_gnss_m, sigma_gnss_m_s : float
+        Likewise of GNSS, horizontally, with the noise of its velocity; down it is half as much
+        again.
     sigma_a_m_s2 : float
         White noise of the accelerometer, as the standard deviation of its mean over 0.1 s: the
         SIGMA_A of the filter. A single sample has √(0.1 s · ``imu_rate_hz``) times that.
@@ -117,6 +132,9 @@ class Scenario:
     sigma_vio_m: float = 0.01
     vio_drift: float = 0.015
     vio_walk_m: float = 0.01
+    gnss_rate_hz: float = 5.0
+    sigma_gnss_m: float = 0.4
+    sigma_gnss_m_s: float = 0.3
     sigma_a_m_s2: float = 0.2
     accel_bias_sigma_m_s2: float = 0.03
     gyro_bias_sigma_rad_s: float = 0.002
@@ -142,7 +160,7 @@ class Scenario:
                     f"{option} {value:g} is out of range: give {low:g} to {high:g} {unit}".rstrip()
                     + "."
                 )
-        needed = self.speed_m_s * (CORNER_S if self.kind == "loop" else START_STOP_S)
+        needed = self.speed_m_s * (START_STOP_S if self.kind == "aisle" else CORNER_S)
         if self.length_m < needed:
             raise SettingsError(
                 f"--length {self.length_m:g} is too short for --speed {self.speed_m_s:g}: starts, "
@@ -152,19 +170,31 @@ class Scenario:
     @property
     def follows(self) -> bool:
         """Whether the nose turns into the direction of flight."""
-        return self.yaw == "follow" or (self.yaw is None and self.kind == "loop")
+        return self.yaw == "follow" or (self.yaw is None and self.kind != "aisle")
 
     @property
     def source_rate_hz(self) -> float:
         """Rate of the position source."""
-        return self.vio_rate_hz if self.kind == "loop" else self.uwb_rate_hz
+        rates = {"aisle": self.uwb_rate_hz, "loop": self.vio_rate_hz, "outdoor": self.gnss_rate_hz}
+        return rates[self.kind]
 
     @property
     def source_sigma_m(self) -> float:
         """White noise of the position source."""
-        return self.sigma_vio_m if self.kind == "loop" else self.sigma_uwb_m
+        sigmas = {"aisle": self.sigma_uwb_m, "loop": self.sigma_vio_m, "outdoor": self.sigma_gnss_m}
+        return sigmas[self.kind]
+
+    @property
+    def aid(self) -> Aid:
+        """What EKF2 takes the positions as."""
+        return GNSS_POS if self.kind == "outdoor" else EV_POS
 
     @property
     def accelerometer_noise_m_s2(self) -> float:
         """White noise of a single sample."""
         return self.sigma_a_m_s2 * math.sqrt(DT_S * self.imu_rate_hz)
+
+
+def scenario_of(kind: Kind, **chosen: Any) -> Scenario:
+    """A flight of a kind as it is usual for it, but for what is chosen."""
+    return Scenario(kind=kind, **{**OF_KIND[kind], **chosen})

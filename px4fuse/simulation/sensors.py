@@ -14,6 +14,8 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, BoolArray
+from px4fuse.readers.px4_positions import DEFAULT_GNSS_DELAY_MS, GPS_3D_FIX, unproject
+from px4fuse.readers.px4_topics import GPS_POSITION
 from px4fuse.simulation.mistakes import Mistakes
 from px4fuse.simulation.motion import Motion, Sines, attitude, direction
 from px4fuse.simulation.scenario import DT_S, Scenario
@@ -29,6 +31,13 @@ FIRST_POSITION_S = 0.1
 # PX4 stamps with the time of arrival until 500 replies at 10 Hz (Timesync.cpp)
 TIMESYNC_CONVERGED_S = 50.0
 NLOS_BURST = 3  # samples, mean
+# Where the local frame has its origin outdoors: latitude, longitude (degrees) and altitude (m)
+HOME = (47.397742, 8.545594, 488.0)
+# Of a fix when it is stamped; GNSS is less exact downwards
+FIX_AGE_S = 1e-3 * DEFAULT_GNSS_DELAY_MS
+OF_GNSS = np.array([1.0, 1.0, 1.5])
+# A compass that is disturbed in flight pulls EKF2's heading along with this time constant
+HEADING_FOLLOWS_S = 3.0
 ATTITUDE_PERIODS_S = (20.0, 60.0)
 ATTITUDE_SINES = 4
 ATTITUDE_LATENCY_US = 200
@@ -38,7 +47,8 @@ POSE_FRAME_NED = 1  # msg/VehicleOdometry.msg
 
 # Streams of random numbers: a mistake in one sensor leaves the others' noise as it was
 Stream = IntEnum(
-    "Stream", "WANDER BIAS IMU ATTITUDE TIMING SOURCE DRIFT NLOS VIBRATION HEIGHT REST", start=0
+    "Stream", "WANDER BIAS IMU ATTITUDE TIMING SOURCE DRIFT NLOS VIBRATION HEIGHT REST SLOW FIX_VELOCITY",
+    start=0,
 )
 
 
@@ -58,6 +68,8 @@ class SensedPositions:
         Of each logged sample, whether it is one of the outliers that were put in.
     error_m : ndarray, shape (n, 3)
         What it measured beyond the truth, NED, mistakes of frame and scale included.
+    position_m, velocity_m_s : ndarray, shape (n, 3)
+        What it measured, NED; a UWB and a VIO send no velocity.
     measured_s : ndarray, shape (n,)
         When it truly measured, seconds from the first data.
     distance_m, drift_m : float, ndarray of shape (3,)
@@ -67,6 +79,8 @@ class SensedPositions:
     topic: Topic
     outlier: BoolArray
     error_m: Array
+    position_m: Array
+    velocity_m_s: Array
     measured_s: Array
     distance_m: float
     drift_m: Array
@@ -134,11 +148,11 @@ def at_rest(
     return force, rate + share * scenario.gyro_noise_rad_s * rng.standard_normal(3)
 
 
-def logged_attitude(scenario: Scenario, motion: Motion) -> Topic:
+def logged_attitude(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
     """vehicle_attitude: the truth with a small slow error, as of a good estimator without EKF2."""
     time_us = _grid_us(motion.duration_s, scenario.attitude_rate_hz)
     truth = attitude(motion.at(seconds(time_us))).body_to_ned
-    error = attitude_error(scenario, seconds(time_us)).as_matrix()
+    error = attitude_error(scenario, mistakes, seconds(time_us)).as_matrix()
     return _attitude_topic("vehicle_attitude", time_us, ATTITUDE_LATENCY_US, error @ truth)
 
 
@@ -162,13 +176,19 @@ def _attitude_topic(
     return Topic(name, stamps(time_us, late_us) | {"q": quaternion})
 
 
-def attitude_error(scenario: Scenario, time_s: Array) -> Rotation:
-    """Error of the logged attitude, a small rotation about north, east and down."""
+def attitude_error(scenario: Scenario, mistakes: Mistakes, time_s: Array) -> Rotation:
+    """Error of the logged attitude, a rotation about north, east and down; small but for heading."""
     tilt, yaw = np.radians([scenario.tilt_error_deg, scenario.yaw_error_deg])
     rng = stream(scenario, Stream.ATTITUDE)
     rms = np.array([tilt, tilt, yaw])
     sines = Sines.draw(rng, rms, ATTITUDE_PERIODS_S, ATTITUDE_SINES)
-    return Rotation.from_rotvec(sines.at(time_s)[0])
+    error = sines.at(time_s)[0]
+    if mistakes.heading_deg:
+        size = np.radians(mistakes.heading_deg)
+        if mistakes.heading_at_s is not None:
+            size *= -np.expm1(-np.maximum(time_s - mistakes.heading_at_s, 0.0) / HEADING_FOLLOWS_S)
+        error[:, 2] += size
+    return Rotation.from_rotvec(error)
 
 
 def land_detector(motion: Motion) -> Topic:
@@ -203,7 +223,7 @@ def ground_truth(scenario: Scenario, motion: Motion) -> Topic:
 
 
 def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> SensedPositions:
-    """vehicle_visual_odometry: UWB in the aisle, VIO around the loop."""
+    """vehicle_visual_odometry of UWB in the aisle and VIO around the loop, GNSS outdoors."""
     timing = stream(scenario, Stream.TIMING)
     interval_s = 1.0 / scenario.source_rate_hz
     count = int((motion.duration_s - FIRST_POSITION_S) / interval_s)
@@ -219,11 +239,14 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> SensedP
     if scenario.kind == "loop":
         drift = vio_drift(scenario, distance)
     position += drift
-    sigma = scenario.source_sigma_m
+    outdoor = scenario.kind == "outdoor"
+    sigma = scenario.source_sigma_m * (OF_GNSS if outdoor else 1.0)
     position += sigma * stream(scenario, Stream.SOURCE).standard_normal(position.shape)
     airborne = (time_s > motion.take_off_s) & (time_s < motion.touch_down_s)
     shift, outlier = outliers(scenario, mistakes, airborne)
     position += shift
+    if mistakes.slow_error_m:
+        position += slow_error(scenario, mistakes, len(time_s), interval_s)
     if mistakes.smoothed_s:
         position = _low_pass(position, interval_s, mistakes.smoothed_s)
     position *= 1.0 + mistakes.scale_percent / 100.0
@@ -236,25 +259,42 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> SensedP
         time_s, mistakes.dropout_s, mistakes.dropout_at_s, motion.duration_s
     ) & thinned(time_s, mistakes.decimate_hz)
     arrival_us, stamp_us = _stamps(mistakes, time_s, timing)
-    rotation = None
-    if scenario.kind == "loop":
-        rotation = attitude(state).body_to_ned[keep]
+    noise = scenario.sigma_gnss_m_s * OF_GNSS
+    velocity = state.velocity_m_s + noise * stream(scenario, Stream.FIX_VELOCITY).standard_normal(
+        position.shape
+    )
+    reported_m = reported_sigma_m(scenario, mistakes)
+    if outdoor:
+        fix_us = stamp_us + round(1e6 * FIX_AGE_S)
+        topic = _fixes(fix_us[keep], position[keep], velocity[keep], reported_m, scenario)
+    else:
+        rotation = attitude(state).body_to_ned[keep] if scenario.kind == "loop" else None
+        topic = _odometry(arrival_us[keep], stamp_us[keep], position[keep], reported_m, rotation)
     return SensedPositions(
-        topic=_odometry(
-            arrival_us[keep], stamp_us[keep], position[keep], reported_sigma_m(scenario, mistakes),
-            rotation,
-        ),
+        topic=topic,
         outlier=outlier[keep],
         error_m=(position - state.position_m)[keep],
+        position_m=position[keep],
+        velocity_m_s=velocity[keep],
         measured_s=time_s[keep],
         distance_m=float(distance[-1]),
         drift_m=drift[-1],
-    )  # fmt: skip
+    )
 
 
 def reported_sigma_m(scenario: Scenario, mistakes: Mistakes) -> float:
     """Standard deviation that the source reports; EKF2 takes none below 0.01 m (EKF2.cpp)."""
     return max(scenario.source_sigma_m, 0.01) * float(np.sqrt(mistakes.r_scale))
+
+
+def slow_error(
+    scenario: Scenario, mistakes: Mistakes, count: int, interval_s: float
+) -> Array:
+    """A first-order Gauss-Markov process on each axis, shape (n, 3)."""
+    noise = stream(scenario, Stream.SLOW).standard_normal((count, 3)) * mistakes.slow_error_m
+    keep = np.exp(-interval_s / mistakes.slow_error_s)
+    noise[1:] *= np.sqrt(1.0 - keep**2)
+    return np.asarray(lfilter([1.0], [1.0, -keep], noise, axis=0))
 
 
 def vio_drift(scenario: Scenario, distance_m: Array) -> Array:
@@ -344,6 +384,37 @@ def _odometry(
             "velocity_frame": np.zeros(count, np.uint8),
             "reset_counter": np.zeros(count, np.uint8),
             "quality": np.zeros(count, np.int8),
+        },
+    )
+
+
+def _fixes(
+    stamp_us: NDArray[np.int64],
+    position_m: Array,
+    velocity_m_s: Array,
+    sigma_m: float,
+    scenario: Scenario,
+) -> Topic:
+    """vehicle_gps_position (msg/SensorGps.msg), with EKF2's own origin."""
+    latitude, longitude = unproject(position_m[:, 0], position_m[:, 1], HOME[:2])
+    size = np.ones(len(stamp_us), np.float32)
+    return Topic(
+        GPS_POSITION,
+        {
+            **stamps(stamp_us),
+            "latitude_deg": latitude,
+            "longitude_deg": longitude,
+            "altitude_msl_m": HOME[2] - position_m[:, 2],
+            "eph": size * np.float32(sigma_m),
+            "epv": size * np.float32(sigma_m * OF_GNSS[2]),
+            "s_variance_m_s": size * np.float32(scenario.sigma_gnss_m_s),
+            **{
+                f"vel_{axis}_m_s": velocity_m_s[:, i].astype(np.float32)
+                for i, axis in enumerate("ned")
+            },
+            "vel_ned_valid": size.astype(np.bool_),
+            "fix_type": (size * GPS_3D_FIX).astype(np.uint8),
+            "satellites_used": (size * 16).astype(np.uint8),
         },
     )
 
