@@ -99,7 +99,9 @@ class Analysis(Comparison):
     @cached_property
     def causes(self) -> tuple[Intervention, ...]:
         """What was changed, each by itself, and what that explains of each discrepancy."""
-        return interventions(self, self.tuning, self.clock, self.heading, self.ekf2_model)
+        return interventions(
+            self, self.tuning, self.clock, self.heading, self.explained, self.ekf2_model
+        )
 
     @cached_property
     def explained(self) -> Explained | Unavailable:

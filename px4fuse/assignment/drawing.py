@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 from px4fuse.assignment.key import folded
 from px4fuse.errors import SettingsError
-from px4fuse.simulation.scenario import KINDS, Kind, Scenario
+from px4fuse.simulation.scenario import Kind, Scenario, scenario_of
 
 # Of a class: one kind of flight for all, or drawn for each
 Kinds = Literal["aisle", "loop", "mixed"]
@@ -41,7 +41,6 @@ NOISES: dict[Kind, dict[str, tuple[float, float, int]]] = {
         "heading_deg": (-180.0, 180.0, 1),
     },
 }
-PASSES: dict[Kind, int] = {"aisle": 6, "loop": 1}
 # Shares of flights with so many mistakes, where the number is not given. The loop has one mistake
 # to offer; with fewer flights without it, "false closure" would be a safe guess.
 COUNTS: dict[Kind, tuple[float, ...]] = {"aisle": (0.1, 0.5, 0.4), "loop": (0.4, 0.6)}
@@ -212,9 +211,8 @@ def draw(
         name: round(low + (high - low) * one(name), decimals)
         for name, (low, high, decimals) in NOISES[kind].items()
     }
-    scenario = Scenario(
-        kind=kind,
-        passes=PASSES[kind],
+    scenario = scenario_of(
+        kind,
         truth=truth and kind == "aisle",
         seed=int(one("seed") * 2**32),
         **numbers,
@@ -224,7 +222,7 @@ def draw(
 
 def most_mistakes(kind: Kinds) -> int:
     """How many mistakes every flight can have."""
-    return min(len(COUNTS[one]) for one in (KINDS if kind == "mixed" else (kind,))) - 1
+    return min(len(COUNTS[one]) for one in (COUNTS if kind == "mixed" else (kind,))) - 1
 
 
 def secret_of(text: str, where: str) -> bytes:

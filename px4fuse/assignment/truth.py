@@ -39,6 +39,8 @@ DID: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "yaw": (("followed the wrong positions",), ()),
     "scale": (("followed the wrong positions",), ()),
     "jump": ((), ("followed the wrong positions",)),
+    "slow-error": (("followed the wrong positions",), ()),
+    "heading": ((), ("followed the positions",)),
     "smoothed": (("followed the wrong positions",), ("fused at the wrong time",)),
     "ekf2-delay": (("fused at the wrong time",), ()),
     "ekf2-off": (("never fused",), ()),
@@ -143,6 +145,8 @@ def _wrong(
             from_s = end_s
         case "nlos" if truth["outlier_time_s"]:
             from_s, *_, until_s = truth["outlier_time_s"] * 2
+        case "heading":
+            from_s = given["heading_at_s"]
         case "dropout" | "imu-dropout" | "jump":
             share = 2.0 / 3.0 if name == "jump" else 0.5
             from_s = given[arguments[1].field]

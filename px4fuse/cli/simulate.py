@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import click
 
@@ -16,7 +16,7 @@ from px4fuse.cli.quantity import TypedQuantity
 from px4fuse.errors import OutputError, SettingsError, on_one_line
 from px4fuse.reading import read_text
 from px4fuse.simulation.mistakes import MISTAKES, as_typed, made, parse
-from px4fuse.simulation.scenario import KINDS, YAWS, Scenario
+from px4fuse.simulation.scenario import KINDS, OF_KIND, YAWS, Kind, Scenario, scenario_of
 
 if TYPE_CHECKING:
     from px4fuse.assignment.drawing import Kinds
@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
 _DEFAULT = Scenario()
 MIXED = "mixed"
-PASSES = {"aisle": _DEFAULT.passes, "loop": 1}
+OUTDOOR: Kind = "outdoor"
+SOURCES = {"aisle": "UWB", "loop": "VIO", OUTDOOR: "GNSS"}
 # What goes with --assignment, and what goes with nothing else
 OF_ASSIGNMENTS = ("output", "assignment", "secret", "secret_file", "count", "kind", "answer_path",
                   "no_truth", "preview")  # fmt: skip
@@ -36,10 +37,11 @@ Command = TypeVar("Command", bound=Callable[..., None])
 # Option, field of the scenario, whose own value is the default, unit and help
 _SCENARIO = (
     ("--length", "length_m", "m", "Of the aisle, or of a side of the square."),
-    ("--speed", "speed_m_s", "m/s", None),
+    ("--speed", "speed_m_s", "m/s", "On the straight."),
     ("--heading", "heading_deg", "°", "Of the aisle or of the first side, clockwise from north."),
     ("--sigma-uwb", "sigma_uwb_m", "m", "White noise of the UWB, per axis: the true SIGMA_Z."),
     ("--uwb-rate", "uwb_rate_hz", "Hz", None),
+    ("--sigma-gnss", "sigma_gnss_m", "m", "White noise of GNSS, north and east."),
     ("--sigma-a", "sigma_a_m_s2", "m/s²",
      "White noise of the accelerometer's mean over 0.1 s: the true SIGMA_A."),
     ("--accel-bias-sigma", "accel_bias_sigma_m_s2", "m/s²",
@@ -50,9 +52,12 @@ _SCENARIO = (
 def _scenario_options(command: Command) -> Command:
     """The real numbers of the scenario."""
     for name, field, unit, meaning in reversed(_SCENARIO):
-        default = getattr(_DEFAULT, field)
-        kind = TypedQuantity(unit, default, between=(0.0, 360.0) if unit == "°" else None)
-        command = click.option(name, field, type=kind, default=default, help=meaning)(command)
+        usual = getattr(_DEFAULT, field)
+        kind = TypedQuantity(unit, usual, between=(0.0, 360.0) if unit == "°" else None)
+        outdoors = OF_KIND[OUTDOOR].get(field)
+        shown = f"{usual:g}" + (f"; outdoors {outdoors:g}" if outdoors else "")
+        told = f"{meaning}  [default: {shown}]"
+        command = click.option(name, field, type=kind, help=told)(command)
     return command
 
 
@@ -115,8 +120,9 @@ class WithMistakes(click.Command):
     "--kind",
     type=click.Choice((*KINDS, MIXED)),
     default=_DEFAULT.kind,
-    help="Passes along an aisle with UWB, or laps around a square with drifting VIO. With "
-    "--assignment mixed: a loop for a third of the class, the aisle for the others.",
+    help="Passes along an aisle with UWB, or laps around a square with drifting VIO or, outdoors, "
+    "with GNSS. With --assignment mixed: a loop for a third of the class, the aisle for the "
+    "others.",
 )
 @click.option(
     "--seed",
@@ -142,20 +148,22 @@ class WithMistakes(click.Command):
 @click.option("--no-truth", is_flag=True, help="Leave the ground truth out of the log.")
 @click.option("--no-ekf2", is_flag=True, help="Fly without EKF2, which is faster.")
 @click.option(
-    "--passes", type=int, metavar="N", help="Passes of the aisle [6], or laps of the loop [1]."
+    "--passes",
+    type=int,
+    metavar="N",
+    help="Passes of the aisle [6], or laps of the square [1; outdoors 3].",
 )
 @click.option(
     "--yaw",
     type=click.Choice(YAWS),
-    help="Whether the nose stays or follows the flight.  [default: fixed; follow in a loop]",
+    help="Whether the nose stays or follows the flight.  [default: fixed; follow around a square]",
 )
 @_scenario_options
 @click.option(
     "--vio-drift",
     type=float,
-    default=_DEFAULT.vio_drift,
     metavar="SHARE",
-    help="Drift of the VIO, as a share of the distance.",
+    help=f"Drift of the VIO, as a share of the distance.  [default: {_DEFAULT.vio_drift:g}]",
 )
 def simulate(
     output: Path,
@@ -168,8 +176,8 @@ def simulate(
     no_truth: bool,
     no_ekf2: bool,
     preview: bool,
-    passes: int | None,
-    **scenario: Any,
+    kind: str,
+    **chosen: Any,
 ) -> None:
     """Simulate a flight with known truth and chosen mistakes, for exercises and exams.
 
@@ -184,27 +192,27 @@ def simulate(
     """
     _check_options(assignment)
     if assignment is not None:
-        drawn_from = _read_secret(secret, secret_file), scenario["kind"], count
+        drawn_from = _read_secret(secret, secret_file), cast("Kinds", kind), count
         _assign(assignment, output, answer_path, *drawn_from, truth=not no_truth, preview=preview)
         return
-    if scenario["kind"] == MIXED:
+    if kind == MIXED:
         raise SettingsError(f"--kind {MIXED} requires --assignment ROSTER.csv.")
     if output.suffix.lower() != ".ulg":
         raise OutputError(f"{output}: the log is a ULog. Give a name that ends in .ulg with -o.")
     check_targets([output, answer_path])
     parsed = parse(mistakes)
-    chosen = Scenario(
-        passes=passes if passes is not None else PASSES[scenario["kind"]],
+    scenario = scenario_of(
+        cast(Kind, kind),
         truth=not no_truth,
         ekf2=not no_ekf2,
-        **scenario,
+        **{name: value for name, value in chosen.items() if value is not None},
     )
     from px4fuse.results.contract import to_json
     from px4fuse.simulation import flights
 
     with progress(steps=("flying", "writing")) as step:
         step("flying")
-        simulation = flights.simulate(chosen, parsed)
+        simulation = flights.simulate(scenario, parsed)
         step("writing the log")
         contents = {output: flights.to_ulog(simulation)}
     if answer_path is not None:
@@ -219,6 +227,11 @@ def simulate(
 
 def _check_options(assignment: Path | None) -> None:
     """Refuse options that do not go together."""
+    if assignment is not None and click.get_current_context().params["kind"] == OUTDOOR:
+        raise SettingsError(
+            f"--kind {OUTDOOR} is for a single flight",
+            f"With --assignment give --kind aisle, loop or {MIXED}.",
+        )
     for parameter in typed_parameters():
         if assignment is not None and parameter.name not in OF_ASSIGNMENTS:
             raise SettingsError(
@@ -324,16 +337,14 @@ def _summary(simulation: Simulation) -> list[str]:
     """What was simulated, one line each."""
     scenario, motion = simulation.scenario, simulation.motion
     names = made(simulation.mistakes)
-    loop = scenario.kind == "loop"
-    path = (
-        f"{scenario.passes} lap{'s' * (scenario.passes > 1)} of a square of {scenario.length_m:g} m"
-        if loop
-        else f"{scenario.passes} pass{'es' * (scenario.passes > 1)} of {scenario.length_m:g} m"
-    )
+    loop, many = scenario.kind == "loop", scenario.passes > 1
+    path = f"{scenario.passes} lap{'s' * many} of a square of {scenario.length_m:g} m"
+    if scenario.kind == "aisle":
+        path = f"{scenario.passes} pass{'es' * many} of {scenario.length_m:g} m"
     return [
         f"Flight    {scenario.kind}, {path} at {scenario.speed_m_s:g} m/s, "
         f"{motion.duration_s:g} s, seed {scenario.seed}",
-        f"Position  {'VIO' if loop else 'UWB'}, {scenario.source_sigma_m:g} m at "
+        f"Position  {SOURCES[scenario.kind]}, {scenario.source_sigma_m:g} m at "
         f"{scenario.source_rate_hz:g} Hz"
         + (f", drift {scenario.vio_drift:.1%} of the path" if loop else ""),
         f"IMU       {scenario.imu_rate_hz:g} Hz, SIGMA_A {scenario.sigma_a_m_s2:g} m/s²",

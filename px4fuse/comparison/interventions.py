@@ -19,6 +19,7 @@ import pandas as pd
 from msgspec import structs
 from scipy.spatial.transform import Rotation
 
+from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import difference, kf_against_truth
 from px4fuse.comparison.estimates import Tuning
 from px4fuse.comparison.model import (
@@ -29,21 +30,34 @@ from px4fuse.comparison.model import (
     FilterSummary,
     UnjudgedFilter,
 )
+from px4fuse.comparison.projection import project_truth
 from px4fuse.comparison.remedy import delay_asked, noise_change, noise_used_m
 from px4fuse.ekf2.agreement import judged_from, settled
 from px4fuse.ekf2.model import Model, moved, replay_settings
 from px4fuse.ekf2.replay import HORIZONTAL as LEVEL
 from px4fuse.ekf2.replay import UPDATE_COLUMNS, Ekf2Replay
-from px4fuse.ekf2_parameters import GNSS_VEL, PARAMETERS
+from px4fuse.ekf2_parameters import EV_POS, GNSS_VEL, PARAMETERS
+from px4fuse.filter.causes import Explained
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.consistency import SIGMA_OFF, nis_band
 from px4fuse.filter.heading import HeadingError
 from px4fuse.filter.kalman import Replay, replay
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import along, within
+from px4fuse.filter.signals import (
+    Acceleration,
+    along,
+    ned_acceleration,
+    project_acceleration,
+    within,
+)
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Unavailable
+from px4fuse.flight import (
+    POSITION_COLUMNS,
+    SPECIFIC_FORCE_COLUMNS,
+    VELOCITY_COLUMNS,
+    Unavailable,
+)
 from px4fuse.record import Positive, Record
 
 Of = Literal["nis", "nees", "apart"]
@@ -54,15 +68,20 @@ NEES_LARGE = 4.0
 CONTENT_NIS = 1.5
 # Of the logarithm, and as far above 1 as below
 EXPLAINS = 0.5
+# How far from all of the logarithm is nearly all: noises are never quite right
+NEARLY_ALL = 0.25
 # Of the logarithm, for what is tried together with the best of the others
 HELPS = 0.1
 CLOCK, TURN, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
-# What is wrong with the source itself
-OF_SOURCE = frozenset((OUTLIERS, CLOCK, TURN))
+FORWARD, RIGHT = "bias_forward_m_s2", "bias_right_m_s2"
+# What is wrong with a sensor, before any setting
+OF_SENSORS = frozenset((OUTLIERS, CLOCK, TURN, FORWARD))
 # What a filter is run with where the source is better than its rate can show (m): what motion
 # capture resolves in flight
 SMALLEST_SIGMA_Z_M = 0.005
 SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
+# What a change of another needs along with it
+ALONG = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT))
 OF_SETTINGS = frozenset((SIGMA_A, SIGMA_Z))
 # What EKF2 has besides the aid's own; PX4's default is tried where something else was flown
 NOT_OF_AID = (
@@ -86,7 +105,8 @@ class Intervention(Record, frozen=True, kw_only=True):
     axis : str
     change : mapping from name to value
         Fields of the settings, PX4's parameters, ``turned_deg`` (of the positions, clockwise seen
-        from above) and ``outliers_left_out`` (how many).
+        from above), ``outliers_left_out`` (how many), and the accelerometer's ``bias_forward_m_s2``
+        and ``bias_right_m_s2``, taken out.
     before, after : float
         The number without the change, of EKF2 by the log, and by a replay with it.
     explains : float
@@ -113,6 +133,16 @@ class Intervention(Record, frozen=True, kw_only=True):
         """Whether it explains enough of it, and not so much that it is something else."""
         return EXPLAINS <= self.explains <= 2.0 - EXPLAINS and not self.denied_by_truth
 
+    @property
+    def of_sensors(self) -> bool:
+        """Whether something is wrong with a sensor, which goes before any setting."""
+        return not OF_SENSORS.isdisjoint(self.change)
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether nothing else has to be looked for: it is all of it, or of a sensor nearly all."""
+        return self.brings_into_band or (self.of_sensors and abs(self.explains - 1.0) <= NEARLY_ALL)
+
 
 def tried_on(
     causes: Iterable[Intervention], owner: FilterName, axis: str, of: Of = "nis"
@@ -128,7 +158,7 @@ def cause_of(
     return min(
         (each for each in tried_on(causes, owner, axis, of) if each.is_cause),
         key=lambda each: (
-            not each.brings_into_band, len(each.change), OF_SOURCE.isdisjoint(each.change),
+            not each.is_enough, len(each.change.keys() - ALONG), not each.of_sensors,
             abs(each.explains - 1.0),
         ),
         default=None,
@@ -148,6 +178,7 @@ def interventions(
     tuning: Tuning,
     clock: ClockOffset | Unavailable,
     heading: HeadingError | Unavailable,
+    explained: Explained | Unavailable,
     model: Model | Unavailable,
 ) -> tuple[Intervention, ...]:
     """Try every candidate on every discrepancy.
@@ -158,11 +189,13 @@ def interventions(
     tuning : mapping from axis name, or "horizontal", to AxisTuning or Unavailable
     clock : ClockOffset or Unavailable
     heading : HeadingError or Unavailable
+    explained : Explained or Unavailable
+        With the biases of the accelerometer.
     model : Model or Unavailable
         Of EKF2.
     """
     filters: dict[FilterName, _Ours | _Ekf2 | None] = {
-        "kf": _Ours(comparison, tuning, clock, heading),
+        "kf": _Ours(comparison, tuning, clock, heading, explained),
         "ekf2": _Ekf2.of(comparison, tuning, clock, heading, model),
     }
     rows: list[Intervention] = []
@@ -276,6 +309,11 @@ def _of_frame(heading: HeadingError | Unavailable) -> list[Change]:
     return [{TURN: -round(heading.turn_deg, 1)}]
 
 
+def _turned(direction: Array, turned_deg: float) -> Array:
+    """A direction in the frame in which the positions are turned (clockwise from above)."""
+    return np.asarray(Rotation.from_euler("z", -turned_deg, degrees=True).apply(direction))
+
+
 def _is_over(result: AxisComparison, owner: FilterName, of: Of) -> bool:
     """Whether the variance is larger than what is shown."""
     statement = result.filters[owner]
@@ -295,6 +333,7 @@ class _Ours:
     tuning: Tuning
     clock: ClockOffset | Unavailable
     heading: HeadingError | Unavailable
+    explained: Explained | Unavailable
 
     def candidates(self, result: AxisComparison, of: Of) -> list[Change]:
         """What to try along an axis."""
@@ -312,17 +351,42 @@ class _Ours:
         if tuned is not None and not over and len(tuned.outlier_time_s):
             found.append({OUTLIERS: float(len(tuned.outlier_time_s))})
         found += _of_clock(self.comparison, self.clock, settings.clock_offset_s)
-        return found if result.axis.name == "down" else found + _of_frame(self.heading)
+        if result.axis.name == "down":
+            return found
+        if isinstance(self.explained, Explained) and self.explained.biased:
+            found.append({
+                FORWARD: round(self.explained.forward_bias.value, 3),
+                RIGHT: round(self.explained.right_bias.value, 3),
+            })  # fmt: skip
+        return found + _of_frame(self.heading)
+
+    def _unbiased(self, change: Change, direction: Array) -> Acceleration | Unavailable:
+        """The acceleration along a direction, without the accelerometer's bias."""
+        flight, imu = self.comparison.flight, self.comparison.flight.imu
+        if isinstance(imu, Unavailable):
+            return imu
+        bias = pd.Series([change[FORWARD], change[RIGHT], 0.0], SPECIFIC_FORCE_COLUMNS)
+        flight = replace(flight, imu=imu.assign(**(imu[SPECIFIC_FORCE_COLUMNS] - bias)))
+        made = ned_acceleration(flight)
+        if isinstance(made, Unavailable):
+            return made
+        return project_acceleration(made, direction, self.comparison.segment)
 
     def number(self, result: AxisComparison, of: Of, change: Change) -> tuple[float, int] | None:
         """Mean NIS or NEES along an axis with a change, or how far apart; and of how many."""
         source, segment, axis = self.comparison.source, self.comparison.segment, result.axis
         named: dict[str, Any] = {name: change[name] for name in change if name in vars(Settings())}
         settings = replace(self.comparison.settings, **named)
+        truth, compass = result.truth, TURN in change and source.origin.is_gnss
         if TURN in change:
-            turned = Rotation.from_euler("z", -change[TURN], degrees=True).apply(axis.direction)
+            turned = _turned(axis.direction, change[TURN])
             measured_m = along(within(source.samples, segment), POSITION_COLUMNS, turned)
             axis = replace(axis, measurement_m=measured_m[np.isfinite(measured_m)])
+            if compass:  # GNSS knows north, and so does the truth: the attitude does not
+                there = replace(axis, direction=turned)
+                truth = project_truth(self.comparison.flight.truth, there, segment)
+        if FORWARD in change:
+            axis = replace(axis, acceleration=self._unbiased(change, axis.direction))
         time_s, tuned = axis.measurement_time_s, tuned_for(self.tuning, axis.name)
         kept = np.ones(len(time_s), dtype=bool)
         if OUTLIERS in change and tuned is not None:
@@ -338,11 +402,11 @@ class _Ours:
         run = replay(axis, settings)
         if of == "apart":
             state = result.ekf2_state
-            return None if isinstance(state, Unavailable) else _rms_apart(run, state)
-        truth = kf_against_truth(run, result.truth, run.steps.index.to_numpy())
-        if isinstance(truth, Unavailable) or truth.nees_position_mean is None:
+            return None if compass or isinstance(state, Unavailable) else _rms_apart(run, state)
+        judged = kf_against_truth(run, truth, run.steps.index.to_numpy())
+        if isinstance(judged, Unavailable) or judged.nees_position_mean is None:
             return None
-        return truth.nees_position_mean, truth.count
+        return judged.nees_position_mean, judged.count
 
 
 @dataclass(frozen=True)
@@ -409,6 +473,9 @@ class _Ekf2:
     def number(self, result: AxisComparison, of: Of, change: Change) -> tuple[float, int] | None:
         """As of :class:`_Ours`, along a horizontal axis; unchanged how far apart by the log."""
         made, direction = self._replayed(change), result.axis.direction
+        if TURN in change and self.comparison.source.origin.is_gnss:
+            # what is put right is the attitude: its frame is turned, north is where it was
+            direction = _turned(direction, -change[TURN])
         updates = made.updates[settled(made.updates.index, judged_from(self.model.flown))]
         if of == "nis":
             nu = along(updates, INNOVATION_COLUMNS, direction[:2])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
@@ -44,6 +45,8 @@ STEP_FALSE_ALARM = 1e-3
 # Mean NIS of what follows a step that is one: of outliers that end, it stays far above 1
 STEP_NIS = 2.5
 MAX_JUMPS = 3
+BIAS_M_S2 = 0.2  # half of EKF2's own limit, EKF2_ABL_LIM
+BIAS_SIGMAS = 4.0  # 6e-5 of clean flights lie beyond
 # Measurements that a step must have on either side
 EDGE = 8
 
@@ -71,6 +74,9 @@ class Explained:
     forward_bias, right_bias : Estimate
         Accelerometer bias (m/s²) along the body's axes; a constant tilt of the attitude is the
         same where the nose keeps its heading.
+    turn : Estimate
+        Of the source's frame against the attitude (rad, clockwise seen from above), with the biases
+        accounted for.
     scale : Estimate
         Distances of the source over those that the IMU gives, minus 1.
     jumps : tuple of Jump
@@ -80,11 +86,25 @@ class Explained:
 
     forward_bias: Estimate
     right_bias: Estimate
+    turn: Estimate
     scale: Estimate
     jumps: tuple[Jump, ...]
     sigma_a_m_s2: float
 
     __repr__ = brief
+
+    @property
+    def bias(self) -> Estimate:
+        """Size of both biases together (m/s²)."""
+        forward, right = self.forward_bias, self.right_bias
+        return Estimate(
+            math.hypot(forward.value, right.value), math.hypot(forward.sigma, right.sigma)
+        )
+
+    @property
+    def biased(self) -> bool:
+        """Whether the accelerometer has a bias that matters, beyond chance."""
+        return self.bias.value >= max(BIAS_M_S2, BIAS_SIGMAS * self.bias.sigma)
 
 
 def explained(
@@ -132,7 +152,12 @@ def explained(
         model = replace(model, steps=steps(model.time_s, [jump.time_s for jump in jumps]))
         sigma_a, found = _fit_noise(model, levels, skip)
     return Explained(
-        found.estimate(FORWARD), found.estimate(RIGHT), _scale(model, sigma_a, skip), jumps, sigma_a
+        found.estimate(FORWARD),
+        found.estimate(RIGHT),
+        found.estimate(TURN),
+        _scale(model, sigma_a, skip),
+        jumps,
+        sigma_a,
     )
 
 

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from px4fuse.analysis import Analysis
 from px4fuse.ekf2.aids import STARVED_S, AidResult
 from px4fuse.ekf2_parameters import AIDS
+from px4fuse.findings.causes import CAUSE, SENSOR
 from px4fuse.findings.model import Found, info, warning
 from px4fuse.flight import Unavailable
 from px4fuse.plain import factor_words, number_words
@@ -50,6 +51,7 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
         )  # fmt: skip
     for name, aid in judged.items():
         if aid.verdict == "variance understated" and name != source:
+            of_source = bool(source) and AIDS[name].switch == AIDS[source].switch
             factor = aid.nis_mean**0.5
             yield warning(
                 "aid_understated",
@@ -58,7 +60,12 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
                 f"{aid.rejected_share:.1%} rejected): its errors are larger than R"
                 f"{_noise_words(aid)} says, or another aid pulls against it.",
                 _understated_remedy(name),
-                {"aid": name, "nis_mean": aid.nis_mean, "rejected_share": aid.rejected_share},
+                {
+                    "aid": name,
+                    "nis_mean": aid.nis_mean,
+                    "rejected_share": aid.rejected_share,
+                    CAUSE: SENSOR if of_source else "",
+                },
             )
         elif aid.verdict == "biased":
             axis, worst = max(aid.axes.items(), key=lambda item: abs(item[1].pull))

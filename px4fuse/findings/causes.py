@@ -84,9 +84,12 @@ NAMES: Mapping[str, str] = {
 }
 # In the evidence of a finding about a variance: what the detector holds it to be the effect of
 CAUSE = "cause"
-NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ELSEWHERE = (
-    "measurement noise", "process noise", "outliers", "clock", "frame", "gate", "elsewhere",
+NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
+    "measurement noise", "process noise", "outliers", "clock", "frame", "gate", "accelerometer",
+    "elsewhere",
 )  # fmt: skip
+# Likewise of an aid: it is of the sensor that the positions are of
+SENSOR = "the source's sensor"
 
 _OVERSTATED = ("kf_variance_overstated", "ekf2_variance_overstated")
 # Cause to what it brings with it, read from above, so that a finding goes to the first cause that
@@ -137,7 +140,10 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
     ),
     "source_jumps": (f"errors_larger_than_claimed:{ELSEWHERE}",),
     "source_scale_wrong": (f"errors_larger_than_claimed:{ELSEWHERE}",),
-    "accelerometer_bias": (f"errors_larger_than_claimed:{ELSEWHERE}",),
+    "accelerometer_bias": (
+        f"errors_larger_than_claimed:{ELSEWHERE}", f"errors_larger_than_claimed:{ACCELEROMETER}",
+        f"kf_variance_understated:{ACCELEROMETER}", "sigma_a_small",
+    ),
     # a step of the stamps moves positions of a vehicle that moves
     "source_clock_changes": (
         "source_jumps", "source_scale_wrong", "source_smoothed", "ekf2_ev_delay_wrong",
@@ -147,12 +153,14 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
     "source_clock_offset": (
         "source_stamps_of_arrival", "ekf2_ev_delay_wrong", f"errors_larger_than_claimed:{CLOCK}",
         f"kf_variance_understated:{CLOCK}", f"ekf2_variance_understated:{CLOCK}",
+        f"aid_understated:{SENSOR}",
     ),
     "source_frame_turned": (
         f"errors_larger_than_claimed:{FRAME}", f"kf_variance_understated:{FRAME}",
     ),
     "ekf2_heading_wrong": (
         f"errors_larger_than_claimed:{FRAME}", f"kf_variance_understated:{FRAME}",
+        f"errors_larger_than_claimed:{ELSEWHERE}", "sigma_a_small", f"aid_understated:{SENSOR}",
     ),
     "source_repeats": (
         "source_smoothed", "source_coloured", "source_jumps", "source_scale_wrong",

@@ -124,7 +124,9 @@ def larger(analysis: Analysis, hidden: list[Hidden]) -> Finding:
     shared = "gnss" if analysis.source.origin.is_gnss else "shared"
     remedy = REMEDIES["drift" if drifts else "ekf2" if alone else shared]
     evidence |= {CAUSE: kind_of(analysis, causes[worst.owner])}
-    if cures := {cure_words(cause): None for cause in causes.values() if cause is not None}:
+    if cures := {
+        cure_words(analysis, cause): None for cause in causes.values() if cause is not None
+    }:
         remedy = " ".join(cures)
     elif frame := _after_turning(analysis, worst.owner):
         before, left = frame

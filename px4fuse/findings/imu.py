@@ -6,16 +6,14 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.filter.causes import Explained
+from px4fuse.filter.causes import BIAS_M_S2, Explained
 from px4fuse.filter.signals import Segment, imu_gaps, within
 from px4fuse.findings.model import MOMENT_S, Found, finding, warning
 from px4fuse.flight import SPECIFIC_FORCE_COLUMNS, Ekf2, Flight, sample_rate
 from px4fuse.record import Span
 from px4fuse.recording import LogInfo
 
-BIAS_M_S2 = 0.2  # half of EKF2's own limit, EKF2_ABL_LIM
 BIAS_ERROR_M_S2 = 0.3  # as SIGMA_A tripled; 0.15 m after one second
-BIAS_SIGMAS = 4.0  # 6e-5 of clean flights lie beyond
 TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))
 IMU_GAP_TOTAL_S = 0.2  # two prediction steps
 MIN_IMU_RATE_HZ = 50.0  # 5 IMU samples per DT of 0.1 s, and 10 with margin for aliasing
@@ -41,10 +39,8 @@ def bias(analysis: Analysis) -> Found:
     if of_ekf2 is not None:
         in_ekf2 = f"{of_ekf2[0]:+.2f} forward, {of_ekf2[1]:+.2f} right"
     if isinstance(found, Explained):
-        forward, right = found.forward_bias, found.right_bias
-        size = float(np.hypot(forward.value, right.value))
-        sigma = float(np.hypot(forward.sigma, right.sigma))
-        if size >= max(BIAS_M_S2, BIAS_SIGMAS * sigma):
+        forward, right, size = found.forward_bias, found.right_bias, found.bias.value
+        if found.biased:
             yield finding(
                 "error" if size >= BIAS_ERROR_M_S2 else "warning",
                 "accelerometer_bias",
@@ -56,7 +52,7 @@ def bias(analysis: Analysis) -> Found:
                 + (f" EKF2 subtracts {in_ekf2}." if in_ekf2 else ""),
                 "Calibrate the accelerometers and the level horizon, at the temperature of the "
                 "flight; a larger SIGMA_A only hides it.",
-                {"bias_m_s2": size, "sigma_m_s2": sigma},
+                {"bias_m_s2": size, "sigma_m_s2": found.bias.sigma},
             )
             return
     if of_ekf2 is None:

@@ -6,8 +6,11 @@ from collections.abc import Mapping
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.interventions import (
+    ALONG,
     CLOCK,
+    FORWARD,
     OUTLIERS,
+    RIGHT,
     SIGMA_A,
     SIGMA_Z,
     TURN,
@@ -22,7 +25,8 @@ from px4fuse.comparison.remedy import (
     remedy_words,
     settings_words,
 )
-from px4fuse.ekf2_parameters import EV_POS, PARAMETERS
+from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.filter.heading import HeadingError
 from px4fuse.findings import causes as kinds
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital, length_words, number_words
@@ -33,13 +37,12 @@ TOLD_BY: Mapping[str, frozenset[str]] = {
     kinds.CLOCK: frozenset(("source_clock_offset", "ekf2_ev_delay_wrong")),
     kinds.FRAME: frozenset(("source_frame_turned", "ekf2_heading_wrong")),
     kinds.GATE: frozenset(("ekf2_gate_small",)),
+    kinds.ACCELEROMETER: frozenset(("accelerometer_bias",)),
 }
 OPTIONS = {SIGMA_Z: "--sigma-z", SIGMA_A: "--sigma-a", CLOCK: "--clock-offset"}
 UNITS = {SIGMA_A: "m/s²", SIGMA_Z: "m"}
 # What a change of a kind is there for; else to bring the mean NIS nearer to 1
 HELPS = {kinds.CLOCK: delay_helps, kinds.GATE: rejects_less}
-# What a change of another parameter needs along with it
-ALONG = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode))
 
 
 def kind_of(analysis: Analysis, cause: Intervention | None) -> str:
@@ -49,7 +52,8 @@ def kind_of(analysis: Analysis, cause: Intervention | None) -> str:
     aid = aid_of(analysis)
     of = {
         OUTLIERS: kinds.OUTLIERS, CLOCK: kinds.CLOCK, aid.delay: kinds.CLOCK, TURN: kinds.FRAME,
-        SIGMA_Z: kinds.NOISE, aid.noise: kinds.NOISE, aid.gate: kinds.GATE,
+        FORWARD: kinds.ACCELEROMETER, SIGMA_Z: kinds.NOISE, aid.noise: kinds.NOISE,
+        aid.gate: kinds.GATE,
     }  # fmt: skip
     return next((kind for name, kind in of.items() if name in cause.change), kinds.PROCESS)
 
@@ -83,13 +87,21 @@ def share_words(cause: Intervention) -> str:
     return f"{cause.explains:.0%}" if cause.explains > 0.0 else "nothing"
 
 
-def cure_words(cause: Intervention) -> str:
+def cure_words(analysis: Analysis, cause: Intervention) -> str:
     """What to do about a cause."""
     parts, change = [], dict(cause.change)
     if change.pop(OUTLIERS, None):
         parts.append("remove the outliers (line of sight, anchor survey), raise no noise")
+    if change.pop(FORWARD, None) is not None:
+        parts.append("calibrate the accelerometer and the level horizon")
+        change.pop(RIGHT)
     if turn_deg := change.pop(TURN, None):
-        parts.append(f"turn the positions by {turn_deg:+.0f}° before they are sent")
+        # GNSS knows north
+        parts.append(
+            f"calibrate the magnetometer, away from metal and motors ({turn_deg:+.0f}°)"
+            if analysis.source.origin.is_gnss
+            else f"turn the positions by {turn_deg:+.0f}° before they are sent"
+        )
     typed = [f"{option} {change.pop(name):g}" for name, option in OPTIONS.items() if name in change]
     if change:
         parts.append(f"set {settings_words(change)}")
@@ -113,7 +125,7 @@ def effect_words(cause: Intervention) -> str:
 def ekf2_cure_words(analysis: Analysis, cause: Intervention) -> str:
     """What to do about a cause of EKF2's, with what a parameter would do to all of the flight."""
     if not cause.change.keys() <= PARAMETERS.keys():
-        return cure_words(cause)
+        return cure_words(analysis, cause)
     words, _ = remedy_words(
         analysis.ekf2_model, cause.change, HELPS.get(kind_of(analysis, cause), noise_helps),
         otherwise=f"{capital(reason_words(analysis, cause))}.",
@@ -130,11 +142,18 @@ def _one(analysis: Analysis, cause: Intervention, name: str) -> str:
         case "clock_offset_s":
             missing_s = value - (settings.clock_offset_s if cause.filter == "kf" else 0.0)
             return f"the stamps are {abs(missing_s):.2g} s {'late' if missing_s < 0 else 'early'}"
+        case "bias_forward_m_s2":
+            right = cause.change[RIGHT]
+            return f"the accelerometer reads {value:+.2f} m/s² too much forward, {right:+.2f} right"
         case "turned_deg":
-            return f"the positions are turned by {-value:+.0f}°"
+            drifts = isinstance(analysis.heading, HeadingError) and analysis.heading.drifts
+            what, turn_deg = "the positions are turned", -value
+            if analysis.source.origin.is_gnss:
+                what, turn_deg = "EKF2's heading is off", value
+            return f"{what} by {turn_deg:+.0f}°{' on average' * drifts}"
         case "sigma_a_m_s2" | "sigma_z_m":
             label = name[:7].upper()
             return f"{label} is {getattr(settings, name):g} instead of {value:.2g} {UNITS[name]}"
     assert not isinstance(analysis.ekf2_model, Unavailable)  # it was replayed
     flown, unit = analysis.ekf2_model.inputs.settings[name], PARAMETERS[name].unit
-    return f"{name} is {flown:g} instead of {value:.3g} {unit}".rstrip()
+    return f"{name} is {flown:.4g} instead of {value:.3g} {unit}".rstrip()

@@ -18,10 +18,15 @@ IN_EKF2_FRAME = "estimator_visual_odometry_aligned"
 READ = "Read 'north' as the source's x axis"
 FUSE_YAW = "EKF2 fuse the source's yaw (EKF2_EV_CTRL bit 3; EKF2_AID_MASK bit 4 before v1.14)."
 
-
 OUTDOORS = (
     "Calibrate the magnetometer away from metal and motors, and look at the age of a fix "
     f"({GNSS_POS.delay}): a wrong one turns the heading."
+)
+
+
+CAUSES_OF_DRIFT = (
+    "A magnetometer indoors does this, or odometry whose own heading drifts.",
+    "A magnetometer near currents or steel does this.",
 )
 
 
@@ -70,9 +75,9 @@ def turned(analysis: Analysis, heading: HeadingError) -> Found:
     if analysis.source.origin.is_gnss:
         remedy = OUTDOORS
     if heading.drifts:
-        yield _drifting(name, heading, remedy)
+        yield _drifting(name, heading, remedy, gnss=analysis.source.origin.is_gnss)
         return
-    if abs(turn) < max(HEADING_SIGMAS * sigma, HEADING_ERROR_DEG):
+    if abs(turn) < max(HEADING_SIGMAS * sigma, HEADING_ERROR_DEG) or _is_a_bias(analysis):
         return
     severity: Severity = "error" if abs(turn) >= HEADING_ERROR_LARGE_DEG else "warning"
     stated = f"turned by {turn:+.0f}° ± {1.96 * sigma:.0f}° (clockwise seen from above) against"
@@ -102,7 +107,15 @@ def turned(analysis: Analysis, heading: HeadingError) -> Found:
     yield finding(severity, *found, {"turn_deg": turn, "sigma_deg": sigma})
 
 
-def _drifting(source: str, heading: HeadingError, remedy: str) -> Finding:
+def _is_a_bias(analysis: Analysis) -> bool:
+    """Whether a bias of the accelerometer, which turns with the nose, explains it as well."""
+    found = analysis.explained
+    if isinstance(found, Unavailable) or analysis.source.orientation is not None:
+        return False
+    return abs(found.turn.value) < HEADING_SIGMAS * found.turn.sigma
+
+
+def _drifting(source: str, heading: HeadingError, remedy: str, *, gnss: bool) -> Finding:
     first, last = heading.ends
     change = last.heading_error_deg - first.heading_error_deg
     by = {"orientation": "the source's own orientation", "positions": "the positions and the IMU"}
@@ -113,7 +126,7 @@ def _drifting(source: str, heading: HeadingError, remedy: str) -> Finding:
         f"{first.heading_error_deg:+.0f}° from {first.start_s:.0f} to {first.end_s:.0f} s and at "
         f"{last.heading_error_deg:+.0f}° from {last.start_s:.0f} to {last.end_s:.0f} s",
         f" (clockwise seen from above, by {by[heading.by]}): no constant turn of the positions "
-        "fixes that. A magnetometer indoors does this, or odometry whose own heading drifts.",
+        f"fixes that. {CAUSES_OF_DRIFT[gnss]}",
         f"{remedy[0].upper()}{remedy[1:]}",
         {
             "from_deg": first.heading_error_deg,

@@ -78,11 +78,14 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
         one for one in findings
         if one.caused_by is None and one.severity != "info" and one.id not in known
     ]  # fmt: skip
+    explained = bool(shapes) or any(
+        one.id == "errors_larger_than_claimed" and one.caused_by for one in findings
+    )
     sentences = [
         _verdict(
             analysis,
-            _judged(analysis, "kf", since, bool(shapes)),
-            _judged(analysis, "ekf2", since, bool(shapes)),
+            _judged(analysis, "kf", since, explained),
+            _judged(analysis, "ekf2", since, explained),
         ),
         *(closer := tuple(_closer(analysis, since))),
         *(_told(analysis, one) for one in causes if one.id not in EFFECTS),

@@ -175,7 +175,7 @@ def _remedy(
     if owner == "ekf2":
         return ekf2_cure_words(analysis, cause)
     if not cause.change.keys() <= OF_SETTINGS:
-        return cure_words(cause)
+        return cure_words(analysis, cause)
     bounded = tuned is not None and tuned.sigma_z.value is None and SIGMA_Z in cause.change
     values = {OPTIONS[name]: value for name, value in cause.change.items()}
     if not bounded:

@@ -39,17 +39,17 @@ EFFECTS: Mapping[str, frozenset[str]] = {
 # What each panel shows; the cover shows that there is something
 SHOWS: Mapping[str, tuple[str, ...]] = {
     "clock": ("clock-offset", "clock-drift", "clock-jump", "smoothed"),
-    "innovations": ("nlos", "dropout", "decimate", "r-scale", "jump", "smoothed", "accel-bias",
-                    "vibration", "ekf2-noise", "ekf2-gate", "ekf2-off"),
-    "map": ("yaw", "scale", "jump", "no-motion", "open-end"),
+    "innovations": ("nlos", "dropout", "decimate", "r-scale", "jump", "smoothed", "slow-error",
+                    "accel-bias", "vibration", "ekf2-noise", "ekf2-gate", "ekf2-off"),
+    "map": ("yaw", "heading", "scale", "jump", "no-motion", "open-end"),
     "parameters": ("decimate", "r-scale", "imu-rate", "no-vvo", "ekf2-noise", "ekf2-delay",
                    "ekf2-gate", "ekf2-off"),
     "sigma": ("dropout", "imu-dropout", "decimate", "vibration", "ekf2-noise"),
     "position along the aisle": ("dropout", "jump", "no-motion"),
     "velocity": ("imu-dropout", "accel-bias", "vibration", "imu-rate", "no-motion"),
     "why EKF2 differs": ("ekf2-delay", "ekf2-gate", "ekf2-off"),
-    "error to truth": ("clock-offset", "yaw", "scale", "jump", "smoothed", "accel-bias",
-                       "ekf2-delay"),
+    "error to truth": ("clock-offset", "yaw", "heading", "slow-error", "scale", "jump", "smoothed",
+                       "accel-bias", "ekf2-delay"),
     "loop": ("jump", "open-end"),
 }  # fmt: skip
 # What needs no measurement, so that it counts only as far as the size is right
@@ -271,6 +271,10 @@ def cures(wrong: Wrong, truth: FormTruth) -> tuple[Cure, ...]:
         ("jump", "--end", before, 1.0),
         ("smoothed", "switch the smoothing off", ANY, 1.0),
         ("smoothed", "--clock-offset", back, 1.0 / 3.0),
+        ("slow-error", "line of sight and link", ANY, 1.0),
+        ("slow-error", "report the true variance", ANY, 0.5),
+        ("heading", "calibrate the compass", ANY, 1.0),
+        ("heading", "--position-yaw", back, 0.5),
         ("accel-bias", "calibrate the accelerometer", ANY, 1.0),
         ("vibration", "balance the propellers", ANY, 1.0),
         ("vibration", "--sigma-a", ANY, 0.5),

@@ -259,9 +259,7 @@ def project(
     return north * EARTH_RADIUS_M, east * EARTH_RADIUS_M
 
 
-def unproject(
-    north_m: Array, east_m: Array, origin: tuple[float, float]
-) -> tuple[Array, Array]:
+def unproject(north_m: Array, east_m: Array, origin: tuple[float, float]) -> tuple[Array, Array]:
     """Latitude and longitude (degrees) of what :func:`project` gives.
 
     Source: PX4 ``MapProjection::reproject``, src/lib/geo/geo.cpp (Snyder 1987, equation 20-14).

@@ -73,17 +73,19 @@ def parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]
     aid = scenario.aid
     known = settings_in_force({}, aid)
     delay_ms = known[aid.delay] if mistakes.ekf2_delay_s is None else 1e3 * mistakes.ekf2_delay_s
-    of_aid = (
-        {GNSS_VEL.noise: scenario.sigma_gnss_m_s} if aid == GNSS_POS else {aid.noise_mode: 1}
+    of_aid = {GNSS_VEL.noise: scenario.sigma_gnss_m_s} if aid == GNSS_POS else {aid.noise_mode: 1}
+    return (
+        known
+        | of_aid
+        | {
+            aid.noise: mistakes.ekf2_noise_m or sensors.reported_sigma_m(scenario, mistakes),
+            aid.gate: mistakes.ekf2_gate,
+            aid.delay: delay_ms,
+            # a source that is slow to arrive has been allowed for
+            "EKF2_DELAY_MAX": max(known["EKF2_DELAY_MAX"], 100.0 + 1e3 * mistakes.clock_jump_s),
+            "EKF2_PREDICT_US": PREDICT_US,
+        }
     )
-    return known | of_aid | {
-        aid.noise: mistakes.ekf2_noise_m or sensors.reported_sigma_m(scenario, mistakes),
-        aid.gate: mistakes.ekf2_gate,
-        aid.delay: delay_ms,
-        # a source that is slow to arrive has been allowed for
-        "EKF2_DELAY_MAX": max(known["EKF2_DELAY_MAX"], 100.0 + 1e3 * mistakes.clock_jump_s),
-        "EKF2_PREDICT_US": PREDICT_US,
-    }
 
 
 def fly(

@@ -127,9 +127,7 @@ def _states(done: Run, track: TopicTrack) -> Topic:
     )
 
 
-def _aid_sources(
-    inputs: Inputs, done: Run, track: TopicTrack, rate_hz: float
-) -> tuple[Topic, ...]:
+def _aid_sources(inputs: Inputs, done: Run, track: TopicTrack, rate_hz: float) -> tuple[Topic, ...]:
     """estimator_aid_src_*: a message for every sample that came in time."""
     events, run, aid = done.events[0], done, inputs.aid
     seen = np.flatnonzero(events.usable & (events.end < len(track.time_us) - track.lag))
@@ -139,6 +137,7 @@ def _aid_sources(
     later_us = track.time_us[rows] + _horizon_us(track, rows) - taken_us
     shown = sensors.stamps(taken_us, later_us)
     measured = received.position_m[sample, :2]
+    north, east = measured.T
     innovation, variance = run.innovation_m[seen, 0], run.variance_m2[seen, 0]
     noise = run.noise_m2[seen, 0]
     idle = np.isnan(innovation[:, :1])
@@ -148,25 +147,36 @@ def _aid_sources(
     used = np.where(run.fused[seen, 0] | run.reset[seen, 0], track.time_us[rows], -1)
     last = np.maximum.accumulate(used)
     last_us = np.where(last >= 0, sensors.START_US + last, 0).astype(np.uint64)
+    gnss = received.velocity_m_s is not None
     position = _aid_source(
-        aid, inputs.settings, shown | {"time_last_fuse": last_us}, innovation, variance, noise
+        aid,
+        inputs.settings,
+        {
+            **shown,
+            "time_last_fuse": last_us,
+            "observation": np.stack(unproject(north, east, sensors.HOME[:2]), axis=1)
+            if gnss
+            else measured.astype(np.float32),
+            "innovation_rejected": run.rejected[seen, 0],
+            "fused": run.fused[seen, 0],
+        },
+        innovation,
+        variance,
+        noise,
     )
-    position.fields["innovation_rejected"] = run.rejected[seen, 0]
-    position.fields["fused"] = run.fused[seen, 0]
-    if received.velocity_m_s is None:
-        position.fields["observation"] = measured.astype(np.float32)
+    if received.velocity_m_s is None or received.velocity_variance_m2_s2 is None:
         return (position,)
-    position.fields["observation"] = np.stack(unproject(*measured.T, sensors.HOME[:2]), axis=1)
     moving, spread = run.velocity_innovation_m_s[seen, 0], run.velocity_variance_m2_s2[seen, 0]
-    assert received.velocity_variance_m2_s2 is not None
     stated = received.velocity_variance_m2_s2[sample]
     speed_noise = VERTICAL_SCALE * np.maximum(stated, inputs.settings[GNSS_VEL.noise] ** 2)
-    velocity = _aid_source(GNSS_VEL, inputs.settings, shown, moving, spread, speed_noise)
-    outside = (velocity.fields["test_ratio"] > 1.0).any(axis=1)
-    velocity.fields["innovation_rejected"] = outside
-    velocity.fields["fused"] = ~outside & np.isfinite(moving).all(axis=1)
-    velocity.fields["observation"] = received.velocity_m_s[sample].astype(np.float32)
-    return position, velocity
+    outside = (moving**2 > inputs.settings[GNSS_VEL.gate] ** 2 * spread).any(axis=1)
+    decisions = {
+        "observation": received.velocity_m_s[sample].astype(np.float32),
+        "innovation_rejected": outside,
+        "fused": ~outside & np.isfinite(moving).all(axis=1),
+    }
+    settings = inputs.settings
+    return position, _aid_source(GNSS_VEL, settings, shown | decisions, moving, spread, speed_noise)
 
 
 def _aid_source(

@@ -34,8 +34,9 @@ class Mistakes:
     :data:`MISTAKES` says what each is. Besides: outliers come in bursts, each in one horizontal
     direction, and ``nlos_size_m`` is their mean size. A drop-out without a time lies around the
     middle, a jump at two thirds; a wrong heading is wrong from the start. A rate of 0 leaves the
-    rate as it is, an EKF2 noise of 0 what the source reports, an EKF2 delay of None the right one. ``r_scale`` is a factor on the variance. A yaw is about the start, clockwise
-    seen from above. ``vibration_m_s2`` is the standard deviation of the noise's mean over 0.1 s.
+    rate as it is, an EKF2 noise of 0 what the source reports, an EKF2 delay of None the right one.
+    ``r_scale`` is a factor on the variance. A yaw is about the start, clockwise seen from above.
+    ``vibration_m_s2`` is the standard deviation of the noise's mean over 0.1 s.
     """
 
     clock_offset_s: float = 0.0
@@ -289,7 +290,8 @@ MISTAKES: Mapping[str, Mistake] = MappingProxyType({
     "ekf2-gate": Mistake(
         (Argument("ekf2_gate", "SD", NUMBER, 1.0, 1000.0),),
         1.0,
-        "EKF2_EVP_GATE (EKF2_GPS_P_GATE) is this: samples further off than so many √S are rejected.",
+        "EKF2_EVP_GATE (EKF2_GPS_P_GATE) is this: samples further off than so many √S are "
+        "rejected.",
         "EKF2 rejects good samples, loses its track and resets to a sample now and then.",
         of_ekf2=True,
     ),

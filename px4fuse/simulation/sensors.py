@@ -47,7 +47,8 @@ POSE_FRAME_NED = 1  # msg/VehicleOdometry.msg
 
 # Streams of random numbers: a mistake in one sensor leaves the others' noise as it was
 Stream = IntEnum(
-    "Stream", "WANDER BIAS IMU ATTITUDE TIMING SOURCE DRIFT NLOS VIBRATION HEIGHT REST SLOW FIX_VELOCITY",
+    "Stream",
+    "WANDER BIAS IMU ATTITUDE TIMING SOURCE DRIFT NLOS VIBRATION HEIGHT REST SLOW FIX_VELOCITY",
     start=0,
 )
 
@@ -177,7 +178,7 @@ def _attitude_topic(
 
 
 def attitude_error(scenario: Scenario, mistakes: Mistakes, time_s: Array) -> Rotation:
-    """Error of the logged attitude, a rotation about north, east and down; small but for heading."""
+    """Error of the logged attitude, a rotation about north, east and down."""
     tilt, yaw = np.radians([scenario.tilt_error_deg, scenario.yaw_error_deg])
     rng = stream(scenario, Stream.ATTITUDE)
     rms = np.array([tilt, tilt, yaw])
@@ -287,9 +288,7 @@ def reported_sigma_m(scenario: Scenario, mistakes: Mistakes) -> float:
     return max(scenario.source_sigma_m, 0.01) * float(np.sqrt(mistakes.r_scale))
 
 
-def slow_error(
-    scenario: Scenario, mistakes: Mistakes, count: int, interval_s: float
-) -> Array:
+def slow_error(scenario: Scenario, mistakes: Mistakes, count: int, interval_s: float) -> Array:
     """A first-order Gauss-Markov process on each axis, shape (n, 3)."""
     noise = stream(scenario, Stream.SLOW).standard_normal((count, 3)) * mistakes.slow_error_m
     keep = np.exp(-interval_s / mistakes.slow_error_s)
