@@ -219,7 +219,7 @@ def test_samples_with_older_stamps_than_the_last_are_not_taken() -> None:
     taken = topics["estimator_aid_src_ev_pos"]["timestamp_sample"].astype(np.int64)
     assert np.any(np.diff(sent) < 0)
     assert np.all(np.diff(taken) > 0)
-    rows = ekf2._vision(simulation.positions.topic)
+    rows = ekf2._received(simulation.positions)
     assert len(rows.stamp_s) < len(sent)
     assert np.all(np.diff(rows.stamp_s) > 0)
 

@@ -24,7 +24,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings.hidden_errors import hidden_errors
 from px4fuse.findings.model import Found, Severity, error, finding, lowered
-from px4fuse.findings.source_positions import MOTION_RANGE_M, motion_range_m
+from px4fuse.findings.source_positions import hardly_moved
 from px4fuse.flight import Unavailable, sample_rate
 from px4fuse.plain import factor_words
 
@@ -96,7 +96,7 @@ def settings_off(analysis: Analysis) -> Found:
     settings = analysis.settings
     both = [off_by("--sigma-z", settings.sigma_z_m, tuned.sigma_z)]
     # without motion the acceleration's noise is hardly seen
-    if motion_range_m(analysis) >= MOTION_RANGE_M:
+    if not hardly_moved(analysis):
         both.append(off_by("--sigma-a", settings.sigma_a_m_s2, tuned.filter_sigma_a))
     off = sorted(filter(None, both), key=lambda each: -each.size)
     # where a source may drift, or the truth shows it, innovations tell too little noise alone, and

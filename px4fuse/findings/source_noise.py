@@ -16,7 +16,7 @@ from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.signals import within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, tune
 from px4fuse.findings.model import Found, error, info, warning
-from px4fuse.findings.source_positions import LAG_NATS, MOTION_RANGE_M, motion_range_m
+from px4fuse.findings.source_positions import LAG_NATS, hardly_moved
 from px4fuse.flight import POSITION_COLUMNS, Unavailable
 
 COLOURED_NATS = 8.0  # a likelihood ratio of 3,000 for two more numbers; clean flights have 0
@@ -73,7 +73,7 @@ def _in_view(analysis: Analysis) -> str:
 
 def repeats(analysis: Analysis) -> Found:
     """Positions that are the one before, sent again, while the vehicle moves."""
-    if motion_range_m(analysis) < MOTION_RANGE_M:
+    if hardly_moved(analysis):
         return
     sent = within(analysis.source.samples, analysis.segment)[POSITION_COLUMNS].dropna().to_numpy()
     again = np.all(np.diff(sent, axis=0) == 0.0, axis=1)

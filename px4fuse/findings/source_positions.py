@@ -27,6 +27,8 @@ from px4fuse.flight import POSITION_COLUMNS, POSITION_VARIANCE_COLUMNS, Unavaila
 from px4fuse.plain import factor_words
 
 MOTION_RANGE_M = 0.5  # 5 to 95 %; a hovering drone with 0.1 m UWB stays below
+NOISE_RANGE = 1.25 * 3.29  # of white noise's σ from 5 to 95 %, with a quarter for chance
+SECOND_DIFFERENCE = 6.0**0.5 / 1.4826  # their median size over σ
 GAIN_NATS = 12.0  # a likelihood ratio of 160,000; clean flights have 0 to 2
 LAG_NATS = 4.0  # earlier stamps e⁴ times as likely; slow errors that do not lag have 0 to 0.1
 LAG_S = 0.05  # at 1 m/s half of a good UWB's noise
@@ -229,10 +231,20 @@ def motion_range_m(comparison: Comparison) -> float:
     return float(np.max(high - low))
 
 
+def hardly_moved(comparison: Comparison) -> bool:
+    """Whether the extent of the positions may as well be their noise.
+
+    The noise is told by second differences, which know no steady motion.
+    """
+    inside = within(comparison.source.samples, comparison.segment)[POSITION_COLUMNS[:2]].dropna()
+    noise_m = np.median(np.abs(np.diff(inside.to_numpy(), 2, axis=0)), axis=0) / SECOND_DIFFERENCE
+    return motion_range_m(comparison) < max(MOTION_RANGE_M, NOISE_RANGE * float(noise_m.max()))
+
+
 def motion(analysis: Analysis) -> Found:
     """The vehicle hardly moved: nothing about dynamics can be identified."""
     extent = motion_range_m(analysis)
-    if extent < MOTION_RANGE_M:
+    if hardly_moved(analysis):
         yield warning(
             "no_motion",
             f"The vehicle moved only {extent:.2f} m horizontally",

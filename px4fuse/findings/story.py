@@ -28,7 +28,7 @@ from px4fuse.findings.causes import CLOCK, FRAME, SETTINGS, VARIANCES
 from px4fuse.findings.hidden_errors import hidden_error
 from px4fuse.findings.model import Finding
 from px4fuse.findings.since import TOLD_BY, effect_words, kind_of, since_words
-from px4fuse.findings.source_positions import MOTION_RANGE_M, motion_range_m
+from px4fuse.findings.source_positions import hardly_moved
 from px4fuse.flight import Unavailable
 from px4fuse.loop.loop import Loop
 from px4fuse.plain import capital, excess_words, length_words
@@ -129,7 +129,7 @@ def _flown(analysis: Analysis) -> str:
     """What was not much of a flight, before a sentence about it."""
     if analysis.flight.airborne == ():
         return "the vehicle never took off: "
-    return "the vehicle hovered: " if motion_range_m(analysis) < MOTION_RANGE_M else ""
+    return "the vehicle hovered: " if hardly_moved(analysis) else ""
 
 
 def _verb(result: AxisComparison, owner: FilterName, verb: str = "is ") -> str:

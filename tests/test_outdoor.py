@@ -1,0 +1,212 @@
+"""Outdoor flights: simulated GNSS against the truth, its EKF2, and what is found in them."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
+
+from px4fuse.analysis import Analysis, explain
+from px4fuse.cli import cli
+from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.interventions import TURN, cause_of
+from px4fuse.comparison.model import FilterSummary
+from px4fuse.comparison.remedy import aid_of
+from px4fuse.ekf2.model import Model
+from px4fuse.ekf2.whatif import WhatIf, what_if
+from px4fuse.errors import SettingsError
+from px4fuse.filter.consistency import nis_band
+from px4fuse.filter.settings import Settings
+from px4fuse.findings import find
+from px4fuse.findings.story import story
+from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Truth, Unavailable
+from px4fuse.readers import read_log
+from px4fuse.readers.px4_positions import project, unproject
+from px4fuse.simulation import sensors
+from px4fuse.simulation.flights import simulate, simulate_flight, to_ulog
+from px4fuse.simulation.mistakes import Mistakes, parse
+from px4fuse.simulation.scenario import Scenario, scenario_of
+
+OUTDOOR = scenario_of("outdoor", seed=5)
+
+
+@cache
+def flown(*texts: str, seed: int = 5) -> Analysis:
+    flight = simulate_flight(scenario_of("outdoor", seed=seed), parse(texts))
+    return explain(compare(flight, Settings(0.27, 0.4)))
+
+
+def roots(analysis: Analysis) -> list[str]:
+    """Findings that nothing else brought about."""
+    return [one.id for one in find(analysis) if one.severity != "info" and not one.caused_by]
+
+
+@given(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4), st.floats(-75.0, 75.0), st.floats(-180.0, 180.0))
+def test_what_is_projected_comes_back(
+    north_m: float, east_m: float, latitude_deg: float, longitude_deg: float
+) -> None:
+    origin = latitude_deg, longitude_deg
+    there = unproject(np.array([north_m]), np.array([east_m]), origin)
+    assert np.concatenate(project(*there, origin)) == pytest.approx([north_m, east_m], abs=1e-5)
+
+
+def test_one_degree_of_latitude_is_as_long_as_on_a_sphere() -> None:
+    latitude, longitude = unproject(np.array([111_194.93]), np.array([0.0]), (47.0, 8.0))
+    assert (latitude[0], longitude[0]) == pytest.approx((48.0, 8.0), abs=1e-6)
+
+
+def test_fixes_are_the_truth_with_the_stated_noise_at_the_age_that_ekf2_takes(
+    tmp_path: Path,
+) -> None:
+    simulation = simulate(scenario_of("outdoor", seed=2, passes=6))
+    log = tmp_path / "outdoor.ulg"
+    log.write_bytes(to_ulog(simulation))
+    flight = read_log(log)
+    track, truth = flight.positions[0], flight.truth
+    assert (track.name, track.origin.is_gnss) == ("vehicle_gps_position", True)
+    assert track.rate_hz == pytest.approx(5.0, rel=0.01)
+    assert isinstance(truth, Truth)
+    assert track.velocity is not None
+    for measured, columns, sigma in (
+        (track.samples, POSITION_COLUMNS, 0.4),
+        (track.velocity, VELOCITY_COLUMNS, 0.3),
+    ):
+        for column, times in zip(columns, (1.0, 1.0, 1.5), strict=True):
+            true = np.interp(measured.index, truth.samples.index, truth.samples[column])
+            error = measured[column].to_numpy() - true
+            assert error.std() == pytest.approx(times * sigma, rel=0.06)
+            assert error.mean() == pytest.approx(0.0, abs=4 * times * sigma / len(error) ** 0.5)
+    stated = track.samples[["north_m2", "east_m2", "down_m2"]].iloc[0]
+    assert stated.to_numpy() == pytest.approx([0.16, 0.16, 0.36], rel=1e-5)
+
+
+@pytest.mark.parametrize("seed", [5, 8])
+def test_a_clean_flight_is_consistent_replayed_and_has_nothing_to_put_right(seed: int) -> None:
+    analysis = flown(seed=seed)
+    assert roots(analysis) == []
+    assert not isinstance(analysis.aids, Unavailable)
+    for name, axes in {"gnss_pos": 2, "gnss_vel": 3}.items():
+        aid = analysis.aids[name]
+        assert (aid.verdict, len(aid.axes)) == ("consistent", axes)
+        for axis in aid.axes.values():
+            # what the model lacks costs GNSS velocity a little
+            low, high = nis_band(axis.samples)
+            assert low < axis.nis_mean < 1.05 * high
+    model = analysis.ekf2_model
+    assert isinstance(model, Model)
+    assert aid_of(analysis).name == model.inputs.aid.name == "gnss_pos"
+    assert model.agreement.good
+    for owner in ("kf", "ekf2"):
+        statement = analysis.axes["north"].filters[owner]
+        assert isinstance(statement, FilterSummary)
+        assert not isinstance(statement.truth, Unavailable)
+        assert statement.truth.position_rmse_m < 0.25
+        assert 0.5 < (statement.truth.nees_position_mean or 0.0) < 2.5
+
+
+@pytest.mark.parametrize(
+    ("mistake", "root"),
+    [
+        ("heading=20", "ekf2_heading_wrong"),
+        ("heading=-12", "ekf2_heading_wrong"),
+        ("heading=25,40", "ekf2_heading_wrong"),
+        ("clock-offset=0.25", "source_clock_offset"),
+        ("ekf2-delay=0", "source_clock_offset"),
+        ("jump=3", "source_jumps"),
+        ("nlos=5%", "source_outliers"),
+        ("dropout=15", "source_gap"),
+        ("smoothed=0.5", "source_smoothed"),
+        ("r-scale=0.1", "ekf2_variance_understated"),
+        ("ekf2-gate=1", "ekf2_gate_small"),
+        ("accel-bias=0.5", "accelerometer_bias"),
+        ("slow-error=0.5,30", "errors_larger_than_claimed"),
+        ("slow-error=0.8,10", "source_coloured"),
+        ("imu-dropout=2", "imu_gap"),
+        ("no-motion", "no_motion"),
+    ],
+)
+def test_the_first_finding_names_the_mistake(mistake: str, root: str) -> None:
+    assert roots(flown(mistake))[0] == root
+
+
+@pytest.mark.parametrize(
+    ("mistake", "of", "name", "value", "within"),
+    [
+        ("heading=20", "nees", TURN, 20.0, 3.0),
+        ("clock-offset=-0.1", "nees", "EKF2_GPS_DELAY", 10.0, 60.0),
+        ("r-scale=0.1", "nis", "EKF2_GPS_P_NOISE", 0.4, 0.02),
+    ],
+)
+def test_the_cause_of_ekf2_is_what_was_made_wrong(
+    mistake: str, of: Any, name: str, value: float, within: float
+) -> None:
+    analysis = flown(mistake)
+    found = cause_of(analysis.causes, "ekf2", "aisle", of)
+    assert found is not None
+    assert found.change[name] == pytest.approx(value, abs=within)
+    assert found.brings_into_band
+    assert "since EKF2" in story(analysis, find(analysis))[0].split("; our filter")[0]
+
+
+def test_what_if_predicts_the_flight_with_the_other_delay() -> None:
+    wrong, right = (flown(*texts).ekf2_model for texts in (("ekf2-delay=0",), ()))
+    assert isinstance(wrong, Model)
+    assert isinstance(right, Model)
+    asked, other = what_if(wrong, [{"EKF2_GPS_DELAY": 110.0}]), what_if(right, [])
+    assert isinstance(asked, WhatIf)
+    assert isinstance(other, WhatIf)
+    (predicted,), true = asked.whatif, other.logged
+    assert predicted.nis_mean == pytest.approx(true.nis_mean, rel=0.1)
+    for one in (predicted, true, asked.logged):
+        assert not isinstance(one.position_rmse_to_truth_m, Unavailable)
+    assert predicted.position_rmse_to_truth_m == pytest.approx(
+        true.position_rmse_to_truth_m, rel=0.1
+    )
+    assert asked.logged.position_rmse_to_truth_m > 1.4 * true.position_rmse_to_truth_m
+
+
+def test_a_slow_error_has_its_size_and_its_time() -> None:
+    mistakes = Mistakes(slow_error_m=0.5, slow_error_s=4.0)
+    drawn = sensors.slow_error(OUTDOOR, mistakes, 100_000, 0.2)
+    assert drawn.std(axis=0) == pytest.approx(0.5, rel=0.05)
+    lag = int(4.0 / 0.2)
+    after = np.mean(drawn[:-lag] * drawn[lag:], axis=0) / np.var(drawn, axis=0)
+    assert after == pytest.approx(np.exp(-1.0), abs=0.05)
+    # it begins as it goes on
+    first = [sensors.slow_error(Scenario(seed=s), mistakes, 2, 0.2)[0] for s in range(400)]
+    assert np.std(first) == pytest.approx(0.5, rel=0.1)
+
+
+def test_a_compass_disturbed_in_flight_turns_the_heading_from_then_on() -> None:
+    time_s = np.array([0.0, 39.9, 43.0, 100.0])
+    clean = sensors.attitude_error(OUTDOOR, Mistakes(), time_s).as_rotvec()
+    wrong = sensors.attitude_error(OUTDOOR, parse(["heading=25,40"]), time_s).as_rotvec()
+    turned = np.degrees(wrong - clean)[:, 2]
+    assert turned == pytest.approx([0.0, 0.0, 25.0 * (1.0 - np.exp(-1.0)), 25.0], abs=0.01)
+
+
+def test_what_has_no_meaning_outdoors_is_refused() -> None:
+    for mistake in ("yaw=10", "scale=5", "no-vvo", "clock-jump", "open-end"):
+        with pytest.raises(SettingsError, match="requires --kind"):
+            simulate(OUTDOOR, parse([mistake]))
+
+
+def test_the_command_flies_as_is_usual_outdoors_and_takes_what_is_typed(tmp_path: Path) -> None:
+    log, arguments = tmp_path / "o.ulg", ["simulate", "--kind", "outdoor", "-o"]
+    done = CliRunner().invoke(cli, [*arguments, str(log), "--speed", "3"])
+    assert done.exit_code == 0, done.output
+    assert "outdoor, 3 laps of a square of 30 m at 3 m/s" in done.output
+    assert "GNSS, 0.4 m at 5 Hz" in done.output
+    roster = tmp_path / "r.csv"
+    roster.write_text("id,name\n1,A\n")
+    refused = CliRunner().invoke(
+        cli, [*arguments, str(tmp_path / "d"), "--assignment", str(roster)]
+    )
+    assert isinstance(refused.exception, SettingsError)
+    assert "--kind outdoor is for a single flight" in str(refused.exception)
