@@ -71,6 +71,7 @@ from px4fuse.origin import MOTION_CAPTURE, RECEIVED
 from px4fuse.readers import read_log
 from px4fuse.readers.mavlink_frames import read_frames
 from px4fuse.readers.mavlink_recording import _in_ned
+from px4fuse.readers.px4_positions import unproject
 
 FUZZ_CASES = int(os.environ.get("PX4FUSE_FUZZ_CASES", "300"))
 VARIANCE_COLUMNS = POSITION_VARIANCE_COLUMNS + VELOCITY_VARIANCE_COLUMNS
@@ -555,13 +556,89 @@ def test_the_version_is_read(read):
 
 
 def test_what_is_not_used_is_listed_with_the_reason(read):
-    recorder = add(Aisle().record(), 1.0, lambda t: message("GPS_RAW_INT", time_usec=us(t)))
+    recorder = add(Aisle().record(), 1.0, lambda t: message("GPS_INPUT", time_usec=us(t)))
     add(recorder, 2.0, lambda t: message("VICON_POSITION_ESTIMATE", usec=us(t)), COMPANION)
     found = {u.name: (u.count, u.reason) for u in read(recorder).unused}
     assert found == {
         "VICON_POSITION_ESTIMATE": (80, "PX4 does not read it"),
-        "GPS_RAW_INT": (40, "GPS is not an indoor position"),
+        "GPS_INPUT": (40, "a substitute GPS receiver"),
     }
+
+
+ORIGIN_DEG = (47.4, 8.5)
+
+
+def fix(boot_s: float, *, at_s: float | None = None, fix_type: int = 3, name: str = "GPS_RAW_INT"):
+    """What a receiver gives 0.11 s later; stamped by the boot clock unless ``at_s`` is given."""
+    north, east, down = Aisle().path(boot_s - 0.11)[0]
+    latitude, longitude = unproject(np.array([north]), np.array([east]), ORIGIN_DEG)
+    accuracy = {"h_acc": 300, "v_acc": 500} if name == "GPS_RAW_INT" else {}
+    return message(
+        name, time_usec=us(boot_s if at_s is None else at_s), fix_type=fix_type,
+        lat=round(latitude[0] * 1e7), lon=round(longitude[0] * 1e7), alt=round(4e5 - 1e3 * down),
+        eph=90, **accuracy,
+    )  # fmt: skip
+
+
+def global_state(boot_s: float):
+    north, east, down = Aisle().path(boot_s)[0]
+    latitude, longitude = unproject(np.array([north]), np.array([east]), ORIGIN_DEG)
+    return message(
+        "GLOBAL_POSITION_INT", time_boot_ms=ms(boot_s), lat=round(latitude[0] * 1e7),
+        lon=round(longitude[0] * 1e7), alt=round(4e5 - 1e3 * down),
+    )  # fmt: skip
+
+
+def outdoors(rate_hz: float = 5.0, *, origin: bool = True, knows: bool = True, **of_fix):
+    recorder = add(Aisle(uwb=None, state="LOCAL_POSITION_NED").record(), rate_hz,
+                   lambda t: fix(t, **of_fix))  # fmt: skip
+    if origin:
+        recorder.hear(unix(60.0), AUTOPILOT, message(
+            "GPS_GLOBAL_ORIGIN", latitude=474000000, longitude=85000000, altitude=400000,
+            time_usec=us(60.0),
+        ))  # fmt: skip
+    return add(recorder, 2.0, global_state) if knows else recorder
+
+
+@pytest.mark.parametrize("origin", [True, False])
+def test_gnss_is_a_position_about_the_autopilots_origin(read, origin):
+    flight = read(outdoors(origin=origin))
+    (track,) = flight.positions
+    assert (track.name, track.origin.by_gnss, track.origin.automatic) == ("GPS_RAW_INT", True, True)
+    assert track.age_s == pytest.approx(0.11)
+    true = np.array([Aisle().path(BOOT_S + t)[0] for t in track.samples.index])
+    assert track.samples[POSITION_COLUMNS].to_numpy() == pytest.approx(true, abs=0.02)
+    variance = track.samples[POSITION_VARIANCE_COLUMNS].iloc[0]
+    assert variance.to_numpy() == pytest.approx([0.09, 0.09, 0.25])
+    result = compare(flight, sigma_z_given=False)
+    assert result.source.name == "GPS_RAW_INT"
+    assert result.settings.sigma_z_m == 0.5  # EKF2_GPS_P_NOISE where nothing larger is stated
+
+
+def test_gnss_is_not_taken_by_itself_where_the_autopilot_does_not_know_where_it_is(read):
+    flight = read(outdoors(knows=False))
+    assert not flight.positions[0].origin.automatic
+    with pytest.raises(MissingDataError, match="`position_source` GPS_RAW_INT"):
+        compare(flight)
+
+
+def test_a_fix_that_is_sent_again_counts_once_and_one_without_3d_not_at_all(read):
+    again = read(add(outdoors(), 5.0, fix, seconds=39.9))
+    assert again.positions[0].rate_hz == pytest.approx(5.0, rel=0.02)
+    assert read(outdoors(fix_type=2)).positions == ()
+
+
+def test_a_receivers_own_clock_is_not_the_boot_clock(read):
+    state = "LOCAL_POSITION_NED"
+    recorder = add(Aisle(uwb=None, state=state).record(), 5.0, lambda t: fix(t, at_s=unix(t)))
+    (track,) = read(add(recorder, 2.0, global_state)).positions
+    true = np.array([Aisle().path(BOOT_S + t)[0] for t in track.samples.index])
+    assert track.samples[POSITION_COLUMNS].to_numpy() == pytest.approx(true, abs=0.03)
+
+
+def test_a_second_receiver_is_a_source_of_its_own(read):
+    recorder = add(outdoors(), 5.0, lambda t: fix(t, name="GPS2_RAW"))
+    assert [track.name for track in read(recorder).positions] == ["GPS_RAW_INT", "GPS2_RAW"]
 
 
 def test_an_empty_recording_of_heartbeats_lacks_everything_by_name(read):

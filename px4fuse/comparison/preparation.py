@@ -9,6 +9,7 @@ from msgspec import structs
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.projection import observation_variance
+from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS
 from px4fuse.errors import MissingDataError, SettingsError, did_you_mean
 from px4fuse.filter.settings import SIGMA_Z_RANGE_M, Settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, make_axes, within
@@ -106,8 +107,9 @@ def prepare(
         flight = replace(flight, truth=NOT_ITS_OWN_TRUTH)
     notes = (*flight.log.notes, *track.notes)
     if track.origin.by_gnss and not choices.get("sigma_z_given", True):
-        sigma_z_m = observation_variance(flight, track, lines[0], segment) ** 0.5
-        if sigma_z_m >= SIGMA_Z_RANGE_M[0]:  # not NaN
+        usual_m = PARAMETERS[GNSS_POS.noise].default
+        sigma_z_m = observation_variance(flight, track, lines[0], segment, usual_m) ** 0.5
+        if sigma_z_m >= SIGMA_Z_RANGE_M[0]:
             settings = replace(settings, sigma_z_m=float(f"{sigma_z_m:.3g}"))
     acceleration = lines[0].acceleration
     if settings.input == "imu" and isinstance(acceleration, Unavailable):
@@ -164,26 +166,25 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
 def no_source(flight: Flight) -> Unavailable:
     """Why no track of a flight is a position source by itself, and what would be one."""
     damaged = "the file is damaged, and " if flight.log.damage else ""
+    unused = next((track.name for track in flight.positions if not track.origin.automatic), "")
+    hint = (
+        f"Only GPS is in it, which EKF2 did not fuse: give `position_source` {unused} to use that"
+    )
     if flight.log.format.startswith("MAVLink"):
         return Unavailable(
             "position source",
             f"{damaged}no external position was sent to the autopilot in this "
             "recording (no VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP)",
-            "Give the positioning system's own file with `position`"
+            f"{f'{hint}, or g' if unused else 'G'}ive the positioning system's own file with "
+            "`position`"
             f"{', or the ULog' if flight.log.has_ulog else ''}.",
-        )
-    hint = "S"
-    if any(not track.origin.automatic for track in flight.positions):
-        hint = (
-            "Only GPS is in it, which EKF2 did not fuse: give `position_source` "
-            "vehicle_gps_position to use that, or s"
         )
     return Unavailable(
         "position source",
         f"{damaged}no external position in this log (no "
         "vehicle_visual_odometry, motion capture or EKF2 innovations of external vision)",
-        f"{hint}et SDLOG_PROFILE to 129 and send the UWB position to PX4 as "
-        "VISION_POSITION_ESTIMATE, or give the UWB's own file with `position`.",
+        f"{f'{hint}, or s' if unused else 'S'}et SDLOG_PROFILE to 129 and send the UWB position "
+        "to PX4 as VISION_POSITION_ESTIMATE, or give the UWB's own file with `position`.",
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from functools import partial
 
@@ -209,19 +210,26 @@ def _innovations_along(north: pd.DataFrame, east: pd.DataFrame, direction: Array
 
 
 def observation_variance(
-    flight: Flight, track: PositionTrack, axis: Axis, segment: Segment
+    flight: Flight,
+    track: PositionTrack,
+    axis: Axis,
+    segment: Segment,
+    usual_m: float = math.nan,
 ) -> float:
     """R (m²) that EKF2 used for the source where it does not log it, NaN if unknown.
+
+    ``usual_m`` is taken for EKF2's own noise where the parameter is not in the log.
 
     R = EKF2_EVP_NOISE², or the sender's variance if larger, unless EKF2_EV_NOISE_MD is 1
     (EKF2.cpp, ev_pos_control.cpp); of GNSS EKF2_GPS_P_NOISE², half as much again in σ for height,
     or the receiver's accuracy if larger (gps_control.cpp, gnss_height_control.cpp).
     """
     aid, parameters = track.origin.aid, flight.log.parameters
-    if aid is None or aid.noise not in parameters:
-        return float("nan")
+    noise_m = usual_m if aid is None else parameters.get(aid.noise, usual_m)
+    if aid is None or math.isnan(noise_m):
+        return math.nan
     scale = GNSS_HEIGHT_SCALE if aid == GNSS_POS and axis.name == "down" else 1.0
-    r = max(scale * parameters[aid.noise], EKF2_MIN_NOISE_M) ** 2
+    r = max(scale * noise_m, EKF2_MIN_NOISE_M) ** 2
     # what a file of its own reports is not what EKF2 was sent
     if parameters.get(aid.noise_mode) == 1.0 or track.alignment is not None:
         return r

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.ekf2_parameters import EV_POS, REPORTED, settings_in_force
+from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, REPORTED, settings_in_force
 from px4fuse.flight import (
     AXIS_NAMES,
     POSITION_VARIANCE_COLUMNS,
@@ -94,7 +94,9 @@ def read_mavlink(path: Path, system: int | None = None) -> Flight:
     imu = _read_imu(recording, remedies["imu"])
     attitude = _read_attitude(recording, remedies["attitude"])
     ekf2 = _read_ekf2(recording, parameters, autopilot, remedies, replay)
-    positions, missing_positions = read_positions(recording, mapped, remedies["position"])
+    positions, missing_positions = read_positions(
+        recording, mapped, remedies["position"], _gnss_delay_s(parameters, autopilot)
+    )
     truth = read_truth(recording, positions, remedies)
     airborne = _read_airborne(recording, remedies["landed"])
     in_flight = ends_in_flight(airborne, recording.duration_s)
@@ -121,6 +123,13 @@ def read_mavlink(path: Path, system: int | None = None) -> Flight:
             if (count := int(np.count_nonzero(frames.message_id == message_ids()[name])))
         ),
     )
+
+
+def _gnss_delay_s(parameters: Mapping[str, float], autopilot: str) -> float:
+    """By which EKF2 takes a fix to be older than its stamp; other autopilots do not tell."""
+    if autopilot != "PX4":
+        return 0.0
+    return 1e-3 * settings_in_force(parameters, GNSS_POS)[GNSS_POS.delay]
 
 
 def _read_imu(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:

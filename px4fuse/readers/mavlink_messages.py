@@ -245,6 +245,29 @@ POSITION_INPUTS = (
 )  # fmt: skip
 
 
+# What a GNSS receiver gave, as the autopilot passes it on; accuracies are extensions of MAVLink 2,
+# eph and epv are dilutions of precision
+GNSS_INPUTS = tuple(
+    Layout(
+        message,
+        {"latitude_deg": "lat", "longitude_deg": "lon", "altitude_m": "alt"}
+        | {"fix_type": "fix_type", "eph_m": "h_acc", "epv_m": "v_acc"},
+        scale={**_DEGREES, "altitude_m": 1e-3, "eph_m": 1e-3, "epv_m": 1e-3},
+    )
+    for message in ("GPS_RAW_INT", "GPS2_RAW")
+)
+ORIGIN = Layout(
+    "GPS_GLOBAL_ORIGIN",
+    {"latitude_deg": "latitude", "longitude_deg": "longitude", "altitude_m": "altitude"},
+    scale={**_DEGREES, "altitude_m": 1e-3},
+)
+GLOBAL_STATE = Layout(
+    "GLOBAL_POSITION_INT",
+    {"latitude_deg": "lat", "longitude_deg": "lon", "altitude_m": "alt"},
+    scale={**_DEGREES, "altitude_m": 1e-3},
+)
+
+
 @dataclass(frozen=True)
 class FrameOfReference:
     """A MAV_FRAME: which component is north (or forward), east (right) and down, and its sign.
@@ -286,7 +309,6 @@ UNUSED: Mapping[str, str] = {
     "VICON_POSITION_ESTIMATE": "PX4 does not read it",
     "GLOBAL_VISION_POSITION_ESTIMATE": "PX4 does not read it",
     "GPS_INPUT": "a substitute GPS receiver",
-    "GPS_RAW_INT": "GPS is not an indoor position",
     "DISTANCE_SENSOR": "a range, not a position",
     "OPTICAL_FLOW_RAD": "an angular rate, not a position",
 }

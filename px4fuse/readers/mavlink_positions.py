@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import pandas as pd
+from msgspec import structs
 
 from px4fuse.flight import (
     POSITION_COLUMNS,
@@ -19,29 +20,41 @@ from px4fuse.flight import (
     Unavailable,
     best_first,
 )
-from px4fuse.origin import with_orientation
+from px4fuse.origin import GNSS, with_orientation
+from px4fuse.readers.layouts import Layout
 from px4fuse.readers.mavlink_clocks import Mapped
 from px4fuse.readers.mavlink_messages import (
     FRAMES_OF_REFERENCE,
+    GLOBAL_STATE,
+    GNSS_INPUTS,
+    ORIGIN,
     POSITION_INPUTS,
+    STATES,
     TRUTH,
     PositionInput,
 )
-from px4fuse.readers.mavlink_recording import RECEIPT_CLOCK, Address, Recording
+from px4fuse.readers.mavlink_recording import BOOT_CLOCK, RECEIPT_CLOCK, Address, Recording
 from px4fuse.readers.mavlink_senders import senders_of
 from px4fuse.readers.parts import attitude_of, orientation_of
 from px4fuse.readers.px4_positions import (
     GLOBAL_COLUMNS,
+    GPS_3D_FIX,
     MIN_TRACK_SAMPLES,
     captured_truth,
     clean_positions,
     motion_capture,
     projected,
+    unproject,
 )
+
+# A boot clock's stamp is no further from its receipt
+OWN_CLOCK_S = 5.0
+# Of a global and a local position that tell the origin together, 5 cm at 1 m/s
+SAME_STATE_S = 0.05
 
 
 def read_positions(
-    recording: Recording, mapped: dict[Address, Mapped], remedy: str
+    recording: Recording, mapped: dict[Address, Mapped], remedy: str, delay_s: float
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
     """Every external position that was sent to the autopilot, the best first.
 
@@ -51,6 +64,8 @@ def read_positions(
         Clock of every sender.
     remedy : str
         What would have recorded one that is missing.
+    delay_s : float
+        By which the autopilot takes a fix to be older than its stamp.
     """
     found: list[PositionTrack | Unavailable] = []
     for message in dict.fromkeys(source.message for source in POSITION_INPUTS):
@@ -70,6 +85,7 @@ def read_positions(
                 source=message,
             )
         ]
+    found += [track for layout in GNSS_INPUTS if (track := _read_gnss(recording, layout, delay_s))]
     missing = tuple(part for part in found if isinstance(part, Unavailable))
     return best_first(part for part in found if isinstance(part, PositionTrack)), missing
 
@@ -127,6 +143,65 @@ def _read_track(
     )
 
 
+def _read_gnss(recording: Recording, layout: Layout, delay_s: float) -> PositionTrack | None:
+    """Fixes of a receiver, about the autopilot's own origin; None where there are none.
+
+    PX4 and ArduPilot stamp a fix with their boot clock, and send it again until the next comes.
+    It is what the autopilot's estimator follows where that knows where on the globe it is.
+    """
+    rows = recording.rows(layout.topic)
+    stamp_us = recording.frames.table(layout.topic, rows)["time_usec"]
+    rows = rows[np.diff(stamp_us, prepend=0) > 0]
+    boot_s = recording.frames.table(layout.topic, rows)["time_usec"] * 1e-6
+    receipt_s = recording.receipt_boot_s(rows)
+    if len(rows) and np.median(np.abs(receipt_s - boot_s)) > OWN_CLOCK_S:
+        boot_s = receipt_s  # UNIX time, or the recording has no boot clock
+    fixes = recording.read(layout, rows, boot_s - delay_s)
+    fixes = fixes[fixes["fix_type"] >= GPS_3D_FIX]
+    if len(fixes) < MIN_TRACK_SAMPLES:
+        return None
+    samples = projected(fixes, local_origin(recording))
+    accuracy = fixes[["eph_m", "eph_m", "epv_m"]].set_axis(POSITION_VARIANCE_COLUMNS, axis=1) ** 2
+    return PositionTrack(
+        name=layout.topic,
+        origin=structs.replace(
+            GNSS, automatic=bool(recording.read(GLOBAL_STATE)["latitude_deg"].any())
+        ),
+        description="GNSS position",
+        samples=clean_positions(samples.join(accuracy), POSITION_COLUMNS),
+        frame="NED",
+        clock=f"{BOOT_CLOCK}, less {1e3 * delay_s:g} ms",
+        topics=(layout.topic,),
+        log=recording.frames.name,
+        age_s=delay_s,
+    )
+
+
+def local_origin(recording: Recording) -> tuple[float, float, float] | None:
+    """The autopilot's origin on the globe (degrees, degrees, m), None where it does not tell.
+
+    As it is sent, or else by its global and its local position.
+    """
+    sent = recording.read(ORIGIN).dropna()
+    if len(sent):
+        latitude, longitude, altitude = sent[GLOBAL_COLUMNS].iloc[-1]
+        return float(latitude), float(longitude), float(altitude)
+    both = pd.merge_asof(
+        recording.read(GLOBAL_STATE), recording.read(STATES[-1])[POSITION_COLUMNS],
+        left_index=True, right_index=True, direction="nearest", tolerance=SAME_STATE_S,  # type: ignore[arg-type]
+    ).dropna()  # fmt: skip
+    both = both[both["latitude_deg"] != 0.0]
+    if both.empty:
+        return None
+    geo, local = both[GLOBAL_COLUMNS].to_numpy(), both[POSITION_COLUMNS].to_numpy()
+    places = [
+        np.concatenate([np.ravel(unproject(-north, -east, (at[0], at[1]))), [at[2] + down]])
+        for at, (north, east, down) in zip(geo, local, strict=True)
+    ]
+    latitude, longitude, altitude = np.median(places, axis=0)
+    return float(latitude), float(longitude), float(altitude)
+
+
 def read_truth(
     recording: Recording, positions: tuple[PositionTrack, ...], remedies: Mapping[str, str]
 ) -> Truth | Unavailable:
@@ -134,7 +209,7 @@ def read_truth(
 
     Simulation truth carries no usable clock (``HIL_STATE_QUATERNION.time_usec`` is 0 in PX4), so
     the time of receipt is taken, and no local position, so it is projected about its own first
-    sample, where the simulated vehicle was put.
+    sample, where the simulated vehicle was put, or about the autopilot's origin where GNSS is.
     """
     for layout in TRUTH:
         rows = recording.rows(layout.topic)
@@ -149,7 +224,8 @@ def read_truth(
             # not sent: a vehicle that never moves has no use for truth
             samples[VELOCITY_COLUMNS] = np.nan
         recording.came_from("truth", RECEIPT_CLOCK, layout.topic)
-        state = pd.concat([projected(samples, None), samples[VELOCITY_COLUMNS]], axis=1)
+        origin = local_origin(recording) if positions and positions[0].origin.is_gnss else None
+        state = pd.concat([projected(samples, origin), samples[VELOCITY_COLUMNS]], axis=1)
         return Truth(layout.topic, state[STATE_COLUMNS], attitude_of(samples))
     captured = motion_capture(positions, "ATT_POS_MOCAP")
     if captured is None:

@@ -273,10 +273,14 @@ def _table(
             head.append("v RMSE (m/s)")
             for row, rmse in zip(rows, np.sqrt((error**2).mean()), strict=True):
                 row.append(f"{rmse:.3f}")
+    smaller = ""
+    if nis[1] > 0.0:  # zero where the positions never change
+        smaller = (
+            f", and the NIS {factor_words(nis[2] / nis[1])} times smaller, about the same track"
+        )
     page.heading("One track, two claims", above=10.0)
     page.write(
         f"With four times SIGMA_A σ_p is {factor_words(sigmas[1] / sigmas[2])} times what it is "
-        f"with a quarter of SIGMA_Z, and the NIS {factor_words(nis[2] / nis[1])} times smaller, "
-        "about the same track. Numbers over the second half of the flight."
+        f"with a quarter of SIGMA_Z{smaller}. Numbers over the second half of the flight."
     )
     page.table(head, rows, right=range(1, len(head)))
