@@ -151,6 +151,9 @@ class PositionTrack:
         ``samples``, where the source measures it by itself: GNSS.
     age_s : float
         What EKF2 takes a sample to be older than its stamp, as far as that was taken off already.
+    place_m : tuple of float
+        Where EKF2 takes the sensor to be in the body (forward, right, down); the positions are the
+        sensor's.
     notes : tuple of str
         Joins and what they dropped.
     """
@@ -168,6 +171,7 @@ class PositionTrack:
     orientation: pd.DataFrame | None = None
     velocity: pd.DataFrame | None = None
     age_s: float = 0.0
+    place_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     notes: tuple[str, ...] = ()
 
     __repr__ = brief

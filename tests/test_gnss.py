@@ -16,10 +16,12 @@ from cli_tools import run
 from exchange import replace
 from findings_tools import analysis as stand_in
 from findings_tools import late, made
+from scipy.spatial.transform import Rotation, Slerp
 from ulog_tools import Log, gnss_log, make_log, position, seconds_of, stamps, topic
 
 import px4fuse
 from px4fuse.analysis import run_preparation
+from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.preparation import choose_source, prepare
 from px4fuse.ekf2.inputs import Received, _rules, read_gnss
 from px4fuse.ekf2.model import Model
@@ -127,6 +129,51 @@ def test_whose_time_counts(parameters: dict[str, float], expected_s: float, tmp_
     track = track_of(flight_of(outdoors(own_s=0.03, **parameters), tmp_path))
     first = seconds_of(stamps(SECONDS, 5.0, 0.2))[0]
     assert track.samples.index[0] - first == pytest.approx(expected_s, abs=1e-6)
+
+
+def test_the_topic_of_the_newest_main_is_read_alike(tmp_path: Path) -> None:
+    """vehicle_gnss holds the receiver's message; its own stamp has the delay taken off."""
+    log = with_velocity(outdoors(own_s=0.03, EKF2_GPS_MODE=0))
+    before = track_of(flight_of(log, tmp_path))
+    old = log["vehicle_gps_position"]
+    renamed = {
+        "latitude_deg": "latitude", "longitude_deg": "longitude", "altitude_msl_m": "altitude_msl",
+        "vel_n_m_s": "vel_north", "vel_e_m_s": "vel_east", "vel_d_m_s": "vel_down",
+        "s_variance_m_s": "speed_accuracy",
+    }  # fmt: skip
+    made = topic("vehicle_gnss", old["timestamp"].astype(np.uint64), {})
+    made.fields.update({  # type: ignore[attr-defined]
+        f"receiver.{renamed.get(name, name)}": values.copy() for name, values in old.items()
+    })  # fmt: skip
+    made.fields["timestamp_sample"] = old["timestamp_sample"].copy()
+    made.fields["antenna_offset"] = np.tile(
+        np.array([0.1, 0.0, -0.2], np.float32), (len(old["timestamp"]), 1)
+    )
+    log.drop("vehicle_gps_position")
+    log.add(made)
+    track = track_of(flight_of(log, tmp_path))
+    assert track.topics == ("vehicle_gnss",)
+    pd.testing.assert_frame_equal(track.samples, before.samples)
+    assert track.velocity is not None
+    assert before.velocity is not None
+    pd.testing.assert_frame_equal(track.velocity, before.velocity)
+    assert track.place_m == pytest.approx((0.1, 0.0, -0.2))
+
+
+def test_positions_are_those_of_the_vehicle_where_the_antenna_is_elsewhere(tmp_path: Path) -> None:
+    moved = flight_of(outdoors(EKF2_GPS_POS_X=0.3, EKF2_GPS_POS_Z=-0.2), tmp_path)
+    antenna, vehicle = track_of(moved), compare(moved).source
+    assert antenna.place_m == pytest.approx((0.3, 0.0, -0.2))
+    assert "0.3 m forward" in vehicle.notes[-1]
+    assert isinstance(moved.attitude, pd.DataFrame)
+    at = antenna.samples.index.to_numpy()
+    known = moved.attitude.index.to_numpy()
+    turned = Slerp(known, Rotation.from_quat(
+        moved.attitude.to_numpy(copy=True), scalar_first=True
+    ))(np.clip(at, known[0], known[-1]))  # fmt: skip
+    expected = antenna.samples[POSITION_COLUMNS].to_numpy() - turned.apply([0.3, 0.0, -0.2])
+    np.testing.assert_allclose(vehicle.samples[POSITION_COLUMNS], expected, atol=1e-4)
+    assert compare(flight_of(outdoors(), tmp_path)).source.notes == ()
 
 
 def test_a_driver_that_knows_no_time_of_its_own_leaves_ekf2_s_delay(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TypedDict, Unpack
 
+import numpy as np
 from msgspec import structs
 
 from px4fuse.comparison.model import Comparison
@@ -13,11 +14,20 @@ from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS
 from px4fuse.errors import MissingDataError, SettingsError, did_you_mean
 from px4fuse.filter.settings import SIGMA_Z_RANGE_M, Settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, make_axes, within
-from px4fuse.flight import Ekf2, Flight, PositionTrack, Truth, Unavailable
+from px4fuse.flight import (
+    POSITION_COLUMNS,
+    QUATERNION_COLUMNS,
+    Ekf2,
+    Flight,
+    PositionTrack,
+    Truth,
+    Unavailable,
+)
 from px4fuse.origin import GIVEN_FILE, PositionKind
 from px4fuse.readers.mavlink_messages import POSITION_INPUTS
 from px4fuse.readers.px4_innovations import with_gnss
 from px4fuse.readers.px4_topics import TOPIC_ORIGINS
+from px4fuse.trajectory.rotation import interpolate, matrix
 
 # Of the names under which logs have external positions, PX4's topics and MAVLink's messages
 LOGGED_ORIGINS = TOPIC_ORIGINS | {source.name: source.origin for source in POSITION_INPUTS}
@@ -90,7 +100,7 @@ def prepare(
     track, reason = choose_source(flight, choices.get("position_source"))
     if kind := choices.get("source_kind"):
         track = replace(track, origin=structs.replace(track.origin, kind=kind))
-    track = shift_clock(track, settings.clock_offset_s)
+    track = _of_vehicle(shift_clock(track, settings.clock_offset_s), flight)
     missing = flight.missing
     if track.origin.by_gnss and isinstance(flight.ekf2, Ekf2):
         # what the log lacks of another source is no lack here
@@ -161,6 +171,23 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
         f"{flight.log.name}: position source {name}: {reasons.get(name, 'no such source')}",
         f"{did_you_mean(name, names)}This log has: {', '.join(names) or 'none'}.",
     )
+
+
+def _of_vehicle(track: PositionTrack, flight: Flight) -> PositionTrack:
+    """The positions of the vehicle, where EKF2 is told that the sensor is not at its origin."""
+    attitude = flight.attitude
+    if not any(track.place_m) or isinstance(attitude, Unavailable) or track.frame != "NED":
+        return track
+    known = attitude.index.to_numpy(), attitude[QUATERNION_COLUMNS].to_numpy()
+    turned = matrix(interpolate(track.samples.index.to_numpy(), *known)) @ np.asarray(track.place_m)
+    samples = track.samples.copy()
+    samples[POSITION_COLUMNS] -= turned
+    forward, right, down = track.place_m
+    note = (
+        f"positions are those of the vehicle's origin: the sensor is {forward:g} m forward, "
+        f"{right:g} m right and {down:g} m down of it, as EKF2 takes it"
+    )
+    return replace(track, samples=samples, notes=(*track.notes, note))
 
 
 def no_source(flight: Flight) -> Unavailable:

@@ -213,6 +213,9 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
             "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate.",
         )
     read = read_gnss(flight, ekf2, record) if gnss else read_vision(flight, ekf2, record, attitude)
+    # since v1.17 each receiver has its own, which its messages carry
+    track = _gnss(flight) if gnss else None
+    place = {} if track is None else dict(zip(aid.place, track.place_m, strict=True))
     if isinstance(read, Unavailable):
         return read
     if isinstance(horizon_s, Unavailable):
@@ -229,7 +232,7 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
         )
     fusing = ekf2.fusing
     return Inputs(
-        settings=settings_in_force(record.parameters, aid),
+        settings=settings_in_force(record.parameters, aid) | place,
         stretches=stretches,
         received=read,
         rules=_rules(record, ekf2.step_s, gnss=gnss),
@@ -271,9 +274,13 @@ def replayed_aid(ekf2: Ekf2) -> Aid:
     return GNSS_POS if fuses_gnss(ekf2) and not used else EV_POS
 
 
+def _gnss(flight: Flight) -> PositionTrack | None:
+    return next((track for track in flight.positions if track.origin.is_gnss), None)
+
+
 def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> Received | Unavailable:
     """The fixes that EKF2 received, as :func:`read_vision` gives positions of vision."""
-    track = next((track for track in flight.positions if track.origin.is_gnss), None)
+    track = _gnss(flight)
     if track is None or track.velocity is None:
         return Unavailable(WHAT, "no vehicle_gps_position in the log", DEFAULT_PROFILE)
     if track.rate_hz < THINNED_HZ:

@@ -10,7 +10,7 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.arrays import Array
-from px4fuse.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS
+from px4fuse.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, Aid
 from px4fuse.flight import (
     AXIS_NAMES,
     POSITION_COLUMNS,
@@ -28,7 +28,12 @@ from px4fuse.origin import with_orientation
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.parts import attitude_of, finite_rows, orientation_of
 from px4fuse.readers.px4_ekf2 import target_step_s
-from px4fuse.readers.px4_topics import GPS_POSITION, KEPT_OBSERVATION, RECONSTRUCTION
+from px4fuse.readers.px4_topics import (
+    ANTENNA_COLUMNS,
+    GPS_POSITION,
+    KEPT_OBSERVATION,
+    RECONSTRUCTION,
+)
 from px4fuse.readers.ulog_topics import Topics
 from px4fuse.recording import ClockMap
 
@@ -103,8 +108,17 @@ def _track(
     if len(samples) < MIN_TRACK_SAMPLES:
         return _unavailable(name, f"{len(samples)} finite samples are too few")
     origin = with_orientation(px4.TOPIC_ORIGINS[name], turns=turns)
-    log = topics.log.name
-    return PositionTrack(name, origin, description, samples, frame, clock, used, log, **more)
+    log, place = topics.log.name, {"place_m": _place_m(topics, origin.aid)}
+    return PositionTrack(
+        name, origin, description, samples, frame, clock, used, log, **place | more
+    )
+
+
+def _place_m(topics: Topics, aid: Aid | None) -> tuple[float, float, float]:
+    """Where EKF2 takes a sensor to be; nowhere else than the vehicle where it is not asked."""
+    names = ("", "", "") if aid is None else aid.place
+    forward, right, down = (float(topics.ekf2_parameters.get(name, 0.0)) for name in names)
+    return forward, right, down
 
 
 def _read_logged(topics: Topics, source: px4.TrackSource) -> PositionTrack | Unavailable:
@@ -349,6 +363,9 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     found = _track(topics, GPS_POSITION, "GNSS position", samples, (layout.topic,), clock=clock)
     if isinstance(found, Unavailable):
         return found
+    if set(ANTENNA_COLUMNS) <= set(gps.columns):  # since v1.17 of each receiver
+        forward, right, down = gps[ANTENNA_COLUMNS].iloc[-1].tolist()
+        found = replace(found, place_m=(forward, right, down))
     notes: tuple[str, ...] = ()
     if found.rate_hz < THINNED_HZ:
         notes = (

@@ -124,7 +124,30 @@ _GPS_OPTIONAL = {
     "published_us": "timestamp", "north_m_s": "vel_n_m_s", "east_m_s": "vel_e_m_s",
     "down_m_s": "vel_d_m_s", "speed_accuracy_m_s": "s_variance_m_s",
 }  # fmt: skip
+ANTENNA_COLUMNS = ["antenna_forward_m", "antenna_right_m", "antenna_down_m"]
+_RECEIVER = "receiver."
 GPS = (
+    Layout(
+        "vehicle_gnss",
+        {
+            "latitude_deg": f"{_RECEIVER}latitude",
+            "longitude_deg": f"{_RECEIVER}longitude",
+            "altitude_m": f"{_RECEIVER}altitude_msl",
+        },
+        "main of 2026",
+        {
+            "eph_m": f"{_RECEIVER}eph",
+            "epv_m": f"{_RECEIVER}epv",
+            "fix_type": f"{_RECEIVER}fix_type",
+            "utc_us": f"{_RECEIVER}time_utc_usec",
+            "published_us": f"{_RECEIVER}timestamp",
+            "north_m_s": f"{_RECEIVER}vel_north",
+            "east_m_s": f"{_RECEIVER}vel_east",
+            "down_m_s": f"{_RECEIVER}vel_down",
+            "speed_accuracy_m_s": f"{_RECEIVER}speed_accuracy",
+            **elements(ANTENNA_COLUMNS, "antenna_offset"),
+        },
+    ),
     Layout(
         "vehicle_gps_position",
         {
@@ -133,7 +156,11 @@ GPS = (
             "altitude_m": "altitude_msl_m",
         },
         "v1.14",
-        _GPS_OPTIONAL,
+        _GPS_OPTIONAL
+        | {
+            name: f"antenna_offset_{axis}"
+            for name, axis in zip(ANTENNA_COLUMNS, "xyz", strict=True)
+        },
     ),
     Layout(
         "vehicle_gps_position",
