@@ -40,7 +40,8 @@ from px4fuse.flight import (
 )
 from px4fuse.inspect.inventory import take_inventory
 from px4fuse.origin import GNSS
-from px4fuse.readers import read_log
+from px4fuse.readers import px4_fixes, read_log
+from px4fuse.readers.px4_fixes import rebuilt_fixes
 from px4fuse.report.clock import clock_advice
 from px4fuse.request import ComparisonRequest
 
@@ -413,8 +414,8 @@ def test_what_changes_nothing_is_refused(models: dict[str, Model]) -> None:
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("v1.13.3_gps_profile1", "2.0 positions of GNSS a second, fewer than EKF2 fused"),
-        ("v1.14.4_gps_magdist", "2.0 positions of GNSS a second, fewer than EKF2 fused"),
+        ("v1.13.3_gps_profile1", "3.0 positions of GNSS a second, fewer than EKF2 fused"),
+        ("v1.14.4_gps_magdist", "3.4 positions of GNSS a second, fewer than EKF2 fused"),
         ("v1.16.1_gps_stock_flow", r"more than GNSS horizontally \(optical flow\)"),
         ("main202603_gps_outage_flow", r"more than GNSS horizontally \(optical flow\)"),
     ],
@@ -583,3 +584,61 @@ def test_a_damaged_fix_takes_its_velocity_with_it(tmp_path: Path) -> None:
     track = track_of(flight_of(log, tmp_path))
     assert track.velocity is not None
     assert track.velocity.index.equals(track.samples.index)
+
+
+@pytest.mark.reallogs
+def test_fixes_between_the_logged_ones_are_rebuilt(shared_logs: Path) -> None:
+    """Of a flight that has every fix: every fifth or so is kept, and two innovations a second."""
+    flight = read_log(shared_logs / "gps" / "v1.16.1_gps_fullrate.ulg")
+    assert isinstance(flight.ekf2, Ekf2)
+    track = track_of(flight)
+    every = track.samples[track.samples.index > 5.0]
+    log = flight.ekf2.aids["gnss_pos"]
+    taken = every.index.to_numpy()
+    shown = log.samples.set_axis(log.samples.index + 0.5 * flight.ekf2.step_s)
+    at = np.searchsorted(shown.index, taken[2::7])
+    at = at[np.abs(shown.index.to_numpy()[at] - taken[2::7]) < 0.002]
+    # snapshots are of the last fix before
+    rows = shown.iloc[at].set_axis(shown.index[at] + 0.03)
+    ekf2 = replace(
+        flight.ekf2, aids=dict(flight.ekf2.aids) | {"gnss_pos": replace(log, samples=rows)}
+    )
+    kept = every.iloc[np.cumsum(np.random.default_rng(1).choice([4, 5, 5, 6], 200))]
+    made, (note,) = rebuilt_fixes(kept, ekf2, 0.11)
+    assert len(made) > 60
+    assert "to within 0.0" in note
+    true = every.iloc[np.abs(taken[:, None] - made.index.to_numpy()).argmin(axis=0)]
+    assert np.abs(true.index - made.index).max() < 0.004
+    error = (made[POSITION_COLUMNS[:2]] - true[POSITION_COLUMNS[:2]].to_numpy()).to_numpy()
+    assert np.sqrt(np.mean(error**2)) < 0.1
+    assert np.isfinite(made[POSITION_COLUMNS]).all(axis=None)
+    # and not where they would be wrong
+    wrong = replace(log, samples=rows.assign(innovation_north=rows["innovation_north"] + 0.5))
+    bad = replace(ekf2, aids=dict(ekf2.aids) | {"gnss_pos": wrong})
+    assert rebuilt_fixes(kept, bad, 0.11)[1] == ()
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize(
+    ("name", "least"), [("v1.13.3_gps_profile1", 100), ("v1.14.4_gps_magdist", 200)]
+)
+def test_flights_with_two_fixes_a_second_get_those_of_their_innovations(
+    name: str, least: int, shared_logs: Path
+) -> None:
+    track = track_of(read_log(shared_logs / "gps" / f"{name}.ulg"))
+    assert "2.0 positions of GNSS a second" in track.notes[0]
+    count, exact_m = re.findall(r"^(\d+) positions.*to within ([\d.]+) m", track.notes[1])[0]
+    assert int(count) > least
+    assert float(exact_m) < 0.1
+    assert track.rate_hz > 2.9
+
+
+def test_the_interval_of_a_receiver_is_told_by_those_that_were_kept() -> None:
+    rng = np.random.default_rng(3)
+    for interval_s in (0.1, 0.096, 0.2, 0.125):
+        kept = np.cumsum(rng.choice([4, 5, 6], 100)) * interval_s
+        found = px4_fixes._interval_s(kept + rng.normal(0.0, 0.0005, 100))
+        assert found == pytest.approx(interval_s, rel=0.01)
+    assert px4_fixes._interval_s(np.cumsum(rng.uniform(0.3, 0.9, 100))) is None
+    # every fifth of 0.1 s, or every fourth of 0.125 s
+    assert px4_fixes._interval_s(np.arange(100) * 0.5) is None

@@ -35,7 +35,7 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
     for name, aid in judged.items():
         if aid.verdict == "starved":
             starved.setdefault(AIDS[name].switch or name, []).append(aid)
-    for together in starved.values():
+    for switch, together in starved.items():
         longest = max(together, key=lambda aid: aid.longest_without)
         labels = ", ".join(aid.label for aid in together)
         yield warning(
@@ -46,12 +46,11 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
             "See what the sensor lacked then (reception, range, light), or whether EKF2 rejected "
             "it; what carried EKF2 meanwhile is in the table.",
             {"aid": labels, "longest_without_s": longest.longest_without,
-             "rejected_share": longest.rejected_share},
+             "rejected_share": longest.rejected_share, CAUSE: _sensor(switch, source)},
             (longest.longest_without_s,),
         )  # fmt: skip
     for name, aid in judged.items():
         if aid.verdict == "variance understated" and name != source:
-            of_source = bool(source) and AIDS[name].switch == AIDS[source].switch
             factor = aid.nis_mean**0.5
             yield warning(
                 "aid_understated",
@@ -64,7 +63,7 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
                     "aid": name,
                     "nis_mean": aid.nis_mean,
                     "rejected_share": aid.rejected_share,
-                    CAUSE: SENSOR if of_source else "",
+                    CAUSE: _sensor(AIDS[name].switch, source),
                 },
             )
         elif aid.verdict == "biased":
@@ -80,6 +79,11 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
                 {"aid": name, "axis": axis, "innovation_mean": worst.innovation_mean,
                  "s_sqrt_median": worst.s_sqrt_median},
             )  # fmt: skip
+
+
+def _sensor(switch: str, source: str) -> str:
+    """Whether the sensor that is switched so is the one whose positions our filter was given."""
+    return SENSOR if source and AIDS[source].switch == switch else ""
 
 
 def _noise_words(aid: AidResult) -> str:

@@ -106,7 +106,7 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
     "ekf2_variance_understated": ("ekf2_rejecting",),
     "source_outliers": (
         f"kf_variance_understated:{OUTLIERS}", f"ekf2_variance_understated:{OUTLIERS}",
-        "ekf2_rejecting",
+        f"ekf2_variance_understated:{ELSEWHERE}", "ekf2_rejecting",
     ),
     "errors_larger_than_claimed": _OVERSTATED,
     # what is rejected is not corrected: EKF2 drifts, resets, and its innovations grow
@@ -114,6 +114,7 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
         "ekf2_rejecting", "ekf2_resets", "ekf2_fusion_interrupted",
         f"ekf2_variance_understated:{GATE}",
         f"ekf2_variance_understated:{ELSEWHERE}", f"errors_larger_than_claimed:{GATE}",
+        f"errors_larger_than_claimed:{ELSEWHERE}", f"aid_starved:{SENSOR}",
     ),
     "source_may_drift": _OVERSTATED,
     "ekf2_ev_delay_wrong": (
@@ -128,7 +129,8 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
     # R describes none of these three
     "source_coloured": (
         "sigma_z_large", "sigma_z_small", "sigma_a_large", "sigma_a_small", *_OVERSTATED,
-        "source_variance_wrong", "errors_larger_than_claimed",
+        "source_variance_wrong", "errors_larger_than_claimed", "kf_variance_understated",
+        "ekf2_variance_understated",
     ),
     "source_axes_unequal": (
         "kf_variance_overstated", "kf_variance_understated", "source_outliers",
@@ -138,7 +140,16 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
         "source_outliers", "kf_variance_overstated", "kf_variance_understated",
         "source_variance_wrong",
     ),
-    "source_jumps": (f"errors_larger_than_claimed:{ELSEWHERE}",),
+    "ekf2_heading_wrong": (
+        f"errors_larger_than_claimed:{FRAME}", f"kf_variance_understated:{FRAME}",
+        f"errors_larger_than_claimed:{ELSEWHERE}", "sigma_a_small", f"aid_understated:{SENSOR}",
+        f"ekf2_variance_understated:{ELSEWHERE}", f"aid_starved:{SENSOR}",
+    ),
+    "source_jumps": (
+        f"errors_larger_than_claimed:{ELSEWHERE}", f"ekf2_variance_understated:{ELSEWHERE}",
+        f"ekf2_variance_understated:{OUTLIERS}", "ekf2_rejecting", "ekf2_resets",
+        f"aid_starved:{SENSOR}", "ekf2_heading_wrong",
+    ),
     "source_scale_wrong": (f"errors_larger_than_claimed:{ELSEWHERE}",),
     "accelerometer_bias": (
         f"errors_larger_than_claimed:{ELSEWHERE}", f"errors_larger_than_claimed:{ACCELEROMETER}",
@@ -158,10 +169,6 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
     "source_frame_turned": (
         f"errors_larger_than_claimed:{FRAME}", f"kf_variance_understated:{FRAME}",
     ),
-    "ekf2_heading_wrong": (
-        f"errors_larger_than_claimed:{FRAME}", f"kf_variance_understated:{FRAME}",
-        f"errors_larger_than_claimed:{ELSEWHERE}", "sigma_a_small", f"aid_understated:{SENSOR}",
-    ),
     "source_repeats": (
         "source_smoothed", "source_coloured", "source_jumps", "source_scale_wrong",
         "source_axes_unequal", "source_noise_changes", "source_clock_offset",
@@ -170,7 +177,10 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
         "ekf2_variance_understated", "errors_larger_than_claimed",
     ),
     "source_not_logged": ("source_decimated",),
-    "source_gap": ("ekf2_fusion_interrupted",),
+    "source_gap": (
+        "ekf2_fusion_interrupted", f"aid_starved:{SENSOR}",
+        f"errors_larger_than_claimed:{ELSEWHERE}",
+    ),
     "logger_dropouts": ("imu_gap",),
 }  # fmt: skip
 # What the recording lacks: put right first, since noises are judged by what was recorded

@@ -123,7 +123,8 @@ def larger(analysis: Analysis, hidden: list[Hidden]) -> Finding:
     alone = all(one.owner == "ekf2" for one in hidden)
     shared = "gnss" if analysis.source.origin.is_gnss else "shared"
     remedy = REMEDIES["drift" if drifts else "ekf2" if alone else shared]
-    evidence |= {CAUSE: kind_of(analysis, causes[worst.owner])}
+    known = filter(None, (causes[worst.owner], *causes.values()))
+    evidence |= {CAUSE: kind_of(analysis, next(known, None))}
     if cures := {
         cure_words(analysis, cause): None for cause in causes.values() if cause is not None
     }:

@@ -24,7 +24,7 @@ from px4fuse.comparison.interventions import (
 from px4fuse.comparison.model import FILTERS, AgainstTruth, AxisComparison, Difference, FilterName
 from px4fuse.ekf2.walk import Why
 from px4fuse.filter.kalman import state_at
-from px4fuse.findings.causes import CLOCK, FRAME, SETTINGS, VARIANCES
+from px4fuse.findings.causes import CLOCK, FRAME, PROCESS, SETTINGS, VARIANCES
 from px4fuse.findings.hidden_errors import hidden_error
 from px4fuse.findings.model import Finding
 from px4fuse.findings.since import TOLD_BY, effect_words, kind_of, since_words
@@ -41,6 +41,8 @@ SHAPED = frozenset((
     "source_axes_unequal", "source_clock_changes", "source_coloured", "source_jumps",
     "source_noise_changes", "source_repeats", "source_scale_wrong", "source_smoothed",
 ))  # fmt: skip
+# What looks like noise of the acceleration, which it turns
+TURNED = frozenset(("ekf2_heading_wrong", "source_frame_turned"))
 # What weighs less than why EKF2 differs
 EFFECTS = frozenset({"ekf2_resets", "ekf2_rejecting", "ekf2_fusion_interrupted"})
 
@@ -66,8 +68,10 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
     shapes = {one.id for one in findings if one.id in SHAPED and one.severity != "info"}
     # what smooths makes positions late, which is no clock
     own = (FRAME,) if "source_smoothed" in shapes else (CLOCK, FRAME)
+    turned = any(one.id in TURNED and one.severity != "info" for one in findings)
     for owner, cause in since.items():
-        if shapes and kind_of(analysis, cause) not in own:
+        kind = kind_of(analysis, cause)
+        if (shapes and kind not in own) or (turned and kind == PROCESS):
             since[owner] = None
     known = TOLD_FIRST
     for cause in filter(None, since.values()):

@@ -23,11 +23,13 @@ from px4fuse.flight import (
     Truth,
     Unavailable,
     best_first,
+    sample_rate,
 )
 from px4fuse.origin import with_orientation
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.parts import attitude_of, finite_rows, orientation_of
 from px4fuse.readers.px4_ekf2 import target_step_s
+from px4fuse.readers.px4_fixes import left_out_fixes, rebuilt_fixes
 from px4fuse.readers.px4_topics import (
     ANTENNA_COLUMNS,
     GPS_POSITION,
@@ -48,10 +50,6 @@ ARRIVAL_SHARE = 0.9
 HEIGHT_TOLERANCE_S = 0.05
 # Logged no faster than this, a receiver's positions were thinned: they give 5 to 20 a second
 THINNED_HZ = 4.0
-# Fixes are 0.05 s apart and more
-SAME_FIX_S = 0.01
-# Within 100 km
-NEAR_DEG = 1.0
 DEFAULT_GNSS_DELAY_MS = 110.0  # EKF2_GPS_DELAY, ekf2_params.c and module.yaml, v1.8 to main
 AUTOPILOT_CLOCK = "autopilot boot clock (as PX4 mapped the sender's stamp)"
 
@@ -347,7 +345,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     if not own:
         gps = gps.set_axis(pd.Index(published_s - delay_ms * 1e-3, name="time_s"))
         clock = f"autopilot boot clock, less {delay_ms:g} ms ({GNSS_POS.delay})"
-    left_out = _left_out(topics, gps, ekf2)
+    left_out = left_out_fixes(topics, gps, ekf2)
     if len(left_out):
         gps = pd.concat([gps, left_out]).sort_index()
         # what their rows do not have is as in the fix before
@@ -360,17 +358,21 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     # together, so that a damaged fix takes its velocity with it
     samples = samples.assign(**_velocity(gps).set_axis(samples.index))
     samples = finite_rows(samples, POSITION_COLUMNS)
+    rate_hz, notes = sample_rate(samples), tuple[str, ...]()
+    if rate_hz < THINNED_HZ and not len(left_out):
+        made, notes = rebuilt_fixes(samples, ekf2, delay_ms * 1e-3)
+        samples = pd.concat([samples, made]).sort_index() if len(made) else samples
     found = _track(topics, GPS_POSITION, "GNSS position", samples, (layout.topic,), clock=clock)
     if isinstance(found, Unavailable):
         return found
     if set(ANTENNA_COLUMNS) <= set(gps.columns):  # since v1.17 of each receiver
         forward, right, down = gps[ANTENNA_COLUMNS].iloc[-1].tolist()
         found = replace(found, place_m=(forward, right, down))
-    notes: tuple[str, ...] = ()
-    if found.rate_hz < THINNED_HZ:
+    if rate_hz < THINNED_HZ:
         notes = (
-            f"the log holds {found.rate_hz:.1f} positions of GNSS a second, fewer than receivers "
+            f"the log holds {rate_hz:.1f} positions of GNSS a second, fewer than receivers "
             "give: the logger left out the others (SDLOG_PROFILE bit 1 keeps them)",
+            *notes,
         )
     if len(left_out):
         notes += (
@@ -384,27 +386,6 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
         age_s=delay_ms * 1e-3,
         notes=found.notes + notes,
     )
-
-
-def _left_out(topics: Topics, gps: pd.DataFrame, ekf2: Ekf2 | Unavailable) -> pd.DataFrame:
-    """Fixes that EKF2 took and the log lacks, from the rows of its innovations (from v1.16).
-
-    The logger keeps every fix only where it comes slower than its limit of 10 a second.
-    """
-    rows = [topics.find((layout,)) for layout in px4.FUSED_FIXES]
-    if isinstance(ekf2, Unavailable) or None in rows:
-        return pd.DataFrame()
-    position, velocity = (topics.of_primary(layout) for layout in px4.FUSED_FIXES)
-    # rows are of half a prediction step before (estimator_interface.cpp)
-    fixes = position.join(velocity, how="inner").dropna()
-    fixes = fixes.set_axis(fixes.index + 0.5 * ekf2.step_s)
-    at = np.clip(np.searchsorted(gps.index, fixes.index), 1, len(gps) - 1)
-    apart = np.minimum(*(np.abs(gps.index.to_numpy()[at - k] - fixes.index) for k in (0, 1)))
-    inside = (fixes.index > gps.index[0]) & (fixes.index < gps.index[-1])
-    known, lacking = fixes[apart <= SAME_FIX_S], fixes[(apart > SAME_FIX_S) & inside]
-    # before v1.16 their position is local, in m
-    degrees = known["latitude_deg"].sub(gps["latitude_deg"].median()).abs().median() < NEAR_DEG
-    return lacking if degrees else pd.DataFrame()
 
 
 def _velocity(gps: pd.DataFrame) -> pd.DataFrame:

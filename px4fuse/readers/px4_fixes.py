@@ -1,0 +1,135 @@
+"""Fixes of GNSS that EKF2 took and the logger left out, from what EKF2 logs of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from px4fuse.arrays import Array
+from px4fuse.flight import POSITION_COLUMNS, POSITION_VARIANCE_COLUMNS, Ekf2, Unavailable
+from px4fuse.readers import px4_topics as px4
+from px4fuse.readers.px4_innovations import with_gnss
+from px4fuse.readers.ulog_topics import Topics
+
+# Fixes are 0.05 s apart and more
+SAME_FIX_S = 0.01
+# Within 100 km
+NEAR_DEG = 1.0
+# Receivers give 4 to 20 fixes a second
+PERIODS_S = np.arange(0.05, 0.26, 0.0005)
+# How far stamps may be from a multiple of the receiver's interval: EKF2's step, and its clock's
+ON_GRID_S = 0.006
+MIN_KNOWN = 10
+# Intervals of one and of the next multiple, before the receiver's own is known
+MIN_ALIKE = 3
+# RMS of what is rebuilt, by fixes that are logged too
+EXACT_M = 0.1
+
+
+def left_out_fixes(topics: Topics, gps: pd.DataFrame, ekf2: Ekf2 | Unavailable) -> pd.DataFrame:
+    """Fixes that EKF2 took and the log lacks, from the rows of its innovations (from v1.16).
+
+    The logger keeps every fix only where it comes slower than its limit of 10 a second.
+    """
+    rows = [topics.find((layout,)) for layout in px4.FUSED_FIXES]
+    if isinstance(ekf2, Unavailable) or None in rows:
+        return pd.DataFrame()
+    position, velocity = (topics.of_primary(layout) for layout in px4.FUSED_FIXES)
+    # rows are of half a prediction step before (estimator_interface.cpp)
+    fixes = position.join(velocity, how="inner").dropna()
+    fixes = fixes.set_axis(fixes.index + 0.5 * ekf2.step_s)
+    at = np.clip(np.searchsorted(gps.index, fixes.index), 1, len(gps) - 1)
+    apart = np.minimum(*(np.abs(gps.index.to_numpy()[at - k] - fixes.index) for k in (0, 1)))
+    inside = (fixes.index > gps.index[0]) & (fixes.index < gps.index[-1])
+    known, lacking = fixes[apart <= SAME_FIX_S], fixes[(apart > SAME_FIX_S) & inside]
+    # before v1.16 their position is local, in m
+    degrees = known["latitude_deg"].sub(gps["latitude_deg"].median()).abs().median() < NEAR_DEG
+    return lacking if degrees else pd.DataFrame()
+
+
+def rebuilt_fixes(
+    fixes: pd.DataFrame, ekf2: Ekf2 | Unavailable, delay_s: float
+) -> tuple[pd.DataFrame, tuple[str, ...]]:
+    """Fixes between the logged ones as EKF2's position plus its innovation, where those are exact.
+
+    An innovation is logged at times of its own (2 Hz up to v1.15) and is of the last fix before,
+    which came a whole number of the receiver's intervals after a logged fix. Where that is none
+    after it, the fix is known: by those the method is judged.
+
+    Parameters
+    ----------
+    fixes : DataFrame
+        Positions (m, NED) and variances by the time that EKF2 takes them to be of.
+    ekf2 : Ekf2 or Unavailable
+    delay_s : float
+        By which EKF2 takes a fix to be older than its stamp; one that is older than the horizon is
+        fused at the horizon (``RingBuffer.h``).
+
+    Returns
+    -------
+    (DataFrame, tuple of str)
+        Those that are not among ``fixes``, without height where EKF2 has none of GNSS, and what
+        was done.
+    """
+    nothing = pd.DataFrame(columns=fixes.columns)
+    if isinstance(ekf2, Unavailable) or isinstance(ekf2.horizon_s, Unavailable) or len(fixes) < 3:
+        return nothing, ()
+    found = with_gnss(ekf2).innovations
+    north, east = found["north"], found["east"]
+    interval_s = _interval_s(fixes.index.to_numpy())
+    if interval_s is None or isinstance(north, Unavailable) or isinstance(east, Unavailable):
+        return nothing, ()
+    late_s = max(0.0, delay_s - ekf2.horizon_s)
+    times, rows = fixes.index.to_numpy(), north.index.to_numpy()
+    before = np.searchsorted(times, rows - late_s) - 1
+    inside = (before >= 0) & (before < len(times) - 1)
+    rows, before = rows[inside], before[inside]
+    passed = (rows - late_s - times[before]) / interval_s
+    # of a row in the step of the fusion it is open which fix it is of
+    clear = passed % 1.0 > ekf2.step_s / interval_s
+    rows, before, passed = rows[clear], before[clear], np.floor(passed[clear])
+    taken_s = times[before] + passed * interval_s
+    made = pd.DataFrame({
+        column: np.interp(taken_s + late_s, ekf2.state.index, ekf2.state[column], np.nan, np.nan)
+        + innovations["innovation_m"].to_numpy()[inside][clear]
+        for column, innovations in zip(POSITION_COLUMNS, (north, east), strict=False)
+    }, index=pd.Index(taken_s, name="time_s"))  # fmt: skip
+    known = passed == 0.0
+    error = (made - fixes[made.columns].to_numpy()[before])[known].dropna()
+    exact_m = float(np.sqrt(np.mean(error.to_numpy() ** 2))) if len(error) >= MIN_KNOWN else np.inf
+    made = made[~known].dropna()
+    made = made[~made.index.duplicated()]
+    if exact_m > EXACT_M or made.empty:
+        return nothing, ()
+    for column in (POSITION_COLUMNS[2], *POSITION_VARIANCE_COLUMNS):
+        if column in fixes:
+            made[column] = np.interp(made.index, times, fixes[column])
+    return made, (
+        f"{len(made)} positions of GNSS that the logger left out are EKF2's position plus its "
+        f"innovation, to within {exact_m:.2f} m (RMS along each axis, by {len(error)} that are "
+        "logged too); their heights are interpolated",
+    )
+
+
+def _interval_s(times: Array) -> float | None:
+    """The receiver's interval: the longest of which all logged ones are multiples.
+
+    A logger that keeps two a second keeps every fifth, say, and now and then every fourth or
+    sixth. None where all are alike, which leaves it open into how many parts they fall.
+    """
+    gaps = np.diff(times)[:, None]
+    off = np.abs(gaps / PERIODS_S - np.round(gaps / PERIODS_S)) * PERIODS_S
+    worst = np.percentile(off, 98, axis=0)
+    fits = np.flatnonzero(worst <= ON_GRID_S)
+    if not len(fits):
+        return None
+    longest = PERIODS_S[fits[-1]]
+    # the best of those next to it
+    near = np.flatnonzero(np.abs(PERIODS_S - longest) < 0.1 * longest)
+    about = PERIODS_S[near[np.argmin(worst[near])]]
+    times_over = np.round(gaps[:, 0] / about)
+    counts = np.bincount(times_over.astype(int))
+    often = counts >= MIN_ALIKE
+    if not np.any(often[1:] & often[:-1]):
+        return None
+    return float(np.median(gaps[:, 0] / times_over))
