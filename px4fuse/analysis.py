@@ -216,6 +216,11 @@ def run_or_judge_aids(
         return run(request, progress, flight)
     lacking, aids = no_source(flight), judge_aids(flight)
     if isinstance(aids, Unavailable):
+        if flight.airborne == ():
+            raise MissingDataError(
+                f"{flight.log.name}: not flown, nothing to judge: {aids.reason}",
+                f"px4fuse info {flight.log.name} says what is logged.",
+            )
         neither = f"{lacking.reason}, and the aids of EKF2 cannot be judged: {aids.reason}"
         raise MissingDataError(f"{flight.log.name}: {neither}", lacking.remedy)
     return AidsAlone(flight, aids, lacking)

@@ -180,8 +180,9 @@ def _remembered(
 def analysed_once() -> Iterator[None]:
     """The same request on the same files is analysed once; for tests that patch nothing of it."""
     with pytest.MonkeyPatch.context() as patch:
-        for place in (analysis, commands, inputs):
+        for place in (analysis, commands):
             patch.setattr(place, "run", _remembered)
+        patch.setattr(inputs, "run_or_judge_aids", _remembered)
         yield
 
 

@@ -13,6 +13,7 @@ import pytest
 from cli_tools import run, run_main
 from exchange import replace
 from flights import aisle_flight
+from pypdf import PdfReader
 from ulog_tools import gnss_log, seconds_of, stamps
 
 from px4fuse.analysis import AidsAlone, bad_verdicts
@@ -250,8 +251,29 @@ def test_a_log_without_position_gets_its_aids_judged(tmp_path: Path) -> None:
     assert isinstance(found, AidsResults)
     assert found.aids["gnss_pos"].axes["east"].samples > 80
     assert found.missing[0].what == "position source"
+    pages = [page.extract_text() for page in PdfReader(report).pages]
+    assert "GNSS position" in pages[0]
+    assert found.log.sha256 in pages[-1].replace("\n", "")
+    assert "Looked for and not found" in pages[-1]
     refused = run("verify", report, log).exception
     assert "the aids of EKF2 alone, nothing of our filter" in str(refused)
+
+
+def test_two_flights_without_position_are_compared_by_their_aids(tmp_path: Path) -> None:
+    made = gnss_log("v1.16")
+    first = made.write(tmp_path / "a.ulg")
+    row = made["estimator_aid_src_gnss_pos"]
+    row["innovation"] = 2.0 * row["innovation"]
+    row["test_ratio"] = 4.0 * row["test_ratio"]
+    second = made.write(tmp_path / "b.ulg")
+    assert run("compare", first, "-o", tmp_path / "a.pdf").exit_code == 0
+    done = run("diff", tmp_path / "a.json", second, "--json", "-")
+    assert done.exit_code == 0, done.output
+    changes = {one["path"]: one for one in json.loads(done.stdout)["numbers"]}
+    north = changes["aids.gnss_pos.axes.north.nis_mean"]
+    assert north["change"] == pytest.approx(4.0, rel=1e-6)
+    further = abs(np.log(north["b"])) > abs(np.log(north["a"]))  # from 1, the best
+    assert north["judgement"] == ("worse" if further else "better")
 
 
 def test_on_the_ground_there_is_nothing_to_judge(tmp_path: Path) -> None:
@@ -259,7 +281,8 @@ def test_on_the_ground_there_is_nothing_to_judge(tmp_path: Path) -> None:
     made["vehicle_land_detected"]["landed"][:] = 1
     done = run("compare", made.write(tmp_path / "a.ulg"), "-o", tmp_path / "a.pdf")
     assert isinstance(done.exception, MissingDataError)
-    assert "the vehicle never took off" in str(done.exception)
+    assert "not flown, nothing to judge: the vehicle never took off" in str(done.exception)
+    assert "px4fuse info a.ulg says what is logged" in str(done.exception)
     assert not (tmp_path / "a.pdf").exists()
 
 

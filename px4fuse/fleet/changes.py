@@ -35,7 +35,7 @@ from px4fuse.results.changes import (
     TextChange,
     Which,
 )
-from px4fuse.results.contract import CHANGES, ChangeResults, ComparisonResults
+from px4fuse.results.contract import CHANGES, AidsResults, ChangeResults, ComparisonResults
 from px4fuse.results.model import provenance, schema_of
 
 # What stands first of the significant changes; and of these, causes before what they bring
@@ -57,6 +57,7 @@ _FLIGHT = {
     "position source": "source.name",
     "px4fuse": "provenance.px4fuse",
 }
+Results = ComparisonResults | AidsResults
 MAX_LINE, MAX_CHANGES, MAX_DRAWN = 160, 4, 20
 
 
@@ -245,7 +246,7 @@ def _compared(side: DiffInput) -> Compared:
 # ------------------------------------------------------------- what else is not the same, in words
 
 
-def _texts(a: ComparisonResults, b: ComparisonResults, *, paired: bool) -> Iterator[TextChange]:
+def _texts(a: Results, b: Results, *, paired: bool) -> Iterator[TextChange]:
     """Settings, parameters of PX4 and facts about the flight that are not the same."""
     places = {**_SETTINGS, **(_SEGMENT if paired else {}), **_FLIGHT}
     for what, place in places.items():
@@ -259,7 +260,7 @@ def _texts(a: ComparisonResults, b: ComparisonResults, *, paired: bool) -> Itera
             yield TextChange("parameter", name, _plain(one.get(name)), _plain(other.get(name)))
 
 
-def _parameters(found: ComparisonResults) -> dict[str, float]:
+def _parameters(found: Results) -> dict[str, float]:
     """Of PX4: those that EKF2 was replayed with, and those that the log has."""
     replayed, logged = at(found, "ekf2_replay.settings") or {}, found.log.parameters
     return {name: float(value) for name, value in (*replayed.items(), *logged.items())}
@@ -271,9 +272,9 @@ def _plain(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _findings(a: ComparisonResults, b: ComparisonResults) -> Iterator[FindingChange]:
+def _findings(a: Results, b: Results) -> Iterator[FindingChange]:
     """Findings that only one of the two has, as a cause or as a consequence."""
-    both: tuple[tuple[ComparisonResults, ComparisonResults, Which], ...]
+    both: tuple[tuple[Results, Results, Which], ...]
     both = ((b, a, "B"), (a, b, "A"))
     for mine, other, only_in in both:
         known = {one.id for one in other.findings}

@@ -9,14 +9,14 @@ from typing import Literal
 
 from msgspec.structs import replace
 
-from px4fuse.analysis import Analysis, run
+from px4fuse.analysis import AidsAlone, Analysis, run_or_judge_aids
 from px4fuse.display import brief
 from px4fuse.errors import LogError, ResultsError
-from px4fuse.findings import find
+from px4fuse.findings import find, find_aids
 from px4fuse.reading import files_by_sha256, read_head, read_whole, shown
 from px4fuse.request import ComparisonRequest, command_line
-from px4fuse.results.build import results
-from px4fuse.results.contract import ComparisonResults, Results
+from px4fuse.results.build import aids_results, results
+from px4fuse.results.contract import AidsResults, ComparisonResults, Results
 from px4fuse.results.model import Student
 from px4fuse.results.reading import MAX_BYTES as MAX_RESULTS_BYTES
 from px4fuse.results.reading import read_results
@@ -46,7 +46,7 @@ class DiffInput:
 
     given: str
     kind: Kind
-    results: ComparisonResults
+    results: ComparisonResults | AidsResults
     analysis: Analysis | None = None
 
     __repr__ = brief
@@ -60,7 +60,7 @@ def read_inputs(
     Raises
     ------
     LogError, MissingDataError
-        A log cannot be read, or cannot be compared with EKF2.
+        A log cannot be read, or nothing of it can be judged.
     ResultsError
         A report or results cannot be read, are not of ``px4fuse compare``, or both are one file.
     """
@@ -86,7 +86,7 @@ def _read(path: Path) -> DiffInput | None:
     if isinstance(report, Refused):
         raise ResultsError(report.reason)
     found: Results = report.results if report else read_results(content, name)
-    if not isinstance(found, ComparisonResults):
+    if not isinstance(found, ComparisonResults | AidsResults):
         raise ResultsError(
             f"{name}: holds {found.schema.name}; px4fuse diff takes what px4fuse compare writes, "
             "or a log."
@@ -102,6 +102,10 @@ def _analysed(path: Path, other: DiffInput | None, progress: Progress) -> DiffIn
         request = replace(
             request, **{name: getattr(other.results.request, name) for name in fields}
         )
-    analysis = run(request, progress)
-    found = results(request, analysis, find(analysis), Student(), command_line(request))
+    analysis, typed = run_or_judge_aids(request, progress), command_line(request)
+    if isinstance(analysis, AidsAlone):
+        findings = find_aids(analysis.aids)
+        alone = aids_results(request, analysis, findings, Student(), typed)
+        return DiffInput(shown(path), "log", alone)
+    found = results(request, analysis, find(analysis), Student(), typed)
     return DiffInput(shown(path), "log", found, analysis)

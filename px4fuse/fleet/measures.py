@@ -32,7 +32,7 @@ from px4fuse.filter.kalman import state_at
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import Tuned
 from px4fuse.flight import Unavailable
-from px4fuse.results.contract import ComparisonResults
+from px4fuse.results.contract import AidsResults, ComparisonResults
 from px4fuse.trajectory.scores import rmse_interval
 
 Bounds = tuple[float, float]
@@ -150,7 +150,9 @@ def at(found: object, path: str) -> Any:
     return reduce(below, path.split("."), found)
 
 
-def numbers(results: ComparisonResults, analysis: Analysis | None = None) -> dict[str, Number]:
+def numbers(
+    results: ComparisonResults | AidsResults, analysis: Analysis | None = None
+) -> dict[str, Number]:
     """Numbers of a comparison by where they stand in its results.
 
     Parameters
@@ -158,17 +160,20 @@ def numbers(results: ComparisonResults, analysis: Analysis | None = None) -> dic
     analysis : Analysis, optional
         What they were made from, for the intervals that only the log can give.
     """
-    every = [summary for axis in results.axes.values() for summary in axis.filters.values()]
+    axes = {} if isinstance(results, AidsResults) else results.axes
+    every = [summary for axis in axes.values() for summary in axis.filters.values()]
     has_truth = not all(isinstance(summary.truth, Unavailable) for summary in every)
     # EKF2 rejects a horizontal position as a whole
-    level = next((name for name in ("north", "east", AISLE) if name in results.axes), "")
+    level = next((name for name in ("north", "east", AISLE) if name in axes), "")
     errors = {
         f"axes.{name}.{path}": values
         for name, axis in ({} if analysis is None else analysis.axes).items()
         for path, values in errors_of(axis).items()
     }
     # what EKF2 did with the source itself is among the axes
-    own = ("gnss_pos",) if results.source.kind == "gnss" else ("ev_pos", "ev_hgt")
+    own: tuple[str, ...] = ("ev_pos", "ev_hgt") if axes else ()
+    if at(results, "source.kind") == "gnss":
+        own = ("gnss_pos",)
     found: dict[str, Number] = {}
     for kind, measure in MEASURES.items():
         for path, names in _places(results, kind):
@@ -197,7 +202,9 @@ def numbers(results: ComparisonResults, analysis: Analysis | None = None) -> dic
     return found
 
 
-def _places(results: ComparisonResults, kind: str) -> Iterator[tuple[str, tuple[str, ...]]]:
+def _places(
+    results: ComparisonResults | AidsResults, kind: str
+) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Every place of a kind in the results, and the names that stand for its ``*``."""
     head, several, tail = kind.partition(".*")
     if not several:

@@ -55,7 +55,7 @@ PAGES: Mapping[type, tuple[Callable[[Any], Iterator[Page]], ...]] = {
         consistency.draw, sensitivity.draw, clock.draw, aids.draw, loop.draw, notes.draw,
         provenance.draw,
     ),
-    AidsDocument: (aids.draw_alone, notes.draw),
+    AidsDocument: (aids.draw_alone, notes.draw, provenance.draw_aids),
     LoopDocument: (loop.draw_report, notes.draw, provenance.draw_loop),
     WhatIfDocument: (whatif.draw,),
     Evaluation: (evaluation.draw,),

@@ -6,8 +6,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
+from px4fuse.flight import Flight, PositionTrack, Unavailable
 from px4fuse.report import clock, fonts
-from px4fuse.report.document import Document, LoopDocument
+from px4fuse.report.document import AidsDocument, Document, LoopDocument
 from px4fuse.report.page import Page
 from px4fuse.report.style import MUTED
 from px4fuse.report.words import alignment_words, clock_words
@@ -19,35 +20,59 @@ INDENT, SIZE = 140.0, 7.5
 def draw(document: Document) -> Iterator[Page]:
     """Draw one page or more."""
     analysis, flight, source = document.analysis, document.analysis.flight, document.analysis.source
-    log, placed = flight.log, source.alignment
-    others = (f"{t.name} ({t.rate_hz:.1f} Hz)" for t in flight.positions if t is not source)
-    aid = source.origin.aid or EV_POS
-    unlike = set().union(*(one.own for one in (EV_POS, GNSS_POS) if one != aid))
-    parameters = (f"{n} {value:g}" for n, value in log.parameters.items() if n not in unlike)
+    placed = source.alignment
     page = _begin("Appendix: provenance", document)
-    facts: dict[str, str] = {
-        "file": f"{log.name}, {log.bytes} bytes, {log.format}",
-        "SHA-256": log.sha256,
-        **{f.role: f"{f.name}, {f.bytes} bytes, SHA-256 {f.sha256}" for f in flight.inputs},
-        "firmware": f"{log.firmware}, git {log.firmware_hash}",
-        "time zero": f"{log.boot_time_s:.6f} s after boot, the first sample of data",
-        "position source": f"{source.name} ({source.origin.kind}, {source.origin.passage}) from "
-        f"{', '.join(source.topics)}; clock: {source.clock}",
-        "also in the log": ", ".join(others) or "no other position",
-        "parameters": ", ".join(parameters) or "none",
-    }
-    _section(page, "The log", facts.items())
+    _log(page, flight, source)
     clocks = map(clock_words, flight.clocks)
     _section(page, "Clocks, to the autopilot's boot clock", plain=clocks)
     _section(page, f"Stamps of {source.name}, by the IMU", plain=[clock.line(document)])
     if placed is not None:
         _section(page, f"Placement of {source.name}", alignment_words(placed).items())
     _section(page, "Choices made on the way", plain=analysis.notes or ["none"])
-    missing = [(p.source or p.what, f"{p.reason}. {p.remedy}") for p in analysis.missing]
-    none = [] if missing else ["nothing is missing"]
-    _section(page, "Looked for and not found", missing, none)
+    _missing(page, analysis.missing)
     _methods(page, "methods.md")
     yield page
+
+
+def draw_aids(document: AidsDocument) -> Iterator[Page]:
+    """Draw one page or more about a flight whose aids alone were judged."""
+    flight, page = document.alone.flight, _begin("Provenance", document)
+    _log(page, flight)
+    _section(page, "Choices made on the way", plain=flight.log.notes or ["none"])
+    _missing(page, (document.alone.lacking, *flight.missing))
+    yield page
+
+
+def _log(page: Page, flight: Flight, source: PositionTrack | None = None) -> None:
+    """What the log is, which position was taken, and its parameters without those of others."""
+    log, facts = flight.log, dict[str, str]()
+    others = (f"{t.name} ({t.rate_hz:.1f} Hz)" for t in flight.positions if t is not source)
+    unlike = set[str]()
+    if source is not None:
+        aid = source.origin.aid or EV_POS
+        unlike = unlike.union(*(one.own for one in (EV_POS, GNSS_POS) if one != aid))
+        facts["position source"] = (
+            f"{source.name} ({source.origin.kind}, {source.origin.passage}) from "
+            f"{', '.join(source.topics)}; clock: {source.clock}"
+        )
+    parameters = (f"{n} {value:g}" for n, value in log.parameters.items() if n not in unlike)
+    facts = {
+        "file": f"{log.name}, {log.bytes} bytes, {log.format}",
+        "SHA-256": log.sha256,
+        **{f.role: f"{f.name}, {f.bytes} bytes, SHA-256 {f.sha256}" for f in flight.inputs},
+        "firmware": f"{log.firmware}, git {log.firmware_hash}",
+        "time zero": f"{log.boot_time_s:.6f} s after boot, the first sample of data",
+        **facts,
+        "also in the log": ", ".join(others) or "no other position",
+        "parameters": ", ".join(parameters) or "none",
+    }
+    _section(page, "The log", facts.items())
+
+
+def _missing(page: Page, parts: Iterable[Unavailable]) -> None:
+    missing = [(part.source or part.what, f"{part.reason}. {part.remedy}") for part in parts]
+    none = [] if missing else ["nothing is missing"]
+    _section(page, "Looked for and not found", missing, none)
 
 
 def draw_loop(document: LoopDocument) -> Iterator[Page]:
@@ -65,10 +90,11 @@ def draw_loop(document: LoopDocument) -> Iterator[Page]:
     yield page
 
 
-def _begin(title: str, document: Document | LoopDocument) -> Page:
+def _begin(title: str, document: Document | AidsDocument | LoopDocument) -> Page:
     """A page that begins with what the report was made with."""
     page, student = Page(title), document.student
-    made = provenance(document.command) if document.made is None else document.made
+    made = None if isinstance(document, AidsDocument) else document.made
+    made = provenance(document.command) if made is None else made
     facts = {
         "command": made.command,
         "px4fuse": f"{made.px4fuse} on Python {made.python}",
