@@ -164,19 +164,24 @@ def test_several_settings_at_once_are_each_alone(model: Model) -> None:
 def test_samples_that_arrive_after_the_horizon_are_late_or_lost(model: Model) -> None:
     vision = model.inputs.received
     assert (model.flown.late, model.flown.lost) == (0, 0)
-    slow = replace(vision, arrival_s=vision.stamp_s + 0.02)
-    made = replace(model, inputs=replace(model.inputs, received=slow))
-    # they arrive 20 ms after their stamp; the horizon is 214 ms, and 100 ms more are forgiven
-    in_time, late, lost = replay_settings(
-        made, [{"EKF2_EV_DELAY": delay} for delay in (190.0, 260.0, 300.0)]
-    )
+    # the horizon is 214 ms, and 100 ms more are forgiven
+
+    def arriving(after_s: float, **settings: float) -> Ekf2Replay:
+        slow = replace(vision, arrival_s=vision.stamp_s + after_s)
+        made = replace(model, inputs=replace(model.inputs, received=slow))
+        return replay_settings(made, [{"EKF2_EV_DELAY": 1.0, **settings}])[0]
+
+    in_time, late, lost = (arriving(after_s) for after_s in (0.20, 0.28, 0.36))
     assert (in_time.late, in_time.lost) == (0, 0)
     assert late.late > 0.95 * len(late.updates)
     assert late.lost == 0
     assert lost.lost > 500
     assert lost.updates["fused"].sum() < 10
-    more = replay_settings(made, [{"EKF2_EV_DELAY": 300.0, "EKF2_DELAY_MAX": 400.0}])[0]
+    more = arriving(0.36, EKF2_DELAY_MAX=400.0)
     assert (more.late, more.lost) == (0, 0)
+    # EKF2 raises EKF2_DELAY_MAX to its longest delay
+    longest = arriving(0.02, EKF2_EV_DELAY=300.0)
+    assert (longest.late, longest.lost) == (0, 0)
 
 
 def unavailable(flight: Flight) -> str:

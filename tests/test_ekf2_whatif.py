@@ -288,7 +288,10 @@ def test_the_stated_sigma_goes_from_after_one_sample_to_before_the_next(stated: 
     state = pd.DataFrame(0.0, index=[20.0, 21.0], columns=STATE_COLUMNS)
     variance = pd.DataFrame({"north_m2": 9.0, "east_m2": 9.0}, index=[21.0]) if stated else NONE
     flight = made(Flight, ekf2=made(Ekf2, state=state, variance=variance), truth=NONE)
-    replay = made(Ekf2Replay, updates=updates, published=state, changed={}, late=1, lost=2)
+    replay = made(
+        Ekf2Replay, updates=updates, published=state, changed={}, late=1, lost=2, settings={},
+        delayed={"heading_rad": None},
+    )  # fmt: skip
     found = _of_replay(flight, replay, ((10.0, 30.0),))
     for axis in found.axes.values():
         assert axis.nis_mean == pytest.approx((0.01 / 0.05 + 0.09 / 0.13) / 2.0)

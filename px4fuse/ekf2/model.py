@@ -33,7 +33,7 @@ from px4fuse.ekf2.intervals import (
     make_intervals,
 )
 from px4fuse.ekf2.output_predictor import follow_attitude, later, publish
-from px4fuse.ekf2.recursion import Run, Variant, run, with_correlation
+from px4fuse.ekf2.recursion import HEADING, Run, Variant, run, with_compass, with_correlation
 from px4fuse.ekf2.replay import UPDATE_COLUMNS, VELOCITY_UPDATE_COLUMNS, Agreement, Ekf2Replay
 from px4fuse.ekf2_parameters import GNSS_POS, check
 from px4fuse.errors import SettingsError
@@ -92,20 +92,19 @@ def open_model(flight: Flight) -> Model | Unavailable:
         for stretch, each in zip(inputs.stretches, intervals, strict=True)
     )
     inputs = replace(inputs, stretches=stretches)
-
-    def replayed(variant: Variant) -> tuple[Ekf2Replay, Agreement | Unavailable]:
-        runs = run_variants(inputs, [variant], {timing: intervals})
-        replay = _assemble(inputs, runs, 0, {})
-        return replay, agreement_with_log(flight, replay)
-
-    replay, agreement = replayed(flown)
+    runs = run_variants(inputs, [flown], {timing: intervals})
+    replay = _assemble(inputs, runs, 0, {})
+    agreement = agreement_with_log(flight, replay)
     if isinstance(agreement, Unavailable):
         return agreement
     share = max(agreement.rejected_share_logged, agreement.rejected_share_replayed)
     if share > REJECTING_SHARE and np.isfinite(inputs.received.rejected).any():
-        _, obeyed = replayed(replace(flown, as_logged=True))
+        again = run_variants(inputs, [replace(flown, as_logged=True)], {timing: intervals})
+        obeyed = agreement_with_log(flight, _assemble(inputs, again, 0, {}))
         if isinstance(obeyed, Agreement):
             agreement = with_obedient(agreement, obeyed)
+    if inputs.aid == GNSS_POS:
+        inputs = replace(inputs, stretches=tuple(map(with_compass, runs)))
     replay = structs.replace(replay, agreement=agreement)
     return Model(flight, inputs, intervals, replay, agreement)
 
@@ -312,7 +311,9 @@ def _tracks(inputs: Inputs, part: Run, at: int) -> tuple[pd.DataFrame, pd.DataFr
         tau_velocity_s=variant.settings["EKF2_TAU_VEL"],
         tau_position_s=variant.settings["EKF2_TAU_POS"],
     )
-    return _track(part, state), _track(part, np.hstack([state[:, THETA], *published]))
+    heading = np.arctan2(stretch.rotation[:, 1, 0], stretch.rotation[:, 0, 0]) + state[:, HEADING]
+    delayed = _track(part, state).assign(heading_rad=heading)
+    return delayed, _track(part, np.hstack([state[:, THETA], *published]))
 
 
 def delayed_states(part: Run, at: int) -> tuple[Array, Array]:

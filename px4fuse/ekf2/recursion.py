@@ -30,12 +30,17 @@ from px4fuse.ekf2.intervals import (
     Intervals,
     Timing,
 )
-from px4fuse.ekf2.stretches import Stretch
+from px4fuse.ekf2.stretches import Compass, Stretch
 from px4fuse.ekf2_parameters import GNSS_VEL
 
 # How long the first pass runs that gives the correlations at the start
 CORRELATING_S = 8.0
 LEAST_VARIANCE = 1e-30
+# Of the heading, in one step: it comes back at once
+MOST_GAIN = 0.999
+# The magnetometer's field is a state of EKF2 too, and gives way where the heading stays turned: on
+# a flight that GNSS turned by 5° it pulled with this share of what the variance tells
+GIVING = 0.4
 # Events whose intervals are stacked at once
 TOGETHER = 64
 # Variance by which a sample is not taken at all
@@ -96,7 +101,8 @@ class Variant:
         if inputs.rules.horizon_by_delay:  # the longest of the delays makes the buffer
             length = math.ceil(delay_s / inputs.predict_s)
             return Timing(delay_s, max(inputs.horizon_s, (length - 1) * inputs.step_s))
-        longest_ms = self.settings["EKF2_DELAY_MAX"]
+        # EKF2 raises it to the longest delay when it starts (EKF2.cpp)
+        longest_ms = max(self.settings["EKF2_DELAY_MAX"], self.settings[inputs.aid.delay])
         if longest_ms == inputs.settings["EKF2_DELAY_MAX"]:
             return Timing(delay_s, inputs.horizon_s)
         # initialise_interface, estimator_interface.cpp: the length of the IMU buffer
@@ -123,6 +129,8 @@ class Run:
     velocity_innovation_m_s, velocity_variance_m2_s2 : ndarray, shape (E, S, 3)
         The same of velocity, where EKF2 fuses it.
     rejected, fused, reset : ndarray of bool, shape (E, S)
+    told_rad, heading_gain : ndarray, shape (E, S)
+        By how much EKF2's own heading turned that of the model, and its gain as a measurement.
     state, variance : ndarray, shape (E + 1, S, 15)
         At the start and after each event.
     covariance : ndarray, shape (S, 15, 15)
@@ -140,6 +148,8 @@ class Run:
     rejected: BoolArray
     fused: BoolArray
     reset: BoolArray
+    told_rad: Array
+    heading_gain: Array
     state: Array
     variance: Array
     covariance: Array
@@ -180,7 +190,10 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     own = np.stack([stretch.attitude_error_rad[end, HEADING], stretch.down_m[end]], axis=-1)
     own_attitude = stretch.attitude_variance_rad2[end]
     own_variance = np.stack([own_attitude[:, :, HEADING], stretch.down_variance_m2[end]], axis=-1)
-    heading = np.where(attitude, own[:, :, 0], 0.0)
+    told_rad, heading_gain = np.zeros((2, events, size))
+    # a delay turns the heading; what other settings do to it is less than what is known of it
+    follows = knob[inputs.aid.delay] != inputs.settings[inputs.aid.delay]
+    turned = None if stretch.compass is None else stretch.compass.between(now_s)
     gate2 = (np.maximum(knob[inputs.aid.gate], MIN_GATE) ** 2)[:, None]
     gyro2 = np.where(attitude, knob["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
     force2 = (knob["EKF2_ACC_NOISE"] ** 2)[:, None, None]
@@ -256,6 +269,12 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
                 spread = _diagonal(P)
         np.subtract(own[e], x[:, OWN], out=innovation[:, :2])
         R[:, :2] = _down_to(spread[:, OWN], own_variance[e])
+        heading_gain[e] = spread[:, HEADING] / (spread[:, HEADING] + R[:, 0])
+        if turned is not None:
+            told, gain = turned[0][e], np.where(follows, turned[1][e], 1.0)
+            innovation[:, 0] = told + gain * (innovation[:, 0] - told)
+        told_rad[e] = innovation[:, 0]
+        heading = np.where(attitude, x[:, HEADING] + innovation[:, 0], 0.0)
         if inputs.vision_height:
             R[:, 1] = NOT_TAKEN
             if sampled[e]:
@@ -267,7 +286,7 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
         HPH.reshape(size, -1)[:, :: len(MEASURED) + 1] += R
         K = np.swapaxes(HP, 1, 2) @ np.linalg.inv(HPH)
         x = x + (K @ innovation[:, :, None])[:, :, 0]
-        x[:, HEADING] = heading[e]
+        x[:, HEADING] = heading
         P = P - K @ HP
         P = 0.5 * (P + np.swapaxes(P, 1, 2))
         if restart is not None and restart.any():
@@ -284,8 +303,8 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
         states[e + 1], spreads[e + 1] = x, _diagonal(P)
     return Run(
         stretch, tuple(variants), tuple(each.events for each in intervals), innovations, variances,
-        noise[:, :, :2], velocity_innovations, velocity_variances, rejected, fused, reset, states,
-        spreads, P,
+        noise[:, :, :2], velocity_innovations, velocity_variances, rejected, fused, reset, told_rad,
+        heading_gain, states, spreads, P,
     )  # fmt: skip
 
 
@@ -382,6 +401,16 @@ def _drift(
     force = biases * (knob["EKF2_ACC_B_NOISE"] * inputs.step_s) ** 2
     limit = np.stack([knob["EKF2_GYR_NOISE"] ** 2, knob["EKF2_ACC_NOISE"] ** 2], axis=-1)
     return np.repeat(np.stack([gyro, force], axis=-1), 3, axis=-1), np.repeat(limit, 3, axis=-1)
+
+
+def with_compass(done: Run) -> Stretch:
+    """The same stretch, with what the magnetometer did to the heading of the first variant."""
+    gain = np.minimum(GIVING * done.heading_gain[:, 0], MOST_GAIN)
+    sums = (np.concatenate([[0.0], np.cumsum(each)])
+            for each in (done.told_rad[:, 0], -np.log1p(-gain)))  # fmt: skip
+    stretch = done.stretch
+    times = np.concatenate([stretch.time_s[:1], stretch.time_s[done.events[0].end]])
+    return replace(stretch, compass=Compass(times, *sums))
 
 
 def with_correlation(inputs: Inputs, stretch: Stretch, intervals: Intervals) -> Stretch:

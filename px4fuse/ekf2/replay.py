@@ -142,8 +142,9 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
         whether it was rejected by the gate, fused, or the position reset to it; variances of
         position and velocity after it, R, and the end of the step in which that happened; then
         the same innovations of velocity.
-    delayed : DataFrame, shape (n, 6)
-        Position and velocity at the fusion horizon at the end of each step (m, m/s, NED).
+    delayed : DataFrame, shape (n, 7)
+        Position and velocity at the fusion horizon at the end of each step (m, m/s, NED), and
+        ``heading_rad``.
     published : DataFrame, shape (n, 6)
         What EKF2 publishes then, by its output predictor.
     """

@@ -53,6 +53,34 @@ MIN_STRETCH_S = 10.0
 
 
 @dataclass(frozen=True)
+class Compass:
+    """What the magnetometer told EKF2 of its heading as flown, summed from the start.
+
+    What EKF2 knows of the magnetometer is not in the log, or thinly. What is left of its heading
+    when the gyro and the positions are accounted for is what the magnetometer did to it.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (n,)
+    told_rad : ndarray, shape (n,)
+        By how much it turned the heading.
+    pull : ndarray, shape (n,)
+        -ln(1 - gain): another heading would have come back by this.
+    """
+
+    time_s: Array
+    told_rad: Array
+    pull: Array
+
+    def between(self, times: Array) -> tuple[Array, Array]:
+        """Turn and gain from one time to the next, along the first axis."""
+        at_start = np.full((1, *times.shape[1:]), self.time_s[0])
+        times = np.concatenate([at_start, times])
+        told, pull = (np.interp(times, self.time_s, each) for each in (self.told_rad, self.pull))
+        return np.diff(told, axis=0), -np.expm1(-np.diff(pull, axis=0))
+
+
+@dataclass(frozen=True)
 class Stretch:
     """A part of the flight that the model replays in one go: n prediction steps.
 
@@ -87,6 +115,9 @@ class Stretch:
         Of the state at the start; the log has variances only.
     fusing : bool
         Whether EKF2 fuses the source when it begins.
+    compass : Compass or None
+        What else than positions and velocities told EKF2 of its heading; None: the heading is
+        EKF2's own as flown, whatever is changed.
     """
 
     time_s: Array
@@ -103,6 +134,7 @@ class Stretch:
     attitude_error_rad: Array
     correlation: Array
     fusing: bool = True
+    compass: Compass | None = None
 
     __repr__ = brief
 

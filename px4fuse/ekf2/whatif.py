@@ -22,6 +22,7 @@ from px4fuse.ekf2.replay import HORIZONTAL, Agreement, Ekf2Replay, Spans
 from px4fuse.ekf2_parameters import GNSS_POS, check
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
+from px4fuse.filter.heading import heading_rad
 from px4fuse.flight import Ekf2, Flight, Unavailable
 from px4fuse.record import Count, NotNegative, Record, Share
 
@@ -33,9 +34,13 @@ NO_TRUTH = Unavailable(
     "the log holds no ground truth",
     "Record motion capture (ATT_POS_MOCAP) beside the position source, or fly in simulation.",
 )
-OWN_HEADING = (
-    "heading and height are EKF2's own as flown: what a setting of GNSS does to them, as a wrong "
-    "delay turns the heading, is not replayed"
+# Of a flight on GNSS
+HEADING_FOLLOWS = (
+    "with another delay of GNSS the heading follows, against a magnetometer whose pull is known "
+    "roughly (to about half a degree); else heading and height are EKF2's own as flown"
+)
+OWN_HEADING = Unavailable(
+    "heading error", "on external vision the heading is EKF2's own as flown", "Read it in the log."
 )
 SWEEP_VALUES = 9
 MAX_SWEEP_VALUES = 200
@@ -82,6 +87,8 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     longest_without_fusion_s : float or Unavailable
     resets : int
         Of horizontal position.
+    heading_error_mean_deg : float or Unavailable
+        Heading minus the truth's, clockwise seen from above.
     late, lost : int
         Samples that arrived after the fusion horizon had passed them: fused late, and never.
     steady : bool
@@ -95,6 +102,7 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     rejected_share: Share
     longest_without_fusion_s: NotNegative | Unavailable
     resets: Count
+    heading_error_mean_deg: float | Unavailable = OWN_HEADING
     late: Count = 0
     lost: Count = 0
     steady: bool = True
@@ -177,7 +185,7 @@ def what_if(model: Model, settings: Sequence[Mapping[str, float]]) -> WhatIf | U
         whatif=_steadied(model, [_of_replay(flight, r, judged) for r in replays], judged),
         judged=judged,
         notes=(
-            *((OWN_HEADING,) if replays and model.inputs.aid == GNSS_POS else ()),
+            *((HEADING_FOLLOWS,) if replays and model.inputs.aid == GNSS_POS else ()),
             *(note for replay in replays for note in _notes(model, replay)),
         ),
     )
@@ -255,6 +263,9 @@ def _of_replay(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
         flight, judged, used, replay.published, variance,
         changed=replay.changed, longest_without_fusion_s=_longest(fused.to_numpy(), judged),
         resets=int(used["reset"].sum()), late=replay.late, lost=replay.lost,
+        heading_error_mean_deg=_heading_error(
+            flight, replay, replay.delayed["heading_rad"], judged
+        ),
     )  # fmt: skip
 
 
@@ -275,9 +286,12 @@ def _of_log(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
     if len(used) > COMPLETE_SHARE * replayed:
         fused = used.index[used["rejected"] == 0].to_numpy()
         longest = _longest(np.concatenate([fused, resets]), judged)
+    assert isinstance(flight.attitude, pd.DataFrame)  # it was replayed
+    heading = pd.Series(heading_rad(flight.attitude), flight.attitude.index)
     return _summary(
         flight, judged, used, ekf2.state, None,
         changed={}, longest_without_fusion_s=longest, resets=len(resets),
+        heading_error_mean_deg=_heading_error(flight, replay, heading, judged),
     )  # fmt: skip
 
 
@@ -319,6 +333,21 @@ def _summary(
     north, east = (axes[axis] for axis in HORIZONTAL)
     share = float(used["rejected"].mean())
     return Summary(north=north, east=east, samples=len(used), rejected_share=share, **more)
+
+
+def _heading_error(
+    flight: Flight, replay: Ekf2Replay, heading: pd.Series, judged: Spans
+) -> float | Unavailable:
+    """Mean of a heading (rad) minus the truth's, in degrees."""
+    if GNSS_POS.noise not in replay.settings:
+        return OWN_HEADING
+    true = None if isinstance(flight.truth, Unavailable) else flight.truth.attitude
+    if true is None:
+        return replace(NO_TRUTH, what="heading error", reason="the log holds no true attitude")
+    kept = heading[settled(heading.index, judged)]
+    at = np.interp(kept.index, true.index, heading_rad(true), np.nan, np.nan)
+    error = np.angle(np.exp(1j * (kept.to_numpy() - at)))
+    return float(np.degrees(np.nanmean(error)))
 
 
 def _longest(fused_s: Array, judged: Spans) -> float:

@@ -190,7 +190,8 @@ def _parts(time: Array, turn: Array, sigma: Array) -> tuple[HeadingPart, ...]:
     )
 
 
-def _yaw(quaternions: pd.DataFrame) -> Array:
+def heading_rad(quaternions: pd.DataFrame) -> Array:
+    """Heading of attitudes, clockwise seen from above, without steps of a whole turn."""
     values = quaternions[QUATERNION_COLUMNS].to_numpy(copy=True)
     angles: Array = Rotation.from_quat(values, scalar_first=True).as_euler("ZYX")[:, 0]
     return np.unwrap(angles)
@@ -206,8 +207,8 @@ def _by_orientation(
     covered = (time >= known[0]) & (time <= known[-1])
     if np.count_nonzero(covered) < MIN_PARTS * MIN_PART_SAMPLES:
         return None
-    own, time = _yaw(inside)[covered], time[covered]
-    yaw = np.interp(time, known, _yaw(attitude))
+    own, time = heading_rad(inside)[covered], time[covered]
+    yaw = np.interp(time, known, heading_rad(attitude))
     turn = own - yaw
     turn -= 2.0 * np.pi * np.round(np.median(turn) / (2.0 * np.pi))
     calm = np.abs(np.gradient(yaw, time)) < np.radians(MAX_TURN_RATE_DEG_S)

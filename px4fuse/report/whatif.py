@@ -30,6 +30,7 @@ MAX_TICKS = 10
 WIDE = 5.0  # values that span more are drawn on a logarithmic scale
 Of = Callable[[Summary, str], float | Unavailable]
 CHAOTIC = "chaotic"
+HEADING_ROW = "heading - truth (°)"
 # Of each EKF2 along an axis
 AXIS_ROWS: tuple[tuple[str, Callable[[Summary, str], str]], ...] = (
     ("{}: mean NIS", lambda s, axis: number_words(s.axes[axis].nis_mean)),
@@ -44,6 +45,7 @@ ROWS: tuple[tuple[str, Callable[[Summary], str]], ...] = (
     ("rejected", lambda s: f"{s.rejected_share:.1%}"),
     ("longest without fusion (s)", lambda s: _number(s.longest_without_fusion_s, 2)),
     ("position resets", lambda s: f"{s.resets}"),
+    (HEADING_ROW, lambda s: _number(s.heading_error_mean_deg, 1)),
 )
 
 
@@ -72,8 +74,11 @@ def rows(made_of: Counterfactual) -> list[list[str]]:
         for axis in HORIZONTAL
         for label, cell in AXIS_ROWS
     ]
+    has_heading = isinstance(found.replayed.heading_error_mean_deg, float)
     return made + [
-        [label, *(cell(s) if s.steady else CHAOTIC for s in every)] for label, cell in ROWS
+        [label, *(cell(s) if s.steady else CHAOTIC for s in every)]
+        for label, cell in ROWS
+        if has_heading or label != HEADING_ROW
     ]
 
 
@@ -101,7 +106,7 @@ def _sweep_cells(summary: Summary) -> list[str]:
     nis, _, _, sigma, rmse = (cell for _, cell in AXIS_ROWS)
     return [
         "/".join(nis(summary, axis) for axis in HORIZONTAL),
-        *(cell(summary) for _, cell in ROWS[1:]),
+        *(cell(summary) for label, cell in ROWS[1:] if label != HEADING_ROW),
         *("/".join(cell(summary, axis) for axis in HORIZONTAL) for cell in (sigma, rmse)),
     ]
 
