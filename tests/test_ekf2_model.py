@@ -166,7 +166,7 @@ def test_samples_that_arrive_after_the_horizon_are_late_or_lost(model: Model) ->
     assert (model.flown.late, model.flown.lost) == (0, 0)
     # the horizon is 214 ms, and 100 ms more are forgiven
 
-    def arriving(after_s: float, **settings: float) -> Ekf2Replay:
+    def arriving(after_s: float, **settings: float) -> Any:
         slow = replace(vision, arrival_s=vision.stamp_s + after_s)
         made = replace(model, inputs=replace(model.inputs, received=slow))
         return replay_settings(made, [{"EKF2_EV_DELAY": 1.0, **settings}])[0]
