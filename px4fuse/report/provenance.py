@@ -12,6 +12,7 @@ from px4fuse.report.document import AidsDocument, Document, LoopDocument
 from px4fuse.report.page import Page
 from px4fuse.report.style import MUTED
 from px4fuse.report.words import alignment_words, clock_words
+from px4fuse.request import with_options
 from px4fuse.results.model import provenance
 
 INDENT, SIZE = 140.0, 7.5
@@ -70,7 +71,9 @@ def _log(page: Page, flight: Flight, source: PositionTrack | None = None) -> Non
 
 
 def _missing(page: Page, parts: Iterable[Unavailable]) -> None:
-    missing = [(part.source or part.what, f"{part.reason}. {part.remedy}") for part in parts]
+    missing = [
+        (part.source or part.what, f"{part.reason}. {with_options(part.remedy)}") for part in parts
+    ]
     none = [] if missing else ["nothing is missing"]
     _section(page, "Looked for and not found", missing, none)
 

@@ -148,21 +148,14 @@ def _aid_sources(inputs: Inputs, done: Run, track: TopicTrack, rate_hz: float) -
     last = np.maximum.accumulate(used)
     last_us = np.where(last >= 0, sensors.START_US + last, 0).astype(np.uint64)
     gnss = received.velocity_m_s is not None
+    observed = unproject(north, east, sensors.HOME[:2]) if gnss else (north, east)
     position = _aid_source(
         aid,
         inputs.settings,
-        {
-            **shown,
-            "time_last_fuse": last_us,
-            "observation": np.stack(unproject(north, east, sensors.HOME[:2]), axis=1)
-            if gnss
-            else measured.astype(np.float32),
-            "innovation_rejected": run.rejected[seen, 0],
-            "fused": run.fused[seen, 0],
-        },
-        innovation,
-        variance,
-        noise,
+        shown | {"time_last_fuse": last_us},
+        np.stack(observed, axis=1).astype(np.float64 if gnss else np.float32),
+        (innovation, variance, noise),
+        (run.rejected[seen, 0], run.fused[seen, 0]),
     )
     if received.velocity_m_s is None or received.velocity_variance_m2_s2 is None:
         return (position,)
@@ -170,32 +163,39 @@ def _aid_sources(inputs: Inputs, done: Run, track: TopicTrack, rate_hz: float) -
     stated = received.velocity_variance_m2_s2[sample]
     speed_noise = VERTICAL_SCALE * np.maximum(stated, inputs.settings[GNSS_VEL.noise] ** 2)
     outside = (moving**2 > inputs.settings[GNSS_VEL.gate] ** 2 * spread).any(axis=1)
-    decisions = {
-        "observation": received.velocity_m_s[sample].astype(np.float32),
-        "innovation_rejected": outside,
-        "fused": ~outside & np.isfinite(moving).all(axis=1),
-    }
-    settings = inputs.settings
-    return position, _aid_source(GNSS_VEL, settings, shown | decisions, moving, spread, speed_noise)
+    return position, _aid_source(
+        GNSS_VEL,
+        inputs.settings,
+        shown,
+        received.velocity_m_s[sample].astype(np.float32),
+        (moving, spread, speed_noise),
+        (outside, ~outside & np.isfinite(moving).all(axis=1)),
+    )
 
 
 def _aid_source(
     aid: Aid,
     settings: Mapping[str, float],
-    fields: dict[str, NDArray[Any]],
-    innovation: Array,
-    variance: Array,
-    noise: Array,
+    stamps: Mapping[str, NDArray[Any]],
+    observation: Array,
+    judged: tuple[Array, Array, Array],
+    decided: tuple[BoolArray, BoolArray],
 ) -> Topic:
-    """What every aid's message has in common."""
+    """An aid's message; ``judged`` are innovation, S and R, ``decided`` rejected and fused."""
+    innovation, variance, noise = judged
     ratio = innovation**2 / (max(settings[aid.gate], 1.0) ** 2 * variance)
-    numbers = {
-        "observation_variance": noise, "innovation": -innovation,
-        "innovation_variance": variance, "test_ratio": ratio,
-    }  # fmt: skip
     return Topic(
         f"estimator_aid_src_{aid.name}",
-        fields | {name: values.astype(np.float32) for name, values in numbers.items()},
+        {
+            **stamps,
+            "observation": observation,
+            "observation_variance": noise.astype(np.float32),
+            "innovation": (-innovation).astype(np.float32),
+            "innovation_variance": variance.astype(np.float32),
+            "test_ratio": ratio.astype(np.float32),
+            "innovation_rejected": decided[0],
+            "fused": decided[1],
+        },
     )
 
 
@@ -221,7 +221,6 @@ def _flags(inputs: Inputs, done: Run, track: TopicTrack) -> Topic:
             "cs_tilt_align": always,
             "cs_yaw_align": always,
             "cs_gnss_pos": on[rows] & gnss,
-            "cs_gnss_vel": on[rows] & gnss,
             "cs_opt_flow": never,
             "cs_mag_hdg": always,
             "cs_baro_hgt": always,
@@ -229,6 +228,7 @@ def _flags(inputs: Inputs, done: Run, track: TopicTrack) -> Topic:
             "cs_ev_yaw": never,
             "cs_ev_hgt": never,
             "cs_ev_vel": never,
+            **({"cs_gnss_vel": on[rows]} if gnss else {}),
         },
     )
 
