@@ -167,7 +167,8 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
         f"aid_understated:{SENSOR}",
     ),
     "source_frame_turned": (
-        f"errors_larger_than_claimed:{FRAME}", f"kf_variance_understated:{FRAME}",
+        f"errors_larger_than_claimed:{FRAME}", f"errors_larger_than_claimed:{ELSEWHERE}",
+        f"kf_variance_understated:{FRAME}",
     ),
     "source_repeats": (
         "source_smoothed", "source_coloured", "source_jumps", "source_scale_wrong",
