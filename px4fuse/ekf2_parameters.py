@@ -66,6 +66,8 @@ class Aid:
 AID_MASK = "EKF2_AID_MASK"
 # Since main of 2026 EKF2 takes a fix's own time of measurement, where the driver knows it
 GNSS_MODE = "EKF2_GPS_MODE"
+# Age of a fix since v1.17, of the first receiver: EKF2 then takes the stamp with it taken off
+RECEIVER_DELAYS = ("SENS_GNSS0_DELAY", "SENS_GPS0_DELAY")
 _SENDER, _RECEIVER = "the variance that the sender states", "the accuracy that the receiver states"
 EV_POS = Aid(
     "ev_pos", "EKF2_EV_CTRL", "EKF2_EVP_NOISE", "EKF2_EVP_GATE", "EKF2_EV_DELAY",
@@ -176,7 +178,7 @@ OLD_DEFAULTS: Mapping[str, float] = {EV_POS.delay: 175.0}
 REPORTED = (
     AID_MASK, "EKF2_EN", EV_POS.gate, EV_POS.noise, EV_POS.switch, EV_POS.delay, EV_POS.noise_mode,
     "EKF2_HGT_MODE", "EKF2_HGT_REF", "EKF2_ACC_NOISE", "EKF2_PREDICT_US", GNSS_POS.switch,
-    GNSS_POS.noise, GNSS_POS.gate, GNSS_POS.delay, GNSS_MODE,
+    GNSS_POS.noise, GNSS_POS.gate, GNSS_POS.delay, GNSS_MODE, *RECEIVER_DELAYS,
     "SDLOG_PROFILE", "SYS_AUTOSTART", "SYS_MC_EST_GROUP",
 )  # fmt: skip
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ import pytest
 from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import structs
 
 from px4fuse.analysis import Analysis, explain
 from px4fuse.cli import cli
@@ -23,7 +26,7 @@ from px4fuse.ekf2.whatif import WhatIf, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.settings import Settings
-from px4fuse.findings import find
+from px4fuse.findings import find, source_clock
 from px4fuse.findings.story import story
 from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Truth, Unavailable
 from px4fuse.readers import read_log
@@ -169,6 +172,17 @@ def test_what_if_predicts_the_flight_with_the_other_delay() -> None:
         true.position_rmse_to_truth_m, rel=0.1
     )
     assert asked.logged.position_rmse_to_truth_m > 1.4 * true.position_rmse_to_truth_m
+
+
+def test_the_delay_that_is_asked_for_is_that_of_the_receiver_where_it_has_one() -> None:
+    analysis = flown("clock-offset=0.25")
+    log = analysis.flight.log
+    assert "SENS_GPS0_DELAY" not in next(source_clock.detect(analysis)).remedy
+    since_v1_17 = structs.replace(log, parameters={**log.parameters, "SENS_GPS0_DELAY": 110.0})
+    changed = replace(analysis, flight=replace(analysis.flight, log=since_v1_17))
+    said = next(source_clock.detect(changed)).remedy
+    (asked,) = re.findall(r"110 ms old \(SENS_GPS0_DELAY\), that would be (\d+) ms", said)
+    assert int(asked) == pytest.approx(110 + 250, abs=60)
 
 
 def test_a_slow_error_has_its_size_and_its_time() -> None:

@@ -8,7 +8,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.whatif import WhatIf, what_if
-from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS
+from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS, RECEIVER_DELAYS
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
 from px4fuse.findings.model import Found, error, finding, warning
 from px4fuse.findings.source_positions import low_pass
@@ -74,17 +74,19 @@ def offset(analysis: Analysis, clock: ClockOffset) -> Found:
 
 def _for_ekf2(analysis: Analysis, clock: ClockOffset) -> str:
     """What putting EKF2's delay right would do, where a replay confirms it."""
-    aid, model = analysis.source.origin.aid, analysis.ekf2_model
-    taken_ms = None if aid != GNSS_POS else analysis.flight.log.parameters.get(GNSS_POS.delay)
-    if taken_ms is not None and isinstance(model, Unavailable):
-        ask_ms = taken_ms - 1e3 * clock.remaining_s
+    source, model = analysis.source, analysis.ekf2_model
+    parameters = analysis.flight.log.parameters
+    known = [name for name in (*RECEIVER_DELAYS, GNSS_POS.delay) if name in parameters]
+    of_receiver = bool(known) and known[0] in RECEIVER_DELAYS  # which the model does not have
+    if source.origin.by_gnss and known and (of_receiver or isinstance(model, Unavailable)):
+        ask_ms = parameters[known[0]] - 1e3 * clock.remaining_s
         return (
-            f"; for EKF2, which takes fixes to be {taken_ms:g} ms old ({GNSS_POS.delay}), that "
-            f"would be {max(ask_ms, 0.0):.0f} ms (not replayed)"
+            f"; for EKF2, which takes fixes to be {parameters[known[0]]:g} ms old ({known[0]}), "
+            f"that would be {max(ask_ms, 0.0):.0f} ms (not replayed)"
         )
-    if isinstance(model, Unavailable) or analysis.source.name != model.inputs.received.source:
+    if isinstance(model, Unavailable) or source.name != model.inputs.received.source:
         return ""
-    changes = remedy.delay_change(model, 1e3 * (analysis.source.age_s - clock.offset_s))
+    changes = remedy.delay_change(model, 1e3 * (source.age_s - clock.offset_s))
     found = what_if(model, [changes]) if changes else None
     if not isinstance(found, WhatIf) or not remedy.delay_helps(found.replayed, *found.whatif):
         return ""
