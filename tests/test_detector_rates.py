@@ -26,7 +26,7 @@ from px4fuse.simulation.scenario import Scenario
 
 TABLE = rates()
 # Told behind what makes it
-BEHIND = ("ekf2_rejecting",)
+BEHIND = ("ekf2_rejecting", "aid_starved", "aid_understated")
 # Sizes that a log cannot show, for the reason in the finding's file; measured all the same
 INVISIBLE = {
     ("source_scale_wrong", "--mistake scale=5%"),

@@ -99,6 +99,15 @@ def test_the_cause_is_what_was_made_wrong(
     assert "replayed: " in (ours if owner == "kf" else ekf2)
 
 
+def test_vibration_asks_ekf2_for_more_process_noise_as_far_as_px4_lets_it() -> None:
+    analysis = flown("vibration=1.5")
+    found = cause(analysis, "ekf2", "nis")
+    assert found.change == {"EKF2_ACC_NOISE": 1.0}  # PX4's largest
+    assert found.explains > 0.5
+    assert "since EKF2_ACC_NOISE is 0.35 instead of 1 m/s²" in story(analysis, find(analysis))[0]
+    assert not any("EKF2_ACC_NOISE" in row.change for row in flown("nlos=7%").causes)
+
+
 def test_an_offset_that_was_applied_to_ours_is_still_missing_to_ekf2() -> None:
     bare = flown("clock-offset=-0.19")
     offset_s = cause(bare, "kf", "nees").change[CLOCK]

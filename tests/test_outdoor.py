@@ -144,6 +144,7 @@ def test_the_first_finding_names_the_mistake(mistake: str, root: str) -> None:
         ("heading=20", "nees", TURN, 20.0, 3.0),
         ("clock-offset=-0.1", "nees", "EKF2_GPS_DELAY", 10.0, 60.0),
         ("r-scale=0.1", "nis", "EKF2_GPS_P_NOISE", 0.4, 0.02),
+        ("vibration=1", "nees", "EKF2_ACC_NOISE", 1.0, 0.0),
     ],
 )
 def test_the_cause_of_ekf2_is_what_was_made_wrong(

@@ -83,9 +83,12 @@ SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
 # What a change of another needs along with it
 ALONG = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT))
 OF_SETTINGS = frozenset((SIGMA_A, SIGMA_Z))
+ACC_NOISE = "EKF2_ACC_NOISE"
+# Tilt and biases are acceleration's noise too, so that a calm flight asks for more than EKF2 takes
+SHAKEN = 3.0
 # What EKF2 has besides the aid's own; PX4's default is tried where something else was flown
 NOT_OF_AID = (
-    "EKF2_ACC_NOISE", "EKF2_GYR_NOISE", "EKF2_ACC_B_NOISE", "EKF2_GYR_B_NOISE", GNSS_VEL.noise,
+    ACC_NOISE, "EKF2_GYR_NOISE", "EKF2_ACC_B_NOISE", "EKF2_GYR_B_NOISE", GNSS_VEL.noise,
     GNSS_VEL.gate,
 )  # fmt: skip
 INNOVATION_COLUMNS, INNOVATION_VARIANCE_COLUMNS = UPDATE_COLUMNS[:2], UPDATE_COLUMNS[2:4]
@@ -455,7 +458,22 @@ class _Ekf2:
             for name in NOT_OF_AID
             if name in flown and not np.isclose(flown[name], PARAMETERS[name].default, rtol=1e-3)
         ]
+        if tuned is not None and not over:
+            found.append(self._shaken(tuned))
         return [change for change in found if change]
+
+    def _shaken(self, tuned: AxisTuning) -> Change:
+        """The process noise that the vibration asks for, as far as PX4's range goes.
+
+        EKF2 adds (EKF2_ACC_NOISE · step)² to the variance of the velocity in each step, ours
+        SIGMA_A² DT² in each DT.
+        """
+        steps = self.comparison.settings.dt_s / self.model.inputs.step_s
+        flown, most = self.model.inputs.settings[ACC_NOISE], PARAMETERS[ACC_NOISE].maximum
+        if (tuned.filter_sigma_a.low or 0.0) * steps**0.5 <= SHAKEN * flown:
+            return {}
+        asked = min((tuned.filter_sigma_a.value or 0.0) * steps**0.5, most)
+        return {ACC_NOISE: float(f"{asked:.2g}")} if asked > flown else {}
 
     def _noise(self, result: AxisComparison, tuned: AxisTuning) -> Change:
         """The source's noise, where EKF2 takes another than the data's interval allows."""

@@ -178,10 +178,7 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
         "ekf2_variance_understated", "errors_larger_than_claimed",
     ),
     "source_not_logged": ("source_decimated",),
-    "source_gap": (
-        "ekf2_fusion_interrupted", f"aid_starved:{SENSOR}",
-        f"errors_larger_than_claimed:{ELSEWHERE}",
-    ),
+    "source_gap": ("ekf2_fusion_interrupted", f"errors_larger_than_claimed:{ELSEWHERE}"),
     "logger_dropouts": ("imu_gap",),
 }  # fmt: skip
 # What the recording lacks: put right first, since noises are judged by what was recorded

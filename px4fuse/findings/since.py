@@ -156,4 +156,5 @@ def _one(analysis: Analysis, cause: Intervention, name: str) -> str:
             return f"{label} is {getattr(settings, name):g} instead of {value:.2g} {UNITS[name]}"
     assert not isinstance(analysis.ekf2_model, Unavailable)  # it was replayed
     flown, unit = analysis.ekf2_model.inputs.settings[name], PARAMETERS[name].unit
+    unit = unit.replace("^2", "²").replace("^3", "³")
     return f"{name} is {flown:.4g} instead of {value:.3g} {unit}".rstrip()
