@@ -175,6 +175,22 @@ def test_what_if_predicts_the_flight_with_the_other_delay() -> None:
     assert asked.logged.position_rmse_to_truth_m > 1.4 * true.position_rmse_to_truth_m
 
 
+def test_the_heading_follows_another_delay_alone() -> None:
+    """On real flights a fix that is taken for too young turns the heading clockwise."""
+    model = flown("ekf2-delay=0").ekf2_model
+    assert isinstance(model, Model)
+    changes: list[dict[str, float]] = [{"EKF2_GPS_DELAY": 110.0}, {"EKF2_GPS_P_NOISE": 0.8}]
+    asked = what_if(model, changes)
+    assert isinstance(asked, WhatIf)
+    summaries = (asked.logged, asked.replayed, *asked.whatif)
+    logged, replayed, delayed, noisy = (one.heading_error_mean_deg for one in summaries)
+    for error in (logged, replayed, delayed, noisy):
+        assert isinstance(error, float)
+    assert replayed == pytest.approx(logged, abs=0.1)
+    assert noisy == pytest.approx(replayed, abs=0.1)
+    assert -5.0 < delayed - replayed < -1.0
+
+
 def test_the_delay_that_is_asked_for_is_that_of_the_receiver_where_it_has_one() -> None:
     analysis = flown("clock-offset=0.25")
     log = analysis.flight.log
