@@ -21,7 +21,7 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.interventions import TURN, cause_of
 from px4fuse.comparison.model import FilterSummary
 from px4fuse.comparison.remedy import aid_of
-from px4fuse.ekf2.model import Model
+from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.whatif import WhatIf, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
@@ -175,9 +175,11 @@ def test_what_if_predicts_the_flight_with_the_other_delay() -> None:
     assert asked.logged.position_rmse_to_truth_m > 1.4 * true.position_rmse_to_truth_m
 
 
-def test_the_heading_follows_another_delay_alone() -> None:
+def test_the_heading_follows_another_delay_alone(tmp_path: Path) -> None:
     """On real flights a fix that is taken for too young turns the heading clockwise."""
-    model = flown("ekf2-delay=0").ekf2_model
+    log = tmp_path / "a.ulg"  # which holds the true attitude, as a flight in memory does not
+    log.write_bytes(to_ulog(simulate(OUTDOOR, parse(["ekf2-delay=0"]))))
+    model = open_model(read_log(log))
     assert isinstance(model, Model)
     changes: list[dict[str, float]] = [{"EKF2_GPS_DELAY": 110.0}, {"EKF2_GPS_P_NOISE": 0.8}]
     asked = what_if(model, changes)
