@@ -7,6 +7,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from exchange import replace
 
@@ -31,7 +32,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import find
 from px4fuse.findings.story import story
-from px4fuse.flight import Unavailable
+from px4fuse.flight import SPECIFIC_FORCE_COLUMNS, Unavailable
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
@@ -97,6 +98,17 @@ def test_the_cause_is_what_was_made_wrong(
     told = story(analysis, find(analysis))[0]
     ekf2, ours = told.split("; our filter")
     assert "replayed: " in (ours if owner == "kf" else ekf2)
+
+
+def test_a_bias_that_is_taken_out_is_an_imu_without_it() -> None:
+    analysis = flown("accel-bias=0.5")
+    found, imu = cause(analysis, "kf"), analysis.flight.imu
+    assert isinstance(imu, pd.DataFrame)
+    without = imu[SPECIFIC_FORCE_COLUMNS] - [found.change[FORWARD], found.change[TO_RIGHT], 0.0]
+    flight = replace(analysis.flight, imu=imu.assign(**without))
+    again = compare(flight, analysis.settings).axes["aisle"].filters["kf"]
+    assert isinstance(again, FilterSummary)
+    assert found.after == pytest.approx(again.nis_mean, rel=1e-6)
 
 
 def test_vibration_asks_ekf2_for_more_process_noise_as_far_as_px4_lets_it() -> None:
