@@ -213,11 +213,11 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
             "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate.",
         )
     read = read_gnss(flight, ekf2, record) if gnss else read_vision(flight, ekf2, record, attitude)
+    if isinstance(read, Unavailable):
+        return read
     # since v1.17 each receiver has its own, which its messages carry
     track = _gnss(flight) if gnss else None
     place = {} if track is None else dict(zip(aid.place, track.place_m, strict=True))
-    if isinstance(read, Unavailable):
-        return read
     if isinstance(horizon_s, Unavailable):
         if not flight.log.firmware.startswith(STAMPED_AT_HORIZON):
             return Unavailable(WHAT, horizon_s.reason, horizon_s.remedy)

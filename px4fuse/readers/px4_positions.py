@@ -10,7 +10,7 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.arrays import Array
-from px4fuse.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, Aid
+from px4fuse.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, Aid, settings_in_force
 from px4fuse.flight import (
     AXIS_NAMES,
     POSITION_COLUMNS,
@@ -50,7 +50,6 @@ ARRIVAL_SHARE = 0.9
 HEIGHT_TOLERANCE_S = 0.05
 # Logged no faster than this, a receiver's positions were thinned: they give 5 to 20 a second
 THINNED_HZ = 4.0
-DEFAULT_GNSS_DELAY_MS = 110.0  # EKF2_GPS_DELAY, ekf2_params.c and module.yaml, v1.8 to main
 AUTOPILOT_CLOCK = "autopilot boot clock (as PX4 mapped the sender's stamp)"
 
 
@@ -340,7 +339,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     parameters = topics.ekf2_parameters
     published_s = (gps["published_us"].to_numpy() - topics.zero_us) * 1e-6
     own = GNSS_MODE in parameters and bool(np.any(published_s - gps.index > SAME_TIME_US * 1e-6))
-    delay_ms = 0.0 if own else parameters.get(GNSS_POS.delay, DEFAULT_GNSS_DELAY_MS)
+    delay_ms = 0.0 if own else settings_in_force(parameters, GNSS_POS)[GNSS_POS.delay]
     clock = "autopilot boot clock, the receiver driver's times of measurement"
     if not own:
         gps = gps.set_axis(pd.Index(published_s - delay_ms * 1e-3, name="time_s"))

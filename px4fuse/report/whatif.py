@@ -30,7 +30,6 @@ MAX_TICKS = 10
 WIDE = 5.0  # values that span more are drawn on a logarithmic scale
 Of = Callable[[Summary, str], float | Unavailable]
 CHAOTIC = "chaotic"
-HEADING_ROW = "heading - truth (°)"
 # Of each EKF2 along an axis
 AXIS_ROWS: tuple[tuple[str, Callable[[Summary, str], str]], ...] = (
     ("{}: mean NIS", lambda s, axis: number_words(s.axes[axis].nis_mean)),
@@ -45,8 +44,9 @@ ROWS: tuple[tuple[str, Callable[[Summary], str]], ...] = (
     ("rejected", lambda s: f"{s.rejected_share:.1%}"),
     ("longest without fusion (s)", lambda s: _number(s.longest_without_fusion_s, 2)),
     ("position resets", lambda s: f"{s.resets}"),
-    (HEADING_ROW, lambda s: _number(s.heading_error_mean_deg, 1)),
 )
+# and where EKF2's heading follows what is changed
+HEADING_ROW = ("heading - truth (°)", lambda s: _number(s.heading_error_mean_deg, 1))
 
 
 def _named(name: str) -> str:
@@ -74,11 +74,10 @@ def rows(made_of: Counterfactual) -> list[list[str]]:
         for axis in HORIZONTAL
         for label, cell in AXIS_ROWS
     ]
-    has_heading = isinstance(found.replayed.heading_error_mean_deg, float)
+    follows = isinstance(found.replayed.heading_error_mean_deg, float)
     return made + [
         [label, *(cell(s) if s.steady else CHAOTIC for s in every)]
-        for label, cell in ROWS
-        if has_heading or label != HEADING_ROW
+        for label, cell in (*ROWS, *([HEADING_ROW] if follows else []))
     ]
 
 
@@ -106,7 +105,7 @@ def _sweep_cells(summary: Summary) -> list[str]:
     nis, _, _, sigma, rmse = (cell for _, cell in AXIS_ROWS)
     return [
         "/".join(nis(summary, axis) for axis in HORIZONTAL),
-        *(cell(summary) for label, cell in ROWS[1:] if label != HEADING_ROW),
+        *(cell(summary) for _, cell in ROWS[1:]),
         *("/".join(cell(summary, axis) for axis in HORIZONTAL) for cell in (sigma, rmse)),
     ]
 

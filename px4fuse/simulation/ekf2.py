@@ -32,7 +32,6 @@ from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.recursion import EAST, HEADING, NORTH, Run, Variant
 from px4fuse.ekf2.stretches import Stretch, down_sampled, step_ends
 from px4fuse.ekf2_parameters import GNSS_POS, GNSS_VEL, settings_in_force
-from px4fuse.readers.px4_topics import GPS_POSITION
 from px4fuse.simulation import sensors
 from px4fuse.simulation.ekf2_topics import TopicTrack, ekf2_topics
 from px4fuse.simulation.mistakes import Mistakes
@@ -226,8 +225,8 @@ def _received(source: sensors.SensedPositions) -> Received:
     )
     newest = np.maximum.accumulate(np.concatenate([[-np.inf], stamp[:-1]]))
     kept = stamp > newest
-    gnss = source.topic.name == GPS_POSITION
-    if gnss:
+    velocity = source.velocity_m_s
+    if velocity is not None:
         accuracy = np.stack([fields["eph"], fields["eph"], fields["epv"]], axis=1)[kept] ** 2
         speed = np.repeat(fields["s_variance_m_s"][kept, None] ** 2, 3, axis=1)
     else:
@@ -240,7 +239,7 @@ def _received(source: sensors.SensedPositions) -> Received:
         rejected=np.full(int(kept.sum()), np.nan),
         reset=np.zeros(int(kept.sum()), dtype=bool),
         source=source.topic.name,
-        velocity_m_s=source.velocity_m_s[kept] if gnss else None,
+        velocity_m_s=None if velocity is None else velocity[kept],
         velocity_variance_m2_s2=speed,
     )
 

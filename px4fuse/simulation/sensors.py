@@ -14,7 +14,8 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, BoolArray
-from px4fuse.readers.px4_positions import DEFAULT_GNSS_DELAY_MS, GPS_3D_FIX, unproject
+from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS
+from px4fuse.readers.px4_positions import GPS_3D_FIX, unproject
 from px4fuse.readers.px4_topics import GPS_POSITION
 from px4fuse.simulation.mistakes import Mistakes
 from px4fuse.simulation.motion import Motion, Sines, attitude, direction
@@ -34,7 +35,7 @@ NLOS_BURST = 3  # samples, mean
 # Where the local frame has its origin outdoors: latitude, longitude (degrees) and altitude (m)
 HOME = (47.397742, 8.545594, 488.0)
 # Of a fix when it is stamped; GNSS is less exact downwards
-FIX_AGE_S = 1e-3 * DEFAULT_GNSS_DELAY_MS
+FIX_AGE_S = 1e-3 * PARAMETERS[GNSS_POS.delay].default
 OF_GNSS = np.array([1.0, 1.0, 1.5])
 # A compass that is disturbed in flight pulls EKF2's heading along with this time constant
 HEADING_FOLLOWS_S = 3.0
@@ -69,8 +70,10 @@ class SensedPositions:
         Of each logged sample, whether it is one of the outliers that were put in.
     error_m : ndarray, shape (n, 3)
         What it measured beyond the truth, NED, mistakes of frame and scale included.
-    position_m, velocity_m_s : ndarray, shape (n, 3)
-        What it measured, NED; a UWB and a VIO send no velocity.
+    position_m : ndarray, shape (n, 3)
+        What it measured, NED.
+    velocity_m_s : ndarray, shape (n, 3), or None
+        The same of GNSS; a UWB and a VIO send no velocity.
     measured_s : ndarray, shape (n,)
         When it truly measured, seconds from the first data.
     distance_m, drift_m : float, ndarray of shape (3,)
@@ -81,7 +84,7 @@ class SensedPositions:
     outlier: BoolArray
     error_m: Array
     position_m: Array
-    velocity_m_s: Array
+    velocity_m_s: Array | None
     measured_s: Array
     distance_m: float
     drift_m: Array
@@ -260,14 +263,13 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> SensedP
         time_s, mistakes.dropout_s, mistakes.dropout_at_s, motion.duration_s
     ) & thinned(time_s, mistakes.decimate_hz)
     arrival_us, stamp_us = _stamps(mistakes, time_s, timing)
-    noise = scenario.sigma_gnss_m_s * OF_GNSS
-    velocity = state.velocity_m_s + noise * stream(scenario, Stream.FIX_VELOCITY).standard_normal(
-        position.shape
-    )
     reported_m = reported_sigma_m(scenario, mistakes)
+    velocity = None
     if outdoor:
+        noise = stream(scenario, Stream.FIX_VELOCITY).standard_normal(position.shape)
+        velocity = (state.velocity_m_s + scenario.sigma_gnss_m_s * OF_GNSS * noise)[keep]
         fix_us = stamp_us + round(1e6 * FIX_AGE_S)
-        topic = _fixes(fix_us[keep], position[keep], velocity[keep], reported_m, scenario)
+        topic = _fixes(fix_us[keep], position[keep], velocity, reported_m, scenario)
     else:
         rotation = attitude(state).body_to_ned[keep] if scenario.kind == "loop" else None
         topic = _odometry(arrival_us[keep], stamp_us[keep], position[keep], reported_m, rotation)
@@ -276,7 +278,7 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> SensedP
         outlier=outlier[keep],
         error_m=(position - state.position_m)[keep],
         position_m=position[keep],
-        velocity_m_s=velocity[keep],
+        velocity_m_s=velocity,
         measured_s=time_s[keep],
         distance_m=float(distance[-1]),
         drift_m=drift[-1],
