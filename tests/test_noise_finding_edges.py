@@ -468,24 +468,6 @@ def test_since_is_said_of_a_cause_alone() -> None:
         assert said.endswith("3 times too sure of itself.")
 
 
-def test_what_brings_a_number_into_its_band_comes_first_and_the_sources_fault_before_settings() -> (
-    None
-):
-    nearer, clock, both = {"sigma_a_m_s2": 3.0}, {"clock_offset_s": 0.25}, {"sigma_z_m": 2.0}
-    causes = (
-        tried("kf", nearer, "aisle", explains=0.99), tried("kf", both, "aisle"),
-        tried("kf", clock, "aisle"), tried("kf", {**clock, **both}, "aisle"),
-    )  # fmt: skip
-    assert (
-        ", since the stamps are 0.25 s early ("
-        in story(flight_of(judged(9.0), causes=causes), ())[0]
-    )
-    assert (
-        ", since SIGMA_Z is 1 instead of 2 m ("
-        in story(flight_of(judged(9.0), causes=causes[:2]), ())[0]
-    )
-
-
 def test_the_same_cause_of_both_is_told_once_and_its_finding_is_not_repeated() -> None:
     change = {"outliers_left_out": 38.0}
     causes = (tried("kf", change, "aisle"), tried("ekf2", change, "aisle", before=4.0))

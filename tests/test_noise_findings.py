@@ -16,7 +16,12 @@ from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
-DETECTORS = (source_clock, source_frame, source_positions, noises)
+DETECTORS = (
+    source_clock.detect,
+    source_frame.detect,
+    source_positions.detect,
+    noises.settings_off,
+)
 RIGHT = Settings(sigma_a_m_s2=0.27, sigma_z_m=0.10)
 SEED = 3
 
@@ -28,7 +33,7 @@ def flown(settings: Settings = RIGHT, *mistakes: str) -> Analysis:
 
 
 def found(analysis: Analysis) -> dict[str, Finding]:
-    return {finding.id: finding for file in DETECTORS for finding in file.detect(analysis)}
+    return {finding.id: finding for detect in DETECTORS for finding in detect(analysis)}
 
 
 def test_a_clean_flight_has_none() -> None:
