@@ -453,15 +453,6 @@ def test_outliers_are_those_that_tuning_found_and_what_was_set_is_not_found_agai
     assert clock_advice(compared, found)["Offset"].startswith("-0.")
 
 
-def test_a_source_without_heights_gives_the_offset_all_the_same() -> None:
-    flight, _ = made_flight(10, offset_s=0.1)
-    samples = flight.positions[0].samples.assign(down_m=np.nan)
-    flat = replace(flight, positions=(replace(flight.positions[0], samples=samples),))
-    found = estimate(flat)
-    assert covers(found, 0.1)
-    assert found.sigma_s < 0.03
-
-
 # --- flights of PX4's simulation with stamps that are wrong by design ---
 
 

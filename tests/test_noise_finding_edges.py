@@ -554,21 +554,6 @@ def test_of_noise_that_no_setting_stands_for_no_setting_is_the_cause() -> None:
 
 
 @pytest.mark.parametrize(
-    ("explains", "parts", "said"),
-    [
-        (1.0, {}, "all"), (0.9, {"brings_into_band": True}, "all"), (0.62, {}, "62%"),
-        (0.05, {}, "5%"), (0.0, {}, "nothing"), (-0.4, {}, "nothing"), (1.01, {}, "too much"),
-        (1.0, {"denied_by_truth": True}, "denied by the truth"),
-        (0.86, {"of": "apart", "brings_into_band": False}, "86%"),
-        (-0.2, {"of": "apart", "brings_into_band": False}, "nothing"),
-    ],
-)  # fmt: skip
-def test_how_much_a_change_explains_in_words(explains: float, parts: Any, said: str) -> None:
-    row = replace(tried("kf", {"sigma_z_m": 1.0}, explains=explains), **parts)
-    assert since.share_words(row) == said
-
-
-@pytest.mark.parametrize(
     ("owner", "change", "said"),
     [
         ("kf", {"outliers_left_out": 1.0}, "1 position is an outlier"),

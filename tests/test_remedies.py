@@ -137,15 +137,6 @@ def test_on_a_loop_of_vio_the_truth_is_told_first_and_no_noise_is_lowered(seed, 
     assert asked.get("EKF2_EVP_NOISE", flown_with) >= flown_with
 
 
-def test_without_truth_the_report_says_that_consistency_is_not_correctness() -> None:
-    findings = find(flown(replace(LOOP, truth=False, seed=1), Settings()))
-    assert {finding.severity for finding in findings} == {"info"}
-    drift = next(finding for finding in findings if finding.id == "source_may_drift")
-    assert "is not correctness" in drift.message
-    assert drift.evidence["short_term_noise_m"] == pytest.approx(0.01, rel=0.1)
-    assert {one.id for one in findings if one.caused_by} == {"kf_variance_overstated"}
-
-
 def test_a_remedy_of_our_filter_that_the_truth_contradicts_is_not_given() -> None:
     comparison = flown(AISLE, Settings())
     worse = filter_words(comparison, Settings(sigma_z_m=3.0), "--sigma-z 3")

@@ -97,14 +97,6 @@ def test_bad_settings_lose_on_unseen_data() -> None:
         )
 
 
-@pytest.mark.parametrize("at", [8, 14, 20])
-def test_a_short_flight_with_a_gap_is_tuned(at: int) -> None:
-    axis = modelled(1, MIN_MEASUREMENTS)
-    time = axis.measurement_time_s + np.where(np.arange(MIN_MEASUREMENTS + 1) >= at, 1.0, 0.0)
-    found = tuned(line(time, axis.measurement_m))
-    assert found.sigma_z.low < SIGMA_Z < found.sigma_z.high
-
-
 def test_horizontal_axes_together_know_more_than_each_alone() -> None:
     for seed in range(2):
         north, east = modelled(seed), modelled(seed + 100)
