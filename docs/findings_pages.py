@@ -29,16 +29,15 @@ from flights import aisle_flight, unexplained, with_noises  # noqa: E402
 from source_errors import coloured, held, laid_over, two_levels, white  # noqa: E402
 from test_aids import aid_log, outage_free, steps  # noqa: E402
 from test_findings import FAULTS  # noqa: E402
-from test_heading import made as turned  # noqa: E402
-from test_heading import named as named_heading  # noqa: E402
 from test_loop import LAP_S, TRUE, GivenClosure, OdometryNoise, laps  # noqa: E402
 
 import px4fuse  # noqa: E402
 from px4fuse.analysis import Analysis, explain  # noqa: E402
 from px4fuse.comparison.comparison import compare  # noqa: E402
 from px4fuse.ekf2.aids import judge_aids  # noqa: E402
+from px4fuse.filter.heading import HeadingPart, turned  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402
-from px4fuse.findings import Finding, find, find_aids, find_loop  # noqa: E402
+from px4fuse.findings import Finding, find, find_aids, find_loop, source_frame  # noqa: E402
 from px4fuse.findings.causes import CONSEQUENCES, NAMES, RECORDING, SETTINGS  # noqa: E402
 from px4fuse.flight import POSITION_COLUMNS  # noqa: E402
 from px4fuse.simulation.flights import simulate_flight  # noqa: E402
@@ -118,8 +117,12 @@ def examples() -> dict[str, Example]:
     )
     _, odometry = laps(3, 5, OdometryNoise(5.0, 20.0))
     keep(find_loop(px4fuse.close_loop(odometry, closures=TRUE)), "three laps of the tests")
-    drifts = named_heading(turned(-36.0, -20.0, -9.0, drift_p=1e-9))
-    keep(drifts.values(), "an estimate that was made up")
+    parts = [
+        HeadingPart(2.0 * n, 2.0 * n + 2.0, at, 1.0) for n, at in enumerate((-36.0, -20.0, -9.0))
+    ]
+    still = unexplained(compare(aisle_flight(duration_s=20.0), axes=("north",)))
+    drifts = replace(still, heading=turned(tuple(parts), 1e-9, "positions"))
+    keep(source_frame.detect(drifts), "an estimate that was made up")
     flight = aisle_flight(duration_s=60.0)
     silent = aid_log(meant=steps((0.0, 1.0)))
     silent = replace(silent, samples=outage_free(silent, 20.0, 41.0))
@@ -151,11 +154,10 @@ def written_in() -> dict[str, tuple[str, str]]:
                 said = ast.get_docstring(function) or ast.get_docstring(tree) or ""
                 found.setdefault(str(name), (path.stem, said))
     # those whose names are put together there
-    for path, start in (("sigma", "sigma_"), ("variance", "kf_var"), ("variance", "ekf2_var")):
-        said = ast.get_docstring(ast.parse((FINDINGS / f"{path}.py").read_text(encoding="utf-8")))
-        for name in NAMES:
-            if name.startswith(start):
-                found.setdefault(name, (path, said or ""))
+    said = ast.get_docstring(ast.parse((FINDINGS / "noises.py").read_text(encoding="utf-8")))
+    for name in NAMES:
+        if name.startswith(("sigma_", "kf_var", "ekf2_var")):
+            found.setdefault(name, ("noises", said or ""))
     return found
 
 

@@ -39,11 +39,10 @@ from px4fuse.ekf2_parameters import check
 from px4fuse.errors import LogError, MissingDataError, SettingsError
 from px4fuse.filter.causes import AFTER_STEP_S, Explained, explained
 from px4fuse.filter.clock import ClockOffset
-from px4fuse.filter.coloured import Coloured, coloured
+from px4fuse.filter.coloured import Coloured, Smoothing, coloured, smoothing
 from px4fuse.filter.heading import HeadingError
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Axis
-from px4fuse.filter.smoothing import Smoothing, smoothing
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.readers import read_log

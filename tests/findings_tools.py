@@ -15,10 +15,9 @@ from exchange import replace
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.interventions import Intervention
 from px4fuse.comparison.model import FILTERS, AgainstTruth, FilterSummary, UnjudgedFilter
-from px4fuse.filter.causes import Explained, Jump
+from px4fuse.filter.causes import Estimate, Explained, Jump
 from px4fuse.filter.clock import ClockOffset, PartOffset
 from px4fuse.filter.consistency import Consistency
-from px4fuse.filter.hypotheses import Estimate
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise

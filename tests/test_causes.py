@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import pytest
 from exchange import replace
-from flights import Estimator, aisle_flight, unexplained
 
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.tuning import Noise
-from px4fuse.findings import NAMES, Finding, find
+from px4fuse.findings import NAMES, Finding
 from px4fuse.findings.causes import CONSEQUENCES, NOISES, RECORDING, by_cause
-from px4fuse.findings.sigma import off_by
 from px4fuse.flight import Flight
 from px4fuse.report.words import verdict_notes
 
@@ -81,25 +78,6 @@ def test_what_the_recording_lacks_comes_before_noises() -> None:
     assert [each.id for each in order] == [
         "source_clock_changes", "source_gap", "sigma_a_large", "no_motion", "ekf2_resets",
     ]  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("chosen", "asked", "severity"),
-    [(0.1, 0.05, "info"), (0.1, 0.01, "warning"), (0.11, 0.05, "warning"), (0.2, 0.01, "error")],
-)
-def test_a_setting_that_nobody_chose_is_advice(chosen: float, asked: float, severity: str) -> None:
-    off = off_by("--sigma-z", chosen, Noise(asked, 0.9 * asked, 1.1 * asked))
-    assert off is not None
-    assert off.severity == severity
-
-
-@pytest.mark.parametrize(("noise_m", "severity"), [(0.10, "warning"), (0.20, "error")])
-def test_ekf2s_untouched_noise_is_advice(noise_m: float, severity: str) -> None:
-    """0.2 m is what the sender reports; EKF2_EVP_NOISE is PX4's 0.1 m."""
-    flight = aisle_flight(ekf2=Estimator(nis=0.1, noise_m=noise_m))
-    found, vertical = find(unexplained(compare(flight)))
-    assert found.id == vertical.id == vertical.caused_by == "ekf2_variance_overstated"
-    assert found.severity == severity
 
 
 @pytest.fixture(scope="module")

@@ -13,9 +13,7 @@ from px4fuse.filter.consistency import (
     Consistency,
     assess,
     assess_horizontal,
-    autocorrelation,
     nis_band,
-    verdict_of,
 )
 from px4fuse.flight import Unavailable
 
@@ -27,15 +25,6 @@ BANDS_OF_TWO = [
 
 def white(seed: int, count: int = 200) -> NDArray[np.float64]:
     return np.random.default_rng(seed).normal(size=count)
-
-
-def ar1(phi: float, count: int, seed: int = 4) -> NDArray[np.float64]:
-    """First-order autoregression of unit variance: r(l) = φ^l."""
-    noise = white(seed, count)
-    values = [noise[0]]
-    for each in noise[1:]:
-        values.append(phi * values[-1] + math.sqrt(1 - phi**2) * each)
-    return np.array(values)
 
 
 def assessed(nu: NDArray[np.float64], s: float | NDArray[np.float64] = 1.0) -> Consistency:
@@ -52,14 +41,6 @@ def test_the_band_holds_95_percent_of_chi_square() -> None:
         low, high = nis_band(count)
         tails = stats.chi2.cdf(low * count, count), stats.chi2.sf(high * count, count)
         assert tails == pytest.approx((0.025, 0.025))
-
-
-def test_verdict_is_two_sided() -> None:
-    band = (0.8, 1.2)
-    verdicts = [verdict_of(nis, band) for nis in (0.79, 0.8, 1.0, 1.2, 1.21)]
-    assert verdicts == [
-        "variance overstated", "consistent", "consistent", "consistent", "variance understated",
-    ]  # fmt: skip
 
 
 def test_95_percent_of_white_flights_are_consistent_and_white() -> None:
@@ -111,15 +92,6 @@ def test_every_number_against_its_formula() -> None:
     assert [result.bias_t, result.bias_p] == pytest.approx([student.statistic, student.pvalue])
 
 
-@pytest.mark.parametrize("phi", [-0.6, 0.3, 0.9])
-def test_autocorrelation_of_an_autoregression_is_its_power(phi: float) -> None:
-    r = autocorrelation(ar1(phi, 40_000), 4)
-    np.testing.assert_allclose(r, phi ** np.arange(1, 5), atol=0.03)
-    coloured = assessed(ar1(phi, 40_000))
-    assert coloured.lag1_autocorrelation == pytest.approx(r[0])
-    assert coloured.ljung_box_p < 1e-6
-
-
 def test_share_outside_the_gate_follows_the_gate() -> None:
     nu = np.repeat([0.5, 2.5, 4.0, 6.0], 5)
     result = assess(nu, np.ones(20), gate=3.0)
@@ -139,7 +111,7 @@ def test_too_few_or_equal_innovations_say_nothing() -> None:
         result = assess(white(1, count), np.ones(count))
         assert isinstance(result, Unavailable)
         assert f"{count} innovations are too few" in result.reason
-    assert assessed(white(1, 10)).ljung_box_lags == 2
+    assert assessed(white(1, 14)).ljung_box_lags == 2
     for value in (0.0, -0.5):
         result = assess(np.full(50, value), np.ones(50))
         assert isinstance(result, Unavailable)

@@ -9,20 +9,14 @@ from detector_rates import (
     CONDITIONS,
     DEFAULT,
     FAULTY_SEED,
-    OPTIONS,
-    RIGHT,
     SCENARIOS,
     Condition,
     Job,
     _rows,
     clean,
     found,
-    jobs,
     rates,
 )
-from exchange import replace
-
-from px4fuse.simulation.scenario import Scenario
 
 TABLE = rates()
 # Told behind what makes it
@@ -66,40 +60,6 @@ def test_the_code_still_does_what_the_table_says() -> None:
     ):
         assert (condition.finding, condition.typed) in certain
         assert condition.finding in found(20_000, condition)
-
-
-def test_a_condition_is_read_as_it_is_typed() -> None:
-    both = Condition("", "--kind loop --mistake nlos=1%,3m --mistake open-end=3m sigma_z_m=0.3")
-    assert both.scenario == "loop, VIO"
-    assert both.mistakes == ("nlos=1%,3m", "open-end=3m")
-    assert both.settings == replace(SCENARIOS["loop, VIO"].settings, sigma_z_m=0.3)
-    assert (both.flight(7).kind, both.flight(7).passes, both.flight(7).seed) == ("loop", 1, 7)
-    usual = Condition("", "")
-    assert (usual.scenario, usual.mistakes, usual.settings) == (DEFAULT, (), RIGHT)
-    assert usual.flight(1) == Scenario(seed=1)
-
-
-@pytest.mark.parametrize("name", SCENARIOS)
-def test_a_scenario_is_flown_as_its_options_say(name) -> None:
-    flown = clean(name).flight(2)
-    assert clean(name).scenario == name
-    assert flown.source_sigma_m == pytest.approx(SCENARIOS[name].settings.sigma_z_m)
-    for option, field in OPTIONS.items():
-        if option in SCENARIOS[name].options:
-            assert getattr(flown, field) != getattr(Scenario(), field) or field == "passes"
-
-
-def test_conditions_that_differ_in_settings_only_share_their_flights() -> None:
-    small, large = Condition("sigma_z_small", "sigma_z_m=0.03"), Condition("a", "sigma_z_m=0.3")
-    yaw = Condition("source_frame_turned", "--mistake yaw=30")
-    made = jobs(1, 2, (DEFAULT,), (small, yaw, large))
-    assert [(job.seed, job.conditions) for job in made] == [
-        (0, (clean(DEFAULT),)),
-        (FAULTY_SEED, (small, large)),
-        (FAULTY_SEED + 1, (small, large)),
-        (FAULTY_SEED, (yaw,)),
-        (FAULTY_SEED + 1, (yaw,)),
-    ]
 
 
 def test_rows_count_what_was_named_and_what_came_first() -> None:

@@ -385,12 +385,9 @@ def test_the_remedy_for_the_sample_log_is_right_and_typing_it_removes_the_findin
 REAL_LOGS = [
     ("simulated/*_aisle_overconfident.ulg", "ekf2_variance_understated", "error",
      {"nis_mean": about(22.0, 0.2), "sigma_z_asked_m": about(0.10, 0.2)}, ""),
-    ("simulated/*_aisle_overconfident.ulg", "ekf2_rejecting", "error",
-     {"rejected_share": about(0.5, 0.2)}, ""),
     ("simulated/*_aisle_2hz_stock.ulg", "ekf2_not_fusing", "error",
      {"fusing_share": 0.0, "source_interval_s": about(0.5, 0.05)}, "10 Hz"),
     ("simulated/*_aisle_nlos.ulg", "source_gap", "warning", {"longest_s": about(8.0, 0.04)}, ""),
-    ("simulated/*_aisle_nlos.ulg", "ekf2_resets", "warning", {"at_s": about(64.0, 0.03)}, ""),
     ("simulated/*_aisle_nlos.ulg", "kf_variance_understated", None, {}, "Remove the outliers"),
     ("simulated/*_aisle_hwlog.ulg", "source_not_logged", "warning", {}, "SDLOG_PROFILE to 129"),
     ("simulated/*_aisle_hwlog.ulg", "source_decimated", "warning", {"logger_limit_hz": 2.0}, ""),

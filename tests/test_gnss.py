@@ -31,7 +31,7 @@ from px4fuse.ekf2.stretches import Compass
 from px4fuse.ekf2.walk import ATTITUDE, GATE, NOISE, SPEED, STAMPS, Why
 from px4fuse.ekf2.whatif import WhatIf, what_if
 from px4fuse.errors import SettingsError
-from px4fuse.findings import find, variance
+from px4fuse.findings import find, noises
 from px4fuse.flight import (
     POSITION_COLUMNS,
     Ekf2,
@@ -293,7 +293,7 @@ def test_a_smaller_r_is_advised_only_where_the_parameter_holds_it_up(
         log.parameters["EKF2_GPS_P_NOISE"] = least_m
     prepared = prepare(flight_of(log, tmp_path))
     monkeypatch.setattr(findings_tools, "SEGMENT", prepared.segment)
-    words = variance._above_stated(
+    words = noises._above_stated(
         stand_in(
             source=prepared.source,
             log=prepared.flight.log,

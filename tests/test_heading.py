@@ -8,17 +8,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from exchange import replace
-from flights import aisle_flight, unexplained
 from scipy.spatial.transform import Rotation
 
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.preparation import choose_segment, choose_source
 from px4fuse.filter import heading
 from px4fuse.filter.heading import DRIFT_P, HeadingError, HeadingPart, heading_error
 from px4fuse.filter.settings import Settings
-from px4fuse.findings import Finding, source_frame
 from px4fuse.flight import QUATERNION_COLUMNS, ROTATION_VARIANCE_COLUMNS, Flight, Unavailable
-from px4fuse.origin import KEPT
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
@@ -130,49 +126,6 @@ def test_motion_capture_flights(shared_logs, log, drifts, low, high):
 
 
 # ---- what is said of it -------------------------------------------------------------------------
-
-
-def named(heading: HeadingError, **track: object) -> dict[str, Finding]:
-    flight = aisle_flight(duration_s=20.0)
-    (source,) = flight.positions
-    comparison = compare(replace(flight, positions=(replace(source, **track),)), axes=("north",))
-    analysis = replace(unexplained(comparison), heading=heading)
-    return {finding.id: finding for finding in source_frame.detect(analysis)}
-
-
-def made(*turns_deg: float, drift_p: float) -> HeadingError:
-    parts = [HeadingPart(2.0 * i, 2.0 * i + 2.0, turn, 1.0) for i, turn in enumerate(turns_deg)]
-    return heading.turned(tuple(parts), drift_p, "positions")
-
-
-def test_a_drifting_heading_is_named_with_its_ends_and_no_turn_is_offered():
-    found = named(made(-36.0, -20.0, -9.0, drift_p=1e-9))
-    assert list(found) == ["ekf2_heading_wrong"]
-    finding = found["ekf2_heading_wrong"]
-    assert finding.severity == "error"
-    for words in ("heading drifts", "-36° from 0 to 2 s", "-9° from 4 to 6 s"):
-        assert words in finding.message
-    assert "--position-yaw" not in finding.remedy
-    assert (finding.evidence["from_deg"], finding.evidence["to_deg"]) == (-36.0, -9.0)
-
-
-def test_a_constant_turn_is_offered_to_be_turned_back():
-    found = named(made(20.0, 21.0, 19.0, drift_p=0.5))
-    assert list(found) == ["source_frame_turned"]
-    assert "-20°" in found["source_frame_turned"].remedy
-    assert "--position-yaw" in found["source_frame_turned"].remedy
-
-
-def test_what_ekf2_has_turned_already_is_not_turned_again():
-    found = named(made(20.0, 21.0, 19.0, drift_p=0.5), name="estimator_visual_odometry_aligned")
-    assert list(found) == ["ekf2_heading_wrong"]
-    assert "--position-yaw" not in found["ekf2_heading_wrong"].remedy
-    assert named(made(20.0, 21.0, 19.0, drift_p=0.5), origin=KEPT) == {}
-
-
-def test_changes_within_chance_or_too_small_to_matter_are_none():
-    assert named(made(-3.0, 0.0, 4.0, drift_p=0.2)) == {}
-    assert named(made(-2.0, 0.0, 2.0, drift_p=1e-9)) == {}
 
 
 def test_a_long_flight_whose_positions_are_thinned_still_has_parts() -> None:

@@ -5,11 +5,9 @@ Each detector on a clean flight, a faulty one, one without what it needs, and a 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cache
 
 import numpy as np
-import pandas as pd
 import pytest
 from exchange import replace
 from flights import aisle_flight, unavailable, unexplained
@@ -17,15 +15,13 @@ from flights import aisle_flight, unavailable, unexplained
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import noises_and_clock
-from px4fuse.filter import hypotheses
-from px4fuse.filter.causes import Explained, explained
-from px4fuse.filter.hypotheses import fit
+from px4fuse.filter.causes import Explained, explained, fit
+from px4fuse.filter.coloured import Smoothing, smoothing
 from px4fuse.filter.kalman import replay
-from px4fuse.filter.likelihood import innovations, innovations_of_signals, preintegrate
+from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.smoothing import Smoothing, smoothing
 from px4fuse.findings import Finding, imu, source_intervals, source_positions, source_stamps
-from px4fuse.flight import POSITION_VARIANCE_COLUMNS, Ekf2, Flight, FusionRecord, Unavailable
+from px4fuse.flight import POSITION_VARIANCE_COLUMNS, Flight, Unavailable
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
@@ -74,7 +70,7 @@ def test_responses_are_what_the_filter_itself_makes_of_signals() -> None:
         measurement_m=np.stack([measured, measured + step[1:]], 1),
         initial=replace(legs.initial, position_m=0.0),
     )
-    nu, s = innovations_of_signals(both, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, none)
+    nu, s = innovations(both, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, none)
     for column, added in zip(nu.T, (0.0, step), strict=True):
         moved = replace(north, measurement_m=north.measurement_m + added)
         updates = replay(moved, RIGHT).updates
@@ -82,7 +78,7 @@ def test_responses_are_what_the_filter_itself_makes_of_signals() -> None:
         np.testing.assert_allclose(s, updates["innovation_variance_m2"], rtol=1e-9)
     # what is not fused, as the filter of the likelihood leaves it out
     skip = np.arange(len(none)) % 7 == 3
-    nu, s = innovations_of_signals(both, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, skip)
+    nu, s = innovations(both, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, skip)
     expected = innovations(legs, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, skip)
     np.testing.assert_allclose([nu[:, 0], s], expected, atol=1e-9)
 
@@ -101,12 +97,6 @@ def test_a_fit_is_least_squares_with_the_prior_as_one_more_measurement() -> None
     sigma = np.sqrt(made.covariance[0, 0])
     for spread, widened in ((3.0, 3.0), (0.5, 1.0)):
         assert replace(made, spread=spread).estimate(0).sigma == pytest.approx(widened * sigma)
-
-
-def test_hats_make_up_every_slow_signal() -> None:
-    time, hats = hypotheses._hats(10.0, 100.0)
-    assert time[[0, -1]].tolist() == [10.0, 100.0]
-    np.testing.assert_allclose(np.sum(hats, axis=0), 1.0)
 
 
 # ------------------------------------------------------------------ the causes
@@ -190,43 +180,12 @@ def test_a_shift_of_the_stamps_that_explains_as_much_is_no_smoothing() -> None:
     assert told.gain_nats == 0.0
 
 
-@pytest.mark.parametrize(
-    ("intervals", "named"),
-    [
-        ([0.1], False),
-        ([0.1] * 9 + [0.2], False),  # a link that loses every tenth
-        ([0.1, 0.2], True),
-        ([0.4, 0.6], True),
-        ([0.1, 0.141], False),
-        ([0.03, 0.17], False),
-    ],
-)
-def test_intervals_of_a_thinned_source_are_whole_multiples(intervals, named) -> None:
-    noise = np.random.default_rng(1).normal(0.0, 0.002, 300)
-    time = 5.0 + np.cumsum((intervals * 300)[:300] + noise)
-    (track,) = flight().positions
-    samples = track.samples.iloc[:300].set_axis(pd.Index(time, name="time_s"))
-    other = replace(flown(), source=replace(track, samples=samples))
-    assert bool(list(source_intervals.thinning(other))) is named
-
-
 # ------------------------------------------------------------------ stamps of arrival
 
 
 @cache
 def with_ekf2(*mistakes: str) -> Analysis:
     return unexplained(compare(simulate_flight(Scenario(seed=3), parse(mistakes)), axes=("north",)))
-
-
-def aged(change: Callable[[pd.Series], pd.Series]) -> list[Finding]:
-    """What is said where the positions have other ages."""
-    comparison = with_ekf2()
-    ekf2 = comparison.flight.ekf2
-    assert isinstance(ekf2, Ekf2)
-    assert isinstance(ekf2.record, FusionRecord)
-    record = replace(ekf2.record, vision_age_s=change(ekf2.record.vision_age_s))
-    flight = replace(comparison.flight, ekf2=replace(ekf2, record=record))
-    return list(source_stamps.arrivals(unexplained(replace(comparison, flight=flight))))
 
 
 @pytest.mark.parametrize(("jump", "severity"), [("50ms", "warning"), ("300ms", "error")])
@@ -238,15 +197,6 @@ def test_the_age_of_what_is_published_shows_when_the_clocks_were_synchronised(
     assert finding.evidence["until_s"] == pytest.approx(50.0, abs=0.5)
     assert finding.evidence["latency_s"] == pytest.approx(float(jump[:-2]) / 1e3, abs=0.005)
     assert "--start 50" in finding.remedy
-
-
-def test_stamps_that_are_all_of_arrival_are_named_and_the_right_ones_are_not() -> None:
-    (finding,) = aged(lambda age: 0.0 * age)
-    assert "never synchronised" in finding.message
-    assert aged(lambda age: age) == []
-    assert aged(lambda age: age - 0.25) == []  # of the future: a clock that is wrong
-    assert aged(lambda age: age.iloc[:5]) == []
-    assert aged(lambda age: age.iloc[:0]) == []
 
 
 # ------------------------------------------------------------------ what is missing
@@ -300,11 +250,3 @@ def test_a_flight_of_a_moment_says_nothing(mistake) -> None:
     assert found(short) == {}
     assert isinstance(short.explained, Unavailable)
     assert isinstance(short.smoothing, Unavailable)
-
-
-def test_a_scale_that_is_small_or_of_a_vehicle_that_hovers_is_not_told() -> None:
-    for mistake, least_sigma in (("no-motion", 0.15), ("scale=5%", 0.025)):
-        causes = flown(mistake).explained
-        assert isinstance(causes, Explained)
-        assert causes.scale.sigma > least_sigma
-        assert "source_scale_wrong" not in found(flown(mistake))

@@ -1,4 +1,4 @@
-"""The filterpy replay against a recursion written out in plain Python, as the lesson writes it."""
+"""The filter and its formulas against a recursion in plain Python, as the lesson writes it."""
 
 from __future__ import annotations
 
@@ -9,26 +9,20 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from filter_tools import any_axis, any_settings, sample_axes
+from filter_tools import any_axis, any_settings
 from flights import line
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from px4fuse.errors import SettingsError
-from px4fuse.filter.kalman import Replay, replay, state_at, variance_at
+from px4fuse.filter import model
+from px4fuse.filter.kalman import UPDATES, replay, state_at, variance_at
+from px4fuse.filter.model import COVARIANCES, STATES
 from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
-from px4fuse.flight import Flight
 
 SAME_TIME_S = 5e-7
-STATE = [
-    "position_m",
-    "velocity_m_s",
-    "position_variance_m2",
-    "covariance_m2_s",
-    "velocity_variance_m2_s2",
-]
-UPDATE = ["innovation_m", "innovation_variance_m2"]
+STATE = STATES + COVARIANCES
 
 
 def steps_of(measured: Sequence[float], dt: float) -> list[float]:
@@ -60,7 +54,7 @@ def mean_acceleration(
 def plain_replay(axis: Axis, chosen: Settings) -> tuple[list[list[float]], list[list[float]]]:
     """The lesson's loop with an input and with Q(dt) = SIGMA_A² DT [[dt³/4, dt²/2], [dt²/2, dt]].
 
-    Returns the state after each step (p, v, P00, P01, P11) and, per update, ν and S.
+    Returns the state after each step (p, v, P00, P01, P11) and, per update, a row of UPDATES.
     """
     measured = axis.measurement_time_s.tolist()
     z_at = dict(zip(measured, axis.measurement_m.tolist(), strict=True))
@@ -86,21 +80,14 @@ def plain_replay(axis: Axis, chosen: Settings) -> tuple[list[list[float]], list[
             s = P[0][0] + r
             k = [P[0][0] / s, P[1][0] / s]
             nu = z_at[now] - x[0]
+            updates.append([z_at[now], nu, s, *k, x[0], P[0][0], P[1][1]])
             x = [x[0] + k[0] * nu, x[1] + k[1] * nu]
             P = [
                 [r * P[0][0] / s, r * P[0][1] / s],
                 [r * P[1][0] / s, P[1][1] - k[1] * P[0][1]],
             ]
-            updates.append([nu, s])
         states.append([*x, P[0][0], P[0][1], P[1][1]])
     return states, updates
-
-
-def assert_equals_plain_recursion(axis: Axis, chosen: Settings) -> None:
-    run = replay(axis, chosen)
-    states, updates = plain_replay(axis, chosen)
-    np.testing.assert_allclose(run.steps[STATE], states, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(run.updates[UPDATE], updates, rtol=1e-9, atol=1e-9)
 
 
 @pytest.fixture
@@ -111,54 +98,13 @@ def axis() -> Axis:
     return line(time, 0.15 * (time - 2.0) ** 2, (imu, np.full(len(imu), 0.3)))
 
 
-def test_replay_of_the_sample_log_equals_the_plain_recursion(sample_flight: Flight) -> None:
-    axes = sample_axes(sample_flight)
-    assert [axis.name for axis in axes] == ["north", "east", "down", "aisle"]
-    for axis in axes:
-        assert_equals_plain_recursion(axis, Settings())
-
-
 @settings(max_examples=60)
 @given(axis=any_axis(), chosen=any_settings)
 def test_replay_of_any_axis_equals_the_plain_recursion(axis: Axis, chosen: Settings) -> None:
-    assert_equals_plain_recursion(axis, chosen)
-
-
-@settings(max_examples=40)
-@given(axis=any_axis(), chosen=any_settings)
-def test_variance_is_positive_grows_on_predict_and_shrinks_on_update(
-    axis: Axis, chosen: Settings
-) -> None:
     run = replay(axis, chosen)
-    p, c, v = (run.steps[name].to_numpy() for name in STATE[2:])
-    assert np.all(p > 0)
-    assert np.all(v > 0)
-    assert np.all(p * v > c * c)
-    s = run.updates["innovation_variance_m2"].to_numpy()
-    assert np.all(s > chosen.sigma_z_m**2)
-    updated = run.steps.index.isin(run.updates.index)[1:]
-    assert np.all(np.diff(p)[~updated] > 0)
-    assert np.all(np.diff(v)[~updated] > 0)
-    prior_p = run.updates["prior_position_variance_m2"].to_numpy()
-    prior_v = run.updates["prior_velocity_variance_m2_s2"].to_numpy()
-    assert np.all(prior_p > p[:-1][updated])
-    assert np.all(prior_p > p[1:][updated])
-    assert np.all(prior_v > v[:-1][updated])
-    assert np.all(prior_v > v[1:][updated])
-
-
-def test_updates_report_the_textbook_gain_and_prior(axis: Axis) -> None:
-    run = replay(axis, Settings())
-    updates = run.updates
-    gain = updates["prior_position_variance_m2"] / updates["innovation_variance_m2"]
-    np.testing.assert_allclose(updates["gain_position"], gain, rtol=1e-12)
-    np.testing.assert_allclose(
-        updates["innovation_m"], updates["measurement_m"] - updates["prior_position_m"], atol=1e-12
-    )
-    posterior = run.steps.loc[updates.index, "position_m"]
-    np.testing.assert_allclose(
-        posterior, updates["prior_position_m"] + gain * updates["innovation_m"], rtol=1e-12
-    )
+    states, updates = plain_replay(axis, chosen)
+    np.testing.assert_allclose(run.steps[STATE], states, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(run.updates[UPDATES], updates, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["sigma_a_m_s2", "sigma_z_m", "dt_s", "clock_offset_s"])
@@ -182,15 +128,6 @@ def test_the_first_measurement_or_a_given_state_is_the_start(axis: Axis) -> None
     assert run.steps[STATE].iloc[0].tolist() == [-1.0, 0.5, 0.25, 0.0, 1.0]
     assert run.steps.index[0] == 1.9
     assert run.updates.index.tolist() == axis.measurement_time_s.tolist()
-
-
-def test_exact_input_keeps_the_state_exact() -> None:
-    """Constant velocity start, constant acceleration: p = t + 0.15 t² leaves no innovation."""
-    time = 0.25 * np.arange(20)
-    imu = np.arange(-0.5, 6.0, 0.02)
-    moving = line(time, time + 0.15 * time**2, (imu, np.full(len(imu), 0.3)))
-    run = replay(moving, Settings(), InitialState(-0.1, -0.1 + 0.0015, 1.0 - 0.03))
-    np.testing.assert_allclose(run.updates["innovation_m"], 0.0, atol=1e-12)
 
 
 def test_the_state_is_predicted_from_the_step_before(axis: Axis) -> None:
@@ -239,14 +176,6 @@ def test_variance_between_steps_is_predicted_from_the_step_before(dt: float, gap
     assert bool((run.steps["input_variance_m2_s4"] > 0.0).any()) == gap
 
 
-def test_variance_just_before_a_measurement_is_that_of_its_prior(axis: Axis) -> None:
-    run = replay(axis, Settings())
-    before = np.nextafter(run.updates.index.to_numpy(), 0.0)
-    position, velocity = variance_at(run, before)
-    np.testing.assert_allclose(position, run.updates["prior_position_variance_m2"], rtol=1e-9)
-    np.testing.assert_allclose(velocity, run.updates["prior_velocity_variance_m2_s2"], rtol=1e-9)
-
-
 @settings(max_examples=30)
 @given(axis=any_axis(), chosen=any_settings, data=st.data())
 def test_a_later_measurement_does_not_change_earlier_output(
@@ -260,10 +189,7 @@ def test_a_later_measurement_does_not_change_earlier_output(
     other = line(axis.measurement_time_s, measured, imu)
     times = np.append(np.linspace(axis.measurement_time_s[0], arrival - 1e-9, 50), arrival)
 
-    def output(run: Replay) -> np.ndarray:
-        return np.array(state_at(run, times))
-
-    before, after = output(replay(axis, chosen)), output(replay(other, chosen))
+    before, after = (np.array(state_at(replay(one, chosen), times)) for one in (axis, other))
     np.testing.assert_array_equal(before[:, :-1], after[:, :-1])
     assert abs(after[0, -1] - before[0, -1]) > 0.0
 
@@ -291,3 +217,43 @@ def test_imu_gap_raises_the_process_noise_by_the_inputs_mean_square() -> None:
     at = whole.steps.index[(whole.steps.index > 4.05) & (whole.steps.index < 4.95)]
     raised = broken.steps.loc[at, "position_variance_m2"]
     assert np.all(raised > whole.steps.loc[at, "position_variance_m2"])
+
+
+# ---- the formulas, element by element, against the matrices that they stand for ----
+
+P = (0.5, -0.2, 0.7)
+
+
+@pytest.mark.parametrize("dt", [0.01, 0.1, 0.7])
+def test_elements_are_those_of_the_matrices(dt: float) -> None:
+    f, b = np.array([[1.0, dt], [0.0, 1.0]]), np.array([[dt**2 / 2.0], [dt]])
+    np.testing.assert_allclose(
+        model.matrix(model.spread(P, dt)), f @ model.matrix(P) @ f.T, rtol=1e-14
+    )
+    x = np.array([[1.5], [-2.0]])
+    moved = f @ x + b * 3.0
+    np.testing.assert_allclose(model.move(1.5, -2.0, 3.0, dt), moved[:, 0], rtol=1e-14)
+    # Q = B Bᵀ / dt: the acceleration is constant over the step
+    np.testing.assert_allclose(model.matrix(model.noise(dt)), b @ b.T / dt, rtol=1e-14)
+
+
+def test_arrays_are_many_steps_at_once() -> None:
+    dt = np.array([0.01, 0.1, 0.7])
+    together = np.array(model.spread(model.noise(dt), dt))
+    for at, each in enumerate(dt.tolist()):
+        np.testing.assert_array_equal(together[:, at], model.spread(model.noise(each), each))
+
+
+def test_many_short_steps_add_the_limit() -> None:
+    count, total = 10_000, 0.7
+    dt = total / count
+    covariance = (0.0, 0.0, 0.0)
+    for _ in range(count):
+        spread, added = model.spread(covariance, dt), model.noise(dt)
+        covariance = tuple(a + b for a, b in zip(spread, added, strict=True))
+    np.testing.assert_allclose(covariance, model.noise_of_many_steps(total), rtol=1e-7)
+
+
+def test_the_start_is_the_lessons() -> None:
+    np.testing.assert_array_equal(model.matrix(model.INITIAL_COVARIANCE), np.diag([0.5**2, 1.0**2]))
+    np.testing.assert_array_equal(model.H, [[1.0, 0.0]])

@@ -69,23 +69,6 @@ def test_an_imu_gap_costs_the_same_in_both_filters() -> None:
     np.testing.assert_allclose(ours, replayed(axis, Settings()), rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("a", "z", "shape"),
-    [((), (), ()), ((3,), (), (3,)), ((), (4,), (4,)), ((3, 1), (4,), (3, 4)), ((3,), (3,), (3,))],
-)
-def test_settings_broadcast_to_a_grid(
-    a: tuple[int, ...], z: tuple[int, ...], shape: tuple[int, ...]
-) -> None:
-    legs = preintegrate(walk(count=12), ZERO)
-    nu, s = innovations(legs, np.full(a, 0.5), np.full(z, 0.1))
-    assert nu.shape == s.shape == (11, *shape)
-    single = np.array(innovations(legs, 0.5, 0.1)).reshape(2, 11, *[1] * len(shape))
-    # a single pair goes through plain floats, whose last bit may differ
-    np.testing.assert_allclose(
-        [nu, s], np.broadcast_to(single, (2, 11, *shape)), rtol=1e-12, atol=1e-14
-    )
-
-
 @settings(max_examples=30)
 @given(axis=any_axis(), chosen=any_settings)
 def test_states_equal_the_replay_at_the_measurements(axis: Axis, chosen: Settings) -> None:

@@ -16,7 +16,6 @@ from scipy.special import expit
 from scipy.stats import norm
 
 from px4fuse.arrays import Array, IntArray
-from px4fuse.filter.banded import factorise
 from px4fuse.filter.fitting import (
     FIRST_SHARE,
     FIRST_WIDTH,
@@ -37,7 +36,14 @@ from px4fuse.filter.likelihood import (
     profile_ends,
     total_over_grid,
 )
-from px4fuse.filter.marginal import Positions, centred, fit, paired_products, squares
+from px4fuse.filter.marginal import (
+    Positions,
+    centred,
+    factorise,
+    fit,
+    paired_products,
+    squares,
+)
 from px4fuse.filter.model import noise_of_many_steps
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
@@ -406,14 +412,6 @@ def clean() -> list[NoiseFit]:
     return [noises_of(*pair(seed)) for seed in SEEDS]
 
 
-def test_clean_data_have_no_outliers(clean: list[NoiseFit]) -> None:
-    for found in clean:
-        assert found.outlier.sum() < 0.5
-        assert found.outlier.max() < 0.5
-        assert found.noises.sigma_z_m == pytest.approx(TRUE.sigma_z_m, rel=0.08)
-        assert found.noises.walk_m == 0.0
-
-
 @pytest.mark.parametrize(
     ("share", "size_m", "length", "least_found"),
     [(0.05, 2.0, 4, 0.99), (0.12, 2.0, 4, 0.99), (0.06, 0.5, 2, 0.9)],
@@ -474,13 +472,6 @@ def test_noise_is_as_uncertain_as_the_likelihood_of_the_mixture_is_curved(
     widening = widened_by_outliers(over, np.full(4000, axes), found, float(wide))
     assert widening > 1.1
     assert widening == pytest.approx(curved * 2.0 * axes * 4000, rel=0.01)
-
-
-def test_what_one_axis_sees_both_leave_out() -> None:
-    outlier = bursts(1, 0.05, 3)
-    north, east = pair(1)
-    found = noises_of(north, spoiled(east, outlier, 2.0, 1))
-    np.testing.assert_array_equal(found.outlier > 0.5, outlier[1:])
 
 
 def test_without_a_search_the_weights_stay() -> None:

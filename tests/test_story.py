@@ -12,8 +12,6 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
 from px4fuse.findings import find
 from px4fuse.findings.story import MOST_SENTENCES, story
-from px4fuse.flight import Reset
-from px4fuse.recording import Dropout
 
 ALONG_DEG = 30.0
 
@@ -65,28 +63,3 @@ def test_an_ekf2_that_is_too_sure_is_told_by_how_much() -> None:
 def test_without_ekf2_its_absence_is_told_with_the_reason() -> None:
     first, *_ = told(compare(aisle_flight(ekf2=None)))
     assert "there is no EKF2 beside it: no topic for EKF2" in first
-
-
-def test_what_cannot_be_judged_is_not_called_honest() -> None:
-    first, *_ = told(compare(aisle_flight(ekf2=Estimator(innovations_logged=False))))
-    ekf2, ours = first.split(";")
-    assert "cannot be judged, since the log has no innovations or too few" in ekf2
-    assert "honest" not in ekf2
-    assert "honest" in ours
-
-
-def test_findings_say_when_they_show() -> None:
-    resets = (
-        Reset(31.0, "position", (0.5, 0.0, 0.0)),
-        Reset(72.5, "position", (-0.5, 0.0, 0.0)),
-    )
-    flight = aisle_flight(
-        uwb=Uwb(gap_s=(50.0, 58.0)),
-        ekf2=Estimator(resets=resets, fusing=((0.0, 1.0), (51.0, 0.0), (58.5, 1.0))),
-        dropouts=(Dropout(20.0, 0.3),),
-    )
-    when = {found.id: (found.when, found.says_when) for found in find(unexplained(compare(flight)))}
-    assert when["source_gap"] == ("50.0 s to 58.0 s", True)
-    assert when["ekf2_resets"] == ("31.0 s, 72.5 s", True)
-    assert when["logger_dropouts"] == ("20.0 s to 20.3 s", False)
-    assert when["ekf2_fusion_interrupted"] == ("51.0 s to 58.5 s", False)

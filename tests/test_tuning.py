@@ -56,17 +56,11 @@ def test_intervals_cover_the_truth_as_often_as_they_say(name: str, true: float) 
     # half a percent in either tail of a binomial distribution
     low, high = binom.ppf([0.005, 0.995], SEEDS, 0.95)
     assert low <= inside <= high
-    # and the ends err to both sides
-    assert any(noise.low > true for noise in noises) or any(noise.high < true for noise in noises)
-
-
-@pytest.mark.parametrize(("name", "true"), [("sigma_z", SIGMA_Z), ("sigma_a", SIGMA_A)])
-def test_estimates_are_unbiased(name: str, true: float) -> None:
-    """By hand over 1000 seeds: SIGMA_Z -0.5 %, SIGMA_A -0.3 %."""
-    values = np.array([getattr(found, name).value for found in many()])
+    # and without bias, as far as so many seeds say: by hand SIGMA_Z -0.5 %, SIGMA_A -0.3 %
+    values = np.array([noise.value for noise in noises])
     error = np.std(values) / np.sqrt(SEEDS)
     assert np.mean(values) == pytest.approx(true, abs=0.01 * true + 2.6 * error)
-    assert error < 0.03 * true  # enough seeds to say so
+    assert error < 0.03 * true
 
 
 def test_nothing_is_called_an_outlier_where_there_is_none() -> None:
@@ -101,21 +95,6 @@ def test_bad_settings_lose_on_unseen_data() -> None:
         assert [one.value, one.low, one.high] == pytest.approx(
             [two.value, two.low, two.high], rel=1e-4
         )
-
-
-def test_irregular_intervals_do_not_disturb() -> None:
-    rng = np.random.default_rng(2)
-    time = np.cumsum(rng.choice([0.1, 0.4], 300))
-    found = tuned(line(time, rng.normal(0.0, SIGMA_Z, 300)))
-    assert found.sigma_z.value == pytest.approx(SIGMA_Z, rel=0.15)
-
-
-@pytest.mark.parametrize("at", [8, 14, 20])
-def test_a_short_flight_with_a_gap_is_tuned(at: int) -> None:
-    axis = modelled(1, MIN_MEASUREMENTS)
-    time = axis.measurement_time_s + np.where(np.arange(MIN_MEASUREMENTS + 1) >= at, 1.0, 0.0)
-    found = tuned(line(time, axis.measurement_m))
-    assert found.sigma_z.low < SIGMA_Z < found.sigma_z.high
 
 
 def test_horizontal_axes_together_know_more_than_each_alone() -> None:
@@ -263,16 +242,7 @@ def tuned_log(log: Path) -> tuple[Comparison, AxisTuning]:
 @pytest.mark.reallogs
 @pytest.mark.parametrize(
     "name",
-    [
-        "main202603_aisle_hwlogvision",
-        "v1.13.3_aisle_hwlogvision",
-        "v1.14.4_aisle_nominal",
-        "v1.16.1_aisle_nominal",
-        "v1.16.1_aisle_10hz",
-        "v1.16.1_aisle_clock_nosync",
-        "v1.16.1_aisle_nlos",
-        "v1.13.3_aisle_evdelay175",
-    ],
+    ["main202603_aisle_hwlogvision", "v1.16.1_aisle_10hz", "v1.16.1_aisle_nlos"],
 )
 def test_the_noise_injected_is_found_in_simulated_flights(shared_logs, name: str) -> None:
     _, found = tuned_log(shared_logs / "simulated" / f"{name}.ulg")
@@ -294,14 +264,3 @@ def test_nlos_is_found(shared_logs) -> None:
     right = np.count_nonzero(distance < 0.02)
     assert right / len(found.outlier_time_s) > 0.9
     assert right / len(truly) > 0.9
-
-
-@pytest.mark.reallogs
-def test_motion_capture_bounds_the_noise(shared_logs) -> None:
-    """Millimetres at 5 Hz: nothing but a bound can be told."""
-    logs = sorted((shared_logs / "real").glob("vladimireganov*.ulg"))
-    assert len(logs) >= 3
-    for log in logs:
-        _, found = tuned_log(log)
-        assert found.sigma_z.value is None, log.name
-        assert found.sigma_z.high < 0.03, log.name

@@ -8,13 +8,12 @@ Agrees with the filterpy replay to 1e-9 for SIGMA_A and SIGMA_Z from 1e-3.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import lapack
 from scipy.optimize import brentq
 from scipy.special import chdtri
 
@@ -60,9 +59,8 @@ class Preintegrated:
 
     def first(self, count: int) -> Preintegrated:
         """The first measurements only."""
-        each = {field.name: getattr(self, field.name) for field in fields(self)}
-        initial = each.pop("initial")
-        return Preintegrated(**{name: of[:count] for name, of in each.items()}, initial=initial)
+        arrays = {name: of[:count] for name, of in vars(self).items() if name != "initial"}
+        return replace(self, **arrays)
 
 
 def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:
@@ -137,10 +135,11 @@ def innovations(
     Returns
     -------
     innovation_m, innovation_variance_m2 : ndarray, shape (m, ...)
+        Of k signals through one filter of shape (m, k) and (m,).
     """
-    made = [step[:2] for step in recursion(legs, sigma_a_m_s2, sigma_z_m, skip)]
-    nu, s = (np.array(part) for part in zip(*made, strict=True))
-    return nu, s
+    steps = recursion(legs, sigma_a_m_s2, sigma_z_m, skip)
+    nu, s = zip(*(step[:2] for step in steps), strict=True)
+    return np.array(nu), np.array(s)
 
 
 @dataclass(frozen=True)
@@ -179,6 +178,9 @@ def recursion(
 ) -> Iterator[tuple[Array, Array, Array, Array, Array, Symmetric[Array]]]:
     """Run the filter over a grid of settings, measurement by measurement.
 
+    The filter is linear in what drives it: with Δp, Δv and measurements of shape (m, k) and one
+    pair of settings, k signals run through one filter at once.
+
     Parameters
     ----------
     legs : Preintegrated
@@ -205,11 +207,11 @@ def recursion(
     variance = r
     for dt, dp, dv, unit, fixed, z, skipped, counts in zip(
         legs.length_s.tolist(),
-        legs.delta_position_m.tolist(),
-        legs.delta_velocity_m_s.tolist(),
+        _rows(legs.delta_position_m),
+        _rows(legs.delta_velocity_m_s),
         legs.noise_unit.tolist(),
         legs.noise_fixed.tolist(),
-        legs.measurement_m.tolist(),
+        _rows(legs.measurement_m),
         [False] * len(legs.measurement_m) if skip is None else skip.tolist(),
         [1.0] * len(legs.measurement_m) if weight is None else weight.tolist(),
         strict=True,
@@ -232,50 +234,9 @@ def recursion(
         yield nu, s, k0, p, v, covariance
 
 
-def innovations_of_signals(
-    legs: Preintegrated, sigma_a_m_s2: float, sigma_z_m: float, skip: BoolArray
-) -> tuple[Array, Array]:
-    """Innovations of many signals by the gains of one filter, and their variance.
-
-    With the gains given, x = Fx + [Δp, Δv] and x = x + K(z - Hx) are linear in what drives them: a
-    triangular system with three bands below the diagonal, which LAPACK solves for all signals at
-    once, by the very recursion from front to back.
-
-    Parameters
-    ----------
-    legs : Preintegrated
-        Δp, Δv and measurements of shape (m, k), with a start at zero.
-    sigma_a_m_s2, sigma_z_m : float
-    skip : ndarray of bool, shape (m,)
-        Measurements that are not fused.
-
-    Returns
-    -------
-    innovation_m, innovation_variance_m2 : ndarray, shape (m, k) and (m,)
-    """
-    parts = legs.delta_position_m, legs.delta_velocity_m_s, legs.measurement_m
-    dp, dv, z = (np.ascontiguousarray(part.T) for part in parts)
-    still = np.zeros(z.shape[1])
-    one = replace(legs, delta_position_m=still, delta_velocity_m_s=still, measurement_m=still)
-    s, *gain = np.array(
-        [
-            (s, k0, covariance[1] / sigma_z_m**2)
-            for _, s, k0, _, _, covariance in recursion(one, sigma_a_m_s2, sigma_z_m, skip)
-        ]
-    ).T
-    k0, k1 = np.where(skip, 0.0, gain)
-    bands = np.zeros((4, 2 * len(s) + 2))
-    # p = (1 - K₀)(p + dt v + Δp) + K₀ z,  v = v + Δv + K₁(z - (p + dt v + Δp))
-    bands[2, 0:-2:2] = k0 - 1.0
-    bands[1, 1:-1:2] = (k0 - 1.0) * legs.length_s
-    bands[3, 0:-2:2] = k1
-    bands[2, 1:-1:2] = k1 * legs.length_s - 1.0
-    right = np.zeros((len(z), len(s) + 1, 2))
-    right[:, 1:, 0] = dp + k0 * (z - dp)
-    right[:, 1:, 1] = dv + k1 * (z - dp)
-    after, _ = lapack.dtbtrs(bands, right.reshape(len(z), -1).T, uplo="L", diag="U", overwrite_b=1)
-    position, velocity = np.moveaxis(after.T.reshape(right.shape)[:, :-1], -1, 0)
-    return (z - position - legs.length_s * velocity - dp).T, s
+def _rows(values: Array) -> list[Any]:
+    """What the filter takes in turn: numbers, or a row of several signals."""
+    return values.tolist() if values.ndim == 1 else list(values)
 
 
 def total_over_grid(

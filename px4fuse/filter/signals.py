@@ -56,9 +56,8 @@ class Acceleration:
         Gravity removed.
     integral_m_s : ndarray, shape (n,)
         Trapezoidal integral from the first sample, for averages over steps.
-    gap_time_s, gap_integral_s : ndarray, shape (g,)
-        Seconds of gap passed since the first sample, at both ends and where a gap begins or ends;
-        between them it is linear.
+    gap_integral_s : ndarray, shape (n,)
+        Seconds of gap passed since the first sample.
     rms_m_s2 : float
         Root mean square of the signal: how wrong the input may be inside a gap.
     """
@@ -66,7 +65,6 @@ class Acceleration:
     time_s: Array
     value_m_s2: Array
     integral_m_s: Array
-    gap_time_s: Array
     gap_integral_s: Array
     rms_m_s2: float
 
@@ -206,8 +204,6 @@ def make_axes(
     acceleration = ned_acceleration(flight)
     known = (*AXIS_NAMES, AISLE)
     asked = tuple(dict.fromkeys(known if names is None else names))
-    if not asked:
-        raise SettingsError("no axis was asked for.")
     if heading_deg is not None and not 0.0 <= heading_deg <= 360.0:
         raise SettingsError(f"`heading_deg` {heading_deg:g} is not between 0 and 360 degrees.")
     if unknown := [name for name in asked if name not in known]:
@@ -224,13 +220,8 @@ def make_axes(
             if names is None:
                 continue
             raise MissingDataError(f"{where} has no position along {name} in this segment.")
-        pushed = (
-            acceleration
-            if isinstance(acceleration, Unavailable)
-            else project_acceleration(acceleration, direction, segment)
-        )
-        time = samples.index.to_numpy()[finite]
-        measured = time, projected[finite]
+        pushed = project_acceleration(acceleration, direction, segment)
+        measured = samples.index.to_numpy()[finite], projected[finite]
         axes.append(Axis(name, direction, heading, note, *measured, pushed, elongation))
     if not axes:
         raise MissingDataError(f"{where} has no finite position in this segment.")
@@ -272,17 +263,19 @@ def _direction(
 
 
 def project_acceleration(
-    acceleration: pd.DataFrame, direction: Array, segment: Segment
+    acceleration: pd.DataFrame | Unavailable, direction: Array, segment: Segment
 ) -> Acceleration | Unavailable:
     """Acceleration along a direction, with what step averages need.
 
     Parameters
     ----------
-    acceleration : DataFrame, shape (n, 3), m/s², NED
+    acceleration : DataFrame, shape (n, 3), m/s², NED, or Unavailable
     direction : ndarray, shape (3,)
     segment : Segment
         Only for the root mean square.
     """
+    if isinstance(acceleration, Unavailable):
+        return acceleration
     time = acceleration.index.to_numpy()
     value = acceleration.to_numpy() @ direction
     inside = (time >= segment.start_s) & (time <= segment.end_s)
@@ -290,16 +283,12 @@ def project_acceleration(
         return Unavailable(
             "IMU", "no IMU sample in the analysed segment", "Choose --start and --end inside it."
         )
-    is_gap = imu_gaps(time)
-    passed = np.concatenate([[0.0], np.cumsum(np.where(is_gap, np.diff(time), 0.0))])
-    before = np.flatnonzero(is_gap)
-    knots = np.union1d([0, len(time) - 1], [before, before + 1])
+    gap_s = np.where(imu_gaps(time), np.diff(time), 0.0)
     return Acceleration(
         time_s=time,
         value_m_s2=value,
         integral_m_s=cumulative_integral(value, time),
-        gap_time_s=time[knots],
-        gap_integral_s=passed[knots],
+        gap_integral_s=np.concatenate([[0.0], np.cumsum(gap_s)]),
         rms_m_s2=float(np.sqrt(np.mean(value[inside] ** 2))),
     )
 
@@ -328,7 +317,7 @@ def step_means(acceleration: Acceleration, edges: ArrayLike) -> tuple[Array, Arr
     edges = np.asarray(edges, dtype=np.float64)
     length = np.diff(edges)
     velocity = np.interp(edges, acceleration.time_s, acceleration.integral_m_s)
-    gap = np.interp(edges, acceleration.gap_time_s, acceleration.gap_integral_s)
+    gap = np.interp(edges, acceleration.time_s, acceleration.gap_integral_s)
     covered = np.clip(edges, acceleration.time_s[0], acceleration.time_s[-1])
     outside = 1.0 - np.diff(covered) / length
     return np.diff(velocity) / length, np.clip(np.diff(gap) / length + outside, 0.0, 1.0)

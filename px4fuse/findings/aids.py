@@ -51,14 +51,17 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
         )  # fmt: skip
     for name, aid in judged.items():
         if aid.verdict == "variance understated" and name != source:
-            factor = aid.nis_mean**0.5
+            factor, noise = aid.nis_mean**0.5, AIDS[name].noise
+            raised = f"raise {noise}" if noise else "its reported accuracy is too small"
             yield warning(
                 "aid_understated",
                 f"EKF2 is {factor_words(factor)} times too sure of {aid.label}",
                 f" (mean NIS {number_words(aid.nis_mean)}, 1 is consistent; "
                 f"{aid.rejected_share:.1%} rejected): its errors are larger than R"
                 f"{_noise_words(aid)} says, or another aid pulls against it.",
-                _understated_remedy(name),
+                # never a value: innovations alone do not tell noise from a wrong delay
+                "Look for what is wrong first (outliers, the sensor's delay or place, another "
+                f"aid); where it is the sensor's own noise, {raised}.",
                 {
                     "aid": name,
                     "nis_mean": aid.nis_mean,
@@ -90,13 +93,3 @@ def _noise_words(aid: AidResult) -> str:
     if aid.noise is None:
         return ""
     return f" (√R {number_words(aid.noise)} {aid.unit}, from {aid.noise_from})"
-
-
-def _understated_remedy(name: str) -> str:
-    """Never a value: innovations alone do not tell noise from a wrong delay."""
-    parameter = AIDS[name].noise
-    return (
-        "Look for what is wrong first (outliers, the sensor's delay or place, another aid); where "
-        "it is the sensor's own noise, "
-        + (f"raise {parameter}." if parameter else "its reported accuracy is too small.")
-    )

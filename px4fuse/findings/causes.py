@@ -92,6 +92,11 @@ NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
 SENSOR = "the source's sensor"
 
 _OVERSTATED = ("kf_variance_overstated", "ekf2_variance_overstated")
+_OURS = ("kf_variance_overstated", "kf_variance_understated")
+SETTINGS = frozenset({"sigma_a_large", "sigma_a_small", "sigma_z_large", "sigma_z_small"})
+VARIANCES = frozenset({*_OVERSTATED, *_OURS, "ekf2_variance_understated"})
+NOISES = SETTINGS | VARIANCES | {"process_noise_forgotten"}
+_FITTED = tuple(sorted(SETTINGS | VARIANCES))
 # Cause to what it brings with it, read from above, so that a finding goes to the first cause that
 # is there; what brings others with it stands before what brings it; "id:cause" only where the
 # evidence names that cause
@@ -121,25 +126,11 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
         f"errors_larger_than_claimed:{CLOCK}", f"ekf2_variance_understated:{CLOCK}",
         f"ekf2_variance_overstated:{CLOCK}",
     ),
-    "source_smoothed": (
-        "sigma_z_large", "sigma_z_small", "sigma_a_large", "sigma_a_small", *_OVERSTATED,
-        "kf_variance_understated", "ekf2_variance_understated", "errors_larger_than_claimed",
-        "ekf2_ev_delay_wrong",
-    ),
+    "source_smoothed": (*_FITTED, "errors_larger_than_claimed", "ekf2_ev_delay_wrong"),
     # R describes none of these three
-    "source_coloured": (
-        "sigma_z_large", "sigma_z_small", "sigma_a_large", "sigma_a_small", *_OVERSTATED,
-        "source_variance_wrong", "errors_larger_than_claimed", "kf_variance_understated",
-        "ekf2_variance_understated",
-    ),
-    "source_axes_unequal": (
-        "kf_variance_overstated", "kf_variance_understated", "source_outliers",
-        "source_variance_wrong",
-    ),
-    "source_noise_changes": (
-        "source_outliers", "kf_variance_overstated", "kf_variance_understated",
-        "source_variance_wrong",
-    ),
+    "source_coloured": (*_FITTED, "source_variance_wrong", "errors_larger_than_claimed"),
+    "source_axes_unequal": (*_OURS, "source_outliers", "source_variance_wrong"),
+    "source_noise_changes": (*_OURS, "source_outliers", "source_variance_wrong"),
     "ekf2_heading_wrong": (
         f"errors_larger_than_claimed:{FRAME}", f"kf_variance_understated:{FRAME}",
         f"errors_larger_than_claimed:{ELSEWHERE}", "sigma_a_small", f"aid_understated:{SENSOR}",
@@ -173,9 +164,8 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
     "source_repeats": (
         "source_smoothed", "source_coloured", "source_jumps", "source_scale_wrong",
         "source_axes_unequal", "source_noise_changes", "source_clock_offset",
-        "source_clock_changes", "ekf2_ev_delay_wrong", "source_outliers", "sigma_z_large",
-        "sigma_z_small", "sigma_a_large", "sigma_a_small", *_OVERSTATED, "kf_variance_understated",
-        "ekf2_variance_understated", "errors_larger_than_claimed",
+        "source_clock_changes", "ekf2_ev_delay_wrong", "source_outliers", *_FITTED,
+        "errors_larger_than_claimed",
     ),
     "source_not_logged": ("source_decimated",),
     "source_gap": ("ekf2_fusion_interrupted", f"errors_larger_than_claimed:{ELSEWHERE}"),
@@ -187,9 +177,6 @@ RECORDING = frozenset({
     "logging_rate_low", "source_decimated", "source_gap", "source_not_logged",
     "source_samples_lost", "too_few_innovations",
 })  # fmt: skip
-SETTINGS = frozenset({"sigma_a_large", "sigma_a_small", "sigma_z_large", "sigma_z_small"})
-VARIANCES = frozenset({*_OVERSTATED, "kf_variance_understated", "ekf2_variance_understated"})
-NOISES = SETTINGS | VARIANCES | {"process_noise_forgotten"}
 
 
 def by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
@@ -209,8 +196,7 @@ def by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
         for first, *rest in taken:
             into += [replace(first, caused_by=cause), *rest]
         # the variance of our filter is judged by the setting that it follows from
-        own = ("kf_variance_overstated", "kf_variance_understated")
-        weighed = (first.severity for first, *_ in taken if first.id not in own)
+        weighed = (first.severity for first, *_ in taken if first.id not in _OURS)
         severity = min((into[0].severity, *weighed), key=SEVERITIES.index)
         into[0] = replace(into[0], severity=severity)
     return tuple(one for group in sorted(groups, key=_rank) for one in group)

@@ -142,15 +142,11 @@ def _drifting(source: str, heading: HeadingError, remedy: str, *, gnss: bool) ->
 def placement(analysis: Analysis) -> Found:
     """What is poorly determined about where a position file lies in the flight."""
     source = analysis.source
-    for warning in source.alignment.warnings if source.alignment is not None else ():
-        said, option, value = warning.rstrip(".").partition("ive --position-")
-        message = capital(f"{said[:-1].rstrip(' :')}" if option else said).rstrip(".")
+    for doubt in source.alignment.warnings if source.alignment is not None else ():
         yield finding(
-            "error" if option else "warning",
+            "error" if "--position-" in doubt else "warning",
             "position_file_placement",
-            f"{source.name}: {message}",
+            f"{source.name}: {capital(doubt.rstrip('.'))}",
             ".",
-            f"Give --position-{value}."
-            if option
-            else "Give --clock-offset, --position-frame and --position-yaw where you know them.",
+            "Give --clock-offset, --position-frame and --position-yaw where you know them.",
         )

@@ -16,9 +16,8 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.causes import AFTER_STEP_S, Explained
 from px4fuse.filter.clock import ClockOffset
-from px4fuse.filter.coloured import Coloured
+from px4fuse.filter.coloured import Coloured, Smoothing
 from px4fuse.filter.signals import within
-from px4fuse.filter.smoothing import Smoothing
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.imu import MIN_IMU_RATE_HZ, too_slow
 from px4fuse.findings.model import Found, finding, moments, times, warning

@@ -1,8 +1,16 @@
-"""S larger or smaller than the innovations show it to be, for our filter and for EKF2 alike."""
+"""SIGMA_Z or SIGMA_A that the innovations do not ask for, and S larger or smaller than they are.
+
+The mean NIS alone cannot tell SIGMA_A from SIGMA_Z: both make S larger. The likelihood can, since
+SIGMA_A makes the innovations of a stretch agree with each other and SIGMA_Z does not. Both are
+fitted together, so that they are put right together: the one that is further off comes first. A
+setting that nobody chose is advice, one step less severe than one that was.
+"""
 
 from __future__ import annotations
 
-from typing import TypeGuard
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 from msgspec import structs
@@ -10,15 +18,18 @@ from msgspec import structs
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.interventions import (
     OF_SETTINGS,
+    SIGMA_A,
     SIGMA_Z,
+    SMALLEST_SIGMA_Z_M,
     Intervention,
     cause_of,
     tried_on,
     tuned_for,
 )
-from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName
+from px4fuse.comparison.model import FILTERS, AxisComparison, Comparison, FilterName
 from px4fuse.comparison.remedy import (
     aid_of,
+    filter_words,
     noise_helps,
     not_replayed,
     remedy_words,
@@ -28,15 +39,36 @@ from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.consistency import SIGMA_OFF, Consistency
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import within
-from px4fuse.filter.tuning import AxisTuning, Noise
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings.causes import CAUSE, ELSEWHERE, NOISE
 from px4fuse.findings.hidden_errors import hidden_errors
-from px4fuse.findings.model import Finding, Found, Severity, finding, lowered
-from px4fuse.findings.sigma import try_out
-from px4fuse.findings.since import OPTIONS, cure_words, ekf2_cure_words, kind_of, reason_words
-from px4fuse.flight import POSITION_VARIANCE_COLUMNS, Unavailable
+from px4fuse.findings.model import Finding, Found, Severity, error, finding, lowered
+from px4fuse.findings.since import (
+    OPTIONS,
+    UNITS,
+    cure_words,
+    ekf2_cure_words,
+    kind_of,
+    reason_words,
+)
+from px4fuse.findings.source_positions import hardly_moved
+from px4fuse.flight import POSITION_VARIANCE_COLUMNS, Unavailable, sample_rate
 from px4fuse.plain import factor_words, number_words
 
+NOISE_OFF = 1.5  # times, in standard deviation; below, the tracks hardly change
+NOISE_OFF_ERROR = 4.0  # times: the gain is a different one
+RESPONSE_TIME_S = 2.5  # five times the lesson's; a vehicle turns around in less
+BEYOND = 1.5  # times the 95 % interval's reach; 0.3 % of clean flights lie beyond
+LAG1_SLOW = 0.3  # correlation; white innovations stay below 2/√n, 0.2 at n = 100
+# What such a setting does
+READINGS = {
+    ("sigma_z", "small"): "The filter mistakes the noise of the measurements for motion.",
+    ("sigma_z", "large"): "The filter distrusts measurements that are better than it thinks.",
+    ("sigma_a", "small"): "The variance grows too little between updates, the gain is too small, "
+    "and the filter lags behind.",
+    ("sigma_a", "large"): "The variance grows too much between updates, and the filter jumps to "
+    "every measurement.",
+}
 SIGMA_OFF_ERROR = 2.0  # times, in standard deviation
 EKF2_NOISE_FLOOR_M = 0.01  # EKF2 never trusts external vision better, EKF2.cpp
 NOISE_FITS = 1.25  # times: the median's own scatter below n = 100 (1.17/√n, two σ)
@@ -65,7 +97,144 @@ AGAINST_TRUTH = (
 Member = tuple[AxisComparison, Consistency]
 
 
+def try_out(
+    comparison: Comparison, values: Mapping[str, float], more: str = "", unseen: float | None = None
+) -> str:
+    """What to type, as far as a replay with it holds what the likelihood promises.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    values : mapping from field of Settings to value
+        Rounded to three digits.
+    more : str
+        Words behind them.
+    unseen : float or None
+        What such settings gain on data that they were not found on (nats), where that is known.
+    """
+    rounded: dict[str, Any] = {name: float(f"{value:.3g}") for name, value in values.items()}
+    typed = " ".join(f"{OPTIONS[name]} {value:g}" for name, value in rounded.items())
+    return filter_words(comparison, replace(comparison.settings, **rounded), typed + more, unseen)
+
+
+class Off(NamedTuple):
+    """How a setting is off: ``size`` times from the most likely value, or from its bound."""
+
+    value: float
+    size: float
+    severity: Severity
+
+
 def detect(analysis: Analysis) -> Found:
+    """Settings first: the variances follow from them."""
+    yield from settings_off(analysis)
+    yield from forgotten(analysis)
+    yield from variances(analysis)
+
+
+def settings_off(analysis: Analysis) -> Found:
+    """What is off beyond its interval, the worse one first."""
+    tunings = map(analysis.tuning.get, (HORIZONTAL, "aisle", "down"))
+    tuned = next((tuned for tuned in tunings if isinstance(tuned, AxisTuning)), None)
+    if tuned is None:
+        return
+    chosen = {SIGMA_Z: analysis.settings.sigma_z_m, SIGMA_A: analysis.settings.sigma_a_m_s2}
+    asked = {SIGMA_Z: tuned.sigma_z, SIGMA_A: tuned.filter_sigma_a}
+    if hardly_moved(analysis):  # without motion the acceleration's noise is hardly seen
+        del asked[SIGMA_A]
+    found = {name: off_by(name, chosen[name], noise) for name, noise in asked.items()}
+    off = {name: each for name, each in found.items() if each is not None}
+    # where a source may drift, or the truth shows it, innovations tell too little noise alone, and
+    # a filter may follow such a source as closely as it likes
+    drifts, slow = analysis.source.origin.may_drift, analysis.source.origin.is_gnss
+    if drifts or slow or any(one.owner == "kf" for one in hidden_errors(analysis)):
+        off = {
+            name: each
+            for name, each in off.items()
+            if chosen[name] < each.value and not (drifts and each.severity == "info")
+        }
+    if not off:
+        return
+    worst_first = sorted(off, key=lambda name: -off[name].size)
+    values = {name: off[name].value for name in worst_first}
+    if SIGMA_Z in values and tuned.sigma_z.value is None:
+        values[SIGMA_Z] = max(values[SIGMA_Z], SMALLEST_SIGMA_Z_M)
+    unseen = None if isinstance(tuned.held_out, Unavailable) else tuned.held_out.gain_nats
+    remedy, first = try_out(analysis, values, unseen=unseen), None
+    for name in worst_first:
+        (value, size, severity), noise, unit = off[name], asked[name], UNITS[name]
+        label, side = name[:7], "small" if chosen[name] < value else "large"
+        least, most, range_ = "at least ", "at most ", ""
+        if noise.value is not None:
+            least, most = "", ""
+            range_ = f", 95 % {noise.low or 0.0:.3g} to {noise.high:.3g}" if noise.high else ""
+        told = finding(
+            severity,
+            f"{label}_{side}",
+            f"{label.upper()} {chosen[name]:g} {unit} is {least}{factor_words(size)} times too "
+            f"{side}",
+            f": the innovations ({tuned.name}) ask for {most}{value:.3g} {unit}{range_}. "
+            f"{READINGS[label, side]}",
+            remedy,
+            {
+                "chosen": chosen[name],
+                "most_likely": value,
+                "factor": chosen[name] / value,
+                "lag1_autocorrelation": getattr(tuned.before, "lag1_autocorrelation", float("nan")),
+            },
+        )
+        yield structs.replace(told, caused_by=first)
+        first = first or told.id
+
+
+def off_by(name: str, chosen: float, asked: Noise) -> Off | None:
+    """How far a setting is off, and how bad that is; None where it is not."""
+    value = _asked(asked)
+    if value is None:
+        return None
+    low, high = (0.0, value) if asked.value is None else (asked.low or 0.0, asked.high or np.inf)
+    low, high = (value * (end / value) ** BEYOND for end in (low, high))
+    size = max(chosen / value, value / chosen)
+    if low <= chosen <= high or size < NOISE_OFF:
+        return None
+    severity: Severity = "error" if size >= NOISE_OFF_ERROR else "warning"
+    return Off(value, size, lowered(severity) if chosen == getattr(Settings(), name) else severity)
+
+
+def forgotten(analysis: Analysis) -> Found:
+    """SIGMA_A so small that σ hardly grows between updates and new measurements are ignored.
+
+    A slow filter is no mistake where nothing happens: its innovations must say that it lags. Told
+    of the first axis on which it needs too long to follow.
+    """
+    for name, result in analysis.axes.items():
+        updates, statement = result.replay.updates, result.filters["kf"]
+        if isinstance(statement, Unavailable) or statement.verdict != "variance understated":
+            continue
+        if statement.lag1_autocorrelation < LAG1_SLOW:
+            continue
+        gain = float(updates["gain_position"].iloc[len(updates) // 2 :].median())
+        response_s = 1.0 / (sample_rate(updates) * gain)
+        if response_s < RESPONSE_TIME_S:
+            continue
+        after = result.replay.steps["position_variance_m2"].reindex(updates.index).to_numpy()
+        before = updates["prior_position_variance_m2"].to_numpy()
+        growth = float(np.median((before[1:] / after[:-1] - 1.0)[len(after) // 2 :]))
+        tuned = tuned_for(analysis.tuning, name)
+        needed = None if tuned is None else tuned.filter_sigma_a.value
+        more = "" if needed is None else f" {try_out(analysis, {SIGMA_A: needed})}"
+        yield error(
+            "process_noise_forgotten",
+            f"With SIGMA_A {analysis.settings.sigma_a_m_s2:g} m/s² Q is forgotten",
+            f": σ_p hardly grows between updates ({growth:.1%} in variance), the gain is "
+            f"{gain:.3f}, and the filter needs {response_s:.0f} s to follow (along {name}).",
+            f"Raise SIGMA_A.{more}",
+            {"relative_growth": growth, "gain": gain, "response_s": response_s, "axis": name},
+        )
+        return
+
+
+def variances(analysis: Analysis) -> Found:
     """One finding for the horizontal axes, which the vertical one follows: they have one noise."""
     for owner in FILTERS:
         for over in (True, False):
@@ -117,7 +286,7 @@ def _of_group(analysis: Analysis, owner: FilterName, group: str, members: list[M
         "outside_gate": statement.outside_gate,
         CAUSE: cause,
     }
-    if tuned is not None and (asked := _asked_m(tuned.sigma_z)) is not None:
+    if tuned is not None and (asked := _asked(tuned.sigma_z)) is not None:
         evidence["sigma_z_asked_m"] = asked
         evidence["sigma_z_asked_is_upper_bound"] = float(tuned.sigma_z.value is None)
     return finding(
@@ -160,8 +329,8 @@ def _is_default(analysis: Analysis, owner: FilterName, result: AxisComparison) -
     return untouched and not abs(np.log(_ekf2_noise_m(result) / default)) > np.log(NOISE_FITS)
 
 
-def _asked_m(noise: Noise) -> float | None:
-    """The source's noise by tuning, the same in all findings: a value, else an upper bound."""
+def _asked(noise: Noise) -> float | None:
+    """A noise by tuning, the same in all findings: a value, else an upper bound."""
     return noise.high if noise.value is None else noise.value
 
 
@@ -177,12 +346,11 @@ def _remedy(
     if not cause.change.keys() <= OF_SETTINGS:
         return cure_words(analysis, cause)
     bounded = tuned is not None and tuned.sigma_z.value is None and SIGMA_Z in cause.change
-    values = {OPTIONS[name]: value for name, value in cause.change.items()}
     if not bounded:
-        return try_out(analysis, values)
+        return try_out(analysis, cause.change)
     return (
         "The source's noise is below what this rate can show. "
-        f"{try_out(analysis, values, ', and less SIGMA_A')}"
+        f"{try_out(analysis, cause.change, ', and less SIGMA_A')}"
     )
 
 
@@ -209,7 +377,7 @@ def _not_replayed(analysis: Analysis, result: AxisComparison, tuned: AxisTuning 
         why = ONLY_HORIZONTAL
     elif not isinstance(model, Unavailable) and not model.agreement.good:
         why = model.agreement.doubted("EKF2 replay")
-    asked_m = None if tuned is None else _asked_m(tuned.sigma_z)
+    asked_m = None if tuned is None else _asked(tuned.sigma_z)
     if asked_m is None or why is None:
         return UNKNOWN_NOISE if tuned is None else NOT_EXPLAINED
     noise_m, used_m = max(asked_m, EKF2_NOISE_FLOOR_M), _ekf2_noise_m(result)
