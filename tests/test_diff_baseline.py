@@ -15,7 +15,6 @@ from scipy.stats import t as student
 
 from px4fuse.cli import cli
 from px4fuse.errors import SettingsError
-from px4fuse.fleet.engine import connected
 from px4fuse.fleet.junit import junit
 from px4fuse.fleet.regressions import MIN_FLIGHTS, marked, read_baseline
 from px4fuse.fleet.rows import csv_bytes, table_of
@@ -236,11 +235,10 @@ def test_the_command_marks_writes_and_fails(tmp_path, monkeypatch):
         assert done.exit_code == code, done.output
         return done.output
 
-    with connected(workers=1):  # of the session, which every run takes
-        ran(0, "-o", "before")
-        same = ran(0, "-o", "after", *options)
-        unchanged = Path("j.xml").read_bytes()
-        ran(1, "-o", "worse", "--sigma-z", "0.3", *options)
+    ran(0, "-o", "before")
+    same = ran(0, "-o", "after", *options)
+    unchanged = Path("j.xml").read_bytes()
+    ran(1, "-o", "worse", "--sigma-z", "0.3", *options)
     assert "Held against the baseline: 1 by the same log" in same
     assert b'failures="0"' in unchanged
     table = pd.read_parquet("worse/fleet.parquet")
