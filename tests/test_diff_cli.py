@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 from collections import Counter
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from click.testing import CliRunner
 from conftest import REPOSITORY, page_of
 from pypdf import PdfReader, PdfWriter
 from results_tools import LOOP
+from ulog_tools import gnss_log
 
 import px4fuse
 from px4fuse.cli import cli
@@ -136,6 +136,14 @@ def test_the_terminal_says_what_changed_first(settings, monkeypatch, tmp_path):
     ]  # fmt: skip
 
 
+def test_a_report_of_aids_alone_is_taken_as_its_results_are(tmp_path):
+    log = gnss_log("v1.16").write(tmp_path / "a.ulg")
+    ran("compare", log, "-o", tmp_path / "a.pdf")
+    found = json.loads(ran("diff", tmp_path / "a.pdf", tmp_path / "a.json", "--json", "-"))
+    assert [found[side]["kind"] for side in "ab"] == ["report", "results"]
+    assert {number["status"] for number in found["numbers"]} == {"same"}
+
+
 # -- bad input -------------------------------------------------------------------------------------
 
 
@@ -165,9 +173,3 @@ def test_what_cannot_be_compared_is_refused(settings, tmp_path):
         (text, usual, "notes.txt"),
     ):
         assert said in refused(a, b)
-
-
-def test_an_input_is_not_written_over(settings, tmp_path):
-    report = shutil.copy(settings[0], tmp_path / "a.pdf")
-    assert "is what this command reads" in refused(report, settings[1], "-o", report)
-    assert Path(report).read_bytes() == settings[0].read_bytes()

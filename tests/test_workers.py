@@ -55,17 +55,6 @@ def run(jobs, processes=2, timeout_s=60.0, memory_bytes=None):
     return [result for _, result in sorted(heard, key=lambda one: one[0])], heard
 
 
-def test_fifty_jobs_in_their_order():
-    jobs = [("square", n) for n in range(50)]
-    results, heard = run(jobs)
-    assert results == [n * n for n in range(50)]
-    assert sorted(heard) == list(enumerate(results))
-
-
-def test_no_jobs_have_no_results():
-    assert run([]) == ([], [])
-
-
 def test_one_bad_job_is_lost_alone():
     before = os.environ.get("OMP_NUM_THREADS")
     jobs = [
@@ -114,9 +103,6 @@ def test_what_eats_memory_is_ended():
 
 def test_processes_are_replaced_after_some_jobs(monkeypatch):
     monkeypatch.setattr(workers, "JOBS_PER_WORKER", 2)
-    results, _ = run([("process", 0)] * 5, processes=1)
-    assert len(set(results)) == 1  # quick ones
-    monkeypatch.setattr(workers, "QUICK_S", 0.0)
     results, _ = run([("process", 0)] * 5, processes=1)
     assert len(set(results)) == 3
     assert results[0] == results[1] != results[2]

@@ -117,19 +117,12 @@ def read_roster(path: Path) -> tuple[Person, ...]:
         raise SettingsError(f"{path}: {len(people)} students", f"Give 1 to {MAX_STUDENTS}.")
     stems: dict[str, Person] = {}
     for person in people:
-        who = one_line(person.student_id or person.name, 40)
         stem = file_stem(person.student_id)
-        if stem is None:
+        if stem is None or stems.setdefault(stem.casefold(), person) is not person:
+            who = one_line(person.student_id or person.name, 40)
             raise SettingsError(
-                f"{path}: {who!r} has no id with letters or digits, after which a file can be "
-                "named",
-                "Give every student one.",
-            )
-        if stems.setdefault(stem.casefold(), person) is not person:
-            raise SettingsError(
-                f"{path}: {one_line(stems[stem.casefold()].student_id, 40)!r} and {who!r} give the "
-                "same file name",
-                "Give every student an id of its own.",
+                f"{path}: after the id of {who!r} no file of its own can be named",
+                "Give every student an id of its own, with letters or digits.",
             )
     return people
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 
 from px4fuse.errors import LogError, MissingDataError, Px4FuseError
-from px4fuse.fleet.logs import CHANGED, local_file
+from px4fuse.fleet.logs import local_file
 from px4fuse.fleet.rows import FAILED, NOT_JUDGED, Row, log_columns, rows_of, what_was_found
 from px4fuse.reading import files_by_sha256, max_log_bytes
 from px4fuse.request import ComparisonRequest, command_line, with_options
@@ -77,7 +77,8 @@ def analyse(job: Job) -> Outcome:
                 return Outcome(sha256)
             outcome = _compared(job, path, sha256)
             if _sha256(path) != sha256:
-                raise LogError(*CHANGED)
+                again = "Run the same command again when it is complete."
+                raise LogError("it changed while it was read", again)
             return outcome
     except Px4FuseError as error:
         return Outcome(sha256, (refused(error, FAILED) | {"log_sha256": sha256},))
