@@ -156,12 +156,14 @@ def test_absent_numbers_are_empty_and_texts_are_no_formulas(tmp_path):
 
 
 def test_logs_without_a_position_are_not_judged_but_known(tmp_path):
-    row = px4fuse.batch(gnss_log("v1.16").write(tmp_path / "a.ulg")).loc[0]
+    log = gnss_log("v1.16").write(tmp_path / "a.ulg")
+    row = px4fuse.batch(log, tmp_path / "out").loc[0]
     assert (row["status"], row["axis"]) == ("not judged", "")
     assert row["firmware"] == "PX4 v1.16.0"
     assert row["duration_s"] > 10
     assert "--position" in row["remedy"]
     assert row["aids"].startswith("gnss_pos variance overstated")
+    assert "1 as before" in command(log, "-o", tmp_path / "out").output
 
 
 @pytest.mark.reallogs
@@ -326,27 +328,6 @@ def test_junk_in_hundreds_costs_a_line_each(tmp_path):
     assert len(table) == 300
     assert set(table["status"]) <= {"failed", "not judged"}
     assert table["reason"].str.len().between(10, 300).all()
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT for one process")
-@pytest.mark.parametrize("after_s", [0.8, 1.4, 2.1])
-def test_an_interrupted_comparison_leaves_nothing_in_part(after_s, tmp_path, sample_log):
-    process = subprocess.Popen(
-        [*PX4FUSE[:-1], "compare", sample_log, "-o", tmp_path / "r.pdf"], text=True,
-        stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, env=environment(),
-    )  # fmt: skip
-    time.sleep(after_s)
-    process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=120)
-    left = sorted(path.name for path in tmp_path.iterdir())
-    if process.returncode == 0:  # it was done before
-        assert left == ["r.json", "r.pdf"]
-    else:
-        assert left == []
-        # by the signal itself where Python is not up yet, or CPython was in exec() (an import)
-        by_signal = process.returncode == -signal.SIGINT
-        assert process.returncode == 130 or by_signal
-        assert said == "px4fuse: interrupted, nothing was written.\n" or (by_signal and not said)
 
 
 def test_bad_input_is_one_line(tmp_path, flights):

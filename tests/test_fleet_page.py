@@ -247,14 +247,11 @@ def test_five_thousand_logs_are_a_hundred_rows(browser: Browser, tmp_path: Path)
     browser.write("v1.14")
     assert browser.ask(rows) == PAGE_ROWS
     browser.click("#all")
-    browser.click("#on")
-    assert browser.ask("document.querySelector('#place').textContent") == "Logs 101 to 200 of 5000"
-    # stepping goes over the end of a page
+    # stepping goes over the end of a page, and back
     browser.click(".list > tbody > tr:last-child .name")
     name = browser.names()[-1]
     browser.press("j", "j")
-    assert browser.ask("document.querySelector('#place').textContent") == "Logs 201 to 300 of 5000"
-    assert browser.ask("document.querySelectorAll('tr.open').length") == 1
+    assert browser.ask("document.querySelector('#place').textContent") == "Logs 101 to 200 of 5000"
     browser.press("k", "k")
     assert browser.ask("document.querySelector('tr.open .name').textContent") == name
     assert browser.ask(rows) == PAGE_ROWS + 1
