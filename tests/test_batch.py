@@ -103,10 +103,8 @@ def test_every_log_is_in_the_table_with_its_numbers_or_its_line(tmp_path):
         tuned.value, tuned.low, tuned.high,
     ]  # fmt: skip
     assert (first["status"] == "done").all()
-    # it says the same as compare, whose report and results these are
     results = read_results((output / first.loc[0, "results"]).read_bytes())
     assert results.request.log == "f1.ulg"
-    assert results.axes["east"].filters["kf"].nis_mean == first.loc[1, "kf_nis_mean"]
     assert results.story == tuple(first.loc[0, "story"].split("\n"))
     assert (output / first.loc[0, "report"]).read_bytes().startswith(b"%PDF")
     # a clock offset is there where it is determinable

@@ -164,33 +164,10 @@ def test_what_is_no_table_of_batch_is_refused(tmp_path):
 
 # -- JUnit -----------------------------------------------------------------------------------------
 
-# Elements of Jenkins' junit-10.xsd that a suite of ours may have, their attributes and children
-SCHEMA = {
-    "testsuites": ({"name", "time", "tests", "failures", "disabled", "errors"}, {"testsuite"}),
-    "testsuite": (
-        {"name", "tests", "failures", "errors", "time", "disabled", "skipped", "timestamp",
-         "hostname", "id", "package"},
-        {"properties", "testcase", "system-out", "system-err"},
-    ),
-    "testcase": (
-        {"name", "assertions", "time", "classname", "status"},
-        {"skipped", "error", "failure", "system-out", "system-err"},
-    ),
-    "failure": ({"type", "message"}, set()),
-    "skipped": ({"message"}, set()),
-}  # fmt: skip
-
 
 def made(table: pd.DataFrame) -> ET.Element:
-    """The XML, which must be as the common schema has it."""
-    root = ET.fromstring(junit(table))
-    for element in root.iter():
-        attributes, children = SCHEMA[element.tag]
-        assert set(element.attrib) <= attributes
-        assert {child.tag for child in element} <= children
-        if element.tag in ("testsuite", "testcase"):
-            assert element.get("name")
-    suite = root.find("testsuite")
+    """The suite, whose counts must be those of its cases."""
+    suite = ET.fromstring(junit(table)).find("testsuite")
     assert suite is not None
     for name, path in (("tests", "testcase"), ("failures", "testcase/failure"),
                        ("skipped", "testcase/skipped")):  # fmt: skip

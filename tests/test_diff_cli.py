@@ -118,19 +118,10 @@ def test_pages_show_both_flights_side_by_side(tmp_path):
     assert (tmp_path / "d.json").is_file()
 
 
-def test_the_terminal_says_what_changed_first(settings, monkeypatch, tmp_path):
+def test_the_same_pair_again_is_written_over(settings, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "80")
-    lines = ran("diff", *settings).splitlines()
-    assert lines[0].startswith("Both are of aisle_uwb.ulg:")
-    table = [line for line in lines if line.startswith("worse")]
-    assert any("NIS of ours, aisle" in line and "×" in line for line in table)
-    assert any(line.startswith("Numbers not shown:") and "unchanged" in line for line in lines)
-    assert any(line.startswith("Setting  SIGMA_Z (m): 0.1 → 0.03") for line in lines)
-    assert any(line.startswith("New") for line in lines)
-    assert lines[-2] == "Wrote    reports/usual_to_small.pdf"
-    # the same again is written over, another pair of the same names is not
-    ran("diff", *settings)
+    for _ in range(2):
+        assert "Wrote    reports/usual_to_small.pdf" in ran("diff", *settings)
     assert sorted(path.name for path in Path("reports").iterdir()) == [
         "usual_to_small.json", "usual_to_small.pdf",
     ]  # fmt: skip

@@ -43,25 +43,6 @@ def parts(row: list[Any]) -> dict[str, Any]:
 # ------------------------------------------------------------------ without a browser
 
 
-def test_a_log_is_one_row_with_its_axes_inside() -> None:
-    table = made_up(40)
-    made = content(html_text(table, "Bench", "px4fuse 1"))
-    assert len(made["rows"]) == 40
-    row = made["rows"][0]
-    assert row[0][0][0] == "flight 0000.ulg"
-    inside = parts(row)
-    assert inside["What happened"][2] == STORY.splitlines()
-    assert inside["Axes"][2] == ["", "north", "east", "down"]
-    assert inside["Findings"][2][0] == "a time without positions (source_gap)"
-    assert [to for _, to in inside["Files"][2]] == [
-        "reports/flight%200000.pdf", "results/flight%200000.json",
-    ]  # fmt: skip
-    failed = parts(made["rows"][9])
-    assert failed["Not judged"][2] == [DAMAGED[0]]
-    assert failed["What to set"][2] == [DAMAGED[1]]
-    assert "Axes" not in failed
-
-
 def test_what_a_judged_log_lacks_is_told_too() -> None:
     table = made_up(30)
     table.loc[table["axis"] == "down", ["reason", "remedy"]] = ("EKF2, down: no heights", "Set it.")
@@ -106,14 +87,6 @@ def test_a_column_without_numbers_is_absent_not_zero() -> None:
     assert "No log with a date has it." in text
     assert "NaN" not in json.dumps(made)
     assert "nan" not in text.split("<script")[0].split("</style>")[1]
-
-
-def test_a_step_in_the_middle_of_the_year_is_told_in_words() -> None:
-    text = html_text(made_up(300), "Bench", "px4fuse 1")
-    for vehicle, expected in (("…00260033", [0.1, 0.3]), ("bench-2", [0.1, 0.1])):
-        (told,) = re.findall(rf'alt="(SIGMA_Z[^"]*{vehicle}[^"]*)"', text)
-        found = [float(value) for value in re.findall(r"quarter ([\d.]+)", told)]
-        assert found == pytest.approx(expected, rel=0.1)
 
 
 def test_an_empty_fleet_and_one_that_only_failed() -> None:

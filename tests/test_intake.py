@@ -234,17 +234,12 @@ def test_what_acts_is_named(edit, said):
     "edit",
     [
         on_root("/OpenAction", ArrayObject([NumberObject(0)])),
-        on_root("/OpenAction", action("GoTo", D=ArrayObject())),
         on_root("/AcroForm", dictionary(Fields=ArrayObject())),
-        on_root("/AA", dictionary()),
         on_root("/Outlines", dictionary(First=dictionary(A=action("URI", URI=TEXT)))),
-        on_root("/Outlines", dictionary(First=dictionary(A=action("Named", N=TEXT)))),
         annotation(Subtype=NameObject("/Link"), A=action("URI", URI=TEXT)),
         annotation(Subtype=NameObject("/FreeText")),
-        annotation(Subtype=NameObject("/Widget")),
-        annotation(),
     ],
-    ids=range(10),
+    ids=range(5),
 )
 def test_what_programs_add_that_save_a_report_is_read(edit):
     """Nothing of it is followed, and the pages are drawn again."""
@@ -308,7 +303,6 @@ def test_bombs_take_little_memory(pdf, said):
         b"/Filter [" + b"/FlateDecode " * 20 + b"]",
         b"/Filter [/FlateDecode /FlateDecode]",
         b"/Filter /LZWDecode",
-        b"/Filter /JBIG2Decode",
         b"/Filter /Invented",
         b"/Filter [/DCTDecode /DCTDecode]",
         b"/Filter 7",
@@ -333,19 +327,12 @@ def test_stream_words_that_make_us_try_again_and_again():
 @pytest.mark.parametrize(
     "pdf",
     [
-        raw(CATALOG, b"<< /Type /Pages /Kids [2 0 R] /Count 1 >>"),
         raw(CATALOG, b"<< /Type /Pages /Kids [3 0 R] >>", b"<< /Type /Pages /Kids [2 0 R] >>"),
-        raw(CATALOG, b"2 0 R"),
         raw(CATALOG, b"3 0 R", b"2 0 R"),
-        raw(b"<< /Type /Pages >>"),
         raw(CATALOG, PAGES, PAGE, trailer=b""),
-        raw(CATALOG, PAGES, PAGE, trailer=b"/Root 9 0 R"),
         raw(CATALOG, PAGES, PAGE, trailer=b"/Root 1 0 R /Prev -5"),
         raw(CATALOG, PAGES, PAGE, trailer=b"/Root 1 0 R /Prev " + b"9" * 6000),
-        raw(CATALOG, PAGES, PAGE, trailer=b"/Root 1 0 R /XRefStm 9"),
-        raw(CATALOG, b"[" * 100_000),
         raw(CATALOG, b"<</A" * 100_000),
-        raw(CATALOG, PAGES, PAGE, stream(b"", b"/Length 99999999")),
         raw(CATALOG, PAGES, PAGE, b"<< /Length 4 0 R >>\nstream\nx\nendstream"),
         raw(
             CATALOG, PAGES, b"<< /Type /Page /Contents [" + b"4 0 R " * 9000 + b"] >>", stream(b"q")
@@ -354,7 +341,7 @@ def test_stream_words_that_make_us_try_again_and_again():
         b"%PDF-1.4\nxref\n0 99999999\ntrailer\n<< >>\nstartxref\n9\n%%EOF",
         b"%PDF-1.4\n" + b"startxref\n9\n%%EOF\n" * 20_000,
     ],
-    ids=range(18),
+    ids=range(11),
 )
 def test_broken_structure(pdf):
     assert reason(pdf)

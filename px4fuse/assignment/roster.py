@@ -165,6 +165,8 @@ def file_stem(student_id: str) -> str | None:
 
     >>> file_stem("s01/2026"), file_stem("../../x"), file_stem("nul"), file_stem("=;")
     ('s01_2026', '_.._x', '_nul', None)
+    >>> file_stem("com1.txt"), file_stem("-rf"), file_stem("a."), len(file_stem("x" * 300))
+    ('_com1.txt', 'rf', 'a', 48)
     """
     text = unicodedata.normalize("NFC", student_id.strip())
     kept = "".join(c if c.isalnum() or c in "-_.@+" else "_" for c in text)
