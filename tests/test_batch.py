@@ -35,6 +35,7 @@ from px4fuse.fleet.job import Job
 from px4fuse.fleet.logs import find_logs
 from px4fuse.fleet.rows import COLUMNS, csv_bytes, rows_of, table_of
 from px4fuse.fleet.run import Fleet
+from px4fuse.fleet.store import kept_in
 from px4fuse.fleet.terminal import print_fleet
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.reading import read_results
@@ -176,7 +177,7 @@ def test_a_flight_on_gnss_has_its_rows(shared_logs):
 
 
 @pytest.mark.usefixtures("remembered")
-def test_a_second_run_does_only_what_is_new(flights, tmp_path):
+def test_a_second_run_does_only_what_is_new(flights, tmp_path, monkeypatch):
     logs, output = tmp_path / "logs", tmp_path / "out"
     shutil.copytree(flights, logs)
     (logs / "f3.ulg").rename(tmp_path / "f3.ulg")
@@ -195,6 +196,10 @@ def test_a_second_run_does_only_what_is_new(flights, tmp_path):
     assert len(after) == 4
     fresh = px4fuse.batch(logs)
     assert_same(table.assign(results=""), fresh)
+    # as where another run has other settings
+    monkeypatch.setattr(run, "kept_in", lambda *_: iter(()))
+    assert "has replaced its rows" in px4fuse.batch(logs / "f1.ulg", output).loc[0, "reason"]
+    monkeypatch.setattr(run, "kept_in", kept_in)
     # other settings are another comparison
     other = px4fuse.batch(logs / "f1.ulg", output, sigma_z_m=0.2)
     assert other.loc[0, "settings"] == "px4fuse compare LOG --sigma-z 0.2"

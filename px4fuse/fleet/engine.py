@@ -149,8 +149,8 @@ def outcomes(
 
 
 def _several(work: Callable[..., Iterator[tuple[int, Any]]], jobs: Sequence[Any]) -> list[Any]:
-    """What a cluster's worker does: its jobs one by one, in a process of their own."""
-    # that of a worker is one, by Dask's default, and may have no processes of its own
+    """What a cluster's worker does: some jobs, one by one in a process apart from its own."""
+    # by Dask's default a worker's process is a daemon, which may have no children
     multiprocessing.current_process().daemon = False
     found = dict(work(jobs, processes=1))
     return [found[index] for index in range(len(jobs))]

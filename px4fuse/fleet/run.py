@@ -214,7 +214,7 @@ def _known(now: _Run, reports: bool) -> dict[int | None, set[str]]:
     known: dict[int | None, set[str]] = defaultdict(set)
     for kept in kept_in(now.output, now.px4fuse, now.settings):
         first = kept.rows[0]
-        files = [now.output / first[kind] for kind in FILES[: 1 + reports]]
+        files = [now.output / first.get(kind, "") for kind in FILES[: 1 + reports]]
         if "axis" not in first or all(file.is_file() for file in files):
             known[kept.size_bytes].add(kept.sha256)
     return known
@@ -258,10 +258,12 @@ def _written(now: _Run, logs: Iterable[FoundLog], baseline: pd.DataFrame | None)
             return [now.lost[log.address]] if log.address in now.lost else []
         sha256 = now.hash_of[log.address]
         first = now.first_of[sha256]
-        if first is log:
+        if first is log and sha256 in rows_of:
             return rows_of[sha256]
-        reason = f"the same file as {first.log}, whose rows stand for both"
-        return [{"status": NOT_JUDGED, "log_sha256": sha256, "reason": reason}]
+        status, reason = NOT_JUDGED, f"the same file as {first.log}, whose rows stand for both"
+        if first is log:
+            status, reason = FAILED, "another run in this folder has replaced its rows"
+        return [{"status": status, "log_sha256": sha256, "reason": reason}]
 
     def rows() -> Iterator[Row]:
         for log in logs:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 
@@ -19,7 +20,7 @@ class Kept(msgspec.Struct, frozen=True):
     px4fuse: str
     settings: str
     size_bytes: int | None
-    rows: list[Row]
+    rows: Annotated[list[Row], msgspec.Meta(min_length=1)]
 
     @property
     def file(self) -> str:
