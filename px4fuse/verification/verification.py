@@ -60,6 +60,8 @@ SHOWN = 20
 SHOWN_TEXT = 120
 # Sizes by which a report multiplies numbers to print them: 1, per cent, thousandths
 PRINTED_SCALES = (1.0, 100.0, 1000.0)
+# Of notes that are drawn again; a page holds about 60
+MAX_NOTES_LINES = 5_000
 _NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 
 Recompute = Callable[[Reported, Mapping[str, Path]], Recomputed | Refused]
@@ -143,6 +145,9 @@ def verify(
         asked = one_line(sha256, 64) or "none"
         reason = f"none of the {len(files)} files given is the log, whose SHA-256 is {asked}"
         return Verdict("other log", (reason,), with_log=False, missing=name)
+    if report.results.student.notes.count("\n") > MAX_NOTES_LINES:
+        reason = f"its notes have more than {MAX_NOTES_LINES} lines, which is no report"
+        return _unknown(Refused(reason, rerun.ASK))
     again = recompute(report.results, files)
     return _unknown(again) if isinstance(again, Refused) else _with_log(report, again)
 
