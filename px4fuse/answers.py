@@ -58,9 +58,9 @@ MISTAKES: Mapping[str, tuple[str, Mapping[str, float]]] = {
     "open-end": ("the loop ends this far from its start: the closure is false", _M),
     "vio-drift": ("the odometry drifts by this share of the path, more than usual", {"%": 1.0}),
     "no-vvo": ("the positions that EKF2 was sent are not logged", {}),
-    "ekf2-noise": ("EKF2_EVP_NOISE is this, and the data ask for another", _M),
-    "ekf2-delay": ("EKF2_EV_DELAY is this, and the stamps are right", _S),
-    "ekf2-gate": ("EKF2_EVP_GATE is this, too small", _SD),
+    "ekf2-noise": ("EKF2_EVP_NOISE or EKF2_GPS_P_NOISE is this, and the data ask for another", _M),
+    "ekf2-delay": ("EKF2_EV_DELAY or EKF2_GPS_DELAY is this, and the stamps are right", _S),
+    "ekf2-gate": ("EKF2_EVP_GATE or EKF2_GPS_P_GATE is this, too small", _SD),
     "ekf2-off": ("EKF2 was told not to fuse the positions", {}),
 }
 EKF2_DID = (
@@ -87,6 +87,10 @@ CURES: Mapping[str, Mapping[str, float]] = {
     "EKF2_EVP_GATE": _SD,
     "EKF2_EV_DELAY": {"ms": 1.0, "s": 1e3},
     "EKF2_EV_CTRL": {"": 1.0},
+    "EKF2_GPS_P_NOISE": _M,
+    "EKF2_GPS_P_GATE": _SD,
+    "EKF2_GPS_DELAY": {"ms": 1.0, "s": 1e3},
+    "EKF2_GPS_CTRL": {"": 1.0},
     "SDLOG_PROFILE": {"": 1.0},
     "correct the stamps at the sender": _S,
     "synchronise the clocks before take-off": {},

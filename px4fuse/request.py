@@ -403,7 +403,6 @@ _ARGUMENTS = {
     "position": "--position",
     "changes": "--set",
     "scheduler": "--scheduler",
-    "memory": "--memory",
 }
 
 

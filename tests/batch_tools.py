@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import hashlib
 import os
 import pickle
@@ -37,35 +36,19 @@ def tiny_logs(folder: Path, count: int) -> Path:
 
 
 class Clock:
-    """The engine's, put forward: what hangs need not be waited for."""
+    """Put forward: what hangs need not be waited for."""
 
-    def __init__(self) -> None:
-        self.ahead_s = 0.0
-
-    sleep = staticmethod(time.sleep)
+    ahead_s = 0.0
 
     def monotonic(self) -> float:
         return time.monotonic() + self.ahead_s
-
-
-def act(work):
-    """What a job says."""
-    what, value = work
-    match what:
-        case "hold the interpreter":
-            windows = sys.platform == "win32"
-            library = ctypes.PyDLL("kernel32" if windows else None)  # which keeps the lock
-            library.Sleep(600_000) if windows else library.sleep(600)
-        case "hog":
-            return len(bytearray(os.urandom(1_000_000)) * value)
-    return bad_jobs.act(work)
 
 
 def analyse(work: job.Job) -> job.Outcome:
     """As the worker does, but a log called "hang" never ends, and one called "crash" crashes."""
     name = Path(work.address).stem
     if name in ("hang", "crash"):
-        act(("hang", 0) if name == "hang" else ("exit", 3))
+        bad_jobs.act(("hang", 0) if name == "hang" else ("exit", 3))
     return analyse_once(work)
 
 

@@ -19,7 +19,7 @@ from px4fuse.assignment import assignment
 from px4fuse.assignment.assignment import assign, fly, key_path
 from px4fuse.assignment.drawing import CHOICES, COUNTS, EASIEST, HARDEST, LOOPS, draw
 from px4fuse.assignment.key import AnswerKey, key_text, read_key
-from px4fuse.assignment.roster import Person, file_stem, read_roster
+from px4fuse.assignment.roster import Person, read_roster
 from px4fuse.cli import cli, main
 from px4fuse.comparison.comparison import compare
 from px4fuse.errors import OutputError, SettingsError
@@ -67,6 +67,8 @@ class TestDraw:
         assert not draw(SECRET, "s1", "aisle", truth=False).scenario.truth
         assert (scenario.seed, scenario.sigma_uwb_m, scenario.heading_deg) == PINNED[0]
         assert drawn.typed == PINNED[1]
+        loops = [n for n in range(12) if draw(SECRET, f"s{n}", "mixed").scenario.kind == "loop"]
+        assert loops == [1, 5, 9, 11]
 
     @pytest.mark.parametrize("kind", ["aisle", "loop", "mixed"])
     def test_students_secrets_and_kinds_differ(self, kind):
@@ -98,18 +100,20 @@ class TestDraw:
             assert first.goes_with(second)
             assert second.goes_with(first)
             parse(drawn.typed)
+            ratios = [EASIEST]
             for choice, text in zip(drawn.chosen, drawn.typed, strict=True):
                 if choice.limit is None:
                     assert text == choice.mistake
                     continue
                 size = size_of(text)
                 signs[choice.mistake, size > 0] += 1
-                shares = sorted((choice.limit, choice.limit * (1 / EASIEST, EASIEST)[
-                    choice.less_is_plainer]))  # fmt: skip
-                assert 0.99 * shares[0] <= abs(size) <= 1.01 * shares[1]
+                ratio = choice.limit / abs(size)
+                ratios.append(1.0 / ratio if choice.less_is_plainer else ratio)
                 if choice.at_s is not None:
                     at = float(text.rpartition(",")[2].removesuffix("s"))
                     assert choice.at_s[0] <= at <= choice.at_s[1]
+            assert drawn.difficulty == pytest.approx(max(ratios), abs=0.011)
+            assert EASIEST <= drawn.difficulty <= HARDEST
         both = {choice.mistake for choice in CHOICES["aisle"] if choice.either_sign}
         assert {name for name, positive in signs if not positive} == both
 
@@ -143,17 +147,6 @@ class TestDraw:
         # half as difficult is twice the limit; where less is plainer, half the limit
         assert clock.typed(0.5, -1.0) == f"clock-offset=-{2 * clock.limit:g}ms"
         assert gate.typed(0.5) == f"ekf2-gate={gate.limit / 2:g}"
-        for n in range(300):
-            drawn = draw(SECRET, f"s{n}", "mixed")
-            ratios = [
-                abs(size_of(typed)) / choice.limit if choice.less_is_plainer
-                else choice.limit / abs(size_of(typed))
-                for choice, typed in zip(drawn.chosen, drawn.typed, strict=True)
-                if choice.limit is not None
-            ]  # fmt: skip
-            hardest = max([EASIEST, *ratios]) if drawn.chosen else HARDEST
-            assert drawn.difficulty == pytest.approx(hardest, abs=0.011)
-            assert EASIEST <= drawn.difficulty <= HARDEST
         each = [draw(SECRET, f"s{n}", "loop", 1).difficulty for n in range(500)]
         counts, _ = np.histogram(each, bins=4, range=(EASIEST, HARDEST))
         assert counts.min() > 90
@@ -180,16 +173,12 @@ def test_what_the_key_expects_is_found_in_the_log(tmp_path, kind, number, count)
 
 
 ROSTERS = {
-    "plain": "id,name\n1001,Ann Lee\n1002,Bob Ray\n",
     "gradescope": "First Name,Last Name,SID,Email\nAnn,Lee,1001,a@x\nBob,Ray,1002,b@x\n",
-    "moodle": '\ufeff"First name","Surname","ID number"\n"Ann","Lee","1001"\n"Bob","Ray","1002"\n',
     "id number empty": "Name,ID number,User name\nAnn Lee,,1001\nBob Ray,,1002\n",
     "semicolons": 'Student ID;Name\r\n1001;"Ann Lee"\r\n1002;Bob Ray\r\n',
     "comma in a quoted title": '"Student ID","Name, whole"\n1001,x\n1002,y\n',
     "tabs": "Student-ID\tFull name\n1001\tAnn Lee\n1002\tBob Ray\n",
-    "old mac": "id,name\r1001,Ann Lee\r1002,Bob Ray\r",
     "empty rows": "\n\nid,name\n\n1001,Ann Lee\n,\n 1002 , Bob Ray \n\n",
-    "UTF-16": "id,name\n1001,Ann Lee\n1002,Bob Ray\n".encode("utf-16"),
     "Windows-1252": "id,naïve,name\n1001,ä,Ann Lee\n1002,ö,Bob Ray\n".encode("cp1252"),
     "short rows": "name,x,id\nAnn Lee,,1001\nBob Ray,,1002,more,cells\n",
 }
@@ -199,10 +188,10 @@ BAD_ROSTERS = {
     "no id column": ("a,b\n1,2\n", "no column tells who"),
     "empty": ("", "empty"),
     "header alone": ("id,name\n", "0 students"),
-    "empty id": ("id,name\n1,A\n,B\n", "'B' has no id"),
+    "empty id": ("id,name\n1,A\n,B\n", "the id of 'B'"),
     "same id": ("id\n1\n2\n1\n", "rows 2 and 4 have the same id '1'"),
     "same but for case": ("id\nab\nAB\n", "rows 2 and 3"),
-    "same file": ("id\na/b\na:b\n", "'a/b' and 'a:b' give the same file name"),
+    "same file": ("id\na/b\na:b\n", "the id of 'a:b' no file of its own"),
     "nothing left": ("id\n///\n", "letters or digits"),
     "binary": (b"\x00\x01\x02id", "not text"),
     "spreadsheet": (b"PK\x03\x04....", "Save it as CSV"),
@@ -227,26 +216,6 @@ class TestRoster:
             read_roster(roster(tmp_path, content))
         assert said in str(error.value)
         assert "\n" not in str(error.value)
-
-    @pytest.mark.parametrize(
-        ("student_id", "stem"),
-        [
-            ("a@b.de", "a@b.de"),
-            ("=1+1|cmd", "_1+1_cmd"),
-            ("../../etc/passwd", "_.._etc_passwd"),
-            ("C:\\x", "C__x"),
-            ("NUL", "_NUL"),
-            ("com1.txt", "_com1.txt"),
-            ("-rf", "rf"),
-            ("a.", "a"),
-            ("ก12", "ก12"),
-            ("x" * 300, "x" * 48),
-            ("\u202e1", "_1"),
-            ("...", None),
-        ],
-    )
-    def test_file_names(self, student_id, stem):
-        assert file_stem(student_id) == stem
 
 
 # ------------------------------------------------------------------ files
@@ -363,17 +332,11 @@ class TestKey:
             return spoilt(students=[{**good["students"][0], **values}])
 
         texts = [
-            "", "[]", "3", "null", "{", '"x"', "[" * 1_000_000, "9" * 10_000, '{"a": NaN}',
-            spoilt(schema=None), spoilt(schema={"name": "px4fuse-results"}),
-            spoilt(schema={**good["schema"], "version": 99}), spoilt(kind=3), spoilt(secret=[]),
-            spoilt(students={}), spoilt(students=[]), spoilt(students=[1]),
-            spoilt(students=[good["students"][0]] * 2), spoilt(students=good["students"] * 600),
-            with_student(id=None), with_student(id=" "), with_student(sha256="x" * 64),
-            with_student(file=7), with_student(name="x" * 2000), with_student(mistakes="nlos"),
-            with_student(findings=[3]), with_student(findings=["x"] * 100),
-            with_student(truth={"sigma_z_m": "0.1"}), with_student(truth={"sigma_z_m": True}),
-            with_student(difficulty="hard"), with_student(difficulty=True),
-            with_student(truth=[]), with_student(scenario={"a": []}), with_student(scenario=1),
+            "", "[" * 1_000_000, "9" * 10_000, spoilt(schema={**good["schema"], "version": 99}),
+            spoilt(students=[]), spoilt(students=[good["students"][0]] * 2),
+            spoilt(students=good["students"] * 600), with_student(id=" "),
+            with_student(sha256="x" * 64), with_student(name="x" * 2000),
+            with_student(findings=["x"] * 100), with_student(truth={"sigma_z_m": True}),
         ]  # fmt: skip
         path = tmp_path / "key.json"
         for text in texts:
@@ -400,18 +363,12 @@ BAD_COMMANDS = {
     ),
     "no secret file": ("--assignment roster.csv -o f --secret-file none", "cannot be read"),
     "seed": ("--assignment roster.csv -o f --seed 3", "--seed is for a single flight"),
-    "mistake": ("--assignment roster.csv -o f --mistake nlos", "--mistake is for a single"),
-    "too many": ("--assignment roster.csv -o f --mistakes 3", "0 to 2"),
     "too many for a loop": ("--assignment roster.csv -o f --kind mixed --mistakes 2", "0 to 1"),
-    "fewer than none": ("--assignment roster.csv -o f --mistakes -1", "--mistakes"),
     "mistakes alone": ("-o f.ulg --mistakes 1", "requires --assignment"),
-    "secret alone": ("-o f.ulg --secret abcdefghij", "requires --assignment"),
-    "preview alone": ("-o f.ulg --preview", "requires --assignment"),
     "preview without a secret": (
         "--assignment roster.csv -o f --preview",
         "requires --secret-file",
     ),
-    "mixed alone": ("-o f.ulg --kind mixed", "requires --assignment"),
     "no roster": ("--assignment none.csv -o f", "cannot be read"),
     "key inside": ("--assignment roster.csv -o f --answer f/k.json", "students' folder"),
     "key is the roster": ("--assignment roster.csv -o f --answer roster.csv", "is the roster"),

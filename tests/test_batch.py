@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import contextvars
 import os
+import random
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from dataclasses import replace
-from importlib import metadata
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import bad_jobs
 import batch_tools
 import pandas as pd
+import psutil
 import pytest
 from batch_tools import environment, started, tiny_log, tiny_logs
 from click.testing import CliRunner
@@ -27,30 +29,32 @@ import px4fuse
 from px4fuse.cli import cli
 from px4fuse.cli.outputs import terminal
 from px4fuse.errors import OutputError, SettingsError
-from px4fuse.fleet import engine, job, run, store
-from px4fuse.fleet.engine import connected
+from px4fuse.fleet import engine, job, run
+from px4fuse.fleet.engine import connected, outcomes
 from px4fuse.fleet.job import Job
 from px4fuse.fleet.logs import find_logs
 from px4fuse.fleet.rows import COLUMNS, csv_bytes, rows_of, table_of
 from px4fuse.fleet.run import Fleet
+from px4fuse.fleet.store import kept_in
 from px4fuse.fleet.terminal import print_fleet
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.reading import read_results
+from px4fuse.verification import workers
+from px4fuse.verification.workers import Failed, run_bounded
 
-
-@pytest.fixture(scope="module")
-def client(tmp_path_factory) -> Iterator[Any]:
-    """Two workers; they are the session's own, which px4fuse.batch uses."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(batch_tools.MEMORY, str(tmp_path_factory.mktemp("memory")))
-        with connected(workers=2, memory="2GB") as client:
-            yield client
+PX4FUSE = [sys.executable, "-m", "px4fuse", "batch"]
 
 
 @pytest.fixture
-def remembered(monkeypatch) -> None:
+def remembered(monkeypatch, memory: Path) -> None:
     """For tests of what surrounds an analysis."""
+    monkeypatch.setenv(batch_tools.MEMORY, str(memory))
     monkeypatch.setattr(run, "analyse", batch_tools.analyse_once)
+
+
+@pytest.fixture(scope="module")
+def memory(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("memory")
 
 
 @pytest.fixture(scope="module")
@@ -59,10 +63,8 @@ def flights(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(client, flights, tmp_path_factory) -> pd.DataFrame:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run, "analyse", batch_tools.analyse_once)
-        return px4fuse.batch(flights, tmp_path_factory.mktemp("undisturbed"))
+def undisturbed(flights, tmp_path_factory) -> pd.DataFrame:
+    return px4fuse.batch(flights, tmp_path_factory.mktemp("undisturbed"))
 
 
 def assert_same(table: pd.DataFrame, expected: pd.DataFrame) -> None:
@@ -76,7 +78,7 @@ def command(*arguments: str | Path) -> Any:
 # ------------------------------------------------------------------ the table
 
 
-def test_every_log_is_in_the_table_with_its_numbers_or_its_line(client, tmp_path):
+def test_every_log_is_in_the_table_with_its_numbers_or_its_line(tmp_path):
     logs = tiny_logs(tmp_path / "logs", 1)
     (logs / "inner").mkdir()
     shutil.copy(logs / "f1.ulg", logs / "inner" / "twin.ulg")
@@ -102,10 +104,8 @@ def test_every_log_is_in_the_table_with_its_numbers_or_its_line(client, tmp_path
         tuned.value, tuned.low, tuned.high,
     ]  # fmt: skip
     assert (first["status"] == "done").all()
-    # it says the same as compare, whose report and results these are
     results = read_results((output / first.loc[0, "results"]).read_bytes())
     assert results.request.log == "f1.ulg"
-    assert results.axes["east"].filters["kf"].nis_mean == first.loc[1, "kf_nis_mean"]
     assert results.story == tuple(first.loc[0, "story"].split("\n"))
     assert (output / first.loc[0, "report"]).read_bytes().startswith(b"%PDF")
     # a clock offset is there where it is determinable
@@ -154,17 +154,19 @@ def test_absent_numbers_are_empty_and_texts_are_no_formulas(tmp_path):
     assert "flight-?.ulg" in csv_bytes(table).decode()
 
 
-def test_logs_without_a_position_are_not_judged_but_known(client, tmp_path):
-    row = px4fuse.batch(gnss_log("v1.16").write(tmp_path / "a.ulg")).loc[0]
+def test_logs_without_a_position_are_not_judged_but_known(tmp_path):
+    log = gnss_log("v1.16").write(tmp_path / "a.ulg")
+    row = px4fuse.batch(log, tmp_path / "out").loc[0]
     assert (row["status"], row["axis"]) == ("not judged", "")
     assert row["firmware"] == "PX4 v1.16.0"
     assert row["duration_s"] > 10
     assert "--position" in row["remedy"]
     assert row["aids"].startswith("gnss_pos variance overstated")
+    assert "1 as before" in command(log, "-o", tmp_path / "out").output
 
 
 @pytest.mark.reallogs
-def test_a_flight_on_gnss_has_its_rows(shared_logs, client):
+def test_a_flight_on_gnss_has_its_rows(shared_logs):
     (log,) = shared_logs.glob("simulated/*no_uwb.ulg")
     table = px4fuse.batch(log)
     assert table["axis"].tolist() == ["aisle", "north", "east"]
@@ -175,7 +177,7 @@ def test_a_flight_on_gnss_has_its_rows(shared_logs, client):
 
 
 @pytest.mark.usefixtures("remembered")
-def test_a_second_run_does_only_what_is_new(client, flights, tmp_path):
+def test_a_second_run_does_only_what_is_new(flights, tmp_path, monkeypatch):
     logs, output = tmp_path / "logs", tmp_path / "out"
     shutil.copytree(flights, logs)
     (logs / "f3.ulg").rename(tmp_path / "f3.ulg")
@@ -188,43 +190,30 @@ def test_a_second_run_does_only_what_is_new(client, flights, tmp_path):
     (logs / "late.ulg").write_bytes(tiny_log(9))  # what failed is tried again
     said: list[tuple[str, int, int]] = []
     table = px4fuse.batch(logs, output, progress=lambda *step: said.append(step))
-    assert said[-1] == ("comparing, 0 failed", 2, 2)
+    assert said[-1] == ("comparing, 0 failed", 4, 4)
     after = {file: file.stat().st_mtime_ns for file in (output / "results").iterdir()}
     assert {file: after[file] for file in times} == times
     assert len(after) == 4
     fresh = px4fuse.batch(logs)
     assert_same(table.assign(results=""), fresh)
+    # as where another run has other settings
+    monkeypatch.setattr(run, "kept_in", lambda *_: iter(()))
+    assert "has replaced its rows" in px4fuse.batch(logs / "f1.ulg", output).loc[0, "reason"]
+    monkeypatch.setattr(run, "kept_in", kept_in)
     # other settings are another comparison
     other = px4fuse.batch(logs / "f1.ulg", output, sigma_z_m=0.2)
     assert other.loc[0, "settings"] == "px4fuse compare LOG --sigma-z 0.2"
     assert other.loc[0, "kf_nis_mean"] < table.loc[0, "kf_nis_mean"]
 
 
-def test_a_killed_worker_costs_nothing(client, flights, undisturbed, tmp_path):
-    killed = []
-
-    def kill(what: str, done: int, of: int) -> None:
-        if what.startswith("comparing,") and not killed:
-            killed.extend(client.run(os.getpid).values())
-            for process in killed:
-                os.kill(process, signal.SIGKILL)
-
-    table = px4fuse.batch(flights, tmp_path, progress=kill)
-    assert len(killed) == 2
-    assert_same(table, undisturbed)
-    client.wait_for_workers(2, timeout=60)
-
-
 def test_ctrl_c_at_a_terminal_keeps_what_is_done_and_says_so_on_one_line(
-    client, flights, undisturbed, tmp_path
+    flights, undisturbed, tmp_path
 ):
-    arguments = [sys.executable, "-m", "px4fuse", "batch", flights, "-o", tmp_path]
-    arguments += ["--workers", "1"]
     process = subprocess.Popen(
-        arguments, stderr=subprocess.PIPE, text=True, env=environment(), start_new_session=True
-    )
-    # a log's rows are kept after its files, so that those of the first are there with the second
-    while len(list(tmp_path.glob("results/*.json"))) < 2:
+        [*PX4FUSE, flights, "-o", tmp_path, "--workers", "1"],
+        stderr=subprocess.PIPE, text=True, env=environment(), start_new_session=True,
+    )  # fmt: skip
+    while not list(tmp_path.glob("rows/*.json")):
         assert process.poll() is None
         time.sleep(0.05)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the workers too
@@ -242,38 +231,38 @@ def test_ctrl_c_at_a_terminal_keeps_what_is_done_and_says_so_on_one_line(
 # ------------------------------------------------------------------ what goes wrong
 
 
-def test_a_log_that_hangs_or_crashes_costs_that_log(client, flights, tmp_path, monkeypatch):
+@pytest.mark.usefixtures("remembered")
+def test_a_log_that_hangs_or_crashes_costs_that_log(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "analyse", batch_tools.analyse)
     logs = tmp_path / "logs"
     logs.mkdir()
     for seed, name in enumerate(("hang", "crash", "well"), 1):
         (logs / f"{name}.ulg").write_bytes(tiny_log(seed))
     clock = batch_tools.Clock()
-    monkeypatch.setattr(engine, "time", clock)
+    monkeypatch.setattr(workers, "time", clock)
 
     def wait_no_longer(what: str, done: int, of: int) -> None:
-        if what.startswith("comparing,") and done == 2:
-            clock.ahead_s = 60.0
+        clock.ahead_s = 600.0 * (done == 2)
 
-    table = px4fuse.batch(logs, timeout_s=60.0, progress=wait_no_longer).set_index("name")
+    table = px4fuse.batch(logs, progress=wait_no_longer).set_index("name")
     assert table.loc["well.ulg", "status"].tolist() == ["done"] * 4
     hang, crash = table.loc["hang.ulg"], table.loc["crash.ulg"]
     assert (hang["status"], crash["status"]) == ("failed", "failed")
-    assert hang["reason"] == "it took longer than 60 s and was ended"
-    assert hang["remedy"] == "Allow more with --timeout."
-    assert "ended 3 times" in crash["reason"]
-    client.wait_for_workers(2, timeout=60)
+    assert hang["reason"] == "it took longer than 600 s and was ended"
+    assert "--timeout" in hang["remedy"]
+    assert crash["reason"] == "the process that read it ended (exit code 3)"
 
 
-def work_on(log: Path | str, **more: Any) -> Job:
-    made = Job(str(log), ComparisonRequest(log="LOG"), False, 10**9, metadata.version("px4fuse"))
-    return replace(made, **more)
+def analysed(log: Path | str, max_bytes: int = 10**9) -> job.Outcome:
+    """As a process of its own does it, whose limits nobody else has."""
+    work = Job(str(log), ComparisonRequest(log="LOG"), False, max_bytes)
+    return contextvars.copy_context().run(job.analyse, work)
 
 
 def test_a_log_that_changes_while_it_is_read_says_so(flights, tmp_path, monkeypatch):
     log = tmp_path / "f.ulg"
     shutil.copy(flights / "f1.ulg", log)
-    sha256, compared = job.identify(work_on(log)), job._compared
+    compared = job._compared
 
     def grows(work: Job, path: Path, sha256: str) -> job.Outcome:
         outcome = compared(work, path, sha256)
@@ -281,29 +270,21 @@ def test_a_log_that_changes_while_it_is_read_says_so(flights, tmp_path, monkeypa
             file.write(b"more")
         return outcome
 
-    assert job.analyse(work_on(log)).rows[0]["status"] == "done"
+    before = analysed(log)
+    assert before.rows[0]["status"] == "done"
     monkeypatch.setattr(job, "_compared", grows)
-    (row,) = job.analyse(work_on(log)).rows
-    assert (row["status"], row["log_sha256"]) == ("failed", sha256)
+    (row,) = analysed(log).rows
+    assert (row["status"], row["log_sha256"]) == ("failed", before.sha256)
     assert row["reason"] == "it changed while it was read"
-    # and between the two times that it is read
-    monkeypatch.undo()
-    (row,) = job.analyse(work_on(log, sha256=sha256)).rows
-    assert row["reason"] == "it changed while it was read"
-    # a worker that comes later may have another version
-    with pytest.raises(SettingsError, match=r"a worker has px4fuse .*, not 9\.9"):
-        job.analyse(work_on(log, px4fuse="9.9"))
 
 
 @pytest.mark.usefixtures("remembered")
 @pytest.mark.parametrize("ends", [KeyboardInterrupt, OutputError])
-def test_what_ends_a_run_keeps_what_is_done(
-    client, flights, undisturbed, tmp_path, monkeypatch, ends
-):
+def test_what_ends_a_run_keeps_what_is_done(flights, undisturbed, tmp_path, monkeypatch, ends):
     write_all, written = run.write_all, []
 
     def full(contents: dict[Path, bytes]) -> None:
-        if written and (ends is OutputError or len(contents) == 1):
+        if written and (ends is OutputError or tmp_path / "fleet.csv" not in contents):
             raise ends("results/f.json: cannot be written (No space left on device).")
         write_all(contents)
         written.append(contents)
@@ -311,37 +292,45 @@ def test_what_ends_a_run_keeps_what_is_done(
     monkeypatch.setattr(run, "write_all", full)
     with pytest.raises(ends, match=r"No space left .*"):
         px4fuse.batch(flights, tmp_path)
-    monkeypatch.undo()
+    monkeypatch.setattr(run, "write_all", write_all)
     if ends is KeyboardInterrupt:  # the table has been written
         assert len(set(pd.read_parquet(tmp_path / "fleet.parquet")["name"])) == 1
-    said: list[tuple[str, int, int]] = []
-    table = px4fuse.batch(flights, tmp_path, progress=lambda *step: said.append(step))
-    assert said[-1] == ("comparing, 0 failed", 2, 2)
-    assert_same(table, undisturbed)
+    # what is no file of rows is done again
+    (tmp_path / "rows" / f"{'0' * 64}.json").write_bytes(b"{}")
+    again = command(flights, "-o", tmp_path)
+    assert "3 logs: 3 done; 1 as before" in again.output
+    assert_same(pd.read_parquet(tmp_path / "fleet.parquet"), undisturbed)
 
 
-def test_rows_are_kept_whole_when_the_disk_is_full(tmp_path):
-    path, row = tmp_path / "rows.sqlite", {"name": "a.ulg", "story": "x" * 50_000}
+def test_two_runs_in_one_folder(tmp_path):
+    """Both end well, and what they leave is one whole table."""
+    logs, out = tiny_logs(tmp_path / "logs", 3), tmp_path / "out"
+    both = [
+        subprocess.Popen(
+            [*PX4FUSE, logs, "-o", out, "--workers", "1"], text=True, stderr=subprocess.PIPE,
+            stdout=subprocess.DEVNULL, env=environment(),
+        )
+        for _ in range(2)
+    ]  # fmt: skip
+    assert [(one.communicate(timeout=300)[1], one.returncode) for one in both] == [("", 0)] * 2
+    table = pd.read_parquet(out / "fleet.parquet")
+    assert table.groupby("name")["status"].unique().map(list).to_dict() == {
+        f"f{number}.ulg": ["done"] for number in (1, 2, 3)
+    }
 
-    def fill() -> None:
-        with store.opened(tmp_path, "1", "s") as rows:
-            rows.connection.execute("pragma max_page_count = 60")
-            for number in range(100):
-                rows.keep(f"{number}", number, [row])
 
-    with pytest.raises(OutputError, match=r"database or disk is full.* make room"):
-        fill()
-    with store.opened(tmp_path, "1", "s") as rows:
-        kept = {sha256 for (sha256,) in rows.connection.execute("select sha256 from kept")}
-        assert 0 < len(kept) < 100
-        assert all(rows.rows(sha256) == [row] for sha256 in kept)
-        assert rows.sizes() == {int(sha256) for sha256 in kept}
-        assert rows.rows("99") == []
-    with store.opened(tmp_path, "2", "s") as rows:
-        assert rows.sizes() == set()
-    path.write_bytes(b"not a database" * 100)
-    with pytest.raises(OutputError, match="not a database"), store.opened(tmp_path, "1", "s"):
-        pass
+def test_junk_in_hundreds_costs_a_line_each(tmp_path):
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    for number in range(300):
+        rng = random.Random(number)
+        (folder / f"{number}.ulg").write_bytes(rng.randbytes(rng.choice((0, 7, 200, 5000))))
+    done = command(folder, "-o", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    table = pd.read_parquet(tmp_path / "out" / "fleet.parquet")
+    assert len(table) == 300
+    assert set(table["status"]) <= {"failed", "not judged"}
+    assert table["reason"].str.len().between(10, 300).all()
 
 
 def test_bad_input_is_one_line(tmp_path, flights):
@@ -393,45 +382,113 @@ def test_logs_are_found_in_folders_globs_and_urls(tmp_path, monkeypatch):
     memory.pipe("/fleet/x.ulg", tiny_log(3))
     (log,) = find_logs(["memory://fleet"])
     assert (log.name, log.log) == ("x.ulg", "memory:///fleet/x.ulg")
-    sha256 = job.identify(work_on(log.address))
-    rows = job.analyse(work_on(log.address)).rows
-    assert {(row["name"], row["log_sha256"]) for row in rows} == {("x.ulg", sha256)}
-    (small,) = job.analyse(work_on(log.address, max_bytes=10)).rows
+    found = analysed(log.address)
+    assert {(row["name"], row["log_sha256"]) for row in found.rows} == {("x.ulg", found.sha256)}
+    (small,) = analysed(log.address, max_bytes=10).rows
     assert small["reason"] == "1 MB, more than the limit of 0 MB"
 
 
 # ------------------------------------------------------------------ a cluster of its own
 
 
-def test_a_scheduler_and_two_workers_that_run_already(flights, undisturbed, tmp_path):
+LOCAL = ("--no-dashboard", "--host", "127.0.0.1")
+
+
+def started_scheduler(log: Path, **more: str) -> Any:
+    ports = ("--port", "0", "--dashboard-address", ":0", "--host", "127.0.0.1")
+    return started("scheduler", *ports, says="Scheduler at:", log=log, **more)
+
+
+def started_workers(address: str, log: Path, *options: str, **more: str) -> Any:
+    arguments = ("--nthreads", "1", *LOCAL, *options)
+    return started("worker", address, *arguments, says="Starting Worker plugin", log=log, **more)
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory) -> Any:
+    """Address of a scheduler with two workers."""
+    logs = tmp_path_factory.mktemp("cluster")
+    path = os.pathsep.join((str(batch_tools.REPOSITORY / "tests"), str(batch_tools.REPOSITORY)))
+    with started_scheduler(logs / "scheduler", PYTHONPATH=path) as line:
+        address = line.split()[-1]
+        with started_workers(address, logs / "both", "--nworkers", "2", PYTHONPATH=path):
+            yield address
+
+
+def test_a_scheduler_and_two_workers_that_run_already(cluster, flights, undisturbed, tmp_path):
+    arguments = [flights, "-o", tmp_path / "out", "--scheduler", cluster]
+    result = command(*arguments, "--fail-on", "failed")
+    assert result.exit_code == 0, result.output
+    assert_same(pd.read_parquet(tmp_path / "out" / "fleet.parquet"), undisturbed)
     other = tmp_path / "px4fuse-9.9.dist-info"
     other.mkdir()
     (other / "METADATA").write_text("Metadata-Version: 2.1\nName: px4fuse\nVersion: 9.9\n")
-    no_dashboard = ("--no-dashboard", "--host", "127.0.0.1")
-    scheduler = ("scheduler", "--port", "0", "--dashboard-address", ":0", "--host", "127.0.0.1")
+    path = f"{tmp_path}{os.pathsep}{batch_tools.REPOSITORY}"
+    with started_workers(cluster, tmp_path / "third", PYTHONPATH=path):
+        assert "has px4fuse 9.9, and this is" in str(command(*arguments).exception)
 
-    def worker(name: str, *options: str, **more: str):
-        return started(
-            "worker", address, "--nthreads", "1", *no_dashboard, *options,
-            says="Starting Worker plugin", log=tmp_path / name, **more,
-        )  # fmt: skip
 
-    with started(*scheduler, says="Scheduler at:", log=tmp_path / "scheduler") as line:
+def test_a_bad_job_is_lost_alone_on_a_cluster_too(cluster):
+    """And a worker that is killed costs nothing; the session's own client is taken."""
+    from distributed import Client
+
+    jobs = [("square", 3), ("raise", "no number"), ("exit", 3), ("hang", 0), ("square", 4)]
+    work = partial(run_bounded, bad_jobs.act, timeout_s=5.0, memory_bytes=2 * 10**9)
+    expected = [9, "ValueError: no number", "exit code 3", "longer than 5 s", 16]
+    with Client(cluster) as client, connected() as same:
+        assert same is client
+        found = []
+        for one, result in outcomes(client, work, [*jobs, ("square", 5)]):
+            if not found:
+                killed = next(iter(client.run(os.getpid).values()))
+                os.kill(killed, signal.SIGKILL)
+            found.append((one, result.reason if isinstance(result, Failed) else result))
+    assert dict(found).keys() == {*jobs, ("square", 5)}
+    for one, what in zip(jobs, expected, strict=True):
+        assert str(what) in str(dict(found)[one])
+
+
+def test_a_scheduler_that_goes_is_said_on_one_line(tmp_path):
+    """Its process is ended while a log is being compared."""
+    logs, out = tiny_logs(tmp_path / "logs", 6), tmp_path / "out"
+    with started_scheduler(tmp_path / "scheduler") as line:
         address = line.split()[-1]
-        with worker("both", "--nworkers", "2"):
-            arguments = [str(flights), "-o", str(tmp_path / "out"), "--scheduler", address]
-            result = command(*arguments, "--fail-on", "failed")
-            assert result.exit_code == 0, result.output
-            table = pd.read_parquet(tmp_path / "out" / "fleet.parquet")
-            assert_same(table, undisturbed)
-            path = f"{tmp_path}{os.pathsep}{batch_tools.REPOSITORY}"
-            with worker("third", PYTHONPATH=path):
-                result = command(*arguments)
-                assert "has px4fuse 9.9, and this is" in str(result.exception)
+        with started_workers(address, tmp_path / "worker"):
+            process = subprocess.Popen(
+                [*PX4FUSE, logs, "-o", out, "--scheduler", address], text=True,
+                stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, env=environment(),
+            )  # fmt: skip
+            while not list(out.glob("results/*.json")):
+                assert process.poll() is None
+                time.sleep(0.05)
+            port = int(address.rpartition(":")[2])
+            (owner,) = {
+                one.pid
+                for one in psutil.net_connections("tcp")
+                if one.status == psutil.CONN_LISTEN and one.laddr.port == port
+            }
+            psutil.Process(owner).kill()
+            _, said = process.communicate(timeout=120)
+    assert process.returncode == 2
+    assert said.startswith("px4fuse: the scheduler is gone")
+    assert said.endswith("What is done is kept: the same command goes on from there.\n")
+    assert said.count("\n") == 1
+
+
+def test_what_a_cluster_lacks_is_one_line(monkeypatch, flights):
+    monkeypatch.setattr(engine, "CONNECT_S", 0.5)
+    for address in ("tcp://127.0.0.1:1", "nonsense://x", ""):
+        with pytest.raises(SettingsError, match="no Dask scheduler answers"), connected(address):
+            pass
+    with connected() as client:
+        assert client is None  # none of those is the session's own
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(SettingsError, match=r'pip install "px4fuse\[batch\]"'):
+        px4fuse.batch(flights, scheduler="tcp://127.0.0.1:1")
 
 
 @pytest.mark.reallogs
-def test_all_shared_logs_in_one_run(client, shared_logs, tmp_path):
+def test_all_shared_logs_in_one_run(shared_logs, tmp_path):
     files = [
         str(file)
         for file in sorted(shared_logs.rglob("*"))

@@ -15,7 +15,6 @@ from scipy.stats import t as student
 
 from px4fuse.cli import cli
 from px4fuse.errors import SettingsError
-from px4fuse.fleet.engine import connected
 from px4fuse.fleet.junit import junit
 from px4fuse.fleet.regressions import MIN_FLIGHTS, marked, read_baseline
 from px4fuse.fleet.rows import csv_bytes, table_of
@@ -165,33 +164,10 @@ def test_what_is_no_table_of_batch_is_refused(tmp_path):
 
 # -- JUnit -----------------------------------------------------------------------------------------
 
-# Elements of Jenkins' junit-10.xsd that a suite of ours may have, their attributes and children
-SCHEMA = {
-    "testsuites": ({"name", "time", "tests", "failures", "disabled", "errors"}, {"testsuite"}),
-    "testsuite": (
-        {"name", "tests", "failures", "errors", "time", "disabled", "skipped", "timestamp",
-         "hostname", "id", "package"},
-        {"properties", "testcase", "system-out", "system-err"},
-    ),
-    "testcase": (
-        {"name", "assertions", "time", "classname", "status"},
-        {"skipped", "error", "failure", "system-out", "system-err"},
-    ),
-    "failure": ({"type", "message"}, set()),
-    "skipped": ({"message"}, set()),
-}  # fmt: skip
-
 
 def made(table: pd.DataFrame) -> ET.Element:
-    """The XML, which must be as the common schema has it."""
-    root = ET.fromstring(junit(table))
-    for element in root.iter():
-        attributes, children = SCHEMA[element.tag]
-        assert set(element.attrib) <= attributes
-        assert {child.tag for child in element} <= children
-        if element.tag in ("testsuite", "testcase"):
-            assert element.get("name")
-    suite = root.find("testsuite")
+    """The suite, whose counts must be those of its cases."""
+    suite = ET.fromstring(junit(table)).find("testsuite")
     assert suite is not None
     for name, path in (("tests", "testcase"), ("failures", "testcase/failure"),
                        ("skipped", "testcase/skipped")):  # fmt: skip
@@ -236,11 +212,10 @@ def test_the_command_marks_writes_and_fails(tmp_path, monkeypatch):
         assert done.exit_code == code, done.output
         return done.output
 
-    with connected(workers=1):  # of the session, which every run takes
-        ran(0, "-o", "before")
-        same = ran(0, "-o", "after", *options)
-        unchanged = Path("j.xml").read_bytes()
-        ran(1, "-o", "worse", "--sigma-z", "0.3", *options)
+    ran(0, "-o", "before")
+    same = ran(0, "-o", "after", *options)
+    unchanged = Path("j.xml").read_bytes()
+    ran(1, "-o", "worse", "--sigma-z", "0.3", *options)
     assert "Held against the baseline: 1 by the same log" in same
     assert b'failures="0"' in unchanged
     table = pd.read_parquet("worse/fleet.parquet")

@@ -16,7 +16,6 @@ from conftest import REPOSITORY as ROOT
 from matplotlib import pyplot
 
 from px4fuse.cli import COMMANDS, cli
-from px4fuse.fleet.engine import connected
 
 pytestmark = pytest.mark.usefixtures("analysed_once")
 
@@ -48,13 +47,6 @@ def at_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-@pytest.fixture(scope="module")
-def workers():
-    """Of the session, so that a batch begins none of its own, as another test's does."""
-    with connected(workers=1, memory="2GB"):
-        yield
-
-
 def typed(line: str) -> None:
     result = CliRunner().invoke(cli, shlex.split(line, comments=True)[1:])
     assert result.exit_code == 0, (line, result.output)
@@ -62,12 +54,11 @@ def typed(line: str) -> None:
 
 @pytest.mark.usefixtures("no_drawing", "at_root")  # tests of their own draw each kind of report
 @pytest.mark.parametrize("page", [page for page in PAGES if commands(page)])
-def test_commands_run_in_order(page: str, request, monkeypatch, tmp_path: Path) -> None:
+def test_commands_run_in_order(page: str, monkeypatch, tmp_path: Path) -> None:
     if page == "docs/instructors.md":
         pytest.skip("a test of its own makes what its commands need")
     for number, line in enumerate(commands(page)):
         if line.startswith("px4fuse batch"):  # the sample logs themselves are in the other lines
-            request.getfixturevalue("workers")
             folder = tmp_path / f"batch_{number}"
             folder.mkdir()
             tiny_logs(folder / "sample_logs", 1)

@@ -179,15 +179,6 @@ def test_a_thousand_pages_are_not_all_drawn() -> None:
     assert [one.page for one in compared(pdf, drawn("a"))] == [2]
 
 
-def test_a_look_is_in_reading_order_and_black_on_white() -> None:
-    (look,) = looks(drawn("two words"))  # type: ignore[misc]
-    assert not isinstance(look, Unavailable)
-    assert look.words == ("two", "words")
-    assert look.grey.shape == (288, 288)
-    assert look.grey.max() == 1.0
-    assert look.grey.min() < 0.2
-
-
 BASE = drawn("a 1.5")
 
 

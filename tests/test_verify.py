@@ -42,7 +42,6 @@ from pypdf.generic import (
     ArrayObject,
     DecodedStreamObject,
     DictionaryObject,
-    EncodedStreamObject,
     FloatObject,
     NameObject,
     NumberObject,
@@ -277,16 +276,9 @@ STRUCTURE: dict[str, tuple[Change, str]] = {
     "no request": (without("request"), "numbers differ"),
     "another command": (put("tune", "request", "command"), "numbers differ"),
     "an unknown setting": (put(1, "request", "please"), "numbers differ"),
+    # only the request is run again; the command is for people, and is made from it
+    "a command": (put("px4fuse compare x.ulg", "provenance", "command"), "numbers differ"),
 }  # fmt: skip
-# Only the request is run again; the command is for people, and one that is not made from it differs
-STRUCTURE |= {
-    f"command: {command[:40]}": (put(command, "provenance", "command"), "numbers differ")
-    for command in (
-        "",
-        "px4fuse compare aisle_uwb.ulg -o evil.pdf",
-        "px4fuse compare " + "a " * 10**6,
-    )
-}
 
 
 @pytest.mark.usefixtures("no_drawing")
@@ -321,12 +313,11 @@ def test_what_is_printed_from_the_record(loop: Base, path: tuple[str, ...]) -> N
 # -- what is changed on the pages ------------------------------------------------------------------
 
 
-def once(pattern: bytes, replacement: Any, *, last: bool = True) -> Callable[[bytes], bytes]:
-    """Replace one match: by default the last."""
+def once(pattern: bytes, replacement: Any) -> Callable[[bytes], bytes]:
+    """Replace the last match."""
 
     def change(content: bytes) -> bytes:
-        found = list(re.finditer(pattern, content))
-        match = found[-1 if last else 0]
+        match = list(re.finditer(pattern, content))[-1]
         new = replacement(match) if callable(replacement) else match.expand(replacement)
         return content[: match.start()] + new + content[match.end() :]
 
@@ -359,27 +350,20 @@ DRAWING: dict[str, Edit] = {
     "another digit": last_digit(lambda digit: text(DIGITS[(digit + 1) % 10])),
     "a digit less": last_digit(lambda _: b""),
     "a point of a line moved": once(rb"([\d.]+) ([\d.]+) l\b", aside),
-    "another point of a line moved": once(rb"([\d.]+) ([\d.]+) l\b", aside, last=False),
-    "a line more": lambda c: c + b"\n0 g\n300 0 1 842 re\nf\n",
     "a white rectangle": lambda c: c + b"\n1 g\n100 690 300 90 re\nf\n",
     "a text more": lambda c: c + b"\nBT\n/f0 12 Tf\n100 100 Td\n(" + A + b") Tj\nET\n",
     "a text moved": once(rb"q 1 0 0 -1 ([\d.]+) ([\d.]+) cm", rb"q 1 0 0 -1 9\1 \2 cm"),
     "a text invisible": once(rb"BT 0 Tr", b"BT 3 Tr"),
-    "a text white": once(rb"BT 0 Tr", b"1 g BT 0 Tr"),
-    "a text larger": once(rb"(/f\d+) [\d.]+ Tf", rb"\1 14 Tf"),
     "another font": once(rb"/f0 ", b"/f1 "),
     "a colour": once(rb"[\d.]+ [\d.]+ [\d.]+ scn", b"0.123 0.123 0.123 scn"),
-    "the end cut off": lambda c: c[: c.rindex(b"\nQ")],
     "a comment": lambda c: c + b"\n% nothing\n",
-    "an inline image": lambda c: c + b"\nBI /W 1 /H 1 /BPC 8 /CS /G ID \xff EI\n",
     "clipped": lambda c: b"0 0 300 300 re W n\n" + c,
     "turned over": lambda c: b"-1 0 0 1 595 0 cm\n" + c,
     "nothing at all": lambda c: b"\n",
 }
 PAGES = 8
 # Nobody who looks at the page sees these, or reads anything else from it (see pages.DISTANCE)
-UNSEEN = {"a comment", "an inline image", "the end cut off", "a point of a line moved",
-          "another point of a line moved", "a colour"}  # fmt: skip
+UNSEEN = {"a comment", "a point of a line moved", "a colour"}
 
 
 # Every page in two ways, and each of the others on one page
@@ -422,10 +406,6 @@ def root(key: str, value: Any) -> Forge:
     return lambda writer: entry(key, value)(writer.root_object)
 
 
-def every_page(key: str, value: Any) -> Forge:
-    return lambda writer: entry(key, value)(writer.root_object["/Pages"])
-
-
 def box(*corners: float) -> ArrayObject:
     return ArrayObject([FloatObject(corner) for corner in corners])
 
@@ -452,25 +432,6 @@ def exchanged_glyphs(writer: PdfWriter) -> None:
     descendant(writer)[NameObject("/CIDToGIDMap")] = writer._add_object(held)
 
 
-def with_a_three_as_eight(content: bytes) -> bytes:
-    """A font whose outlines were edited."""
-    from fontTools.ttLib import TTFont  # type: ignore[import-untyped]
-
-    changed = TTFont(io.BytesIO(content))
-    names = [changed.getGlyphName(DIGITS[digit]) for digit in (3, 8)]
-    changed["glyf"][names[0]] = changed["glyf"][names[1]]
-    out = io.BytesIO()
-    changed.save(out)
-    return out.getvalue()
-
-
-def narrower_letters(writer: PdfWriter) -> None:
-    widths = descendant(writer)["/W"]
-    for place, width in enumerate(widths):
-        if not isinstance(width, int) and float(width) > 600.0:
-            widths[place] = FloatObject(36.0)
-
-
 def titled(**entries: str) -> Forge:
     return lambda writer: writer.add_metadata({f"/{key}": held for key, held in entries.items()})
 
@@ -483,41 +444,25 @@ NOTHING = dictionary()
 DOCUMENT: dict[str, tuple[Forge, str]] = {
     "the first page away": (kids(lambda k: k[1:]), "page differs"),
     "a page away": (kids(lambda k: k[:3] + k[4:]), "page differs"),
-    "the last page away": (kids(lambda k: k[:-1]), "page differs"),
     "a page twice": (kids(lambda k: [*k[:2], *k[1:]]), "page differs"),
-    "a page again at the end": (kids(lambda k: [*k, k[2]]), "page differs"),
     "two pages exchanged": (kids(lambda k: [k[1], k[0], *k[2:]]), "page differs"),
-    "pages in reverse": (kids(lambda k: k[::-1]), "page differs"),
     "one page for all": (kids(lambda k: k[:1] * len(k)), "page differs"),
     "an annotation": (page(2, "/Annots", ArrayObject([NOTE])), "page differs"),
     "a page turned": (page(3, "/Rotate", 180), "page differs"),
     "a page cut": (page(3, "/CropBox", box(0, 0, 300, 300)), "page differs"),
-    "a page smaller": (page(3, "/MediaBox", box(0, 0, 595.28, 641.68)), "page differs"),
-    "a page in other units": (page(3, "/UserUnit", 2), "verified"),
     "an action of a page": (page(3, "/AA", dictionary(O=script("1"))), "refused"),
-    "all pages turned": (every_page("/Rotate", 180), "page differs"),
-    "all pages cut": (every_page("/CropBox", box(0, 0, 300, 300)), "page differs"),
     "glyphs exchanged": (exchanged_glyphs, "page differs"),
-    "a glyph redrawn": (
-        replaced(lambda w: descendant(w)["/FontDescriptor"], "/FontFile2", with_a_three_as_eight),
-        "page differs",
-    ),
-    "letters narrower": (narrower_letters, "page differs"),
     "texts of glyphs exchanged": (
         replaced(font("/f0"), "/ToUnicode", lambda c: c.replace(b"> <0031>", b"> <0039>")),
         "page differs",
     ),
     "a script": (root("/OpenAction", script("app.alert(1)")), "refused"),
     "a form": (root("/AcroForm", dictionary(Fields=ArrayObject())), "verified"),
-    "layers": (root("/OCProperties", dictionary(OCGs=ArrayObject(), D=NOTHING)), "verified"),
     "named scripts": (
         lambda w: entry("/JavaScript", dictionary(Names=ArrayObject()))(w.root_object["/Names"]),
         "refused",
     ),
     "another title": (titled(Title="my report"), "verified"),
-    "another creator": (titled(Creator="abc"), "verified"),
-    "an author": (titled(Author="Eve"), "verified"),
-    "a date": (titled(CreationDate="D:20260101"), "verified"),
     "a part that nothing refers to": (lambda w: w._add_object(dictionary(Eve=NOTHING)), "verified"),
 }  # fmt: skip
 
@@ -533,14 +478,6 @@ def test_a_changed_document(aisle: Base, name: str) -> None:
     assert verdict.redrawn in (b"", aisle.pdf)
     assert verdict.status == "verified"
     assert verdict.outcome == expected, verdict
-
-
-def test_a_letter_drawn_as_another_is_found_on_every_page(aisle: Base) -> None:
-    """All texts stay what they are: only the pictures tell."""
-    found = aisle.verified(sealed(forged(aisle.pdf, exchanged_glyphs))).pages
-    assert len(found) == PAGES
-    assert not any(one.words for one in found)
-    assert min(one.picture for one in found) > pages.DISTANCE
 
 
 def appended(pdf: bytes, change: Forge) -> bytes:
@@ -573,26 +510,11 @@ def packed(writer: PdfWriter) -> None:
     writer.add_annotation(0, Link(rect=(50, 50, 200, 70), url="http://example.org"))
 
 
-def unpacked(writer: PdfWriter) -> None:
-    """Every stream as it is, without a filter."""
-    for place, held in enumerate(writer._objects):
-        if isinstance(held, EncodedStreamObject):
-            bare = DecodedStreamObject()
-            bare.update({k: v for k, v in held.items() if k not in ("/Filter", "/Length")})
-            bare.set_data(held.get_data())
-            writer._objects[place] = bare
-
-
 FILES: dict[str, tuple[Callable[[Base, Base], bytes], set[str]]] = {
     "saved again": (lambda a, _: forged(a.pdf), {"verified"}),
-    "saved again twice": (lambda a, _: forged(forged(a.pdf)), {"verified"}),
     "packed in another way": (lambda a, _: forged(a.pdf, packed), {"verified"}),
-    "not packed at all": (lambda a, _: forged(a.pdf, unpacked), {"verified"}),
     "metadata appended": (lambda a, _: appended(a.pdf, titled(Author="Ada")), {"verified"}),
     "the seal removed": (lambda a, _: a.pdf.removesuffix(seal(a.pdf)), {"verified"}),
-    "the seal of another": (
-        lambda a, b: a.pdf.removesuffix(seal(a.pdf)) + seal(b.pdf), {"verified"},
-    ),
     "bytes appended": (lambda a, _: a.pdf + b"\n% Eve\n", {"verified"}),
     "a version appended": (lambda a, _: appended(a.pdf, emptied), {"page differs"}),
     "a page of another report": (pages_of_another, {"page differs"}),
@@ -631,17 +553,8 @@ def test_a_joined_recording_is_found_by_its_content(tmp_path: Path) -> None:
     """And what it is called here does not show."""
     source = REPOSITORY / "sample_logs"
     target = tmp_path / "joined.pdf"
-    words = [
-        "compare",
-        str(source / "aisle_uwb.ulg"),
-        "--position",
-        str(source / "aisle_uwb_external.csv"),
-        "--axis",
-        "down",
-        "-o",
-        str(target),
-    ]
-    outcome = CliRunner().invoke(cli, words, standalone_mode=False)
+    words = f"compare {source}/aisle_uwb.ulg --position {source}/aisle_uwb_external.csv --axis down"
+    outcome = CliRunner().invoke(cli, [*words.split(), "-o", str(target)], standalone_mode=False)
     assert outcome.exception is None, outcome.output
     report = report_of(target.read_bytes())
     (tmp_path / "a").write_bytes(LOG.read_bytes())

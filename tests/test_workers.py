@@ -9,41 +9,13 @@ import subprocess
 import sys
 from contextlib import closing
 
-import bad_jobs
 import pytest
+from bad_jobs import act
 
-from px4fuse.errors import LogError
 from px4fuse.verification import workers
 from px4fuse.verification.workers import Failed, run_bounded
 
 MEMORY = 1_500_000_000
-
-
-class Unreadable:
-    """Pickles, and cannot be read back."""
-
-    def __reduce__(self):
-        return int, ("no number",)
-
-
-def act(job):
-    """What a job says."""
-    what, value = job
-    match what:
-        case "spin":
-            while True:
-                pass
-        case "hog":
-            return len(bytearray(value))
-        case "own error":
-            raise LogError(value)
-        case "big":
-            return bytes(value)
-        case "local":
-            return lambda: value
-        case "unreadable":
-            return Unreadable()
-    return bad_jobs.act(job)
 
 
 def run(jobs, processes=2, timeout_s=60.0, memory_bytes=None):
@@ -53,17 +25,6 @@ def run(jobs, processes=2, timeout_s=60.0, memory_bytes=None):
     assert not multiprocessing.active_children()
     assert [index for index, _ in sorted(heard, key=lambda one: one[0])] == [*range(len(jobs))]
     return [result for _, result in sorted(heard, key=lambda one: one[0])], heard
-
-
-def test_fifty_jobs_in_their_order():
-    jobs = [("square", n) for n in range(50)]
-    results, heard = run(jobs)
-    assert results == [n * n for n in range(50)]
-    assert sorted(heard) == list(enumerate(results))
-
-
-def test_no_jobs_have_no_results():
-    assert run([]) == ([], [])
 
 
 def test_one_bad_job_is_lost_alone():
@@ -95,7 +56,7 @@ def test_one_bad_job_is_lost_alone():
 
 
 def test_what_hangs_is_ended():
-    results, _ = run([("hang", 0), ("square", 2), ("spin", 0), ("square", 3)], timeout_s=3.0)
+    results, _ = run([("hang", 0), ("square", 2), ("hang", 0), ("square", 3)], timeout_s=3.0)
     assert results[1::2] == [4, 9]
     late = Failed("it took longer than 3 s and was ended.")
     assert results[0::2] == [late, late]
@@ -114,9 +75,6 @@ def test_what_eats_memory_is_ended():
 
 def test_processes_are_replaced_after_some_jobs(monkeypatch):
     monkeypatch.setattr(workers, "JOBS_PER_WORKER", 2)
-    results, _ = run([("process", 0)] * 5, processes=1)
-    assert len(set(results)) == 1  # quick ones
-    monkeypatch.setattr(workers, "QUICK_S", 0.0)
     results, _ = run([("process", 0)] * 5, processes=1)
     assert len(set(results)) == 3
     assert results[0] == results[1] != results[2]
@@ -140,7 +98,7 @@ INTERRUPTED = """
 import os, sys, time
 sys.path.insert(0, {tests!r})
 from px4fuse.verification.workers import run_bounded
-from test_workers import act
+from bad_jobs import act
 
 if __name__ == "__main__":
     for _, result in run_bounded(act, [("process", 0), ("hang", 0)], processes=1, timeout_s=500,

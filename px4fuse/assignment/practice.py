@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from px4fuse.analysis import run
-from px4fuse.errors import SettingsError
 from px4fuse.explore.data import flight_data
 from px4fuse.explore.packing import Packer
 from px4fuse.explore.page import data_scripts, page_text
@@ -38,8 +37,7 @@ CHOICES = {
 }
 # Of two mistakes: that of the motion and one of single samples; a noise would hide another
 BOTH_SEEN = ({"clock", "source"}, {"clock", "gate"}, {"frame", "source"}, {"frame", "gate"})
-LEVELS = (1, 2, 3)
-MOST_FLIGHTS = 20
+HARDEST = 3
 MOST_SEED = 2**32 - 1
 SIGMA_A_M_S2, SIGMA_Z_M = 0.10, 0.10
 # Short of a minute, with two turns. A quiet IMU, which SIGMA_A fits: else its own errors would look
@@ -157,18 +155,7 @@ def draw(seed: int, level: int = 1, count: int = 10) -> tuple[Round, ...]:
     level : {1, 2, 3}
         1: one mistake, large; 2: smaller; 3: small, and two of them in every second flight.
     count : int
-
-    Raises
-    ------
-    SettingsError
-        A number is out of range.
     """
-    for option, value, low, high in (
-        ("--level", level, LEVELS[0], LEVELS[-1]), ("--flights", count, 1, MOST_FLIGHTS),
-        ("--seed", seed, 0, MOST_SEED),
-    ):  # fmt: skip
-        if not low <= value <= high:
-            raise SettingsError(f"{option} {value}: give {low} to {high}.")
     rng = np.random.default_rng([seed, level, count])
     names: list[str] = []
     while len(names) < count:
@@ -179,7 +166,7 @@ def draw(seed: int, level: int = 1, count: int = 10) -> tuple[Round, ...]:
 def _round(rng: np.random.Generator, choice: str, level: int) -> Round:
     tricks = [one for one in TRICKS if one.choice == choice]
     tricks = [tricks[rng.integers(len(tricks))]] if tricks else []
-    if level == LEVELS[-1] and tricks and rng.random() < 0.5:
+    if level == HARDEST and tricks and rng.random() < 0.5:
         others = [one for one in TRICKS if {one.choice, choice} in BOTH_SEEN]
         tricks += [others[rng.integers(len(others))]] if others else []
     typed = []

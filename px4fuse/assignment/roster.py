@@ -117,19 +117,12 @@ def read_roster(path: Path) -> tuple[Person, ...]:
         raise SettingsError(f"{path}: {len(people)} students", f"Give 1 to {MAX_STUDENTS}.")
     stems: dict[str, Person] = {}
     for person in people:
-        who = one_line(person.student_id or person.name, 40)
         stem = file_stem(person.student_id)
-        if stem is None:
+        if stem is None or stems.setdefault(stem.casefold(), person) is not person:
+            who = one_line(person.student_id or person.name, 40)
             raise SettingsError(
-                f"{path}: {who!r} has no id with letters or digits, after which a file can be "
-                "named",
-                "Give every student one.",
-            )
-        if stems.setdefault(stem.casefold(), person) is not person:
-            raise SettingsError(
-                f"{path}: {one_line(stems[stem.casefold()].student_id, 40)!r} and {who!r} give the "
-                "same file name",
-                "Give every student an id of its own.",
+                f"{path}: after the id of {who!r} no file of its own can be named",
+                "Give every student an id of its own, with letters or digits.",
             )
     return people
 
@@ -172,6 +165,8 @@ def file_stem(student_id: str) -> str | None:
 
     >>> file_stem("s01/2026"), file_stem("../../x"), file_stem("nul"), file_stem("=;")
     ('s01_2026', '_.._x', '_nul', None)
+    >>> file_stem("com1.txt"), file_stem("-rf"), file_stem("a."), len(file_stem("x" * 300))
+    ('_com1.txt', 'rf', 'a', 48)
     """
     text = unicodedata.normalize("NFC", student_id.strip())
     kept = "".join(c if c.isalnum() or c in "-_.@+" else "_" for c in text)

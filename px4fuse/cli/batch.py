@@ -51,8 +51,11 @@ CLUSTERS = ("slurm", "kubernetes")
 )
 @click.option(
     "--memory",
-    metavar="SIZE",
-    help="Memory for each, as 2GB.  [default: an equal share of this computer's]",
+    "memory_gb",
+    type=click.FloatRange(min=1.0),
+    default=4.0,
+    metavar="GB",
+    help="Memory for each (on Linux); what needs more is ended.  [default: 4]",
 )
 @click.option(
     "--scheduler",
@@ -85,7 +88,7 @@ def batch(
     reports: bool,
     timeout_s: float,
     workers: int | None,
-    memory: str | None,
+    memory_gb: float,
     scheduler: str | None,
     baseline: Path | None,
     junit_path: Path | None,
@@ -105,11 +108,8 @@ def batch(
         raise SettingsError("say with -o which folder the table goes to.")
     if output.exists() and not output.is_dir():
         raise OutputError(f"-o {output}: is not a folder. Give another place.")
-    if scheduler is not None and (workers, memory) != (None, None):
-        raise SettingsError(
-            "--workers and --memory are of a cluster that px4fuse starts; with --scheduler they "
-            "are given to dask worker."
-        )
+    if scheduler is not None and workers is not None:
+        raise SettingsError("--workers is for this computer, and --scheduler for a cluster.")
     check_targets([] if junit_path is None else [junit_path])  # before the work, not after it
     if fail_on == WORSE and baseline is None:
         raise SettingsError("--fail-on worse requires --baseline: worse than what?")
@@ -122,7 +122,6 @@ def batch(
     before = None if baseline is None else read_baseline(baseline)
     try:
         with progress() as step:
-            step("starting the workers")
             fleet = run(
                 logs,
                 output,
@@ -131,7 +130,7 @@ def batch(
                 baseline=before,
                 scheduler=scheduler,
                 workers=workers,
-                memory=memory or "auto",
+                memory_gb=memory_gb,
                 progress=partial(_shown, step, time.monotonic()),
                 **given,
             )

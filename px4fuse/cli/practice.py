@@ -16,7 +16,7 @@ from px4fuse.writing import STANDARD_OUTPUT
 @click.command()
 @click.option(
     "--seed",
-    type=int,
+    type=click.IntRange(0, 2**32 - 1),
     metavar="N",
     help="The same number gives the same flights.  [default: drawn]",
 )

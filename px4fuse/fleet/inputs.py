@@ -16,13 +16,12 @@ from px4fuse.findings import find, find_aids
 from px4fuse.reading import files_by_sha256, read_head, read_whole, shown
 from px4fuse.request import ComparisonRequest, command_line
 from px4fuse.results.build import aids_results, results
-from px4fuse.results.contract import AidsResults, ComparisonResults, Results
+from px4fuse.results.contract import AidsResults, ComparisonResults
 from px4fuse.results.model import Student
 from px4fuse.results.reading import MAX_BYTES as MAX_RESULTS_BYTES
 from px4fuse.results.reading import read_results
 from px4fuse.verification.intake import MAX_BYTES as MAX_REPORT_BYTES
-from px4fuse.verification.intake import read_report
-from px4fuse.verification.model import Refused
+from px4fuse.verification.intake import attached_results
 
 Kind = Literal["log", "report", "results"]
 Progress = Callable[[str], None]
@@ -82,10 +81,7 @@ def _read(path: Path) -> DiffInput | None:
     limit = MAX_REPORT_BYTES if is_report else MAX_RESULTS_BYTES
     advice = "Reports are below 2 MB" if is_report else "Give results of px4fuse compare"
     content = read_whole(path, ResultsError, limit, smaller=advice)
-    report = read_report(content, name) if is_report else None
-    if isinstance(report, Refused):
-        raise ResultsError(report.reason)
-    found: Results = report.results if report else read_results(content, name)
+    found = (attached_results if is_report else read_results)(content, name)
     if not isinstance(found, ComparisonResults | AidsResults):
         raise ResultsError(
             f"{name}: holds {found.schema.name}; px4fuse diff takes what px4fuse compare writes, "

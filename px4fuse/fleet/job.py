@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import re
-import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 
 import msgspec
 
-from px4fuse.errors import LogError, MissingDataError, Px4FuseError, SettingsError
-from px4fuse.fleet.logs import CHANGED, local_file
+from px4fuse.errors import LogError, MissingDataError, Px4FuseError
+from px4fuse.fleet.logs import local_file
 from px4fuse.fleet.rows import FAILED, NOT_JUDGED, Row, log_columns, rows_of, what_was_found
 from px4fuse.reading import files_by_sha256, max_log_bytes
 from px4fuse.request import ComparisonRequest, command_line, with_options
@@ -33,18 +29,15 @@ class Job:
         Whether the PDF is made too.
     max_bytes : int
         Largest log that is read.
-    px4fuse : str
-        Version that must do it.
-    sha256 : str
-        Of the log where that is known already, else empty.
+    known : frozenset of str
+        SHA-256 of logs of this size that need not be compared again.
     """
 
     address: str
     request: ComparisonRequest
     reports: bool
     max_bytes: int
-    px4fuse: str
-    sha256: str = ""
+    known: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -53,27 +46,18 @@ class Outcome:
 
     Attributes
     ----------
+    sha256 : str
+        Of the log; empty where it could not be read.
     rows : tuple of Row
-        An axis each; one where the log could not be compared.
+        An axis each; one where the log could not be compared, none where it is known.
     results, report : bytes
         JSON and PDF; empty where there is none.
     """
 
-    rows: tuple[Row, ...]
+    sha256: str
+    rows: tuple[Row, ...] = ()
     results: bytes = b""
     report: bytes = b""
-
-
-def identify(job: Job) -> str:
-    """SHA-256 of a log.
-
-    Raises
-    ------
-    LogError
-        It cannot be read.
-    """
-    with _opened(job) as path:
-        return _sha256(path)
 
 
 def analyse(job: Job) -> Outcome:
@@ -83,38 +67,21 @@ def analyse(job: Job) -> Outcome:
     -------
     Outcome
         Also of a log that cannot be compared: its one row says why.
-
-    Raises
-    ------
-    SettingsError
-        This is another version of px4fuse.
     """
-    version = metadata.version("px4fuse")
-    if version != job.px4fuse:
-        raise SettingsError(f"a worker has px4fuse {version}, not {job.px4fuse}.")
-    sha256 = job.sha256
-    try:
-        with _opened(job) as path:
-            sha256 = _sha256(path)
-            if job.sha256 not in ("", sha256):
-                raise LogError(*CHANGED)
-            outcome = _compared(job, path, sha256)
-            if _sha256(path) != sha256:
-                raise LogError(*CHANGED)
-            return outcome
-    except Px4FuseError as error:
-        return Outcome((refused(error, FAILED) | {"log_sha256": sha256},))
-
-
-@contextmanager
-def _opened(job: Job) -> Iterator[Path]:
-    """The log as a file of this computer, within its limit."""
-    before = max_log_bytes.set(job.max_bytes)
+    sha256 = ""
+    max_log_bytes.set(job.max_bytes)
     try:
         with local_file(job.address) as path:
-            yield path
-    finally:
-        max_log_bytes.reset(before)
+            sha256 = _sha256(path)
+            if sha256 in job.known:
+                return Outcome(sha256)
+            outcome = _compared(job, path, sha256)
+            if _sha256(path) != sha256:
+                again = "Run the same command again when it is complete."
+                raise LogError("it changed while it was read", again)
+            return outcome
+    except Px4FuseError as error:
+        return Outcome(sha256, (refused(error, FAILED) | {"log_sha256": sha256},))
 
 
 def refused(error: Px4FuseError, status: str, name: str = "") -> Row:
@@ -140,7 +107,7 @@ def _compared(job: Job, path: Path, sha256: str) -> Outcome:
         if isinstance(analysis, AidsAlone):
             known |= what_was_found(find_aids(analysis.aids), analysis.aids)
             lacking = MissingDataError(analysis.lacking.reason, analysis.lacking.remedy)
-            return Outcome((known | refused(lacking, NOT_JUDGED, path.name),))
+            return Outcome(sha256, (known | refused(lacking, NOT_JUDGED, path.name),))
         findings = find(analysis)
         found = results(request, analysis, findings, Student(), command)
         text, report = to_json(found), b""
@@ -151,8 +118,8 @@ def _compared(job: Job, path: Path, sha256: str) -> Outcome:
             report = render(Document(analysis, findings, Student(), command), text)
     except Px4FuseError as error:
         status = NOT_JUDGED if isinstance(error, MissingDataError) else FAILED
-        return Outcome((known | refused(error, status, path.name),))
-    return Outcome(tuple(rows_of(found)), text.encode(), report)
+        return Outcome(sha256, (known | refused(error, status, path.name),))
+    return Outcome(sha256, tuple(rows_of(found)), text.encode(), report)
 
 
 def _sha256(path: Path) -> str:
@@ -167,10 +134,3 @@ def file_stem(name: str, sha256: str) -> str:
     'Flug_3-abababababab'
     """
     return f"{re.sub(r'[^A-Za-z0-9_.-]+', '_', Path(name).stem)[:60]}-{sha256[:12]}"
-
-
-def dask_setup(worker: object) -> None:
-    """Begin a worker of this computer, as Dask calls a module that it preloads."""
-    del worker
-    # Ctrl-C in a terminal reaches all its processes; it is for the one that ends the others
-    signal.signal(signal.SIGINT, signal.SIG_IGN)

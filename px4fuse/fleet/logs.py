@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from px4fuse.errors import LogError, SettingsError
 from px4fuse.reading import max_log_bytes
@@ -19,11 +19,6 @@ if TYPE_CHECKING:
 
 #: What is taken from a folder; a file that is named itself may be called anything
 SUFFIXES = (".ulg", ".tlog", ".bin")
-CHANGED = ("it changed while it was read", "Run the same command again when it is complete.")
-# By these, as far as a file system has them, a file is the same as before
-_SAME = (
-    "size", "mtime", "ETag", "etag", "LastModified", "last_modified", "updated", "md5Hash",
-)  # fmt: skip
 
 
 @dataclass(frozen=True, order=True)
@@ -90,14 +85,13 @@ def _logs_in(given: str) -> list[FoundLog]:
             f"{given}: no logs there ({', '.join(SUFFIXES)})",
             "Give a file, or a folder that holds some.",
         )
-    return [_found(given, files, path, info) for path, info in infos.items()]
-
-
-def _found(given: str, files: AbstractFileSystem, path: str, info: dict[str, Any]) -> FoundLog:
-    address = path if _is_local(files) else files.unstrip_protocol(path)
-    is_relative = _is_local(files) and not Path(given).is_absolute()
-    log = os.path.relpath(path) if is_relative else address
-    return FoundLog(_name(path), log, address, info.get("size"))
+    found = []
+    for path, info in infos.items():
+        address = path if _is_local(files) else files.unstrip_protocol(path)
+        is_relative = _is_local(files) and not Path(given).is_absolute()
+        log = os.path.relpath(path) if is_relative else address
+        found.append(FoundLog(_name(path), log, address, info.get("size")))
+    return found
 
 
 @contextmanager
@@ -112,7 +106,7 @@ def local_file(address: str) -> Iterator[Path]:
     Raises
     ------
     LogError
-        It is too large, or it changed while it was fetched.
+        It is too large.
     SettingsError
         A package is missing that its kind of URL requires.
     """
@@ -120,8 +114,7 @@ def local_file(address: str) -> Iterator[Path]:
     if _is_local(files):
         yield Path(path)
         return
-    before = _identity(files, path)
-    size, limit = before.get("size"), max_log_bytes.get()
+    size, limit = files.info(path).get("size"), max_log_bytes.get()
     if size is not None and size > limit:
         raise LogError(
             f"{size / 1e6:,.0f} MB, more than the limit of {limit / 1e6:,.0f} MB",
@@ -130,15 +123,7 @@ def local_file(address: str) -> Iterator[Path]:
     with TemporaryDirectory(prefix="px4fuse-") as folder:
         local = Path(folder, _name(path))
         files.get_file(path, str(local))
-        files.invalidate_cache()
-        if _identity(files, path) != before:
-            raise LogError(*CHANGED)
         yield local
-
-
-def _identity(files: AbstractFileSystem, path: str) -> dict[str, Any]:
-    info = files.info(path)
-    return {name: info[name] for name in _SAME if info.get(name) is not None}
 
 
 def _file_system(address: str) -> tuple[AbstractFileSystem, str]:

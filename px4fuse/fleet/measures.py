@@ -234,7 +234,7 @@ def _of_aid(part: AidAxis | AidResult, value: float) -> Bounds | None:
     axes = (part,) if isinstance(part, AidAxis) else tuple(part.axes.values())
     if not axes:
         return None
-    count = min(_independent(axis.samples, axis.lag1_autocorrelation) for axis in axes)
+    count = min(independent_count(axis.samples, axis.lag1_autocorrelation) for axis in axes)
     if isinstance(part, AidResult):
         return share_interval(value, count)
     # innovations beyond the gate are not normal
@@ -248,7 +248,7 @@ def _of_normal(mean_square: float, count: float) -> Bounds:
 
 
 def _of_innovations(judged: FilterSummary, field: str, value: float) -> Bounds | None:
-    count = independent_count(judged)
+    count = independent_count(judged.count, judged.lag1_autocorrelation)
     if field in ("outside_gate", "rejected_share"):
         return share_interval(value, count)
     if field not in ("nis_mean", "innovation_std_m") or not _is_normal(judged, count):
@@ -265,16 +265,12 @@ def bootstrapped(errors: Array, field: str) -> Bounds | None:
     return None if isinstance(found, Unavailable) else (found.low**power, found.high**power)
 
 
-def independent_count(judged: FilterSummary) -> float:
-    """How many of the innovations' squares are as good as independent.
+def independent_count(count: int, lag1: float) -> float:
+    """How many of so many innovations' squares are as good as independent.
 
     With the autocorrelation r^k of a first-order process squares have r^2k, hence a share of
     1/(1 + 2 Σ r^2k) (Bayley and Hammersley 1946).
     """
-    return _independent(judged.count, judged.lag1_autocorrelation)
-
-
-def _independent(count: int, lag1: float) -> float:
     return count * (1.0 - lag1**2) / (1.0 + lag1**2)
 
 

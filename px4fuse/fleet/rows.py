@@ -117,24 +117,20 @@ def log_columns(log: Log) -> Row:
     }
 
 
-def table_of(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
-    """The fleet's table: all columns in their order, with their types.
-
-    Parameters
-    ----------
-    rows : iterable of mapping
-        Absent numbers and texts may be left out or None. What is not UTF-8 in a file's name, which
-        no table can hold, is replaced.
-    """
+def table_of(rows: Iterable[Row]) -> pd.DataFrame:
+    """The fleet's table: all columns in their order, with their types."""
     texts = dict.fromkeys((name for name, kind in COLUMNS.items() if kind == "str"), "")
-    known = [
-        {name: _held(value) for name, value in row.items() if value is not None} for row in rows
-    ]
-    return pd.DataFrame([texts | row for row in known], columns=list(COLUMNS)).astype(COLUMNS)
+    known = [texts | writable(row) for row in rows]
+    return pd.DataFrame(known, columns=list(COLUMNS)).astype(COLUMNS)
 
 
-def _held(value: Any) -> Any:
-    return value.encode(errors="replace").decode() if isinstance(value, str) else value
+def writable(row: Row) -> Row:
+    """A row without what is absent, and what is not UTF-8 in a file's name replaced."""
+    return {
+        name: value.encode(errors="replace").decode() if isinstance(value, str) else value
+        for name, value in row.items()
+        if value is not None
+    }
 
 
 def csv_bytes(table: pd.DataFrame) -> bytes:

@@ -3,34 +3,34 @@
 from __future__ import annotations
 
 import io
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import msgspec
 import pandas as pd
 
-from px4fuse.errors import OutputError, Px4FuseError, SettingsError
+from px4fuse.errors import LogError, Px4FuseError, SettingsError
 from px4fuse.filter.settings import Settings
 from px4fuse.fleet import TIMEOUT_S
-from px4fuse.fleet.engine import WorkerFailed, connected, outcomes
-from px4fuse.fleet.job import Job, Outcome, analyse, file_stem, identify, refused
+from px4fuse.fleet.engine import connected, outcomes
+from px4fuse.fleet.job import Job, Outcome, analyse, file_stem, refused
 from px4fuse.fleet.logs import FoundLog, find_logs
 from px4fuse.fleet.page import html_text
 from px4fuse.fleet.regressions import marked
-from px4fuse.fleet.rows import FAILED, NOT_JUDGED, Row, csv_bytes, table_of
-from px4fuse.fleet.store import Store, opened
+from px4fuse.fleet.rows import FAILED, NOT_JUDGED, Row, csv_bytes, table_of, writable
+from px4fuse.fleet.store import Kept, kept_in
 from px4fuse.reading import max_log_bytes
 from px4fuse.request import ComparisonRequest, command_line
+from px4fuse.verification.workers import MEMORY_BYTES, Failed, run_bounded
 from px4fuse.writing import write_all
-
-if TYPE_CHECKING:
-    from distributed import Client
 
 # Columns of the files of a log, relative to the folder
 FILES = ("results", "report")
@@ -63,14 +63,15 @@ class Fleet:
 
 
 @dataclass(frozen=True)
-class _Found:
-    """What is known of the logs so far."""
+class _Run:
+    """Where a run writes, what its rows rest on, and what is known of its logs so far."""
 
-    logs: Mapping[str, FoundLog]  # by address, as all of it
     output: Path
-    store: Store
-    hash_of: dict[str, str] = field(default_factory=dict)
-    lost: dict[str, Row] = field(default_factory=dict)  # rows of those that give none
+    px4fuse: str
+    settings: str
+    hash_of: dict[str, str] = field(default_factory=dict)  # by address, of those that have rows
+    first_of: dict[str, FoundLog] = field(default_factory=dict)  # by hash, whose rows stand for all
+    lost: dict[str, Row] = field(default_factory=dict)  # by address, rows of those that failed
     reused: set[str] = field(default_factory=set)
 
 
@@ -83,7 +84,7 @@ def batch(
     baseline: pd.DataFrame | None = None,
     scheduler: str | None = None,
     workers: int | None = None,
-    memory: str = "auto",
+    memory_gb: float = MEMORY_BYTES / 1e9,
     progress: Progress = lambda what, done, of: None,
     **settings: Any,
 ) -> pd.DataFrame:
@@ -109,8 +110,8 @@ def batch(
         Address of a Dask scheduler.
     workers : int, optional
         Processes on this computer; by default one per core.
-    memory : str
-        Of each, as "2 GB".
+    memory_gb : float
+        Address space for one log, of which libraries take 0.6 GB; Linux alone enforces it.
     progress : callable
         Told what is being done, how many logs are done, and of how many.
     **settings
@@ -138,7 +139,7 @@ def batch(
             baseline=baseline,
             scheduler=scheduler,
             workers=workers,
-            memory=memory,
+            memory_gb=memory_gb,
             progress=progress,
             **settings,
         )
@@ -154,7 +155,7 @@ def run(
     baseline: pd.DataFrame | None = None,
     scheduler: str | None = None,
     workers: int | None = None,
-    memory: str = "auto",
+    memory_gb: float = MEMORY_BYTES / 1e9,
     progress: Progress = lambda what, done, of: None,
     **settings: Any,
 ) -> Fleet:
@@ -172,7 +173,9 @@ def run(
     Px4FuseError
         The cluster is gone.
     """
-    logs = {log.address: log for log in find_logs(paths)}
+    if find_spec("fsspec") is None or find_spec("pyarrow") is None:
+        raise SettingsError("many logs require more", 'Run pip install "px4fuse[batch]".')
+    logs = find_logs(paths)
     try:
         request = ComparisonRequest(log="LOG", **settings)
     except TypeError as error:
@@ -181,127 +184,105 @@ def run(
         raise SettingsError("`mavlink` and `position` belong to one flight, not to many.")
     sigma_z_m = Settings().sigma_z_m if request.sigma_z_m is None else request.sigma_z_m
     Settings(request.sigma_a_m_s2, sigma_z_m, request.dt_s)  # refuses what is out of range
-    version, used = metadata.version("px4fuse"), command_line(request)
-    job = Job("", request, reports, max_log_bytes.get(), version)
-    with connected(scheduler, workers, memory) as client, opened(output, version, used) as store:
-        work = partial(_worked, client, timeout_s, progress)
-        found = _Found(logs, output, store)
+    now = _Run(output, metadata.version("px4fuse"), command_line(request))
+    known = _known(now, reports)
+    of_address = {log.address: log for log in logs}
+    jobs = [
+        Job(log.address, request, reports, max_log_bytes.get(), frozenset(known[log.size_bytes]))
+        for log in logs
+    ]
+    bounded = partial(run_bounded, analyse, timeout_s=timeout_s, memory_bytes=int(memory_gb * 1e9))
+    with (
+        connected(scheduler) as client,
+        closing(outcomes(client, bounded, jobs, workers)) as work,
+    ):
+        progress("comparing", 0, len(jobs))
         try:
-            _identify(found, work, job)
-            todo = list(_todo(found, job))
             try:
-                for one, outcome in work(analyse, todo, "comparing"):
-                    _keep(found, one.address, outcome)
+                for number, (job, outcome) in enumerate(work, 1):
+                    _keep(now, of_address[job.address], outcome)
+                    progress(f"comparing, {len(now.lost)} failed", number, len(jobs))
             finally:
-                fleet = _written(found, baseline)
-        except OutputError as error:
-            raise OutputError(f"{error} {_GOES_ON}") from error
+                fleet = _written(now, logs, baseline)
         except Px4FuseError as error:
-            raise Px4FuseError(f"{error} {_GOES_ON}") from error
+            raise type(error)(f"{error} {_GOES_ON}") from error
     return fleet
 
 
-def _worked(
-    client: Client, timeout_s: float, progress: Progress, function: Callable[[Job], Any],
-    jobs: Sequence[Job], what: str,
-) -> Iterator[tuple[Job, Any]]:  # fmt: skip
-    """What comes of every job; of one whose worker gave nothing, the row that says why."""
-    failed = 0
-    progress(what, 0, len(jobs))
-    with closing(outcomes(client, function, jobs, timeout_s=timeout_s)) as found:
-        for number, (job, outcome) in enumerate(found, 1):
-            if isinstance(outcome, WorkerFailed):
-                row = refused(outcome.error, FAILED) | {"log_sha256": job.sha256}
-                outcome = Outcome((row,))  # noqa: PLW2901
-            failed += isinstance(outcome, Outcome) and outcome.rows[0]["status"] == FAILED
-            yield job, outcome
-            progress(f"{what}, {failed} failed", number, len(jobs))
+def _known(now: _Run, reports: bool) -> dict[int | None, set[str]]:
+    """Hashes of the logs of which everything is there, by their size."""
+    known: dict[int | None, set[str]] = defaultdict(set)
+    for kept in kept_in(now.output, now.px4fuse, now.settings):
+        first = kept.rows[0]
+        files = [now.output / first.get(kind, "") for kind in FILES[: 1 + reports]]
+        if "axis" not in first or all(file.is_file() for file in files):
+            known[kept.size_bytes].add(kept.sha256)
+    return known
 
 
-def _identify(found: _Found, work: Callable[..., Iterator[tuple[Job, Any]]], job: Job) -> None:
-    """Hash the logs that may be known, or be the same as another: those of a size that is."""
-    sizes, known = Counter(log.size_bytes for log in found.logs.values()), found.store.sizes()
-    asked = [
-        replace(job, address=log.address)
-        for log in found.logs.values()
-        if log.size_bytes is None or sizes[log.size_bytes] > 1 or log.size_bytes in known
-    ]
-    for one, sha256 in work(identify, asked, "looking for what is new"):
-        if isinstance(sha256, Outcome):
-            found.lost[one.address] = sha256.rows[0]
-        else:
-            found.hash_of[one.address] = sha256
-    first_of: dict[str, FoundLog] = {}
-    for log in found.logs.values():
-        if (sha256 := found.hash_of.get(log.address)) is None:
-            continue
-        if (first := first_of.setdefault(sha256, log)) is not log:
-            found.lost[log.address] = {
-                "status": NOT_JUDGED,
-                "log_sha256": sha256,
-                "reason": f"the same file as {first.log}, whose rows stand for both",
-            }
-
-
-def _todo(found: _Found, job: Job) -> Iterator[Job]:
-    """Jobs of the logs of which not everything is there."""
-    for log in found.logs.values():
-        if log.address in found.lost:
-            continue
-        sha256 = found.hash_of.get(log.address, "")
-        rows = found.store.rows(sha256)
-        files = [rows[0][kind] for kind in FILES[: 1 + job.reports]] if rows else [""]
-        if rows and ("axis" not in rows[0] or all((found.output / f).is_file() for f in files)):
-            found.reused.add(sha256)
-        else:
-            yield replace(job, address=log.address, sha256=sha256)
-
-
-def _keep(found: _Found, address: str, outcome: Outcome) -> None:
-    """Write a log's files, then its rows: rows without files are never there."""
-    row = outcome.rows[0]
-    if row["status"] == FAILED:
-        found.lost[address] = row
+def _keep(now: _Run, log: FoundLog, outcome: Outcome | Failed) -> None:
+    """Keep what came of a log."""
+    if isinstance(outcome, Failed):
+        remedy = "Allow more with --timeout or --memory, or look at it with px4fuse compare."
+        outcome = Outcome("", (refused(LogError(outcome.reason.rstrip("."), remedy), FAILED),))
+    if outcome.rows and outcome.rows[0]["status"] == FAILED:
+        now.lost[log.address] = outcome.rows[0]
         return
-    sha256 = found.hash_of[address] = row["log_sha256"]
-    stem = f"results/{file_stem(row['name'], sha256)}"
-    contents = {
-        f"{stem}{end}": content
-        for end, content in ((".json", outcome.results), (".pdf", outcome.report))
-    }
-    write_all({found.output / name: content for name, content in contents.items() if content})
-    files = dict(zip(FILES, (name if contents[name] else "" for name in contents), strict=True))
-    rows = [each | files for each in outcome.rows]
-    found.store.keep(sha256, found.logs[address].size_bytes, rows)
+    first = min(log, now.first_of.get(outcome.sha256, log))
+    if not outcome.rows:
+        now.reused.add(outcome.sha256)
+    elif first is log:
+        _write(now, log, outcome)
+    now.hash_of[log.address] = outcome.sha256
+    now.first_of[outcome.sha256] = first
 
 
-def _written(found: _Found, baseline: pd.DataFrame | None) -> Fleet:
+def _write(now: _Run, log: FoundLog, outcome: Outcome) -> None:
+    """Write a log's files and its rows together."""
+    stem = f"results/{file_stem(log.name, outcome.sha256)}"
+    made = {f"{stem}.json": outcome.results, f"{stem}.pdf": outcome.report}
+    files = {kind: name if made[name] else "" for kind, name in zip(FILES, made, strict=True)}
+    rows = [writable(row) | files for row in outcome.rows]
+    kept = Kept(outcome.sha256, now.px4fuse, now.settings, log.size_bytes, rows)
+    contents = made | {kept.file: msgspec.json.encode(kept)}
+    write_all({now.output / name: content for name, content in contents.items() if content})
+
+
+def _written(now: _Run, logs: Iterable[FoundLog], baseline: pd.DataFrame | None) -> Fleet:
     """Make the table of all that is known by now, and write it."""
     severities: set[str] = set()
+    rows_of = {kept.sha256: kept.rows for kept in kept_in(now.output, now.px4fuse, now.settings)}
+
+    def rows_of_log(log: FoundLog) -> Iterable[Row]:
+        if log.address not in now.hash_of:
+            return [now.lost[log.address]] if log.address in now.lost else []
+        sha256 = now.hash_of[log.address]
+        first = now.first_of[sha256]
+        if first is log and sha256 in rows_of:
+            return rows_of[sha256]
+        status, reason = NOT_JUDGED, f"the same file as {first.log}, whose rows stand for both"
+        if first is log:
+            status, reason = FAILED, "another run in this folder has replaced its rows"
+        return [{"status": status, "log_sha256": sha256, "reason": reason}]
 
     def rows() -> Iterator[Row]:
-        for log in found.logs.values():
-            lost = found.lost.get(log.address)
-            kept = [lost] if lost else found.store.rows(found.hash_of.get(log.address, ""))
-            for row in kept:
+        for log in logs:
+            common = {"log": log.log, "name": log.name}
+            common |= {"px4fuse": now.px4fuse, "settings": now.settings}
+            for row in rows_of_log(log):
                 severities.update(row.get("severities", ()))
-                yield row | {
-                    "log": log.log,
-                    "name": log.name,
-                    "px4fuse": found.store.px4fuse,
-                    "settings": found.store.settings,
-                }
+                yield row | common
 
     table, against = table_of(rows()), ""
     if baseline is not None:
         table, against = marked(table, baseline)
-    page = html_text(table, found.output.resolve().name, f"px4fuse {found.store.px4fuse}")
+    page = html_text(table, now.output.resolve().name, f"px4fuse {now.px4fuse}")
     parquet = io.BytesIO()
     table.to_parquet(parquet, index=False)
     contents = {
-        found.output / "fleet.parquet": parquet.getvalue(),
-        found.output / "fleet.csv": csv_bytes(table),
-        found.output / "fleet.html": page.encode(),
+        now.output / "fleet.parquet": parquet.getvalue(),
+        now.output / "fleet.csv": csv_bytes(table),
+        now.output / "fleet.html": page.encode(),
     }
     write_all(contents)
-    return Fleet(table, len(found.reused), frozenset(severities), tuple(contents), against)
+    return Fleet(table, len(now.reused), frozenset(severities), tuple(contents), against)

@@ -16,8 +16,7 @@ import io
 import logging
 import re
 import zlib
-from contextlib import suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 import pypdf
@@ -27,7 +26,7 @@ from pypdf.generic import ArrayObject, DictionaryObject, IndirectObject, StreamO
 from px4fuse.errors import ResultsError
 from px4fuse.report.pdf import RESULTS_NAME
 from px4fuse.report.seal import seal_of
-from px4fuse.results.contract import AidsResults, ComparisonResults, LoopResults, Reported
+from px4fuse.results.contract import AidsResults, ComparisonResults, LoopResults, Results
 from px4fuse.results.reading import MAX_BYTES as MAX_ATTACHMENT_BYTES
 from px4fuse.results.reading import one_line, read_results
 from px4fuse.verification.model import Refused, Report
@@ -46,30 +45,13 @@ _DAMAGED = "damaged: it cannot be read as a PDF. Hand in the file that px4fuse w
 _LOCKED = "encrypted, or damaged. Hand in the file px4fuse wrote."
 _COSTLY = "it takes more memory or work to open than a report can need."
 
-# What acts, by key of a dictionary ... Links, comments, forms without scripts and the view to open
+# What acts: keys of a dictionary ... Links, comments, forms without scripts and the view to open
 # with are what programs add that save a report again
-_KEYS = {
-    "/JS": "JavaScript",
-    "/JavaScript": "JavaScript",
-    "/XFA": "an XFA form",
-    "/RichMediaContent": "rich media",
-    "/RichMediaSettings": "rich media",
-    "/Collection": "a portfolio",
-    "/RF": "related files",
-}
-# ... and by type of an action
-_ACTIONS = {
-    "/JavaScript": "JavaScript",
-    "/Launch": "an action that starts a program",
-    "/SubmitForm": "an action that sends a form",
-    "/ImportData": "an action that imports data",
-    "/GoToR": "a link to another file",
-    "/GoToE": "a link into an attached file",
-    "/Rendition": "rich media",
-    "/RichMediaExecute": "rich media",
-    "/Movie": "rich media",
-    "/Sound": "rich media",
-}
+_KEYS = re.compile("/(JS|JavaScript|XFA|RichMediaContent|RichMediaSettings|Collection|RF)")
+# ... and types of an action
+_ACTIONS = re.compile(
+    "/(JavaScript|Launch|SubmitForm|ImportData|GoToR|GoToE|Rendition|RichMediaExecute|Movie|Sound)"
+)
 
 # pypdf's defaults are for any PDF. A recovery of broken streams, filters other than Flate, chains
 # of filters and the external JBIG2 decoder are not for ours.
@@ -122,57 +104,62 @@ def read_report(pdf: bytes, name: str) -> Report | Refused:
     Returns
     -------
     Report or Refused
-        The strings of ``results`` are cleaned.
+        Refused too where it is of what cannot be verified: the aids of EKF2 alone.
+    """
+    try:
+        results = attached_results(pdf, name)
+    except ResultsError as refusal:
+        return Refused(f"{refusal.reason}.", refusal.remedy)
+    if not isinstance(results, ComparisonResults | LoopResults):
+        alone = isinstance(results, AidsResults)
+        held = (
+            "the aids of EKF2 alone, nothing of our filter" if alone else "no results of a report"
+        )
+        return Refused(f"{one_line(name, 200)}: {RESULTS_NAME} in it holds {held}.")
+    return Report(hashlib.sha256(pdf).hexdigest(), seal_of(pdf), results, pdf)
+
+
+def attached_results(pdf: bytes, name: str) -> Results:
+    """The results attached to a PDF, their strings cleaned.
+
+    Raises
+    ------
+    ResultsError
+        It is not one that px4fuse can have written.
     """
     remedy = ""
     try:
         _check_file(pdf)
-        known = {setting.name for setting in fields(pypdf.Configuration)}
-        limits = {name: value for name, value in _PYPDF_LIMITS.items() if name in known}
-        with pypdf.apply_configuration(**limits):
-            results = _results(pdf)
-        return Report(hashlib.sha256(pdf).hexdigest(), seal_of(pdf), results, pdf)
+        with pypdf.apply_configuration(**_PYPDF_LIMITS):
+            return _results(pdf)
     except ResultsError as refusal:
-        reason, remedy = f"{refusal.reason}.", refusal.remedy
+        reason, remedy = refusal.reason, refusal.remedy
     except (LimitReachedError, RecursionError, MemoryError):
         reason = _COSTLY
     # pypdf names no closed set of exceptions for what is broken in a file
     except Exception:  # noqa: BLE001
         reason = _LOCKED if b"/Encrypt" in pdf else _DAMAGED
-    return Refused(f"{one_line(name, 200)}: {reason}", remedy)
+    raise ResultsError(f"{one_line(name, 200)}: {reason}", remedy)
 
 
-def _results(pdf: bytes) -> Reported:
+def _results(pdf: bytes) -> Results:
     # strict: a file that needs repair is read differently by every program
     reader = pypdf.PdfReader(
         io.BytesIO(pdf), strict=True, xref_stream_maximum_entries=10 * MAX_OBJECTS
     )
     if reader.is_encrypted:
-        raise ResultsError("encrypted. Hand in the file that px4fuse wrote.")
-    try:
-        count = len(reader.pages)
-    except LimitReachedError:
-        count = MAX_PAGES + 1
-    if not 0 < count <= MAX_PAGES:
-        raise ResultsError(f"more than {MAX_PAGES} pages." if count else "a PDF without pages.")
+        raise ResultsError(_LOCKED)
+    if not 0 < len(reader.pages) <= MAX_PAGES:
+        raise ResultsError(f"a PDF without pages, or with more than {MAX_PAGES}.")
     contents = _walk(reader)
     if contents.found:
         raise ResultsError(f"it contains {', '.join(sorted(contents.found))}; no report does.")
-    where = f"{RESULTS_NAME} in it"
-    results = read_results(_attachment(contents), where)
-    if not isinstance(results, ComparisonResults | LoopResults):
-        alone = isinstance(results, AidsResults)
-        what = (
-            "the aids of EKF2 alone, nothing of our filter" if alone else "no results of a report"
-        )
-        raise ResultsError(f"{where} holds {what}.")
-    return results
+    return read_results(_attachment(contents), f"{RESULTS_NAME} in it")
 
 
 def _check_file(pdf: bytes) -> None:
     for wrong, why in (
         (len(pdf) > MAX_BYTES, f"larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB."),
-        (not pdf, "an empty file."),
         (not pdf.startswith(b"%PDF-"), "not a PDF."),
         (b"%%EOF" not in pdf[-2048:], "cut off: the end of the PDF is missing. Hand it in again."),
     ):
@@ -251,14 +238,14 @@ def _is_listed(reader: pypdf.PdfReader, number: int, generation: int) -> bool:
 
 def _look_at(value: DictionaryObject, contents: _Contents) -> None:
     """Note what a dictionary has that a report has not."""
-    contents.found.update(text for key, text in _KEYS.items() if key in value)
+    contents.found.update(key[1:] for key in value if _KEYS.fullmatch(key))
+    action = _name(value.get("/S")) or ""
+    if _ACTIONS.fullmatch(action):
+        contents.found.add(action[1:])
     for key in ("/OpenAction", "/AA"):
         opened = _resolved(value.get(key))
         if isinstance(opened, DictionaryObject) and "/URI" in str(opened):
             contents.found.add("an action that opens an address")
-    action = _name(value.get("/S"))
-    if action in _ACTIONS:
-        contents.found.add(_ACTIONS[action])
     if "/EF" in value:
         contents.files.append(value)
         versions = _resolved(value.get("/EF"))
@@ -306,12 +293,9 @@ def _attachment(contents: _Contents) -> bytes:
     if names != {RESULTS_NAME}:
         shown = one_line(" / ".join(sorted(names)), 80)
         raise ResultsError(f"the attached file is called {shown!r}, not {RESULTS_NAME!r}.")
-    data = None
     (stream,) = streams.values()
-    most = pypdf.apply_configuration(zlib_maximum_output_length=MAX_ATTACHMENT_BYTES)
-    with suppress(LimitReachedError), most:
-        data = bytes(stream.get_data())
-    if data is None or len(data) > MAX_ATTACHMENT_BYTES:
+    data = bytes(stream.get_data())
+    if len(data) > MAX_ATTACHMENT_BYTES:
         limit = MAX_ATTACHMENT_BYTES // 1_000_000
         raise ResultsError(f"{RESULTS_NAME} in it is larger than {limit} MB.")
     return data

@@ -25,7 +25,6 @@ from px4fuse.results.model import LIBRARIES, Provenance
 from px4fuse.results.reading import one_line
 from px4fuse.verification.model import Refused
 
-MAX_NAME_BYTES = 240
 ASK = "Ask how the report was made, and for the log and all files that it was made from."
 NOT_OURS = "the recorded request is not one that px4fuse can have made"
 _Place = Callable[[str, str | None, str], Path]
@@ -113,7 +112,7 @@ def _place(
         raise FileMissingError(asked, one_line(recorded, 80) or "its file")
     name = recorded
     plain = name == Path(name).name and "\\" not in name and name.isprintable()
-    if not plain or len(name.encode(errors="replace")) > MAX_NAME_BYTES:
+    if not plain:
         raise ResultsError(f"{NOT_OURS}: a file name in it is not a plain name", ASK)
     # each in a folder of its own: two may have one name
     folder = Path(tempfile.mkdtemp(dir=within))

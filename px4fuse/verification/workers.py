@@ -24,10 +24,9 @@ from px4fuse.threads import ONE_THREAD
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-# A worker is replaced after so many jobs: what libraries cache does not grow with the class. What
-# is done in less than this fills no cache, and a new process takes two seconds to import
-JOBS_PER_WORKER = 40
-QUICK_S = 0.5
+# A worker is replaced after so many jobs: what libraries cache does not grow with the class. A new
+# process takes two seconds to import
+JOBS_PER_WORKER = 80
 # Of one report: a flight of ten minutes takes about one minute; what takes longer is not a report
 TIMEOUT_S = 120.0
 MEMORY_BYTES = 4_000_000_000
@@ -63,7 +62,6 @@ class _Worker:
         self.ready = False
         self.job = job
         self.jobs_done = 0
-        self.sent = time.monotonic()
         self.deadline = time.monotonic() + START_S
 
     def end(self) -> None:
@@ -128,7 +126,7 @@ def run_bounded(
                         worker.ready = True
                     else:
                         yield worker.job, result
-                        worker.jobs_done += time.monotonic() - worker.sent >= QUICK_S
+                        worker.jobs_done += 1
                         if not sound or worker.jobs_done >= JOBS_PER_WORKER or not waiting:
                             drop(worker)
                             continue
@@ -158,7 +156,6 @@ def bounded(
 
 
 def _send(worker: _Worker, jobs: Sequence[Any]) -> None:
-    worker.sent = time.monotonic()
     # a process that died in between shows at the next look at its pipe
     with suppress(BrokenPipeError, ConnectionResetError):
         worker.pipe.send(jobs[worker.job])

@@ -46,7 +46,6 @@ from px4fuse.assignment.key import Answer, AnswerKey, key_text, read_key  # noqa
 from px4fuse.assignment.roster import read_people, read_roster  # noqa: E402
 from px4fuse.cli import cli  # noqa: E402
 from px4fuse.errors import Px4FuseError  # noqa: E402
-from px4fuse.fleet.engine import connected  # noqa: E402
 from px4fuse.fleet.regressions import read_baseline  # noqa: E402
 from px4fuse.fleet.rows import table_of  # noqa: E402
 from px4fuse.grading import grade as grading  # noqa: E402
@@ -373,9 +372,7 @@ def main() -> None:
             (sent, given.pipelines - given.pipelines * 2 // 3),
         ]
     print(f"{'target':20}{'inputs':>10}{'read':>10}{'refused':>10}{'escaped':>10}{'s':>8}")
-    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
-        if any(target.name == "batch" for target, _ in jobs):
-            stack.enter_context(connected(workers=1, memory="2GB"))
+    with tempfile.TemporaryDirectory() as folder:
         for target, count in jobs:
             begin = time.monotonic()
             outcome = tried(target, count, given.seed, Path(folder))
