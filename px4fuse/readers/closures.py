@@ -11,7 +11,6 @@ from px4fuse.request import GivenClosure
 
 MAX_CLOSURES = 10_000
 MAX_FILE_BYTES = 1_000_000
-_FIELDS = (2, 3)
 
 
 def parse_closure(text: str) -> GivenClosure:
@@ -22,12 +21,11 @@ def parse_closure(text: str) -> GivenClosure:
     TrajectoryError
         It is not two or three finite numbers.
     """
-    parts = [part.strip() for part in text.split(",")]
     try:
-        numbers = [float(part) for part in parts]
+        numbers = [float(part) for part in text.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) not in _FIELDS or not all(abs(number) < float("inf") for number in numbers):
+    if len(numbers) not in (2, 3) or not all(abs(number) < float("inf") for number in numbers):
         raise TrajectoryError(
             f"closure {text.strip()[:60]!r} is not T1,T2 or T1,T2,SIGMA: two times in s and a "
             "standard deviation in m."
