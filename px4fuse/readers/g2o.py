@@ -96,7 +96,7 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
         vertices.refuse_where(twice, "a vertex for the second time", "Take one of them out.")
     index = np.minimum(np.searchsorted(ids, ends), len(ids) - 1)
     edges.refuse_where(
-        (ids[index] != ends).any(axis=1),
+        ids[index] != ends,
         "an edge to a vertex that the file does not have",
         "Add its VERTEX line, or take all of them out.",
     )
@@ -168,9 +168,9 @@ def _parse(rows: Rows, tag: str) -> tuple[np.ndarray[Any, np.dtype[np.int64]], A
     words, numbers = rows.parse(1 + named, count)
     wrong = np.array([_VERTEX.fullmatch(word) is None for word in words[:, 1:].flat])
     what = "the number of a vertex is no integer"
-    rows.refuse_where(wrong.reshape(-1, named).any(axis=1), what, "Give an integer.")
-    bad = (~np.isfinite(numbers)).any(axis=1)
-    rows.refuse_where(bad, "a number that is not finite", "Correct it, or take the line out.")
+    rows.refuse_where(wrong.reshape(-1, named), what, "Give an integer.")
+    remedy = "Correct it, or take the line out."
+    rows.refuse_where(~np.isfinite(numbers), "a number that is not finite", remedy)
     return words[:, 1:].astype(np.int64), numbers
 
 
@@ -198,7 +198,7 @@ def _information(rows: Rows, numbers: Array, size: int) -> Array:
     entry = np.abs(numbers)
     tiny = (row == column) & (entry > 0.0) & (entry < _LEAST_INFORMATION)
     rows.refuse_where(
-        (tiny | (entry > _MOST_INFORMATION)).any(axis=1),
+        tiny | (entry > _MOST_INFORMATION),
         "the information matrix has an entry that cannot be computed with",
         f"Give 0 for what the edge does not tell, else {_LEAST_INFORMATION:g} to "
         f"{_MOST_INFORMATION:g}.",

@@ -92,14 +92,15 @@ class Rows:
         return TrajectoryError(at_line(self.file, self.lines[row][0], what, remedy))
 
     def refuse_where(self, bad: BoolArray, what: str, remedy: str) -> None:
-        """Refuse the first row of those that are bad, shape (n,).
+        """Refuse the first row with something bad, shape (n,) or (n, k).
 
         Raises
         ------
         TrajectoryError
         """
-        if bad.any():
-            raise self.refuse(int(np.argmax(bad)), what, remedy)
+        places = np.argwhere(bad)
+        if len(places):
+            raise self.refuse(int(places[0, 0]), what, remedy)
 
     def parse(
         self, words: int, values: int, separator: str | None = None

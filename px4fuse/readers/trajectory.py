@@ -96,7 +96,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
     stamps, values = rows.parse(1, columns - 1, separator)
     time, time_words = _seconds(rows, stamps[:, 0].tolist())
     rows.refuse_where(
-        (~(np.abs(values[:, :7]) < MAX_VALUE)).any(axis=1),
+        ~(np.abs(values[:, :7]) < MAX_VALUE),
         f"a value that is not finite, or beyond {MAX_VALUE:.0e}",
         "Remove that line.",
     )
