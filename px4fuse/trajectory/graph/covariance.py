@@ -80,7 +80,7 @@ def gate(graph: PoseGraph, edge_indices: Sequence[int] | IntArray) -> list[GateR
     tested = np.asarray(edge_indices, dtype=np.intp)
     if not len(tested):
         return []
-    chain = odometry_chain(graph, np.setdiff1d(np.arange(len(graph.first)), tested))
+    chain = odometry_chain(graph, tested)
     a, b = graph.first[tested], graph.second[tested]
     low, high = int(min(a.min(), b.min())), int(max(a.max(), b.max()))
     worlds, poses = _dead_reckoning(graph, low, high, chain)
