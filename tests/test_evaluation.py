@@ -224,7 +224,7 @@ def test_alignments_without_motion_are_refused() -> None:
         with pytest.raises(TrajectoryError, match=r"yaw cannot be found.*`alignment` none"):
             fit(x, y, "yaw")
     for kind in ("se3", "sim3"):
-        with pytest.raises(TrajectoryError, match="does not move"):
+        with pytest.raises(TrajectoryError, match="did not move"):
             fit(np.ones((9, 3)), up[:9], kind)  # type: ignore[arg-type]
         with pytest.raises(TrajectoryError, match=kind):
             fit(still, still[::-1].copy() + up, kind)  # type: ignore[arg-type]
@@ -466,7 +466,6 @@ def test_interchanged_and_doubtful_arguments_are_warned_about() -> None:
     for said, estimate, reference, how in (
         ("is ground truth and log:vio is not", truth, vio, {}),
         ("one pose in 0.4 s", vio, slam[np.arange(0, len(truth), 8)], {"max_gap_s": 1.0}),
-        ("lasts 20.0 s", vio, slam[:400], {}),
         ("Only 33%", vio, truth[:400], {}),
         ("covers only 33%", vio[:400], truth, {}),
         ("0.667 times it would fit best", large, truth, {"alignment": "se3"}),

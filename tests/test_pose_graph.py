@@ -525,7 +525,7 @@ def test_gate_needs_odometry() -> None:
         gate(gap, [edge - 1])
     for at, direction, said in (
         (12, 2, "has a direction without information"),
-        (edge, slice(None), "has no information"),
+        (edge, slice(None), "it has no information"),
     ):
         information = graph.information.copy()
         information[at, direction, :] = information[at, :, direction] = 0.0
