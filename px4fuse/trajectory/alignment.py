@@ -163,7 +163,7 @@ def _check(transform: Transform, estimate_m: Array, reference_m: Array, kind: st
         instead = "`alignment` yaw if z is vertical in both, or `alignment` none"
     if told < max(MIN_SPREAD_M, MIN_SHARE * length) or left > limit * told:
         raise TrajectoryError(
-            f"The {motion} {told:.2g} m, where an alignment leaves {left:.2g} m, so {kind} cannot be "
-            "found",
+            f"The {motion} {told:.2g} m, where an alignment leaves {left:.2g} m, so {kind} cannot "
+            "be found",
             f"The vehicle did not move enough, or the estimate does not follow; use {instead}.",
         )

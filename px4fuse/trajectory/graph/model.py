@@ -60,6 +60,11 @@ class PoseGraph:
     def __len__(self) -> int:
         return len(self.ids)
 
+    def of_edges(self, chosen: BoolArray) -> PoseGraph:
+        """The graph with some of its edges, shape (m,)."""
+        edges = ("first", "second", "measurements", "information")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in edges})
+
     @property
     def freedom(self) -> int:
         """Numbers of a tangent: 3 in the plane, 6 in space."""
