@@ -98,8 +98,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "n.md": ["my own words"],
     }.items():
         write(folder / name, rows)
-    for name in ("hard.json", "hard.png"):
-        (folder / name).hardlink_to(folder / "s.tum")
+    (folder / "hard.json").hardlink_to(folder / "s.tum")
     (folder / "soft.json").symlink_to(folder / "l.ulg")
     (folder / "s.pdf").write_bytes((folder / "s.tum").read_bytes())
     return folder
@@ -213,18 +212,17 @@ def test_the_results_keep_the_command_that_makes_them_again(desk, tmp_path) -> N
     assert set(contents(tmp_path)) == {"o.tum"}
 
 
-def test_evaluate_writes_page_picture_and_results(desk, tmp_path, monkeypatch) -> None:
+def test_evaluate_writes_page_and_results(desk, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     command = ["evaluate", desk / "s.tum", desk / "l.ulg:truth"]
     result = run(*command)
     assert result.exit_code == 0, result.output
     assert "ATE (m)" in result.output
     name = "s_against_l_truth"
-    assert set(contents(tmp_path)) == {f"{name}.pdf", f"{name}.png", f"{name}.json"}
-    for end in ("pdf", "png", "json"):
+    assert set(contents(tmp_path)) == {f"{name}.pdf", f"{name}.json"}
+    for end in ("pdf", "json"):
         assert f"Wrote    {Path('reports', name)}.{end}" in result.output
     folder = tmp_path / "reports"
-    assert (folder / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
     reader = pypdf.PdfReader(folder / f"{name}.pdf")
     text = (folder / f"{name}.json").read_bytes()
     assert reader.attachments["results.json"] == [text]
@@ -266,12 +264,10 @@ def test_evaluate_with_other_settings_or_files_writes_over_no_page(
 @pytest.mark.parametrize(
     ("options", "written"),
     [
-        ("-o p.pdf", {"p.pdf", "p.png", "p.json"}),
-        ("-o p.pdf --picture q.png --json r.json", {"p.pdf", "q.png", "r.json"}),
-        ("--picture q.png", {"q.png"}),
+        ("-o p.pdf", {"p.pdf", "p.json"}),
+        ("-o p.pdf --json r.json", {"p.pdf", "r.json"}),
         ("--json r.json", {"r.json"}),
         ("--json -", set()),
-        ("--json - --picture q.png", {"q.png"}),
     ],
 )
 def test_evaluate_writes_what_is_named(desk, tmp_path, monkeypatch, options, written) -> None:
@@ -431,13 +427,6 @@ REFUSED = {
     "RPE over half a frame": ("evaluate s.tum s.tum --rpe 1.5f", "frames come whole"),
     "RPE over too many": (f"evaluate s.tum s.tum --rpe {'9' * 26}f", "is not a distance"),
     "page as text": ("evaluate s.tum s.tum -o page.txt", "ends in .pdf"),
-    "picture as JPEG": ("evaluate s.tum s.tum --picture p.jpg", "ends in .png"),
-    "picture to print": ("evaluate s.tum s.tum --picture -", "ends in .png"),
-    "picture for results": (
-        "evaluate s.tum s.tum --picture p.png --json p.png",
-        "two outputs name the same file",
-    ),
-    "picture into a file": ("evaluate s.tum s.tum --picture n.md/e.png", "cannot be written"),
 }
 
 # What a command reads, it does not write over
@@ -456,7 +445,6 @@ SPARED = {
     "estimate": "evaluate s.tum s.tum --json s.tum",
     "reference of evaluate": "evaluate s.tum l.ulg:truth --json l.ulg",
     "estimate by its page": "evaluate s.pdf s.tum -o s.pdf",
-    "estimate by the page's picture": "evaluate s.tum s.tum -o hard.pdf",
 }
 
 
