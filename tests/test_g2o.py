@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -157,25 +156,6 @@ def test_round_trip_is_exact(dimension: int, seed: int) -> None:
     again = parse_g2o(text, "a.g2o")
     equal(once, again)
     assert g2o_text(again) == text
-
-
-@pytest.mark.parametrize("count", [1_001, 4_001])
-def test_the_work_per_line_is_little_and_does_not_grow(count: int) -> None:
-    """Calls are counted, which take the same number on every machine."""
-    text = g2o_text(made(3, count))
-    calls = 0
-
-    def counted(_frame: object, event: str, _argument: object) -> None:
-        nonlocal calls
-        calls += event in ("call", "c_call")
-
-    before = sys.getprofile()
-    sys.setprofile(counted)
-    try:
-        parse_g2o(text, "a.g2o")
-    finally:
-        sys.setprofile(before)
-    assert calls < 12 * len(text.splitlines())
 
 
 @pytest.mark.reallogs

@@ -106,6 +106,3 @@ def test_group(values: list[float], dimension: int) -> None:
     np.testing.assert_allclose(
         homogeneous(lie.between(a, b)), homogeneous(lie.compose(lie.inverse(a), b)), atol=1e-11
     )
-    np.testing.assert_allclose(
-        lie.adjoint(lie.compose(a, b)), lie.adjoint(a) @ lie.adjoint(b), atol=1e-9
-    )

@@ -11,8 +11,8 @@ from exchange import replace
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2, kstest
-from trajectory_tools import GTSAM_ORDER, gtsam_optimiser, gtsam_problem
+from scipy.stats import kstest
+from trajectory_tools import GTSAM_ORDER, drifted, gtsam_optimiser, gtsam_problem
 
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.g2o import parse_g2o, read_g2o
@@ -80,32 +80,36 @@ def test_chordal_initialisation_is_two_dense_least_squares(dimension: int, seed:
     assert (graph.second == 0).any()
     n, measured = len(graph), lie.rotation_matrix(graph.measurements)
     held = lie.rotation_matrix(graph.poses[:1])[0]
+    edges = list(
+        zip(graph.first, graph.second, graph.measurements, measured, graph.information, strict=True)
+    )
+
+    def least_squares(weights: list[Any], values: list[Any], at_0: np.ndarray) -> np.ndarray:
+        """Unknowns x of each pose with (weight of i, of j) · (x_i, x_j) = value; x_0 is held."""
+        rows, right = [], []
+        for (i, j, *_), (of_i, of_j), value in zip(edges, weights, values, strict=True):
+            row = np.zeros((d, n * d))
+            row[:, i * d : i * d + d] += of_i
+            row[:, j * d : j * d + d] += of_j
+            rows.append(row[:, d:])
+            right.append(value - row[:, :d] @ at_0)
+        return np.linalg.lstsq(np.vstack(rows), np.concatenate(right))[0]
+
     # sqrt(trace of the rotation's information) · (Z' Y_i - Y_j) = 0, Y the transposed rotations
-    rows, right = [], []
-    for i, j, z, omega in zip(graph.first, graph.second, measured, graph.information, strict=True):
-        row = np.zeros((d, n * d))
-        row[:, i * d : i * d + d] += z.T
-        row[:, j * d : j * d + d] -= np.eye(d)
-        row *= np.sqrt(np.trace(omega[d:, d:]))
-        rows.append(row[:, d:])
-        right.append(-row[:, :d] @ held.T)
-    relaxed = np.linalg.lstsq(np.vstack(rows), np.vstack(right))[0].reshape(n - 1, d, d)
+    roots = [np.sqrt(np.trace(omega[d:, d:])) for *_, omega in edges]
+    weights = [(root * z.T, -root * np.eye(d)) for root, z in zip(roots, measured, strict=True)]
+    relaxed = least_squares(weights, [np.zeros((d, d))] * len(edges), held.T)
     rotation = [held]
-    for transposed in relaxed:
+    for transposed in relaxed.reshape(n - 1, d, d):
         u, _, vt = np.linalg.svd(transposed.T)
         rotation.append(u @ np.diag([1.0] * (d - 1) + [np.linalg.det(u @ vt)]) @ vt)
     # L' (R_i Z)' (t_j - t_i - R_i z) = 0, L the Cholesky factor of the position's information
-    rows, right = [], []
-    for i, j, pose, z, omega in zip(
-        graph.first, graph.second, graph.measurements, measured, graph.information, strict=True
-    ):
-        weight = np.linalg.cholesky(omega[:d, :d]).T @ (rotation[i] @ z).T
-        row = np.zeros((d, n * d))
-        row[:, i * d : i * d + d] -= weight
-        row[:, j * d : j * d + d] += weight
-        rows.append(row[:, d:])
-        right.append(weight @ rotation[i] @ pose[:d] - row[:, :d] @ graph.poses[0, :d])
-    position = np.linalg.lstsq(np.vstack(rows), np.concatenate(right))[0].reshape(n - 1, d)
+    roots = [np.linalg.cholesky(w[:d, :d]).T @ (rotation[i] @ z).T for i, _, _, z, w in edges]
+    values = [
+        root @ rotation[i] @ pose[:d] for root, (i, _, pose, *_) in zip(roots, edges, strict=True)
+    ]
+    weights = [(-root, root) for root in roots]
+    position = least_squares(weights, values, graph.poses[0, :d]).reshape(n - 1, d)
     made = _chordal(graph)
     assert made.initialised == FROM_CHORDAL
     np.testing.assert_array_equal(made.poses[0], graph.poses[0])
@@ -293,9 +297,8 @@ def laps(seed: int, false: int = 1) -> tuple[PoseGraph, np.ndarray, np.ndarray]:
         Rotation.from_euler("ZYX", angles).as_quat(),
     ])  # fmt: skip
     spread = np.array([0.03] * 3 + [0.02] * 3)  # m and rad per step
-    steps = lie.between(truth[:-1], truth[1:])
-    steps = lie.compose(steps, lie.exp(rng.normal(size=(n - 1, 6)) * spread))
-    odometry = lie.compose(truth[:1], lie.chain(steps))
+    odometry = drifted(truth, spread, rng)
+    steps = lie.between(odometry[:-1], odometry[1:])
     pairs = [(0, lap * per_lap) for lap in range(1, count + 1)]
     while len(pairs) < count + false:
         a, b = np.sort(rng.integers(0, n, 2)).tolist()
@@ -416,20 +419,6 @@ def test_gate_is_uniform_for_true_closures(
     assert {each.degrees_of_freedom for each in found} == {freedom}
     assert kstest([each.p for each in found], "uniform").pvalue > 0.01
     assert np.mean([each.accepted for each in found]) > 0.995
-
-
-def test_gate_refuses_what_is_false() -> None:
-    graph, _, true = laps(0)
-    closures = np.flatnonzero(~graph.successive)
-    found = gate(graph, closures)
-    assert [each.second for each in found] == graph.second[closures].tolist()
-    assert all(each.accepted for each, ok in zip(found, true[closures], strict=True) if ok)
-    far = replace(graph, measurements=graph.measurements.copy())
-    far.measurements[closures[0], 0] += 1e3
-    refused = gate(far, closures[:1])[0]
-    assert not refused.accepted
-    assert refused.p < 1e-9
-    assert refused.d2 > chi2.ppf(0.999, 3)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

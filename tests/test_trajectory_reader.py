@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import REPOSITORY
 from exchange import replace
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -19,8 +18,6 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.readers import trajectory as reader
 from px4fuse.readers.trajectory import read_trajectory, tum_text
 from px4fuse.trajectory.model import Trajectory
-
-SHARED = REPOSITORY.parent / "shared" / "trajectories"
 
 # The one track that every dialect below is written from
 POSES = 50
@@ -273,25 +270,3 @@ def test_any_text_is_read_or_refused(pieces: list[str], tmp_path: Path) -> None:
     except TrajectoryError as error:
         message = str(error)
     assert "\n" not in message
-
-
-@pytest.mark.reallogs
-@pytest.mark.parametrize(
-    ("name", "poses", "kind"),
-    [
-        ("evo_fr2_desk_ORB.txt", 2893, "slam"),
-        ("evo_fr2_desk_groundtruth.txt", 20956, "truth"),
-        ("evo_freiburg1_xyz-ORB_kf_mono.txt", 32, "slam"),
-        ("rpg_vislam_MH_04_groundtruth.txt", 19753, "truth"),
-        ("rpg_vislam_rp_MH_04_estimate0.txt", 1347, "unknown"),
-    ],
-)
-def test_published_trajectories(name: str, poses: int, kind: str) -> None:
-    if not SHARED.is_dir():
-        pytest.skip("the published trajectories (../shared/trajectories) are not here")
-    got = read_trajectory(SHARED / name)
-    assert (len(got), got.kind, got.unix_offset_s) == (poses, kind, 0.0)
-    table = np.loadtxt(SHARED / name)
-    table = table[np.diff(table[:, 0], prepend=0.0) > 0.0]
-    np.testing.assert_array_equal(got.time_s, table[:, 0])
-    np.testing.assert_array_equal(got.position_m, table[:, 1:4])
