@@ -23,7 +23,6 @@ from px4fuse.loop.loop import Loop
 from px4fuse.loop.model import OdometryNoise
 from px4fuse.loop.odometry import odometry_variances
 from px4fuse.loop.sources import LoopSource, read_source, split_part
-from px4fuse.readers.closures import parse_closure, read_closures
 from px4fuse.request import GivenClosure
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.model import Kind, Trajectory
@@ -379,21 +378,6 @@ def test_the_slam_file_is_levelled_and_closes_better_than_the_odometry() -> None
     height = found.odometry.trajectory.position_m[:, 2]
     assert np.ptp(height) < 2.5
     assert found.path_length_m == pytest.approx(86.0, abs=5.0)
-
-
-@pytest.mark.parametrize("text", ["", "1", "a,b", "1,nan", "1;2", "inf,2"])
-def test_what_is_no_closure_is_refused(text: str) -> None:
-    with pytest.raises(TrajectoryError, match="T1,T2"):
-        parse_closure(text)
-
-
-def test_a_file_of_closures(tmp_path: Path) -> None:
-    path = tmp_path / "closures.csv"
-    path.write_text("t1,t2,sigma\n# same corner\n1,2\n\n 3.5 , 4, 0.5  # guess\n")
-    assert read_closures(path) == (GivenClosure(1.0, 2.0, 0.10), GivenClosure(3.5, 4.0, 0.5))
-    path.write_text("1,2\n3,x\n")
-    with pytest.raises(TrajectoryError, match=r"closures\.csv, line 2: closure '3,x'"):
-        read_closures(path)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 """What the readers of text tables share: text of bytes, numbers, and errors that name the line.
 
-Position files, trajectories, pose graphs (g2o) and closures are such tables.
+Position files, trajectories and pose graphs (g2o) are such tables.
 """
 
 from __future__ import annotations
