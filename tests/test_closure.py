@@ -6,6 +6,7 @@ import itertools
 import math
 
 import numpy as np
+from exchange import replace
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -15,6 +16,7 @@ from px4fuse.loop.closure import (
     correct_by_distance,
     distribute_by_distance,
     heading_change_rad,
+    in_frame,
     key_frame_spacing_m,
     key_frames,
     upright,
@@ -106,6 +108,9 @@ def test_a_cameras_world_becomes_forward_right_down() -> None:
 
 def test_east_north_up_becomes_north_east_down() -> None:
     position = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0], [1.0, 2.0, 4.0]])
-    found = upright(Trajectory("m", "truth", np.arange(3.0), position, None, "ENU"))
+    given = Trajectory("m", "truth", np.arange(3.0), position, None, "ENU")
+    found = upright(replace(given, position_variance_m2=position**2))
     np.testing.assert_allclose(found.position_m[1], [2.0, 1.0, -3.0])
+    np.testing.assert_allclose(found.position_variance_m2, found.position_m**2)
     assert found.frame == "NED"
+    np.testing.assert_allclose(in_frame(found, "ENU").position_m, position)

@@ -171,7 +171,8 @@ def test_alignments_without_motion_are_refused() -> None:
     random = np.random.default_rng(3)
     still = random.normal(0.0, 0.01, (200, 3))
     up = np.linspace(0.0, 3.0, 200)[:, None] * [0.0, 0.0, 1.0]
-    for x, y in ((up, up), (up + 0.01 * random.normal(size=up.shape), up + still)):
+    around = np.column_stack([np.sin(up[:, 2]), np.cos(up[:, 2]), up[:, 2]])
+    for x, y in ((up, up), (up + 0.01 * random.normal(size=up.shape), up + still), (up, around)):
         with pytest.raises(TrajectoryError, match=r"yaw cannot be found.*`alignment` none"):
             fit(x, y, "yaw")
     for x, y in ((np.ones((9, 3)), up[:9]), (still, still[::-1].copy() + up)):
