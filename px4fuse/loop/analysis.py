@@ -99,10 +99,10 @@ def analyse(
         (GivenClosure(stamp(one.time_1_s), stamp(one.time_2_s), one.sigma_m), None)
         for one in closures
     ]
+    for closure, _ in claims:
+        _check(closure, path)
     if not isinstance(known, Unavailable):
         claims.insert(0, (GivenClosure(segment.start_s, segment.end_s, known.sigma_m), known))
-    for closure, known_end in claims:
-        _check(closure, path, is_landing=known_end is not None)
     spacing = key_frame_spacing_m(path.position_m) if spacing_m is None else spacing_m
     frames, distance = _key_frames(path, spacing)
     graph, nodes, statement = pose_graph(path, frames, claims, noise)
@@ -194,11 +194,11 @@ def _within(name: str, value: float, least: float) -> None:
         raise SettingsError(f"`{name}` {value:g} is outside {least:g} to {MOST:g}.")
 
 
-def _check(closure: GivenClosure, path: Trajectory, *, is_landing: bool) -> None:
+def _check(closure: GivenClosure, path: Trajectory) -> None:
     """Refuse a closure outside the path, one that leads back in time, and one without width."""
     (low, high), times = path.time_s[[0, -1]], (closure.time_1_s, closure.time_2_s)
     label = f"{path.name}: closure {times[0]:.12g},{times[1]:.12g}"
-    if not (is_landing or low <= times[0] < times[1] <= high):
+    if not low <= times[0] < times[1] <= high:
         raise TrajectoryError(
             f"{label}: its times do not follow each other within the path, which runs from "
             f"{low:.2f} s to {high:.2f} s."
