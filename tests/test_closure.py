@@ -6,14 +6,17 @@ import itertools
 import math
 
 import numpy as np
+from exchange import replace
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from trajectory_tools import square
 
 from px4fuse.loop.closure import (
     correct_by_distance,
     distribute_by_distance,
     heading_change_rad,
+    in_frame,
     key_frame_spacing_m,
     key_frames,
     upright,
@@ -38,24 +41,13 @@ def test_distribution_equals_the_lessons_own_code(odom: list[tuple[float, float]
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
 
 
-def square(count: int = 401, side_m: float = 20.0) -> tuple[np.ndarray, Rotation]:
-    """A square flown nose first, corners turned on the spot."""
-    share = np.linspace(0.0, 4.0, count)
-    leg = np.minimum(share.astype(int), 3)
-    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]]) * side_m
-    along = (share - leg)[:, None]
-    flat = (1 - along) * corners[leg] + along * corners[leg + 1]
-    position = np.column_stack([flat, np.full(count, -1.5)])
-    return position, Rotation.from_rotvec(np.outer(leg * np.pi / 2, [0.0, 0.0, 1.0]))
-
-
 def trajectory(position: np.ndarray, rotation: Rotation | None) -> Trajectory:
     time = np.arange(len(position)) * 0.1
     return Trajectory("flight", "vio", time, position, rotation, "FRD")
 
 
 def test_heading_drift_that_grows_with_distance_is_undone() -> None:
-    position, rotation = square()
+    position, rotation = square(100, 20.0)
     distance = cumulative_distance(position)
     share = distance / distance[-1]
     drift = math.radians(8.0)
@@ -76,7 +68,7 @@ def test_heading_drift_that_grows_with_distance_is_undone() -> None:
 
 
 def test_translation_drift_in_proportion_to_distance_is_undone() -> None:
-    position, rotation = square()
+    position, rotation = square(100, 20.0)
     distance = cumulative_distance(position)
     misclosure = np.array([1.2, -0.8, 0.1])
     drifted = position + (distance / distance[-1])[:, None] * misclosure
@@ -85,7 +77,7 @@ def test_translation_drift_in_proportion_to_distance_is_undone() -> None:
 
 
 def test_length_on_key_frames_is_not_lengthened_by_noise() -> None:
-    position, _ = square(count=2400)  # 80 m, 3.3 cm a step
+    position, _ = square(600, 20.0)  # 80 m, 3.3 cm a step
     noisy = position + np.random.default_rng(1).normal(0.0, 0.02, position.shape)
     frames = key_frames(noisy, key_frame_spacing_m(noisy))
     assert cumulative_distance(noisy)[-1] > 95.0
@@ -116,6 +108,9 @@ def test_a_cameras_world_becomes_forward_right_down() -> None:
 
 def test_east_north_up_becomes_north_east_down() -> None:
     position = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0], [1.0, 2.0, 4.0]])
-    found = upright(Trajectory("m", "truth", np.arange(3.0), position, None, "ENU"))
+    given = Trajectory("m", "truth", np.arange(3.0), position, None, "ENU")
+    found = upright(replace(given, position_variance_m2=position**2))
     np.testing.assert_allclose(found.position_m[1], [2.0, 1.0, -3.0])
+    np.testing.assert_allclose(found.position_variance_m2, found.position_m**2)
     assert found.frame == "NED"
+    np.testing.assert_allclose(in_frame(found, "ENU").position_m, position)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,9 +28,8 @@ from trajectory_tools import (
 
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.flight import Unavailable
-from px4fuse.readers.trajectory import read_trajectory
 from px4fuse.trajectory.alignment import AlignmentKind, fit
-from px4fuse.trajectory.association import associate
+from px4fuse.trajectory.association import Method, associate
 from px4fuse.trajectory.evaluation import choose_alignment, evaluate
 from px4fuse.trajectory.model import Frame, Kind, Trajectory
 from px4fuse.trajectory.offset import clock_difference, estimate_time_offset
@@ -73,25 +71,6 @@ def evo_aligned(estimate: str, reference: str, kind: AlignmentKind) -> tuple[Any
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("pair", PUBLISHED, ids=NAMES)
-@pytest.mark.parametrize("offset_s", [0.0, 0.013, -0.5])
-def test_association_by_the_nearest_is_that_of_evo(pair: tuple[str, str], offset_s: float) -> None:
-    pytest.importorskip("evo")
-    from evo.core import sync
-
-    for first, second in (pair, pair[::-1]):
-        x, y = published(first), published(second)
-        expected = sync.matching_time_indices
-        if len(x) > len(y):
-            theirs = expected(y.time_s, x.time_s, 0.01, offset_s)[::-1]
-        else:
-            theirs = expected(x.time_s, y.time_s, 0.01, -offset_s)
-        used, matched, _ = associate(x, y, method="nearest", time_offset_s=offset_s)
-        np.testing.assert_array_equal(used.time_s, x.time_s[theirs[0]])
-        np.testing.assert_array_equal(matched.time_s, y.time_s[theirs[1]])
-
-
-@pytest.mark.reallogs
-@pytest.mark.parametrize("pair", PUBLISHED, ids=NAMES)
 @pytest.mark.parametrize("kind", ["none", "se3", "sim3"])
 def test_ate_is_that_of_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
     pytest.importorskip("evo")
@@ -113,13 +92,7 @@ def test_ate_is_that_of_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
             assert getattr(ours, name) == pytest.approx(theirs[name], rel=0, abs=1e-9)
 
 
-DELTAS = (
-    Delta(1, "frames"),
-    Delta(10, "frames"),
-    Delta(0.5, "m"),
-    Delta(1.0, "m"),
-    Delta(5.0, "m"),
-)
+DELTAS = (Delta(1, "frames"), Delta(10, "frames"), Delta(0.5, "m"), Delta(5.0, "m"))
 
 
 @pytest.mark.reallogs
@@ -156,29 +129,6 @@ def test_rpe_is_that_of_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
 
 # -- alignment -------------------------------------------------------------------------------------
 
-ANGLE = st.floats(-3.1, 3.1)
-
-
-@given(
-    angles=st.tuples(ANGLE, ANGLE, ANGLE),
-    shift=st.tuples(*[st.floats(-1e3, 1e3)] * 3),
-    scale=st.floats(0.05, 20.0),
-    seed=st.integers(0, 1000),
-)
-def test_a_random_similarity_is_recovered(
-    angles: tuple[float, ...], shift: tuple[float, ...], scale: float, seed: int
-) -> None:
-    points = np.random.default_rng(seed).normal(0.0, 5.0, (30, 3))
-    turn = Rotation.from_euler("ZYX", angles)
-    for kind, freedom in (("yaw", 4), ("se3", 6), ("sim3", 7)):
-        used = Rotation.from_euler("Z", angles[0]) if kind == "yaw" else turn
-        factor = scale if kind == "sim3" else 1.0
-        got = fit(points, factor * used.apply(points) + shift, kind)  # type: ignore[arg-type]
-        assert got.degrees_of_freedom == freedom
-        assert (got.rotation.inv() * used).magnitude() < 1e-9
-        assert got.scale == pytest.approx(factor, rel=1e-9)
-        np.testing.assert_allclose(got.translation_m, shift, atol=1e-7)
-
 
 @pytest.mark.parametrize(("kind", "unknowns"), [("yaw", 4), ("se3", 6), ("sim3", 7)])
 def test_closed_forms_are_the_minimum(kind: AlignmentKind, unknowns: int) -> None:
@@ -192,6 +142,7 @@ def test_closed_forms_are_the_minimum(kind: AlignmentKind, unknowns: int) -> Non
         return float(((y - scale * turn.apply(x) - p[:3]) ** 2).sum())
 
     got = fit(x, y, kind)
+    assert got.degrees_of_freedom == unknowns
     ours = float(((y - got.apply(x)) ** 2).sum())
     starts = [
         np.concatenate((y.mean(axis=0), random.uniform(-3, 3, unknowns - 3))) for _ in range(8)
@@ -220,19 +171,16 @@ def test_alignments_without_motion_are_refused() -> None:
     random = np.random.default_rng(3)
     still = random.normal(0.0, 0.01, (200, 3))
     up = np.linspace(0.0, 3.0, 200)[:, None] * [0.0, 0.0, 1.0]
-    for x, y in ((up, up), (up + 0.01 * random.normal(size=up.shape), up + still)):
+    around = np.column_stack([np.sin(up[:, 2]), np.cos(up[:, 2]), up[:, 2]])
+    for x, y in ((up, up), (up + 0.01 * random.normal(size=up.shape), up + still), (up, around)):
         with pytest.raises(TrajectoryError, match=r"yaw cannot be found.*`alignment` none"):
             fit(x, y, "yaw")
-    for kind in ("se3", "sim3"):
-        with pytest.raises(TrajectoryError, match="does not move"):
-            fit(np.ones((9, 3)), up[:9], kind)  # type: ignore[arg-type]
-        with pytest.raises(TrajectoryError, match=kind):
-            fit(still, still[::-1].copy() + up, kind)  # type: ignore[arg-type]
+    for x, y in ((np.ones((9, 3)), up[:9]), (still, still[::-1].copy() + up)):
+        with pytest.raises(TrajectoryError, match="sim3 cannot be found"):
+            fit(x, y, "sim3")
     with pytest.raises(TrajectoryError, match="Only 2 poses"):
         fit(up[:2], up[:2], "none")
-    unmoved = fit(up[:9], up[:9] + 1.0, "none")
-    assert (unmoved.quaternion_wxyz, unmoved.scale) == ((1.0, 0.0, 0.0, 0.0), 1.0)
-    assert unmoved.translation_m == (0.0, 0.0, 0.0)
+    assert fit(up[:9], up[:9] + 1.0, "none").translation_m == (0.0, 0.0, 0.0)
 
 
 # -- association -----------------------------------------------------------------------------------
@@ -295,16 +243,13 @@ def test_nearest_pairs_and_what_is_left_out_are_those_of_the_definition(denser: 
     assert (got.max_gap_s, got.poses) == (limit, len(used))
 
 
-def test_no_overlap_names_both_spans_and_the_remedy() -> None:
+@pytest.mark.parametrize("method", ["interpolate", "nearest"])
+def test_no_overlap_names_both_spans_and_the_remedy(method: Method) -> None:
     reference = flight()
     estimate = replace(reference, name="boot.tum", time_s=reference.time_s + 500.0)
-    for method in ("interpolate", "nearest"):
-        with pytest.raises(
-            TrajectoryError, match=r"boot.tum: no poses match.*500.000 to 559.950 s"
-        ):
-            associate(estimate, reference, method=method)  # type: ignore[arg-type]
-    with pytest.raises(TrajectoryError, match=r"0.000 to 59.950 s.*`time_offset_s` auto"):
-        evaluate(estimate, reference, time_offset_s=0.0)
+    said = r"no poses match.*500.000 to 559.950 s.*0.000 to 59.950 s.*`time_offset_s` auto"
+    with pytest.raises(TrajectoryError, match=said):
+        evaluate(estimate, reference, association=method, time_offset_s=0.0)
     assert evaluate(estimate, reference, time_offset_s=-500.0).ate.translation_m.rmse < 1e-9
 
 
@@ -348,20 +293,17 @@ def test_a_drift_in_scale_is_the_rpe_over_distance() -> None:
 @given(
     steps=st.lists(st.sampled_from([0.0, 0.1, 0.25, 1.0, 3.0]), min_size=3, max_size=40),
     value=st.sampled_from([0.1, 0.3, 0.5, 1.0, 2.0]),
-    tolerance=st.sampled_from([0.0, 0.1, 0.5]),
 )
-def test_pairs_are_those_of_the_definition(
-    steps: list[float], value: float, tolerance: float
-) -> None:
+def test_pairs_are_those_of_the_definition(steps: list[float], value: float) -> None:
     along = np.concatenate(([0.0], np.cumsum(steps)))
     position, time = along[:, None] * [1.0, 0.0, 0.0], np.arange(len(along), dtype=float)
     expected = []
     for i in range(len(along) - 1):
         miss = np.abs(along[i + 1 :] - along[i] - value)
         j = int(np.argmin(miss))
-        if miss[j] <= tolerance * value:
+        if miss[j] <= 0.1 * value:
             expected.append((i, i + 1 + j))
-    start, end = pairs(position, time, Delta(value, "m"), relative_tolerance=tolerance)
+    start, end = pairs(position, time, Delta(value, "m"))
     assert list(zip(start.tolist(), end.tolist(), strict=True)) == expected
     start, end = pairs(position, time, Delta(2.0, "s"), all_pairs=False)
     np.testing.assert_array_equal(start, np.arange(0, len(along) - 2, 2))
@@ -408,9 +350,7 @@ def test_what_cannot_be_had_is_absent_with_the_reason() -> None:
         (("slam", "unknown"), ("truth", "NED"), "kf_mono", 1.0, "sim3", "it is monocular"),
         (("slam", "unknown"), ("truth", "NED"), "harmony", 1.0, "se3", "first key frame"),
         (("unknown", "unknown"), ("truth", "unknown"), "a", 1.0, "se3", "does not say what made"),
-        (("vio", "NED"), ("truth", "unknown"), "a", 1.0, "se3", "do not share a vertical"),
         (("truth", "NED"), ("truth", "NED"), "a", 1.0, "none", "ground truth"),
-        (("truth", "unknown"), ("slam", "unknown"), "a", 1.0, "se3", "first key frame"),
     ],
 )
 def test_the_alignment_follows_from_what_the_two_are(
@@ -463,25 +403,19 @@ def test_interchanged_and_doubtful_arguments_are_warned_about() -> None:
     slam = replace(vio, kind="slam", name="slam")
     large = moved(truth, TURN, SHIFT, 1.5, kind="vio")
     assert not evaluate(vio, truth).warnings
+    # clocks that fit better apart; less may be the filter's own lag
+    lag, late = (replace(slam, time_s=slam.time_s - offset_s) for offset_s in (0.08, 0.12))
+    flown = replace(truth, name="log:truth")
+    assert not evaluate(lag, flown).warnings
     for said, estimate, reference, how in (
+        ("motions fit best with +0.120 s added", late, flown, {}),
         ("is ground truth and log:vio is not", truth, vio, {}),
         ("one pose in 0.4 s", vio, slam[np.arange(0, len(truth), 8)], {"max_gap_s": 1.0}),
-        ("lasts 20.0 s", vio, slam[:400], {}),
         ("Only 33%", vio, truth[:400], {}),
         ("covers only 33%", vio[:400], truth, {}),
         ("0.667 times it would fit best", large, truth, {"alignment": "se3"}),
     ):
         assert said in evaluate(estimate, reference, **how).warnings[0]
-
-
-@pytest.mark.parametrize(("offset_s", "said"), [(0.08, False), (0.12, True)])
-def test_clocks_that_fit_better_apart_are_warned_about(offset_s: float, said: bool) -> None:
-    """Less may be the filter's own lag."""
-    truth = replace(flight(), name="log:truth", kind="truth")
-    slam = moved(truth, TURN, SHIFT, kind="slam", name="slam")
-    late = replace(slam, time_s=slam.time_s - offset_s)
-    warned = " ".join(evaluate(late, truth).warnings)
-    assert ("motions fit best with +0.120 s added" in warned) is said
 
 
 # -- clocks ----------------------------------------------------------------------------------------
@@ -571,15 +505,12 @@ def test_a_motion_that_repeats_is_ambiguous() -> None:
 @pytest.mark.parametrize("pair", PUBLISHED, ids=NAMES)
 def test_published_trajectories_that_were_shifted_are_shifted_back(pair: tuple[str, str]) -> None:
     estimate, reference = map(published, pair)
-    base = estimate_time_offset(estimate, reference)
-    assert abs(base.offset_s) < 0.06  # their own clocks are not perfect
-    for shift_s in (0.137, -2.5, 30.0):
-        shifted = replace(estimate, time_s=estimate.time_s + shift_s)
+    base = estimate_time_offset(estimate, reference).offset_s
+    assert abs(base) < 0.06  # their own clocks are not perfect
+    for shift_s in (0.137, 30.0, 12.5 - estimate.time_s[0]):
+        shifted = replace(estimate, time_s=estimate.time_s + shift_s, unix_offset_s=None)
         got = estimate_time_offset(shifted, reference)
-        assert got.offset_s == pytest.approx(base.offset_s - shift_s, abs=1e-3)
-    boot = replace(estimate, time_s=estimate.time_s - estimate.time_s[0] + 12.5, unix_offset_s=None)
-    got = estimate_time_offset(boot, reference)
-    assert got.offset_s == pytest.approx(base.offset_s + estimate.time_s[0] - 12.5, abs=1e-3)
+        assert got.offset_s == pytest.approx(base - shift_s, abs=1e-3)
 
 
 # -- intervals -------------------------------------------------------------------------------------
@@ -616,31 +547,3 @@ def test_too_few_blocks_give_no_interval() -> None:
     same = rmse_interval(np.full(100, 0.5), "ATE")
     assert (same.low, same.high) == (pytest.approx(0.5), pytest.approx(0.5))
     assert rmse_interval(np.sin(drift * 99), "ATE") == rmse_interval(np.sin(drift * 99), "ATE")
-
-
-# -- the sample ------------------------------------------------------------------------------------
-
-
-def test_the_sample_slam_against_the_log_that_it_was_made_from() -> None:
-    from px4fuse.loop.tracks import trajectory_of
-    from px4fuse.readers import read_log
-
-    log: Path = REPOSITORY / "sample_logs" / "loop_vio.ulg"
-    flown = read_log(log)
-    truth, vio = (trajectory_of(flown, part) for part in ("truth", "vio"))  # type: ignore[arg-type]
-    slam = read_trajectory(SAMPLE)
-    odometry = evaluate(vio, truth)
-    assert odometry.alignment == "yaw"
-    assert 0.3 < odometry.ate.translation_m.rmse < 0.6
-    # the log has no UNIX time: the offset is found from the motion
-    got = evaluate(slam, truth)
-    assert got.alignment == "se3"
-    assert got.time_offset.determinable
-    assert got.ate.translation_m.rmse < 0.08
-    assert got.ate.rotation_deg.rmse < 0.6
-    assert np.degrees(got.body_rotation.magnitude()) == pytest.approx(120.0, abs=1.0)
-    assert got.association.coverage_reference < 1.0
-    assert len(got.time_s) == len(got.distance_m) == len(got.position_error_m)
-    other = evaluate(vio, slam)
-    assert other.alignment == "se3"
-    assert other.time_offset.offset_s == pytest.approx(-(got.time_offset.offset_s or 0.0), abs=0.1)

@@ -1,4 +1,4 @@
-"""The page and the picture of ``evaluate``: what they say and draw, against closed forms."""
+"""The page of ``evaluate``: what they say and draw, against closed forms."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from exchange import replace
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from page_tools import every
-from PIL import Image
 from pypdf import PdfReader
 from scipy.spatial.transform import Rotation
 from trajectory_tools import PUBLISHED, flight, moved, published
@@ -26,7 +25,6 @@ from px4fuse.report.evaluation import (
     distance_words,
     draw,
     growth_words,
-    picture,
     quarters,
     score_rows,
     summary,
@@ -304,7 +302,6 @@ def test_without_orientations_the_page_says_why_there_is_no_rpe() -> None:
     bare = replace(flight(), rotation=None, kind="vio")
     score = evaluate(bare, flight())
     assert said(score).count("the estimate has no orientation") >= 2
-    assert picture(score)[:4] == b"\x89PNG"
 
 
 def test_the_colours_darken_so_that_grey_shows_them() -> None:
@@ -327,11 +324,6 @@ def test_same_bytes_with_the_results_inside_and_no_date() -> None:
     assert reader.metadata is not None
     assert str(reader.metadata.creation_date).startswith("2000-01-01")
     assert len(reader.pages) == 1
-    drawn = picture(score)
-    assert drawn == picture(score)
-    image = Image.open(io.BytesIO(drawn))
-    assert image.size == (1500, 810)
-    assert not any("time" in str(key).lower() or "date" in str(key).lower() for key in image.info)
 
 
 @pytest.mark.reallogs

@@ -557,7 +557,7 @@ def test_open_opens_what_is_looked_at(
     for words, name in (
         (["explore", log, *part, "--open", "-o", "page.html"], "page.html"),
         (["compare", log, *part, "--show", "-o", "report.pdf"], "report.pdf"),
-        (["evaluate", f"{log}:ekf2", f"{log}:truth", "--picture", "a.png", "--open"], "a.png"),
+        (["evaluate", f"{log}:ekf2", f"{log}:truth", "-o", "a.pdf", "--open"], "a.pdf"),
         (["compare", log, *part, "--json", "only.json", "-o", "other.pdf"], None),
     ):
         done = CliRunner().invoke(cli, words)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -32,36 +31,27 @@ def equal(a: PoseGraph, b: PoseGraph) -> None:
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name), strict=True)
 
 
-def test_plane() -> None:
-    graph = parse_g2o(PLANE.replace(UNIT_2, "1 2 3 40 5 60"), "a.g2o")
-    assert graph.dimension == 2
-    assert graph.initialised == FROM_FILE
-    assert graph.information[0].tolist() == [[1, 2, 3], [2, 40, 5], [3, 5, 60]]
+@pytest.mark.parametrize(("whole", "unit"), [(PLANE, UNIT_2), (SPACE, UNIT_3)])
+def test_information_is_an_upper_triangle_row_by_row(whole: str, unit: str) -> None:
+    size = 3 if whole == PLANE else 6
+    upper = np.triu_indices(size)
+    expected = np.zeros((size, size))
+    expected[upper] = np.arange(len(upper[0])) + 100.0 * (upper[0] == upper[1])
+    graph = parse_g2o(whole.replace(unit, " ".join(map(str, expected[upper]))), "a.g2o")
+    assert (graph.dimension, graph.initialised) == (size // 3 + 1, FROM_FILE)
+    np.testing.assert_array_equal(np.triu(graph.information[0]), expected)
+    np.testing.assert_array_equal(graph.information[0], graph.information[0].T)
 
 
-def test_space() -> None:
-    numbers = " ".join(str(100 if k in {0, 6, 11, 15, 18, 20} else k) for k in range(21))
-    graph = parse_g2o(SPACE.replace(UNIT_3, numbers), "a.g2o")
-    assert graph.dimension == 3
-    assert graph.information[0, 0].tolist() == [100, 1, 2, 3, 4, 5]
-    assert graph.information[0, :, 5].tolist() == [5, 10, 14, 17, 19, 100]
-
-
-def test_layout_is_no_matter() -> None:
+def test_layout_comments_and_order_are_no_matter(tmp_path: Path) -> None:
+    file = tmp_path / "a.g2o"
     messy = (
-        "\ufeff# made by hand\r\n\r\n" + PLANE.replace("\n", "  \r\n").replace(" ", "   ")
+        "\ufeff# made by hand\r\n\r\n" + PLANE.replace("\n", " # remark \r\n").replace(" ", "   ")
         + "FIX 0\r\nPARAMS_SE3OFFSET 0 0 0 0 0 0 0 1\r\n  # end"
     )  # fmt: skip
-    equal(parse_g2o(messy.removeprefix("\ufeff"), "a.g2o"), parse_g2o(PLANE, "a.g2o"))
-
-
-def test_marks_comments_and_order_are_no_matter(tmp_path: Path) -> None:
-    file = tmp_path / "a.g2o"
-    lines = PLANE.replace("0 0 0\n", "0 0 0 # start\n")
-    file.write_text("\ufeff" + lines, encoding="utf-8")
-    equal(read_g2o(file), parse_g2o(PLANE, "a.g2o"))
-    vertices_last = "\n".join(PLANE.splitlines()[::-1])
-    equal(parse_g2o(vertices_last, "a"), parse_g2o(PLANE, "a"))
+    for text in (messy, "\n".join(PLANE.splitlines()[::-1])):
+        file.write_text(text, encoding="utf-8")
+        equal(read_g2o(file), parse_g2o(PLANE, "a.g2o"))
 
 
 def test_quaternions_are_normalised() -> None:
@@ -77,39 +67,35 @@ def test_without_vertices() -> None:
 
 
 EDGE = f"EDGE_SE2 0 1 1 0 0 {UNIT_2}"
+NOT_READ, NO_TABLE, NO_VERTEX = "is not read here", "columns of numbers", "the number of a vertex"
 REFUSED = {
     "no edges": ("VERTEX_SE2 0 0 0 0\n", "no edges"),
     "empty": ("", "no edges"),
     "mixed": (PLANE + SPACE, "line 4: poses in space (SE3) beside poses in the plane (SE2)"),
-    "unknown edge": (PLANE + f"EDGE_SE2_XY 0 1 1 0 {UNIT_2}", "line 4: 'EDGE_SE2_XY' is not"),
-    "unknown vertex": ("VERTEX_XY 5 1 2\n" + PLANE, "line 1: 'VERTEX_XY' is not read here"),
-    "TORO": (f"EDGE2 0 1 1 0 0 {UNIT_2}", "line 1: EDGE2 is TORO's format. Convert it"),
-    "misspelt": (PLANE + "EGDE_SE2 0 1", "line 4: 'EGDE_SE2' is not read here"),
-    "cut off": (PLANE + "EDGE_SE2 0 1 1 0", "line 4: EDGE_SE2 has 4 numbers, not 11"),
-    "too long": (PLANE.replace("1 0 0\n", "1 0 0 0\n"), "line 2: VERTEX_SE2 has 5 numbers, not 4"),
-    "word": (PLANE.replace("1 1 0 0\n", "1 1 x 0\n"), "line 2: 'x' is not a number"),
+    "unknown edge": (PLANE + f"EDGE_SE2_XY 0 1 1 0 {UNIT_2}", f"line 4: 'EDGE_SE2_XY' {NOT_READ}"),
+    "TORO": (f"EDGE2 0 1 1 0 0 {UNIT_2}", f"line 1: 'EDGE2' {NOT_READ}"),
+    "cut off": (PLANE + "EDGE_SE2 0 1 1 0", f"line 4: 'EDGE_SE2 0 1 1 0' is not 12 {NO_TABLE}"),
+    "nothing": (PLANE + "EDGE_SE2", "line 4: 'EDGE_SE2' is not 12"),
+    "too long": (PLANE.replace("1 0 0\n", "1 0 0 0\n"), "line 2: 'VERTEX_SE2 1 1 0 0 0' is not 5"),
+    "word": (PLANE.replace("1 1 0 0\n", "1 1 x 0\n"), "line 2: 'VERTEX_SE2 1 1 x 0' is not 5"),
     "NaN": (PLANE.replace("1 1 0 0\n", "1 1 nan 0\n"), "line 2: a number that is not finite"),
     "infinite": (PLANE.replace(UNIT_2, "1 0 0 inf 0 1"), "line 3: a number that is not finite"),
-    "fraction": (PLANE.replace("SE2 0 1", "SE2 0 1.5"), "line 3: '1.5' is not the number of a"),
-    "underscore": (PLANE.replace("SE2 0 1", "SE2 0 1_0"), "line 3: '1_0' is not the number of a"),
-    "huge": (PLANE.replace("SE2 0 1", "SE2 0 " + "9" * 30), "line 3: '999999999999999999999999"),
-    "missing": (PLANE + EDGE.replace("0 1", "1 5", 1), "line 4: an edge to vertex 5, which"),
-    "twice": (PLANE + "\nVERTEX_SE2 1 0 0 0", "line 5: vertex 1 for the second time (first on "),
-    "self": (PLANE + EDGE.replace("0 1", "1 1", 1), "line 4: an edge from vertex 1 to itself"),
+    "fraction": (PLANE.replace("SE2 0 1", "SE2 0 1.5"), f"line 3: {NO_VERTEX}"),
+    "underscore": (PLANE.replace("SE2 0 1", "SE2 0 1_0"), f"line 3: {NO_VERTEX}"),
+    "huge": (PLANE.replace("SE2 0 1", "SE2 0 " + "9" * 30), f"line 3: {NO_VERTEX}"),
+    "missing": (PLANE + EDGE.replace("0 1", "1 5", 1), "line 4: an edge to a vertex that the file"),
+    "twice": (PLANE + "\nVERTEX_SE2 1 0 0 0", "line 5: a vertex for the second time"),
+    "self": (PLANE + EDGE.replace("0 1", "1 1", 1), "line 4: an edge from a vertex to itself"),
     "negative": (PLANE.replace(UNIT_2, "1 0 0 1 0 -1"), "line 3: the information matrix has a neg"),
     "indefinite": (PLANE.replace(UNIT_2, "1 2 0 1 0 1"), "line 3: the information matrix has a n"),
-    "no rotation": (SPACE.replace("0 0 0 1\nE", "0 0 0 0\nE"), "line 2: a quaternion of length 0"),
-    "endless rotation": (
-        SPACE.replace("0 0 0 1\nE", "0 0 0 1.8e308\nE"),
-        "line 2",
-    ),
-    "long rotation": (
-        SPACE.replace("0 0 0 1\nE", "0 0 0 1.7e308\nE"),
-        "line 2: a quaternion of length",
-    ),
-    "FIX of none": (PLANE + "FIX 8", "line 4: FIX of vertex 8, which the file does not have"),
-    "two FIX": (PLANE + "FIX 0\nFIX 1", "line 5: FIX of a second vertex (1 beside 0)"),
+    "no rotation": (SPACE.replace("0 0 0 1\nE", "0 0 0 0\nE"), "line 2: a quaternion whose length"),
+    "endless": (SPACE.replace("0 0 0 1\nE", "0 0 0 1.8e308\nE"), "line 2: a number that is not"),
+    "long": (SPACE.replace("0 0 0 1\nE", "0 0 0 1.7e308\nE"), "line 2: a quaternion whose length"),
+    "two FIX": (PLANE + "FIX 0\nFIX 1", "line 5: FIX of a second vertex"),
     "parts": (f"{EDGE}\n{EDGE.replace('0 1', '5 6', 1)}", "falls into 2 parts: vertex 5 is not"),
+    "too small": (PLANE.replace(UNIT_2, "1e-51 0 0 1 0 1"), "line 3: the information matrix has"),
+    "smallest": (PLANE.replace(UNIT_2, "1 0 0 5e-324 0 1"), "line 3: the information matrix has"),
+    "too large": (PLANE.replace(UNIT_2, "1 0 0 1 0 1e51"), "line 3: the information matrix has an"),
 }
 
 
@@ -172,25 +158,6 @@ def test_round_trip_is_exact(dimension: int, seed: int) -> None:
     assert g2o_text(again) == text
 
 
-@pytest.mark.parametrize("count", [1_001, 4_001])
-def test_the_work_per_line_is_little_and_does_not_grow(count: int) -> None:
-    """Calls are counted, which take the same number on every machine."""
-    text = g2o_text(made(3, count))
-    calls = 0
-
-    def counted(_frame: object, event: str, _argument: object) -> None:
-        nonlocal calls
-        calls += event in ("call", "c_call")
-
-    before = sys.getprofile()
-    sys.setprofile(counted)
-    try:
-        parse_g2o(text, "a.g2o")
-    finally:
-        sys.setprofile(before)
-    assert calls < 12 * len(text.splitlines())
-
-
 @pytest.mark.reallogs
 def test_public_graphs_come_back_the_same() -> None:
     folder = Path(__file__).resolve().parents[2] / "shared" / "pose_graphs"
@@ -206,37 +173,18 @@ def test_public_graphs_come_back_the_same() -> None:
 SQUARE = "".join(f"EDGE_SE2 {i} {i + 1} 1 0 1.57 {{}}\n" for i in range(4))
 
 
-def square(information: str, edge: int) -> str:
-    """A path around a square that closes twice, with another information in one edge."""
-    text = SQUARE + "EDGE_SE2 0 4 0.1 0.1 6.2 {}\nEDGE_SE2 0 3 0.1 1.1 4.7 {}\n"
-    return text.format(*[information if edge == one else UNIT_2 for one in range(6)])
-
-
-@pytest.mark.parametrize("edge", [1, 4])
-@pytest.mark.parametrize("entry", ["5e-324", "1e-300", "1e-51", "1e51", "1e300"])
-def test_information_that_overflows_is_refused_with_its_line(
-    tmp_path, monkeypatch, capsys, entry, edge
-) -> None:
-    path = tmp_path / "g.g2o"
-    path.write_text(square(f"{entry} 0 0 1 0 1", edge))
-    code, out, err = run_main(monkeypatch, capsys, "loop", path)
-    assert (code, out) == (2, "")
-    said = f"g.g2o, line {edge + 1}: the information matrix has the entry {float(entry):.3g}, which"
-    assert said in err
-    assert len(err.splitlines()) == 1
-
-
 @pytest.mark.parametrize("edge", [1, 4])
 @pytest.mark.parametrize("row", [0, 5])
-@pytest.mark.parametrize("entry", ["1e-50", "1e-30", "1e-12", "1e12", "1e30", "1e50", "0"])
+@pytest.mark.parametrize("entry", ["1e-50", "1e-12", "1e12", "1e50", "0"])
 def test_information_of_any_size_that_is_read_gives_numbers(
     tmp_path, monkeypatch, capsys, entry, row, edge
 ) -> None:
-    """Warnings are errors in these tests, and JSON holds neither NaN nor infinity."""
+    """A path around a square that closes twice; warnings are errors, and JSON holds no NaN."""
     numbers = UNIT_2.split()
     numbers[row] = entry
+    text = SQUARE + "EDGE_SE2 0 4 0.1 0.1 6.2 {}\nEDGE_SE2 0 3 0.1 1.1 4.7 {}\n"
     path = tmp_path / "g.g2o"
-    path.write_text(square(" ".join(numbers), edge))
+    path.write_text(text.format(*[" ".join(numbers) if edge == i else UNIT_2 for i in range(6)]))
     code, out, err = run_main(monkeypatch, capsys, "loop", path, "--json", "-", "--robust")
     assert (code, err) == (0, "")
     assert json.loads(out, parse_constant=pytest.fail)["graph"]["solutions"]

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from conftest import REPOSITORY
 from exchange import replace
-from findings_tools import made
 from pyulog import ULog
 from scipy.spatial.transform import Rotation, Slerp
+from trajectory_tools import drifted, square
 
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.findings import find_loop
@@ -20,14 +20,12 @@ from px4fuse.lesson import ODOMETRY_M, loop_lines
 from px4fuse.loop.analysis import analyse, loop_in
 from px4fuse.loop.corrections import BY_DISTANCE, PLAIN, SINGLE_LOOP
 from px4fuse.loop.loop import Loop
-from px4fuse.loop.model import Closure, OdometryNoise
+from px4fuse.loop.model import OdometryNoise
 from px4fuse.loop.odometry import odometry_variances
 from px4fuse.loop.sources import LoopSource, read_source, split_part
-from px4fuse.readers.closures import parse_closure, read_closures
-from px4fuse.report.loop import closure_name
 from px4fuse.request import GivenClosure
 from px4fuse.trajectory.evaluation import Evaluation
-from px4fuse.trajectory.model import Trajectory
+from px4fuse.trajectory.model import Kind, Trajectory
 from px4fuse.trajectory.scores import Statistics
 
 SAMPLE = REPOSITORY / "sample_logs" / "loop_vio.ulg"
@@ -198,40 +196,21 @@ def test_an_absolute_track_is_not_taken_for_odometry() -> None:
 
 def laps(count: int, seed: int, noise: OdometryNoise) -> tuple[Trajectory, Trajectory]:
     """Truth and odometry of laps around a square, nose first, with drift as the noise says."""
-    rng = np.random.default_rng(seed)
-    corners = SIDE_M * np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=float)
-    per_leg = int(SIDE_M / SPEED_M_S * RATE_HZ)
-    legs = [
-        corners[leg % 4] + share * (corners[(leg + 1) % 4] - corners[leg % 4])
-        for leg in range(4 * count)
-        for share in np.arange(per_leg)[:, None] / per_leg
-    ]
-    flat = np.array([*legs, corners[0]]).reshape(-1, 2)
-    position = np.column_stack([flat, np.full(len(flat), -1.5)])
-    turn = np.minimum(np.arange(len(flat)) / per_leg, 4 * count - 1e-9).astype(int) * np.pi / 2
-    rotation = Rotation.from_rotvec(np.outer(turn, [0, 0, 1]))
-    time = np.arange(len(flat)) / RATE_HZ
-    length = np.linalg.norm(np.diff(position, axis=0), axis=1)
-    duration = np.diff(time)
-    sigma = np.sqrt(noise.position_m**2 / 100 * length + noise.position_m_per_root_s**2 * duration)
-    heading = np.radians(
-        np.sqrt(noise.heading_deg**2 / 100 * length + noise.heading_deg_per_root_s**2 * duration)
-    )
-    turns = rng.normal(size=(len(heading), 3)) * np.outer(
-        heading, [noise.tilt_share, noise.tilt_share, 1.0]
-    )
-    moved = rotation[:-1].inv().apply(np.diff(position, axis=0))
-    moved += rng.normal(size=moved.shape) * sigma[:, None]
-    steps = rotation[:-1].inv() * rotation[1:] * Rotation.from_rotvec(turns)
-    measured, oriented = [position[0]], [rotation[0]]
-    for step, turned in zip(moved, steps, strict=True):
-        measured.append(measured[-1] + oriented[-1].apply(step))
-        oriented.append(oriented[-1] * turned)
-    truth = Trajectory("truth", "truth", time, position, rotation, "NED")
-    odometry = Trajectory(
-        "laps", "vio", time, np.array(measured), Rotation.concatenate(oriented), "NED"
-    )
-    return truth, odometry
+    position, rotation = square(int(SIDE_M / SPEED_M_S * RATE_HZ), SIDE_M, count)
+    truth = np.column_stack([position, rotation.as_quat()])
+    length, duration = SPEED_M_S / RATE_HZ, 1.0 / RATE_HZ
+    moved = noise.position_m**2 / 100 * length + noise.position_m_per_root_s**2 * duration
+    turned = noise.heading_deg**2 / 100 * length + noise.heading_deg_per_root_s**2 * duration
+    heading = np.radians(np.sqrt(turned))
+    tilt = noise.tilt_share * heading
+    sigma = np.array([np.sqrt(moved)] * 3 + [tilt, tilt, heading])
+    odometry = drifted(truth, sigma, np.random.default_rng(seed))
+    time = np.arange(len(truth)) / RATE_HZ
+
+    def flown(name: str, kind: Kind, poses: np.ndarray) -> Trajectory:
+        return Trajectory(name, kind, time, poses[:, :3], Rotation.from_quat(poses[:, 3:]), "NED")
+
+    return flown("truth", "truth", truth), flown("laps", "vio", odometry)
 
 
 LAP_S = 4 * SIDE_M / SPEED_M_S
@@ -401,53 +380,21 @@ def test_the_slam_file_is_levelled_and_closes_better_than_the_odometry() -> None
     assert found.path_length_m == pytest.approx(86.0, abs=5.0)
 
 
-@pytest.mark.parametrize("text", ["", "1", "1,2,3,4", "a,b", "1,nan", "1;2", "inf,2"])
-def test_what_is_no_closure_is_refused(text: str) -> None:
-    with pytest.raises(TrajectoryError, match="T1,T2"):
-        parse_closure(text)
-    assert parse_closure("1,2") == GivenClosure(1.0, 2.0, 0.10)
-    assert parse_closure(" 1.5 , 20,0.3") == GivenClosure(1.5, 20.0, 0.3)
-
-
-def test_a_file_of_closures(tmp_path: Path) -> None:
-    path = tmp_path / "closures.csv"
-    path.write_text("t1,t2,sigma\n# same corner\n1,2\n\n3, 4, 0.5  # guess\n")
-    assert [c.sigma_m for c in read_closures(path)] == [0.10, 0.5]
-    path.write_text("1,2\n3,x\n")
-    with pytest.raises(TrajectoryError, match=r"closures\.csv, line 2: closure '3,x'"):
-        read_closures(path)
-    path.write_text("# none\n")
-    with pytest.raises(TrajectoryError, match="0 closures"):
-        read_closures(path)
-    with pytest.raises(TrajectoryError, match="cannot be read"):
-        read_closures(tmp_path / "missing.csv")
-
-
 @pytest.mark.parametrize(
-    ("closure", "says"),
+    ("how", "says"),
     [
-        (GivenClosure(5.0, 500.0), "500 s is outside the path, which runs from"),
-        (GivenClosure(-5.0, 50.0), "-5 s is outside the path"),
-        (GivenClosure(50.0, 20.0), "the first time must be before the second"),
-        (GivenClosure(20.0, 50.0, 0.0), "SIGMA 0 is outside"),
+        ({"closures": (GivenClosure(-5.0, 50.0),)}, "closure -5,50: its times"),
+        ({"closures": (GivenClosure(20.0, 50.0, 200.0),)}, "SIGMA 200 is outside"),
+        ({"start_s": 500.0, "end_s": 600.0}, "too few"),
+        ({"start_s": 96.0, "end_s": 98.0}, "too short for a loop"),
+        ({"spacing_m": 101.0}, "`key_frames_m` 101 is outside"),
     ],
 )
-def test_impossible_closures_are_refused(
-    sample: LoopSource, closure: GivenClosure, says: str
+def test_impossible_parts_and_closures_are_refused(
+    sample: LoopSource, how: dict[str, Any], says: str
 ) -> None:
-    with pytest.raises(TrajectoryError, match=says):
-        analyse(sample, closures=(closure,))
-
-
-def test_impossible_parts_are_refused(sample: LoopSource) -> None:
-    with pytest.raises(SettingsError, match="`start_s` or `end_s`"):
-        analyse(sample, start_s=50.0, end_s=20.0)
-    with pytest.raises(TrajectoryError, match="too few"):
-        analyse(sample, start_s=500.0, end_s=600.0)
-    with pytest.raises(TrajectoryError, match="too short for a loop"):
-        analyse(sample, start_s=96.0, end_s=98.0)
-    with pytest.raises(SettingsError, match="exclude each other"):
-        analyse(sample, landed_at=(0.0, 0.0, None), came_back=False)
+    with pytest.raises((TrajectoryError, SettingsError), match=says):
+        analyse(sample, **how)
 
 
 def test_a_part_of_a_log_is_named_after_a_colon(tmp_path: Path) -> None:
@@ -456,11 +403,3 @@ def test_a_part_of_a_log_is_named_after_a_colon(tmp_path: Path) -> None:
     odd = tmp_path / "a:vio"
     odd.write_bytes(b"")
     assert split_part(str(odd)) == (odd, None)
-    with pytest.raises(TrajectoryError, match="'slam' is not a part of a flight"):
-        split_part(f"{SAMPLE}:slam")
-
-
-def test_a_closure_with_unix_stamps_counts_from_the_first_pose() -> None:
-    closure = made(Closure, source="given", time_1_s=1.7e9 + 3.0, time_2_s=1.7e9 + 63.5)
-    for start_s, expected in ((1.7e9, "3.00 s and 63.50 s"), (0.0, "1700000003.00 s and")):
-        assert closure_name(closure, made(Loop, start_s=start_s)).startswith(expected)

@@ -67,7 +67,6 @@ READERS = {
     "mavlink": "info l.ulg --mavlink {}",
     "position": "info l.ulg --position {}",
     "notes": "compare l.ulg --notes {} -o out/c.pdf",
-    "closures": "loop s.tum --closures {}",
     "reference": "loop s.tum --reference {}",
     "roster": "simulate --assignment {} -o out",
     "secret": "simulate --assignment roster.csv --secret-file {} -o out",

@@ -149,7 +149,7 @@ def test_every_option_of_an_analysis_is_in_the_request(command, declared, kinds)
     """An option that the request forgets would be missing from every record."""
     about_outputs = {
         "-o", "--json", "--student", "--id", "--notes", "--answers", "--fail-on", "--checks",
-        "--tum", "--g2o", "--closures", "--robust", "--max-size", "--show",
+        "--tum", "--g2o", "--robust", "--max-size", "--show",
     }  # fmt: skip
     options = {parameter.opts[0] for parameter in command.params if parameter.opts[0][0] == "-"}
     asked = {option.name for option in declared.values()}

@@ -55,11 +55,3 @@ def test_rotations_are_scipys() -> None:
     assert matrix(both) == pytest.approx((theirs[:25] * theirs[25:]).as_matrix(), abs=1e-12)
     v, u = rng.normal(size=(2, 3))
     assert skew(v) @ u == pytest.approx(np.cross(v, u))
-
-
-def test_interpolation_does_not_mind_the_sign() -> None:
-    times = np.array([0.0, 1.0, 2.0])
-    known = from_vector(np.array([[0.0, 0.0, 0.10], [0.0, 0.0, 0.12], [0.0, 0.0, 0.14]]))
-    known[1] *= -1.0
-    found = to_vector(interpolate(np.array([0.5, 1.5]), times, known))
-    assert found[:, 2] == pytest.approx([0.11, 0.13], abs=1e-6)

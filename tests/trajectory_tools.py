@@ -12,6 +12,7 @@ from exchange import replace
 from scipy.spatial.transform import Rotation
 
 from px4fuse.readers.trajectory import read_trajectory
+from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.model import Frame, Kind, Trajectory
 
@@ -52,6 +53,23 @@ def moved(
     """The same motion in another world."""
     position = scale * turn.apply(one.position_m) + shift
     return replace(one, position_m=position, rotation=turn * one.rotation, **changes)
+
+
+def square(per_leg: int, side_m: float, laps: int = 1) -> tuple[np.ndarray, Rotation]:
+    """Positions and rotations around a square, nose first, corners turned on the spot."""
+    count = np.arange(4 * laps * per_leg + 1)
+    leg = np.minimum(count // per_leg, 4 * laps - 1)
+    corners = side_m * np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    along = (count / per_leg - leg)[:, None]
+    position = (1.0 - along) * corners[leg % 4] + along * corners[(leg + 1) % 4] - [0.0, 0.0, 1.5]
+    return position, Rotation.from_rotvec(np.outer(leg * np.pi / 2, [0.0, 0.0, 1.0]))
+
+
+def drifted(poses: np.ndarray, sigma: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Poses by odometry whose steps err by so much (m, then rad), shapes (n, 7) and (6,)."""
+    steps = lie.between(poses[:-1], poses[1:])
+    noise = lie.exp(rng.normal(size=(len(steps), 6)) * sigma)
+    return lie.compose(poses[:1], lie.chain(lie.compose(steps, noise)))
 
 
 SHIFT = np.array([100.0, -20.0, 3.0])

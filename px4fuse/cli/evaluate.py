@@ -24,7 +24,7 @@ from px4fuse.cli.outputs import (
     report_paths,
     result_files,
 )
-from px4fuse.errors import OutputError, SettingsError
+from px4fuse.errors import SettingsError
 from px4fuse.request import EVALUATION_OPTIONS, EvaluationRequest, command_line, settings_name
 from px4fuse.writing import STANDARD_OUTPUT
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from px4fuse.results.contract import EvaluationResults
     from px4fuse.trajectory.scores import Delta
 
-STEPS = ("reading", "scoring", "drawing the report", "drawing the picture")
+STEPS = ("reading", "scoring", "drawing the report")
 MAX_DELTA = 1e6
 _DELTA = re.compile(r"(\d+\.?\d*|\.\d+) ?(m|s|frames|f)")
 
@@ -69,11 +69,6 @@ def delta(text: str) -> Delta:
     metavar="FILE.pdf",
     help="The page.  [default: reports/ESTIMATE_against_REFERENCE.pdf]",
 )
-@path_option(
-    "--picture",
-    metavar="FILE.png",
-    help="The picture: the path by its error, APE, RPE.  [default: beside the PDF]",
-)
 @results_option
 @open_option
 def evaluate(
@@ -81,19 +76,16 @@ def evaluate(
     reference: Path,
     rpe: tuple[Delta, ...],
     output: Path | None,
-    picture: Path | None,
     json_path: Path | None,
     **given: Any,
 ) -> None:
     """Score a trajectory against a reference: ATE and RPE, with intervals.
 
     Either is a trajectory file (TUM, EuRoC, ORB-SLAM3) or a part of a flight log: LOG:vio,
-    LOG:ekf2, LOG:kf (our filter) or LOG:truth. Writes a page (PDF), a picture (PNG) and the results
-    (JSON); where -o, --picture or --json names a file, only what is named and what stands beside
-    the PDF.
+    LOG:ekf2, LOG:kf (our filter) or LOG:truth. Writes a page (PDF) and the results (JSON); where
+    --json names a file and -o none, only that.
     """
     from px4fuse.loop.sources import file_name, read_source
-    from px4fuse.report.evaluation import picture as draw
     from px4fuse.report.evaluation import print_evaluation
     from px4fuse.results.build_trajectories import evaluation_results
     from px4fuse.trajectory.evaluation import evaluate as score
@@ -103,7 +95,8 @@ def evaluate(
     )
     if request.max_gap_s is not None and request.max_gap_s <= 0.0:
         raise SettingsError(f"--max-gap {request.max_gap_s:g}: give more than 0 seconds.")
-    _picture(output, picture, json_path)  # before the work, not after it
+    alone = output is None and json_path is not None
+    check_targets((json_path,) if alone else report_paths(output or Path("A.pdf"), json_path))
     with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
         step("reading")
         first = read_source(request.estimate, system=request.system)
@@ -120,14 +113,10 @@ def evaluate(
             all_pairs=not request.consecutive,
         )
         results = evaluation_results(found, command_line(request))
-        if output is None and picture is None and json_path is None:
+        if output is None and not alone:
             name = f"{file_name(estimate)}_against_{file_name(reference)}"
             output = free_report(name, settings_name(request), results, _same)
         contents = result_files(results, json_path, output, found, step)
-        picture = _picture(output, picture, json_path)
-        if picture is not None:
-            step("drawing the picture")
-            contents[picture] = draw(found)
     finish(contents, lambda console: print_evaluation(console, found))
 
 
@@ -137,23 +126,3 @@ def _same(old: EvaluationResults, mine: EvaluationResults) -> bool:
         (one.provenance.command, one.estimate.sha256, one.reference.sha256) for one in (old, mine)
     )
     return first == second
-
-
-def _picture(output: Path | None, picture: Path | None, json_path: Path | None) -> Path | None:
-    """Where the picture goes: beside the page unless it is named.
-
-    Raises
-    ------
-    OutputError
-        It is no PNG, or two outputs are the same file.
-    """
-    results = json_path
-    if output is not None:
-        output, results = report_paths(output, json_path)
-        picture = picture or output.with_suffix(".png")
-    if picture is not None and picture.suffix.lower() != ".png":
-        raise OutputError(
-            f"{picture}: the picture is a PNG. Give a name that ends in .png with --picture."
-        )
-    check_targets([output, picture, results])
-    return picture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +29,14 @@ from px4fuse.cli.outputs import (
 )
 from px4fuse.errors import SettingsError
 from px4fuse.reading import shown
-from px4fuse.request import LOOP_OPTIONS, Landing, LoopRequest, command_line, settings_name
+from px4fuse.request import (
+    LOOP_OPTIONS,
+    GivenClosure,
+    Landing,
+    LoopRequest,
+    command_line,
+    settings_name,
+)
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
@@ -45,15 +53,25 @@ MAX_LANDED_AT = 10_000.0
 FOR_GRAPHS = ("source", "json_path", "g2o", "robust")
 
 
-def landing(text: str) -> Landing:
-    """Read ``FORWARD,RIGHT`` or ``FORWARD,RIGHT,DEG``."""
+def _numbers(text: str, meant: str, most: float) -> list[float]:
+    """Two or three finite numbers between commas."""
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) not in (2, 3) or not all(abs(n) <= MAX_LANDED_AT for n in numbers):
-        raise click.BadParameter(f"{text!r} is not FORWARD,RIGHT in m, or FORWARD,RIGHT,DEG.")
-    return Landing(*numbers)
+    if len(numbers) not in (2, 3) or not all(abs(number) <= most for number in numbers):
+        raise click.BadParameter(f"{text!r} is not {meant}.")
+    return numbers
+
+
+def landing(text: str) -> Landing:
+    """Read ``FORWARD,RIGHT`` or ``FORWARD,RIGHT,DEG``."""
+    return Landing(*_numbers(text, "FORWARD,RIGHT in m, or FORWARD,RIGHT,DEG", MAX_LANDED_AT))
+
+
+def closure(text: str) -> GivenClosure:
+    """Read ``T1,T2`` or ``T1,T2,SIGMA``."""
+    return GivenClosure(*_numbers(text, "T1,T2 in s, or T1,T2,SIGMA", sys.float_info.max))
 
 
 @click.command()
@@ -68,11 +86,12 @@ def landing(text: str) -> Landing:
 @click.option("--open", "opened", is_flag=True, help="It did not come back: use no landing.")
 @click.option(
     "--closure",
+    "closures",
+    type=closure,
     multiple=True,
     metavar="T1,T2[,SIGMA]",
     help="It was at the same place at two times, within SIGMA m (0.10); may be repeated.",
 )
-@path_option("--closures", metavar="FILE", help="Such closures, one a line.")
 @click.option(
     "--robust", is_flag=True, help="Solve a pose graph of over 1000 closures robustly too: minutes."
 )
@@ -143,17 +162,8 @@ def _same(old: LoopResults, mine: LoopResults) -> bool:
 
 def loop_request(source: Path, given: dict[str, Any]) -> LoopRequest:
     """What the command's options gave, as a request."""
-    from px4fuse.readers.closures import parse_closure, read_closures
-
-    closures = tuple(parse_closure(text) for text in given.pop("closure"))
-    file = given.pop("closures")
     del given["robust"]
-    return LoopRequest(
-        source=str(source),
-        closures=closures if file is None else closures + read_closures(file),
-        came_back=not given.pop("opened"),
-        **given,
-    )
+    return LoopRequest(source=str(source), came_back=not given.pop("opened"), **given)
 
 
 def _files(found: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]:

@@ -35,6 +35,8 @@ MIN_PATH_M = 2.0
 # What `compare` takes for a loop: this long, and ending within this share of its length
 LOOP_MIN_PATH_M = 10.0
 LOOP_MAX_GAP_SHARE = 0.10
+# In m, or degrees: what is larger was mistyped
+MOST = 100.0
 
 
 def analyse(
@@ -76,7 +78,8 @@ def analyse(
         The part is too short, a closure lies outside it, or a number is out of range.
     """
     noise = noise or OdometryNoise()
-    _check_drift(noise)
+    _within("position_drift_m", noise.position_m, 1e-4)
+    _within("heading_drift_deg", noise.heading_deg, 1e-4)
     trajectory, flight = source.trajectory, source.flight
     zero_s = float(trajectory.time_s[0]) if trajectory.unix_offset_s == 0.0 else 0.0
 
@@ -89,25 +92,22 @@ def analyse(
     truth = None if flight is None or trajectory.kind == "truth" else truth_of(flight)
     whole = upright(trajectory)
     path = part_of(whole, segment, at_rest)
-    notes = list(whole.notes)
-    by_truth = None
-    if truth is not None and came_back and landed_at is None:
-        by_truth = true_end(path, truth, segment, at_rest)
-    if isinstance(by_truth, str):
-        notes.append(f"the truth does not tell where it ended: {by_truth}")
+    real = truth if came_back and landed_at is None else None
+    by_truth = None if real is None else true_end(path, real, segment, at_rest)
     known = _known_end(path, landed_at, came_back, by_truth)
     claims: list[Claim] = [
         (GivenClosure(stamp(one.time_1_s), stamp(one.time_2_s), one.sigma_m), None)
         for one in closures
     ]
+    for closure, _ in claims:
+        _check(closure, path)
     if not isinstance(known, Unavailable):
         claims.insert(0, (GivenClosure(segment.start_s, segment.end_s, known.sigma_m), known))
-    for closure, known_end in claims:
-        _check(closure, path, is_landing=known_end is not None)
     spacing = key_frame_spacing_m(path.position_m) if spacing_m is None else spacing_m
     frames, distance = _key_frames(path, spacing)
     graph, nodes, statement = pose_graph(path, frames, claims, noise)
-    notes.insert(len(whole.notes), statement)
+    untold = f"the truth does not tell where it ended: {by_truth}"
+    notes = (*whole.notes, statement, untold if isinstance(by_truth, str) else "")
     judged = judge(graph, claims)
     solved, judged = solve_all(path, nodes, graph, judged, progress)
     end_m, heading = path.position_m[-1] - path.position_m[0], heading_change_deg(path)
@@ -177,8 +177,7 @@ def _is_absolute(trajectory: Trajectory, flight: Flight) -> bool:
 
 def _key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
     """Indices of poses that are key frames, and the distance along them at each pose."""
-    if not 1e-3 <= spacing_m <= 100.0:
-        raise SettingsError(f"`key_frames_m` {spacing_m:g} is outside 0.001 to 100 m.")
+    _within("key_frames_m", spacing_m, 1e-3)
     frames = key_frames(path.position_m, spacing_m)
     along = cumulative_distance(path.position_m[frames])
     if not along[-1] >= max(MIN_PATH_M * min(1.0, spacing_m / 0.5), 1e-6):
@@ -190,26 +189,21 @@ def _key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
     return frames, np.interp(path.time_s, path.time_s[frames], along)
 
 
-def _check_drift(noise: OdometryNoise) -> None:
-    drifts = {"position_drift_m": noise.position_m, "heading_drift_deg": noise.heading_deg}
-    for name, drift in drifts.items():
-        if not 1e-4 <= drift <= 100.0:
-            raise SettingsError(f"`{name}` {drift:g} is outside 0.0001 to 100.")
+def _within(name: str, value: float, least: float) -> None:
+    if not least <= value <= MOST:
+        raise SettingsError(f"`{name}` {value:g} is outside {least:g} to {MOST:g}.")
 
 
-def _check(closure: GivenClosure, path: Trajectory, *, is_landing: bool) -> None:
+def _check(closure: GivenClosure, path: Trajectory) -> None:
     """Refuse a closure outside the path, one that leads back in time, and one without width."""
     (low, high), times = path.time_s[[0, -1]], (closure.time_1_s, closure.time_2_s)
     label = f"{path.name}: closure {times[0]:.12g},{times[1]:.12g}"
-    outside = [] if is_landing else [time for time in times if not low <= time <= high]
-    if outside:
+    if not low <= times[0] < times[1] <= high:
         raise TrajectoryError(
-            f"{label}: {outside[0]:.12g} s is outside the path, which runs from {low:.2f} s to "
-            f"{high:.2f} s."
+            f"{label}: its times do not follow each other within the path, which runs from "
+            f"{low:.2f} s to {high:.2f} s."
         )
-    if not (is_landing or times[0] < times[1]):
-        raise TrajectoryError(f"{label}: the first time must be before the second.")
-    if not 1e-4 <= closure.sigma_m <= 100.0:
+    if not 1e-4 <= closure.sigma_m <= MOST:
         raise TrajectoryError(f"{label}: SIGMA {closure.sigma_m:g} is outside 0.0001 to 100 m.")
 
 

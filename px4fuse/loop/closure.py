@@ -42,41 +42,34 @@ def upright(trajectory: Trajectory) -> Trajectory:
 
     A camera's orientation becomes that of a vehicle whose nose is where the camera looks.
     """
-    if trajectory.frame in ("NED", "FRD"):
+    if trajectory.frame not in _TO_Z_DOWN:
         return trajectory
     order, sign, frame, note = _TO_Z_DOWN[trajectory.frame]
     variance = trajectory.position_variance_m2
     return replace(
-        trajectory,
-        position_m=trajectory.position_m[:, order] * sign,
-        rotation=_turned(trajectory, _turn(trajectory.frame), trajectory.frame),
-        frame=frame,
+        _turned(trajectory, np.diag(sign) @ np.eye(3)[order], frame),
         position_variance_m2=None if variance is None else variance[:, order],
+        rotation_variance_rad2=trajectory.rotation_variance_rad2,
         notes=(*trajectory.notes, note),
     )
 
 
 def in_frame(trajectory: Trajectory, frame: Frame) -> Trajectory:
     """What :func:`upright` made of a trajectory in ``frame``, turned back into that frame."""
-    if frame not in _TO_Z_DOWN or trajectory.frame not in ("NED", "FRD"):
+    if frame not in _TO_Z_DOWN or trajectory.frame in _TO_Z_DOWN:
         return trajectory
-    back = _turn(frame).inv()
-    turned = _turned(trajectory, back, frame)
-    return replace(trajectory.moved(back.apply(trajectory.position_m), turned), frame=frame)
-
-
-def _turn(frame: Frame) -> Rotation:
-    """From a frame into its one with z down."""
     order, sign, _, _ = _TO_Z_DOWN[frame]
-    return Rotation.from_matrix(np.eye(3)[order] * np.array(sign)[:, None])
+    return _turned(trajectory, (np.diag(sign) @ np.eye(3)[order]).T, frame)
 
 
-def _turned(trajectory: Trajectory, turn: Rotation, frame: Frame) -> Rotation | None:
-    """Orientations in a frame turned from or to ``frame``; a camera's axes turn with it."""
-    if trajectory.rotation is None:
-        return None
-    turned = turn * trajectory.rotation
-    return turned * turn.inv() if frame == "camera" else turned
+def _turned(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:
+    """The same poses in another frame; a camera's axes turn with its world."""
+    turn, rotation = Rotation.from_matrix(matrix), trajectory.rotation
+    if rotation is not None:
+        rotation = turn * rotation
+        if "camera" in (trajectory.frame, frame):
+            rotation = rotation * turn.inv()
+    return replace(trajectory.moved(trajectory.position_m @ matrix.T, rotation), frame=frame)
 
 
 def key_frame_spacing_m(position_m: Array) -> float:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from msgspec import structs
 from scipy.spatial.transform import Rotation, Slerp
 
-from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import Px4FuseError
 from px4fuse.flight import Unavailable
 from px4fuse.loop.closure import correct_by_distance, distribute_by_distance
@@ -18,7 +17,7 @@ from px4fuse.loop.model import LANDING, Closure, CorrectedPath, Way
 from px4fuse.loop.odometry import Claim
 from px4fuse.record import written
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
-from px4fuse.trajectory.graph.analysis import SOLUTIONS
+from px4fuse.trajectory.graph.analysis import ROBUST, SOLUTIONS
 from px4fuse.trajectory.graph.covariance import gate
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution, solve
@@ -107,35 +106,27 @@ def solve_all(
     rejected = np.zeros(len(edges), dtype=np.bool_)
     rejected[loops] = [not closure.accepted for closure in closures]
     for name, label in SOLUTIONS.items():
-        way = f"pose_graph_{name}"
+        way, robust = f"pose_graph_{name}", ROBUST.get(name, "none")
         progress(f"solving: {label}")
-        if name in ("dcs", "gnc"):
-            if len(closures) < 2:
-                more = "Give further closures with --closure."
-                found[way] = Unavailable(label, SINGLE_LOOP, more)
-                continue
-            solution = solve(graph, robust="dcs" if name == "dcs" else "gnc", loops=loops)
-            weights = solution.weights[loops].tolist()
-            closures = tuple(
-                structs.replace(closure, **{f"weight_{name}": weight})
-                for closure, weight in zip(closures, weights, strict=True)
-            )
+        if robust != "none" and len(closures) < 2:
+            more = "Give further closures with --closure."
+            found[way] = Unavailable(label, SINGLE_LOOP, more)
         elif name == "gated" and rejected[loops].all():
             found[way] = _refused("pose graph", closures[0])
-            continue
         elif name == "gated" and not rejected.any():
             found[way] = found["pose_graph_all"]
-            continue
         else:
-            solution = solve(without(graph, rejected) if name == "gated" else graph)
-        found[way] = _carried(path, nodes, graph.poses, solution.poses), solution
+            used = ~rejected if name == "gated" else np.ones_like(rejected)
+            solution = solve(graph.of_edges(used), robust=robust, loops=loops[used])
+            found[way] = _carried(path, nodes, graph.poses, solution.poses), solution
+            if robust != "none":
+                closures = tuple(
+                    structs.replace(closure, **{f"weight_{name}": weight})
+                    for closure, weight in zip(
+                        closures, solution.weights[loops].tolist(), strict=True
+                    )
+                )
     return found, closures
-
-
-def without(graph: PoseGraph, dropped: BoolArray) -> PoseGraph:
-    """A graph without some of its edges."""
-    edges = ("first", "second", "measurements", "information")
-    return replace(graph, **{name: getattr(graph, name)[~dropped] for name in edges})
 
 
 def _carried(path: Trajectory, nodes: IntArray, before: Array, after: Array) -> Trajectory:

@@ -9,12 +9,7 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.display import Shown
 from px4fuse.errors import MissingDataError
 from px4fuse.flight import Unavailable
-from px4fuse.loop.model import (
-    CorrectedPath,
-    KnownEnd,
-    LoopPart,
-    Way,
-)
+from px4fuse.loop.model import CorrectedPath, KnownEnd, LoopPart, Way
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.model import Frame, Trajectory
 
@@ -86,8 +81,7 @@ class Loop(Shown, LoopPart, frozen=True, kw_only=True, eq=False):
         """
         if isinstance(self.graph, Unavailable):
             raise MissingDataError(f"{self.graph.what}: {self.graph.reason}.")
-        ways: tuple[Way, ...] = ("pose_graph_gated", "pose_graph_all")
-        for solution in (self.paths[way].solution for way in ways if way in self.paths):
-            if solution is not None:
-                return replace(self.graph, poses=solution.poses)
-        return self.graph
+        gated, plain = self.paths.get("pose_graph_gated"), self.paths.get("pose_graph_all")
+        solved = gated or plain
+        found = None if solved is None else solved.solution
+        return self.graph if found is None else replace(self.graph, poses=found.poses)

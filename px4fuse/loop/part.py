@@ -75,30 +75,26 @@ def chosen_part(
     at_rest = False
     if flight is None:
         reason = "the whole trajectory"
-    elif isinstance(flight.airborne, Unavailable):
-        reason = "the whole track: the log has no land detector"
-    elif not flight.airborne:
-        reason = "the whole track: the land detector never says that it flies"
+    elif isinstance(flight.airborne, Unavailable) or not flight.airborne:
+        reason = "the whole track: no land detector says that it flies"
     else:
         low, high = max(low, flight.airborne[0][0]), min(high, flight.airborne[-1][1])
-        count = len(flight.airborne)
         reason = "from take-off to landing, by the land detector"
-        if count > 1:
-            reason = f"from the first take-off to the last of {count} landings"
+        if len(flight.airborne) > 1:
+            reason = f"from the first take-off to the last of {len(flight.airborne)} landings"
         at_rest = start_s is None and end_s is None
-    given = [n for n, v in (("--from", start_s), ("--to", end_s)) if v is not None]
-    low, high = low if start_s is None else start_s, high if end_s is None else end_s
+    if start_s is not None or end_s is not None:
+        low, high = low if start_s is None else start_s, high if end_s is None else end_s
+        reason = "chosen with --from or --to"
     if not low < high:
         raise SettingsError(
             f"the part from {low:.12g} s to {high:.12g} s is empty; the track runs from "
             f"{span[0]:.2f} s to {span[1]:.2f} s",
             "Change `start_s` or `end_s`.",
         )
-    if given:
-        reason = f"chosen with {' and '.join(given)}"
     inside = max(low, span[0]), min(high, span[1])
     if inside != (low, high) and inside[0] < inside[1]:
-        return Segment(*inside, f"{reason}, cut at the ends of the data"), at_rest
+        reason, (low, high) = f"{reason}, cut at the ends of the data", inside
     return Segment(low, high, reason), at_rest
 
 

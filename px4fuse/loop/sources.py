@@ -54,28 +54,22 @@ def split_part(argument: str) -> tuple[Path, Part | None]:
     return whole, None
 
 
-def head_of(path: Path) -> bytes:
-    """First bytes of a file.
+def _is_text(head: bytes) -> bool:
+    """Whether a file that begins like this is text, and so no flight log."""
+    binary = any(byte < 9 or 13 < byte < 32 for byte in head)
+    return head.startswith(_UTF16) or (bool(head) and not binary)
+
+
+def is_g2o(path: Path) -> bool:
+    """Whether a file is a pose graph in g2o's format.
 
     Raises
     ------
     TrajectoryError
         It cannot be read.
     """
-    return read_head(path, _HEAD_BYTES, TrajectoryError)
-
-
-def is_text(path: Path) -> bool:
-    """Whether a file is text, and so no flight log."""
-    head = head_of(path)
-    binary = any(byte < 9 or 13 < byte < 32 for byte in head)
-    return head.startswith(_UTF16) or (bool(head) and not binary)
-
-
-def is_g2o(path: Path) -> bool:
-    """Whether a file is a pose graph in g2o's format."""
-    lines = head_of(path).splitlines()
-    return is_text(path) and any(line.strip().startswith(_G2O) for line in lines)
+    head = read_head(path, _HEAD_BYTES, TrajectoryError)
+    return _is_text(head) and any(line.strip().startswith(_G2O) for line in head.splitlines())
 
 
 def read_source(
@@ -107,14 +101,15 @@ def read_source(
         A flight log states its frame.
     """
     path, part = split_part(argument)
-    if not head_of(path):
+    head = read_head(path, _HEAD_BYTES, TrajectoryError)
+    if not head:
         raise TrajectoryError(f"{shown(path)}: the file is empty", "Copy or export it again.")
     if is_g2o(path):
         raise TrajectoryError(
             f"{shown(path)}: a pose graph, not a trajectory",
             f"Solve it with px4fuse loop {shown(path)}.",
         )
-    if is_text(path):
+    if _is_text(head):
         if part is not None:
             raise TrajectoryError(
                 f"{shown(path)}: a trajectory file has no part {part!r}", "Leave it out."
@@ -134,7 +129,5 @@ def read_source(
         if isinstance(odometry, Unavailable):
             chosen = "ekf2"
             if isinstance(flight.ekf2, Unavailable):
-                raise MissingDataError(
-                    f"{flight.log.name}: {odometry.reason}", f"{odometry.remedy}"
-                )
+                raise MissingDataError(f"{flight.log.name}: {odometry.reason}", odometry.remedy)
     return LoopSource(trajectory_of(flight, chosen), flight)

@@ -1,14 +1,18 @@
 """What the readers of text tables share: text of bytes, numbers, and errors that name the line.
 
-Position files, trajectories, pose graphs (g2o) and closures are such tables.
+Position files, trajectories and pose graphs (g2o) are such tables.
 """
 
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass, field
 from typing import Any
 
-from px4fuse.arrays import Array
+import numpy as np
+
+from px4fuse.arrays import Array, BoolArray
+from px4fuse.errors import TrajectoryError
 
 # A UNIX clock that is set lies between 2000 and 2100
 UNIX_START_S, UNIX_END_S = 946_684_800.0, 4_102_444_800.0
@@ -66,3 +70,71 @@ def at_line(name: str, number: int, what: str, remedy: str) -> str:
     "uwb.csv, line 7: 'x' is not a number. Correct or remove that line."
     """
     return f"{name}, line {number}: {what}. {remedy}"
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows of a table in a text file, of trajectories and pose graphs.
+
+    Attributes
+    ----------
+    file : str
+        Name of the file, for messages.
+    lines : list of (int, str)
+        Their numbers in the file, and what they say.
+    """
+
+    file: str
+    lines: list[tuple[int, str]] = field(default_factory=list)
+
+    def refuse(self, row: int, what: str, remedy: str) -> TrajectoryError:
+        """Error that names the line of a row."""
+        return TrajectoryError(at_line(self.file, self.lines[row][0], what, remedy))
+
+    def refuse_where(self, bad: BoolArray, what: str, remedy: str) -> None:
+        """Refuse the first row with something bad, shape (n,) or (n, k).
+
+        Raises
+        ------
+        TrajectoryError
+        """
+        places = np.argwhere(bad)
+        if len(places):
+            raise self.refuse(int(places[0, 0]), what, remedy)
+
+    def parse(
+        self, words: int, values: int, separator: str | None = None
+    ) -> tuple[np.ndarray[Any, np.dtype[np.str_]], Array]:
+        """Columns of words, and behind them columns of numbers; ``#`` begins a remark.
+
+        Parameters
+        ----------
+        words, values : int
+            How many columns there are of either.
+        separator : str, optional
+            White space by default.
+
+        Returns
+        -------
+        words : ndarray of str, shape (n, words)
+        values : ndarray, shape (n, values)
+
+        Raises
+        ------
+        TrajectoryError
+            Names the first row that has other columns.
+        """
+        texts = [text for _, text in self.lines]
+        columns = [("words", "U80", (words,)), ("values", "f8", (values,))]
+        try:
+            table = np.loadtxt(texts, dtype=columns, delimiter=separator, ndmin=1)
+        except ValueError as error:
+            parts = (text.partition("#")[0].split(separator) for text in texts)
+            well = (
+                len(part) == words + values and all(is_number(one.strip()) for one in part[words:])
+                for part in parts
+            )  # fmt: skip
+            row = next((row for row, good in enumerate(well) if not good), 0)
+            what = f"{quote(texts[row])} is not {words + values} columns of numbers"
+            raise self.refuse(row, what, "Correct or remove that line.") from error
+        return table["words"], np.ascontiguousarray(table["values"])

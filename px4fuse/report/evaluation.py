@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Mapping
 from functools import cache
-from importlib import metadata
 from itertools import pairwise
-from textwrap import fill
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -19,7 +16,7 @@ from px4fuse.loop.analysis import SMALLEST_STAMP_S
 from px4fuse.report import style
 from px4fuse.report.page import WIDTH, Page, halves, legend_above
 from px4fuse.report.screen import show
-from px4fuse.report.style import EKF2, MUTED, OURS, TRUTH, report_style
+from px4fuse.report.style import EKF2, MUTED, OURS, TRUTH
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Frame, Trajectory
 from px4fuse.trajectory.scores import Interval, PairwiseError, Statistics
@@ -57,7 +54,6 @@ CURVES: tuple[dict[str, Any], ...] = (
     {"color": "#4f7fb5", "lw": 0.9, "ls": (0, (4, 1))},
     {"color": OURS, "lw": 1.1},
 )
-PICTURE_INCHES, PICTURE_DPI, PICTURE_LETTERS = (10.0, 5.4), 150, 115
 # Above this share of the squared error the worst tenth of the poses is what there is to look at
 FEW_DECIDE = 0.5
 # Quarters of a path differ if one is so many times the other
@@ -119,30 +115,6 @@ def draw(score: Evaluation) -> Iterator[Page]:
     _maps(page, score)
     _panels(page, score)
     yield page
-
-
-def picture(score: Evaluation) -> bytes:
-    """The path by error, APE over time and RPE per delta, as PNG for a slide or a notebook."""
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    with report_style():
-        figure = Figure(figsize=PICTURE_INCHES)
-        title = fill(summary(score), PICTURE_LETTERS)
-        figure.text(0.015, 0.985, title, size=9.5, weight="bold", va="top")
-        axes = figure.add_axes((0.06, 0.14, 0.40, 0.74), title="the path, by its error (APE)")
-        draw_path(axes, score, views(score)[0], figure.add_axes((0.475, 0.14, 0.012, 0.74)))
-        handles, labels = axes.get_legend_handles_labels()
-        figure.legend(handles, labels, loc="lower left", ncols=4, bbox_to_anchor=(0.02, 0.01))
-        axes = figure.add_axes((0.58, 0.60, 0.40, 0.28), title="APE over time (m)")
-        draw_ape(axes, score, score.time_s - zero_s(score), time_label(score))
-        axes.legend(loc="upper right", bbox_to_anchor=(1.01, -0.19), ncols=4, columnspacing=1.0,
-                    handlelength=1.9, borderaxespad=0.0)  # fmt: skip
-        title = "RPE per delta (m); diamond: RMSE"
-        _boxes(figure.add_axes((0.58, 0.14, 0.40, 0.28), title=title), score)
-        out = io.BytesIO()
-        software = f"px4fuse {metadata.version('px4fuse')}"
-        figure.savefig(out, format="png", dpi=PICTURE_DPI, metadata={"Software": software})
-    return out.getvalue()
 
 
 def _maps(page: Page, score: Evaluation) -> None:

@@ -93,11 +93,11 @@ def fit(estimate_m: Array, reference_m: Array, kind: AlignmentKind) -> Transform
         x, y = (m[:, 0] + 1j * m[:, 1] for m in (estimate_m, reference_m))
         heading = float(np.angle(np.vdot(x - x.mean(), y - y.mean())))
         transform = _transform(Rotation.from_euler("z", heading), estimate_m, reference_m, 1.0, 4)
-        _check_yaw(transform, estimate_m, reference_m)
+        _check(transform, estimate_m, reference_m, kind)
         return transform
     # the scale is left out of the question: a wrong one is no reason to doubt the turn
     free = umeyama(estimate_m, reference_m, with_scale=True)
-    _check_turn(free, estimate_m, reference_m, kind)
+    _check(free, estimate_m, reference_m, kind)
     return free if kind == "sim3" else umeyama(estimate_m, reference_m, with_scale=False)
 
 
@@ -143,39 +143,27 @@ def rms_m(difference_m: Array) -> float:
     return float(np.sqrt((difference_m * difference_m).sum(axis=1).mean()))
 
 
-def _check_yaw(transform: Transform, estimate_m: Array, reference_m: Array) -> None:
-    """Refuse a yaw that the horizontal motion does not determine."""
-    moved = min(float(np.hypot(*_spread(m[:, :2]))) for m in (estimate_m, reference_m))
-    left = rms_m((reference_m - transform.apply(estimate_m))[:, :2])
-    extent = float(np.linalg.norm(_spread(reference_m)))
-    if moved < max(MIN_SPREAD_M, MIN_SHARE * extent) or left > MAX_PLANE_RATIO * moved:
-        raise TrajectoryError(
-            f"The horizontal motion is {moved:.2g} m (RMS) and what an alignment leaves is "
-            f"{left:.2g} m: a yaw cannot be found from it",
-            "The vehicle did not move, or the "
-            "estimate does not follow; `alignment` none compares without turning.",
-        )
-
-
-def _check_turn(
-    transform: Transform, estimate_m: Array, reference_m: Array, kind: AlignmentKind
-) -> None:
+def _check(transform: Transform, estimate_m: Array, reference_m: Array, kind: str) -> None:
     """Refuse a turn that the motion does not determine.
 
-    The second singular value is the extent of the motion away from a line.
+    What determines a yaw is the horizontal motion; any other turn, the extent away from a line,
+    which is the second singular value.
     """
     spread, target = _spread(estimate_m), _spread(reference_m)
-    length, width, _ = np.minimum(transform.scale * spread, target)
-    left = rms_m(reference_m - transform.apply(estimate_m))
-    if min(length, spread[0]) < MIN_SPREAD_M:
+    if kind == "yaw":
+        told = min(float(np.hypot(*_spread(m[:, :2]))) for m in (estimate_m, reference_m))
+        left = rms_m((reference_m - transform.apply(estimate_m))[:, :2])
+        length, limit = float(np.linalg.norm(target)), MAX_PLANE_RATIO
+        motion, instead = "horizontal motion (RMS) is", "`alignment` none"
+    else:
+        length, told, _ = np.minimum(transform.scale * spread, target)
+        left = rms_m(reference_m - transform.apply(estimate_m))
+        limit = MAX_LINE_RATIO
+        motion = f"motion is along a line: {length:.2g} m (RMS) by"
+        instead = "`alignment` yaw if z is vertical in both, or `alignment` none"
+    if told < max(MIN_SPREAD_M, MIN_SHARE * length) or left > limit * told:
         raise TrajectoryError(
-            f"One of the two does not move, so {kind} cannot be found from it",
-            "`alignment` none compares without turning.",
-        )
-    if width < MIN_SHARE * length or left > MAX_LINE_RATIO * width:
-        raise TrajectoryError(
-            f"The motion is along a line: {length:.2g} m (RMS) by {width:.2g} m across it, where "
-            f"an alignment leaves {left:.2g} m, so the turn about that line and with it {kind} "
-            f"cannot be found",
-            "Use `alignment` yaw if z is vertical in both, or `alignment` none.",
+            f"The {motion} {told:.2g} m, where an alignment leaves {left:.2g} m, so {kind} cannot "
+            "be found",
+            f"The vehicle did not move enough, or the estimate does not follow; use {instead}.",
         )

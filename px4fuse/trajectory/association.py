@@ -122,8 +122,7 @@ def bracketed(time_s: Array, reference_s: Array, limit: float) -> BoolArray:
     right = np.clip(np.searchsorted(reference_s, time_s), 1, len(reference_s) - 1)
     before, after = reference_s[right - 1], reference_s[right]
     between = (before <= time_s) & (time_s <= after) & (after - before <= limit)
-    bracketed: BoolArray = between | (before == time_s) | (after == time_s)
-    return bracketed
+    return np.asarray(between | (before == time_s) | (after == time_s))
 
 
 def _at(trajectory: Trajectory, time_s: Array) -> Trajectory:
@@ -136,12 +135,8 @@ def _at(trajectory: Trajectory, time_s: Array) -> Trajectory:
 
 def positions_at(trajectory: Trajectory, time_s: Array) -> Array:
     """Positions at times within its span, shape (n, 3)."""
-    known = trajectory.time_s
-    right = np.clip(np.searchsorted(known, time_s), 1, len(known) - 1)
-    share = (time_s - known[right - 1]) / (known[right] - known[right - 1])
-    before, after = trajectory.position_m[right - 1], trajectory.position_m[right]
-    between: Array = before + share[:, None] * (after - before)
-    return between
+    columns = trajectory.position_m.T
+    return np.stack([np.interp(time_s, trajectory.time_s, one) for one in columns], axis=-1)
 
 
 def _nearest(

@@ -44,25 +44,20 @@ def moments(a: Series, b: Series, a_known: BoolArray, b_known: BoolArray) -> Mom
     a_known, b_known : ndarray of bool, shapes (n,) and (m,)
         At least one sample of each.
     """
-
-    def over(x: Array | Complex, y: Array | Complex) -> Complex:
-        """Σ conj(x) y over the overlap."""
-        return _correlated(y, x)
-
     # about their means, else roundings matter
     a, b = (
         np.where(known, values - np.mean(values[known]), 0.0)
         for values, known in ((a, a_known), (b, b_known))
     )
     m, n = a_known.astype(float), b_known.astype(float)
-    count = np.rint(over(m, n).real)
+    count = np.rint(_correlated(n, m).real)
     weight = 1.0 / np.maximum(count, 1.0)
-    sum_a, sum_b = over(a, n), over(m, b)  # the first conjugate
+    sum_a, sum_b = _correlated(n, a), _correlated(b, m)  # the first conjugate
     return Moments(
         count,
-        over(a, b) - sum_a * sum_b * weight,
-        over(np.abs(a) ** 2, n).real - np.abs(sum_a) ** 2 * weight,
-        over(m, np.abs(b) ** 2).real - np.abs(sum_b) ** 2 * weight,
+        _correlated(b, a) - sum_a * sum_b * weight,
+        _correlated(n, np.abs(a) ** 2).real - np.abs(sum_a) ** 2 * weight,
+        _correlated(np.abs(b) ** 2, m).real - np.abs(sum_b) ** 2 * weight,
     )
 
 

@@ -175,7 +175,7 @@ def evaluate(
     error = np.linalg.norm(aligned.position_m - y.position_m, axis=1)
     both = rotations_of(aligned, y, "ATE of the rotation")
     rotation_error: Array | None = None
-    rotation: Statistics | Unavailable
+    rotation: Maybe[Statistics]
     if isinstance(both, Unavailable):
         rotation = both
     else:
@@ -245,13 +245,16 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     if free:
         made = "comes from SLAM, whose world is its first key frame"
         why = f"as {free[0].name} {made if free[0].kind == 'slam' else 'does not say what made it'}"
-    name = next((one.name for one in (estimate, reference) if _MONO.search(one.name)), "")
-    if not free or (not name and abs(scale - 1.0) <= MAX_SCALE_ERROR):
+    because = [
+        f"{one.name} says that it is monocular"
+        for one in (estimate, reference)
+        if _MONO.search(one.name)
+    ]
+    if abs(scale - 1.0) > MAX_SCALE_ERROR:
+        because.append(f"the scale is {scale:.3g}, more than {MAX_SCALE_ERROR:.0%} off")
+    if not free or not because:
         return "se3", f"Rotation and position (6 DoF), {why}."
-    because = f"the scale is {scale:.3g}, more than {MAX_SCALE_ERROR:.0%} off"
-    if name:
-        because = f"{name} says that it is monocular"
-    return "sim3", f"Rotation, position and scale (7 DoF), {why}, and {because}."
+    return "sim3", f"Rotation, position and scale (7 DoF), {why}, and {because[0]}."
 
 
 def _time_offset(
@@ -290,16 +293,12 @@ def _swapped(estimate: Trajectory, reference: Trajectory) -> list[str]:
     if reference.kind == "truth" != estimate.kind:
         return []
     step, other_step = (float(np.median(np.diff(one.time_s))) for one in (estimate, reference))
-    span, other_span = (float(np.ptp(one.time_s)) for one in (estimate, reference))
     signs = {
         f"{estimate.name} is ground truth and {reference.name} is not": (
             estimate.kind == "truth" != reference.kind
         ),
         f"The reference has one pose in {other_step:.3g} s, the estimate one in {step:.3g} s": (
             other_step > MAX_SPARSER * step
-        ),
-        f"The reference lasts {other_span:.1f} s, the estimate {span:.1f} s": (
-            other_span < MIN_COVERAGE * span
         ),
     }
     swap = "Are the two interchanged? The estimate comes first."

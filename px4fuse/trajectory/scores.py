@@ -163,7 +163,6 @@ def pairs(
     delta: Delta,
     *,
     all_pairs: bool = True,
-    relative_tolerance: float = RELATIVE_TOLERANCE,
 ) -> tuple[IntArray, IntArray]:
     """Pairs of poses that are a delta apart.
 
@@ -174,10 +173,8 @@ def pairs(
     delta : Delta
         A distance is one along the path.
     all_pairs : bool
-        From every pose to the one whose distance from it is nearest to the delta, if within the
-        tolerance; else from the end of each pair to the first pose that is at least a delta on.
-    relative_tolerance : float
-        Of the delta.
+        From every pose to the one whose distance from it is nearest to the delta, if within a tenth
+        of it; else from the end of each pair to the first pose that is at least a delta on.
 
     Returns
     -------
@@ -208,7 +205,7 @@ def pairs(
     best = np.argmin(miss, axis=1)
     # of poses at rest, all equally far, the first
     first = np.searchsorted(along, along[near[start, best]])
-    kept = miss[start, best] <= relative_tolerance * delta.value
+    kept = miss[start, best] <= RELATIVE_TOLERANCE * delta.value
     return start[kept], np.maximum(first, start + 1)[kept]
 
 

@@ -53,7 +53,6 @@ from px4fuse.grading import sheets  # noqa: E402
 from px4fuse.grading.overrides import read_overrides  # noqa: E402
 from px4fuse.grading.rubric import read_rubric, rubric_text  # noqa: E402
 from px4fuse.readers import read_log  # noqa: E402
-from px4fuse.readers.closures import read_closures  # noqa: E402
 from px4fuse.readers.g2o import read_g2o  # noqa: E402
 from px4fuse.readers.position_csv import read_position_csv  # noqa: E402
 from px4fuse.readers.trajectory import read_trajectory  # noqa: E402
@@ -219,10 +218,6 @@ TARGETS = (
     Target("position file", _text(*_POSITIONS), read_position_csv, ".csv", True, 900, 5.0),
     Target("g2o", _text(_GRAPH_2D, _GRAPH_3D), read_g2o, ".g2o", True, 1800, 20.0),
     Target("pose graph", _text(_GRAPH_2D, _GRAPH_3D), _graph, ".g2o", True, 180, 2.0),
-    Target(
-        "closures", _text("# of the corridor\n0.5,12.25,0.1\n5,10\n"), read_closures, ".txt",
-        True, 600, 10.0,
-    ),
     Target(
         "answers", lambda: [answers.form_text("a.ulg", "0" * 64).encode()], answers.read_answers,
         ".toml", True, 900, 8.0,

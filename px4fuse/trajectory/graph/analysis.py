@@ -12,7 +12,7 @@ from px4fuse.flight import Unavailable
 from px4fuse.record import Count, Record
 from px4fuse.trajectory.graph.covariance import GateResult, gate
 from px4fuse.trajectory.graph.model import PoseGraph
-from px4fuse.trajectory.graph.solver import GraphSolution, Solution, solve
+from px4fuse.trajectory.graph.solver import GraphSolution, Robust, Solution, solve
 
 MANY_CLOSURES = 1000
 # What the solutions of the pose graph are called
@@ -22,6 +22,8 @@ SOLUTIONS: Mapping[str, str] = {
     "dcs": "pose graph, DCS",
     "gnc": "pose graph, GNC",
 }
+# and those of them that doubt closures
+ROBUST: Mapping[str, Robust] = {"dcs": "dcs", "gnc": "gnc"}
 
 
 class Graph(Record, frozen=True, kw_only=True):
@@ -95,9 +97,9 @@ def analyse_graph(
         gates = Unavailable("gate", str(error), "It needs an odometry edge between all successors.")
     count = int(np.count_nonzero(closures))
     if count > 1 and (count <= MANY_CLOSURES if robust is None else robust):
-        for key in ("dcs", "gnc"):
+        for key, method in ROBUST.items():
             progress(f"solving: {SOLUTIONS[key]}")
-            solutions[key] = solve(graph, robust="dcs" if key == "dcs" else "gnc", loops=closures)
+            solutions[key] = solve(graph, robust=method, loops=closures)
     return SolvedGraph(
         name=name,
         dimension=graph.dimension,

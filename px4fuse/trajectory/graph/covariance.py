@@ -80,10 +80,21 @@ def gate(graph: PoseGraph, edge_indices: Sequence[int] | IntArray) -> list[GateR
     tested = np.asarray(edge_indices, dtype=np.intp)
     if not len(tested):
         return []
-    chain = odometry_chain(graph, np.setdiff1d(np.arange(len(graph.first)), tested))
+    chain = odometry_chain(graph, tested)
     a, b = graph.first[tested], graph.second[tested]
     low, high = int(min(a.min(), b.min())), int(max(a.max(), b.max()))
-    worlds, poses = _dead_reckoning(graph, low, high, chain)
+    used = chain[low:high]
+    gap = np.flatnonzero(used < 0)
+    if len(gap):
+        at = low + int(gap[0])
+        raise TrajectoryError(
+            f"No odometry edge joins vertices {graph.ids[at]} and {graph.ids[at + 1]}, so odometry "
+            "alone does not tell how well the closure fits",
+            "Add the edge, or test shorter closures.",
+        )
+    poses = lie.chain(odometry_steps(graph, used))
+    carry = lie.adjoint(poses[1:])
+    worlds = carry @ _covariances(graph, used) @ carry.transpose(0, 2, 1)  # in the axes of low
     total = np.concatenate([np.zeros((1, *worlds.shape[1:])), np.cumsum(worlds, axis=0)])
     span = total[np.maximum(a, b) - low] - total[np.minimum(a, b) - low]
     to_end = lie.adjoint(lie.inverse(poses[b - low]))
@@ -102,40 +113,18 @@ def _tested(graph: PoseGraph, edge: int, residual: Array, covariance: Array) -> 
     ends = int(graph.ids[graph.first[edge]]), int(graph.ids[graph.second[edge]])
     directions, variance = observed_directions(graph.information[edge])
     freedom = len(variance)
-    if not freedom:
-        raise TrajectoryError(
-            f"The closure from vertex {ends[0]} to {ends[1]} has no information",
-            "Give its inverse covariance.",
-        )
     seen = directions.T @ residual
     spread = directions.T @ covariance @ directions + np.diag(variance)
-    is_finite = bool(np.isfinite(spread).all())
-    if not is_finite or np.linalg.eigvalsh(unit_diagonal(spread)[1])[0] <= _SINGULAR:
+    known = freedom and np.isfinite(spread).all()
+    if not known or np.linalg.eigvalsh(unit_diagonal(spread)[1])[0] <= _SINGULAR:
         raise TrajectoryError(
-            f"Odometry between vertices {ends[0]} and {ends[1]} is too uncertain to test the "
-            "closure with the digits that numbers have",
-            "Give its edges information that is closer to the closure's.",
+            f"The closure from vertex {ends[0]} to {ends[1]} cannot be tested: it has no "
+            "information, or odometry is too uncertain for the digits that numbers have",
+            "Give the closure's inverse covariance, and odometry information closer to it.",
         )
     d2 = float(seen @ np.linalg.solve(spread, seen))
     p = float(chdtrc(freedom, d2))
     return GateResult(*ends, d2, freedom, p, p >= GATE_ALPHA)
-
-
-def _dead_reckoning(graph: PoseGraph, low: int, high: int, chain: IntArray) -> tuple[Array, Array]:
-    """Covariances of the steps in the axes of pose ``low``, and poses as seen from it."""
-    used = chain[low:high]
-    gap = np.flatnonzero(used < 0)
-    if len(gap):
-        at = low + int(gap[0])
-        raise TrajectoryError(
-            f"No odometry edge joins vertices {graph.ids[at]} and {graph.ids[at + 1]}, so odometry "
-            "alone does not tell how well the closure fits",
-            "Add the edge, or test shorter closures.",
-        )
-    covariance = _covariances(graph, used)
-    poses = lie.chain(odometry_steps(graph, used))
-    carry = lie.adjoint(poses[1:])
-    return carry @ covariance @ carry.transpose(0, 2, 1), poses
 
 
 def _covariances(graph: PoseGraph, used: IntArray) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array
@@ -15,6 +16,7 @@ from px4fuse.trajectory.graph.model import (
     PoseGraph,
     composed,
     cost,
+    odometry_chain,
     require_connected,
 )
 from px4fuse.trajectory.graph.system import BlockSystem
@@ -23,10 +25,10 @@ from px4fuse.trajectory.graph.system import BlockSystem
 def initialise(graph: PoseGraph) -> PoseGraph:
     """Poses from the edges alone, except the first, which stays.
 
-    Two starts are made, and the one of lower cost is taken: the edges composed one after the
-    other, and chordal initialisation (Carlone et al. 2015, Initialization techniques for 3D SLAM,
-    section IV-C): rotations by linear least squares without the constraint that they are rotations,
-    projected on rotations, then translations by linear least squares.
+    Chordal initialisation (Carlone et al. 2015, Initialization techniques for 3D SLAM, section
+    IV-C): rotations by linear least squares without the constraint that they are rotations,
+    projected on rotations, then translations by linear least squares. Where odometry leads from
+    the first pose to the last, its composed edges are taken if their cost is lower.
 
     Parameters
     ----------
@@ -41,23 +43,24 @@ def initialise(graph: PoseGraph) -> PoseGraph:
     Raises
     ------
     TrajectoryError
-        If the graph falls into parts.
+        If the graph falls into parts, or its edges do not determine its poses.
     """
+    if np.any(odometry_chain(graph) < 0):
+        return _chordal(graph)
     started = composed(graph)
     try:
-        chordal = _chordal(graph)
-    except TrajectoryError:  # rotations that only odometry or nothing tells
+        return min(started, _chordal(graph), key=cost)
+    except TrajectoryError:  # rotations that only odometry tells
         return started
-    return min(started, chordal, key=cost) if chordal is not None else started
 
 
-def _chordal(graph: PoseGraph) -> PoseGraph | None:
-    """Chordal initialisation; None where the linear systems are singular.
+def _chordal(graph: PoseGraph) -> PoseGraph:
+    """Chordal initialisation.
 
     Raises
     ------
     TrajectoryError
-        If the edges that tell a rotation do not join all poses.
+        If the edges that tell a rotation do not join all poses, or poses are not determined.
     """
     d = graph.dimension
     spin = np.trace(graph.information[:, d:, d:], axis1=1, axis2=2)
@@ -74,9 +77,7 @@ def _chordal(graph: PoseGraph) -> PoseGraph | None:
         np.where(held[1][:, None, None], weighted.transpose(0, 2, 1) @ first.T, 0.0),
         np.where(held[0][:, None, None], weighted @ first.T, 0.0),
     )
-    relaxed = system.solve(system.matrix(own, own, -weighted.transpose(0, 2, 1)), right)
-    if relaxed is None:
-        return None
+    relaxed = _solved(system, system.matrix(own, own, -weighted.transpose(0, 2, 1)), right)
     relaxed[0] = first.T
     rotation = _nearest_rotations(relaxed.transpose(0, 2, 1))
     # Residual of an edge in the axes of the measured pose: (R_i Z)' (t_j - t_i - R_i z)
@@ -89,9 +90,7 @@ def _chordal(graph: PoseGraph) -> PoseGraph | None:
         (np.where(held[1][:, None, None], start, 0.0) - pull)[..., 0],
         (np.where(held[0][:, None, None], start, 0.0) + pull)[..., 0],
     )
-    position = system.solve(system.matrix(information, information, -information), system_right)
-    if position is None:
-        return None
+    position = _solved(system, system.matrix(information, information, -information), system_right)
     position[0] = graph.poses[0, :d]
     if d == 2:
         heading = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
@@ -100,6 +99,13 @@ def _chordal(graph: PoseGraph) -> PoseGraph | None:
         poses = np.column_stack([position, Rotation.from_matrix(rotation).as_quat()])
     poses[0] = graph.poses[0]
     return replace(graph, poses=poses, initialised=FROM_CHORDAL)
+
+
+def _solved(system: BlockSystem, matrix: sparse.csc_array[np.float64], right: Array) -> Array:
+    solution = system.solve(matrix, right)
+    if solution is None:
+        raise TrajectoryError("The edges do not determine where to start", "Give VERTEX lines.")
+    return solution
 
 
 def _nearest_rotations(matrices: Array) -> Array:

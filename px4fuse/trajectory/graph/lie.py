@@ -13,14 +13,14 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.polynomial.polynomial import polyval
+from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array
-from px4fuse.trajectory.rotation import from_elements, from_vector, matrix, skew
+from px4fuse.trajectory.rotation import from_elements, skew
 
 # Below this angle (rad) series replace quotients that cancel; five terms then reach 1e-14
 SMALL = 0.3
 _B = (1 / 6, -1 / 120, 1 / 5040, -1 / 362880, 1 / 39916800)
-
 _C = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
 _C_SLOPE = (1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520, 691 / 130767436800)
 
@@ -55,7 +55,7 @@ def rotation_matrix(pose: Array) -> Array:
     if pose.shape[-1] == 3:
         c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
         return from_elements((c, -s), (s, c))
-    return matrix(pose[..., (6, 3, 4, 5)])
+    return _turn(pose).as_matrix()
 
 
 def identity(width: int) -> Array:
@@ -86,9 +86,9 @@ def compose(a: Array, b: Array) -> Array:
         made[..., 1] = a[..., 1] + s * b[..., 0] + c * b[..., 1]
         made[..., 2] = a[..., 2] + b[..., 2]
         return made
-    made[..., :3] = a[..., :3] + _rotate(a[..., 3:], b[..., :3])
-    quaternion = _multiply(a[..., 3:], b[..., 3:])
-    made[..., 3:] = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    turn = _turn(a)
+    made[..., :3] = a[..., :3] + turn.apply(b[..., :3])
+    made[..., 3:] = (turn * _turn(b)).as_quat()
     return made
 
 
@@ -106,9 +106,9 @@ def between(a: Array, b: Array) -> Array:
         made[..., 0], made[..., 1] = c * x + s * y, c * y - s * x
         made[..., 2] = b[..., 2] - a[..., 2]
         return made
-    back = a[..., 3:] * np.array([-1.0, -1.0, -1.0, 1.0])
-    made[..., :3] = _rotate(back, b[..., :3] - a[..., :3])
-    made[..., 3:] = _multiply(back, b[..., 3:])
+    back = _turn(a).inv()
+    made[..., :3] = back.apply(b[..., :3] - a[..., :3])
+    made[..., 3:] = (back * _turn(b)).as_quat()
     return made
 
 
@@ -123,7 +123,7 @@ def exp(tangent: Array) -> Array:
     theta = np.linalg.norm(phi, axis=-1)[..., None]
     turned = cross(phi, rho)
     position = rho + _a(theta) * turned + _b(theta) * cross(phi, turned)
-    return np.concatenate([position, from_vector(phi)[..., (1, 2, 3, 0)]], axis=-1)
+    return np.concatenate([position, Rotation.from_rotvec(phi).as_quat()], axis=-1)
 
 
 def log(pose: Array) -> Array:
@@ -139,19 +139,11 @@ def log(pose: Array) -> Array:
         x, y, half = pose[..., 0], pose[..., 1], 0.5 * theta
         cotangent = 1.0 - theta * theta * _c(np.abs(theta))
         return np.stack([cotangent * x + half * y, cotangent * y - half * x, theta], axis=-1)
-    made = np.empty((*pose.shape[:-1], 6))
-    position, vector = pose[..., :3], pose[..., 3:6]
-    w = pose[..., 6:]
-    sine = np.linalg.norm(vector, axis=-1)[..., None]
-    # The arctangent, unlike the arccosine, is exact near 0 and near pi
-    half_angle = np.arctan2(sine, np.abs(w))
-    tiny = sine < 1e-9
-    scale = np.where(tiny, 2.0, 2.0 * half_angle / np.where(tiny, 1.0, sine))
-    phi = np.where(w < 0.0, -scale, scale) * vector
+    position, phi = pose[..., :3], _turn(pose).as_rotvec()
     turned = cross(phi, position)
-    made[..., 3:] = phi
-    made[..., :3] = position - 0.5 * turned + _c(2.0 * half_angle) * cross(phi, turned)
-    return made
+    theta = np.linalg.norm(phi, axis=-1)[..., None]
+    rho = position - 0.5 * turned + _c(theta) * cross(phi, turned)
+    return np.concatenate([rho, phi], axis=-1)
 
 
 def adjoint(pose: Array) -> Array:
@@ -231,23 +223,13 @@ def chain(steps: Array) -> Array:
     return made
 
 
+def _turn(pose: Array) -> Rotation:
+    """Rotation of poses in space."""
+    return Rotation.from_quat(pose[..., 3:])
+
+
 def _outer(a: Array, b: Array) -> Array:
     made: Array = a[..., :, None] * b[..., None, :]
-    return made
-
-
-def _rotate(quaternion: Array, vector: Array) -> Array:
-    axis = quaternion[..., :3]
-    twice = 2.0 * cross(axis, vector)
-    made: Array = vector + quaternion[..., 3:] * twice + cross(axis, twice)
-    return made
-
-
-def _multiply(a: Array, b: Array) -> Array:
-    made = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    u, v, s, t = a[..., :3], b[..., :3], a[..., 3:], b[..., 3:]
-    made[..., :3] = s * v + t * u + cross(u, v)
-    made[..., 3] = a[..., 3] * b[..., 3] - np.sum(u * v, axis=-1)
     return made
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.sparse.csgraph import connected_components
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
@@ -60,10 +60,10 @@ class PoseGraph:
     def __len__(self) -> int:
         return len(self.ids)
 
-    @property
-    def width(self) -> int:
-        """Numbers of a pose: 3 in the plane, 7 in space."""
-        return 3 if self.dimension == 2 else 7
+    def of_edges(self, chosen: BoolArray) -> PoseGraph:
+        """The graph with some of its edges, shape (m,)."""
+        edges = ("first", "second", "measurements", "information")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in edges})
 
     @property
     def freedom(self) -> int:
@@ -165,7 +165,7 @@ def require_connected(graph: PoseGraph, used: BoolArray, what: str) -> None:
     Parameters
     ----------
     used : ndarray of bool, shape (m,)
-        The edges that may hold it together.
+        The edges that may hold it together, where they tell anything at all.
     what : str
         Their name, for the message: "the edges".
 
@@ -176,7 +176,10 @@ def require_connected(graph: PoseGraph, used: BoolArray, what: str) -> None:
     """
     if not len(graph.first):
         raise TrajectoryError("The pose graph has no edges", "Give a file with EDGE lines.")
-    parts, part = connected_components(_links(graph, used), directed=False)
+    tells = used & (np.trace(graph.information, axis1=1, axis2=2) > 0.0)
+    ends, n = (graph.first[tells], graph.second[tells]), len(graph)
+    links = sparse.coo_array((np.ones(len(ends[0])), ends), shape=(n, n))
+    parts, part = connected_components(links, directed=False)
     if parts > 1:
         apart = graph.ids[np.flatnonzero(part != part[0])[0]]
         raise TrajectoryError(
@@ -187,59 +190,27 @@ def require_connected(graph: PoseGraph, used: BoolArray, what: str) -> None:
 
 
 def composed(graph: PoseGraph) -> PoseGraph:
-    """The same graph with poses along its edges, from the first pose on.
-
-    Takes the edges between successive poses where they lead from the first pose to the last, and
-    the shortest ways through all edges otherwise.
-
-    Raises
-    ------
-    TrajectoryError
-        If the graph falls into parts.
-    """
-    n = len(graph)
-    chain = odometry_chain(graph)
-    if np.all(chain >= 0):
-        steps = odometry_steps(graph, chain)
-        poses = lie.compose(graph.poses[:1], lie.chain(steps))
-        return replace(graph, poses=poses, initialised=FROM_ODOMETRY)
-    require_connected(graph, np.ones(len(graph.first), dtype=bool), "the edges")
-    links = _links(graph, np.ones(len(graph.first), dtype=bool))
-    _, parent = breadth_first_order(links, 0, directed=False)
-    parent[0] = 0
-    steps = np.empty((n, graph.width))
-    steps[0] = graph.poses[0]
-    # Of several edges between the same two poses the last one stays: any will do for a start
-    for a, b, measured in (
-        (graph.first, graph.second, graph.measurements),
-        (graph.second, graph.first, lie.inverse(graph.measurements)),
-    ):
-        down = parent[b] == a
-        steps[b[down]] = measured[down]
-    # Every pass doubles how far each pose sees towards the first one
-    while np.any(parent):
-        far = parent != 0
-        steps[far] = lie.compose(steps[parent[far]], steps[far])
-        parent = np.where(far, parent[parent], 0)
-    steps[1:] = lie.compose(steps[:1], steps[1:])
-    return replace(graph, poses=steps, initialised="edges composed along the shortest ways")
+    """The same graph with poses along its odometry, which has no gap, from the first pose on."""
+    steps = odometry_steps(graph, odometry_chain(graph))
+    poses = lie.compose(graph.poses[:1], lie.chain(steps))
+    return replace(graph, poses=poses, initialised=FROM_ODOMETRY)
 
 
-def odometry_chain(graph: PoseGraph, edges: IntArray | None = None) -> IntArray:
+def odometry_chain(graph: PoseGraph, without: IntArray | None = None) -> IntArray:
     """The edge that leads from each pose to the next, -1 where there is none.
 
     Parameters
     ----------
-    edges : ndarray of int, optional
-        Those that may be used; all by default. The first one between two poses is taken.
+    without : ndarray of int, optional
+        Edges that may not be used. The first one between two poses is taken.
 
     Returns
     -------
     ndarray of int, shape (n - 1,)
     """
     among = np.flatnonzero(graph.successive)
-    if edges is not None:
-        among = among[np.isin(among, edges)]
+    if without is not None:
+        among = np.setdiff1d(among, without)
     made = np.full(len(graph) - 1, -1, dtype=np.intp)
     # Backwards, so that of several edges the first one is what stays
     among = among[::-1]
@@ -263,11 +234,3 @@ def odometry_steps(graph: PoseGraph, chain: IntArray) -> Array:
     back = graph.first[chain] > graph.second[chain]
     steps[back] = lie.inverse(steps[back])
     return steps
-
-
-def _links(graph: PoseGraph, used: BoolArray) -> sparse.csr_array[np.float64]:
-    """Adjacency of poses by edges that tell anything at all."""
-    tells = used & (np.trace(graph.information, axis1=1, axis2=2) > 0.0)
-    i, j = graph.first[tells], graph.second[tells]
-    n = len(graph)
-    return sparse.coo_array((np.ones(len(i)), (i, j)), shape=(n, n)).tocsr()

@@ -222,10 +222,8 @@ class _GraphProblem:
     ) -> tuple[Residuals | None, float]:
         """Where a damped step leads, and how much it lowers the linearised cost."""
         step = self._system.solve(matrix, -gradient, damping)
-        if step is None:
-            return None, 0.0
-        promised = 0.5 * float(np.sum(step * (damping * step - gradient)))
-        if promised < 0.0:
+        promised = 0.0 if step is None else 0.5 * float(np.sum(step * (damping * step - gradient)))
+        if step is None or promised < 0.0:
             return None, 0.0
         return residuals(self.graph, lie.compose(state.poses, lie.exp(step))), promised
 
