@@ -400,15 +400,6 @@ def test_a_given_offset_is_used_and_warned_of_where_it_is_wrong(flight: Flight) 
     assert_same_track(track, flight.positions[0], 0.1)
 
 
-def test_a_flight_that_is_nearly_a_point_leaves_the_yaw_open() -> None:
-    flight = flight_along(length_m=0.6, duration_s=25.0)
-    alignment, _ = placed(
-        flight, recorded(flight), frame="enu", yaw_deg="auto", clock_offset_s=OFFSET_S
-    )  # fmt: skip
-    assert alignment.yaw_sigma_deg > 2.0
-    assert any("yaw is poorly determined" in warning for warning in alignment.warnings)
-
-
 # -- what real files are like ----------------------------------------------------------------------
 
 

@@ -396,15 +396,6 @@ def test_positions_without_a_number_and_variances_of_zero(read):
 # ---- EKF2's state and variances -----------------------------------------------------------------
 
 
-def test_local_position_with_covariance_gives_state_and_variances(read):
-    aisle = Aisle(state="LOCAL_POSITION_NED_COV")
-    flight = read(aisle)
-    expected = np.array([np.hstack(aisle.path(t)[:2]) for t in aisle.times(20.0)])
-    np.testing.assert_allclose(flight.ekf2.state[STATE_COLUMNS], expected, atol=1e-5)
-    variances = np.tile([*POSE_VARIANCE, *VELOCITY_VARIANCE], (800, 1))
-    np.testing.assert_allclose(flight.ekf2.variance[VARIANCE_COLUMNS], variances, rtol=1e-6)
-
-
 @pytest.mark.parametrize("state", ["LOCAL_POSITION_NED", "ODOMETRY"])
 def test_estimator_status_stands_in_for_variances(read, state):
     """Its horizontal accuracy is the root of the sum over both axes."""
@@ -463,15 +454,10 @@ def simulated(name: str, aisle: Aisle, boot_s: float):
     if name == "HIL_STATE_QUATERNION":
         speed = dict(zip(("vx", "vy", "vz"), (round(x * 100) for x in v), strict=True))
         return message(name, alt=round(height * 1e3), **as_integer, **speed)
-    if name == "SIMSTATE":
-        return message(name, lat=as_integer["lat"], lng=as_integer["lon"])
-    return message(
-        "SIM_STATE", lat=latitude, lon=longitude, lat_int=as_integer["lat"],
-        lon_int=as_integer["lon"], alt=height, vn=v[0], ve=v[1], vd=v[2],
-    )  # fmt: skip
+    return message(name, lat=as_integer["lat"], lng=as_integer["lon"])
 
 
-@pytest.mark.parametrize("name", ["HIL_STATE_QUATERNION", "SIM_STATE", "SIMSTATE"])
+@pytest.mark.parametrize("name", ["HIL_STATE_QUATERNION", "SIMSTATE"])
 def test_simulation_truth_is_projected_about_its_first_sample(read, name):
     """At the time of receipt, since its own stamp is 0 in PX4."""
     aisle = Aisle(asks=True)
@@ -819,9 +805,9 @@ WIRE = {
 }  # fmt: skip
 READ = [
     "HEARTBEAT", "HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "ATTITUDE", "ATTITUDE_QUATERNION",
-    "ODOMETRY", "LOCAL_POSITION_NED", "LOCAL_POSITION_NED_COV", "ESTIMATOR_STATUS", "TIMESYNC",
+    "ODOMETRY", "LOCAL_POSITION_NED", "ESTIMATOR_STATUS", "TIMESYNC",
     "SYSTEM_TIME", "VISION_POSITION_ESTIMATE", "ATT_POS_MOCAP", "EXTENDED_SYS_STATE",
-    "PARAM_VALUE", "AUTOPILOT_VERSION", "HIL_STATE_QUATERNION", "SIM_STATE", "SIMSTATE", "RAW_IMU",
+    "PARAM_VALUE", "AUTOPILOT_VERSION", "HIL_STATE_QUATERNION", "SIMSTATE", "RAW_IMU",
 ]  # fmt: skip
 SENDERS = [(1, 1), (1, 1), (1, 1), (1, 197), (2, 1), (255, 190)]
 

@@ -253,23 +253,6 @@ def test_unknown_ids_are_counted_and_cost_nothing_else(read):
         assert frames.bad_bytes == 0
 
 
-@pytest.mark.parametrize("with_stamps", [True, False])
-def test_frames_of_another_dialect_are_counted_and_are_no_damage(read, with_stamps):
-    """Another definition of a message has another checksum seed (CRC_EXTRA)."""
-    number = 30  # ATTITUDE
-    foreign = [
-        raw_frame(number, bytes([i] * 28), seed=7, sequence=i % 256, v1=i % 2 == 0)
-        for i in range(40)
-    ]
-    parts = beats(20)
-    for i in range(0, 20, 2):
-        parts[i:i] = foreign[2 * i : 2 * i + 4]
-    frames = read(stamped(*parts) if with_stamps else b"".join(parts))
-    assert names(frames) == ["HEARTBEAT"] * 20
-    assert dict(frames.passed_over) == {number: 40}
-    assert frames.bad_bytes == 0
-
-
 def test_frames_of_a_known_message_that_were_changed_on_the_way_are_damage(read):
     beat = beats(10)
     beat[4] = beat[4][:-1] + bytes([beat[4][-1] ^ 1])
@@ -306,7 +289,7 @@ def test_a_recording_that_is_cut_off_says_so(tmp_path, stamped: bool, missing: i
     assert [text.startswith(wanted) for text in log.damage] == [True] * (missing > 0)
 
 
-@pytest.mark.parametrize("behind", [b"\x00" * 50, raw_frame(60_000, b"abcdefg", seed=7)])
+@pytest.mark.parametrize("behind", [b"\x00" * 50, raw_frame(40_000, b"abcdefg", seed=7)])
 def test_what_follows_the_last_frame_is_not_always_the_next(read, behind: bytes):
     """Rubbish, and a whole frame of a dialect that is not known here."""
     assert not read(b"".join(beats(6)) + behind).in_frame
@@ -552,7 +535,6 @@ def test_shortest_frames_of_random_senders_cost_a_bounded_amount_each(tmp_path, 
     [
         ("ODOMETRY", AUTOPILOT),
         ("ODOMETRY", COMPANION),
-        ("LOCAL_POSITION_NED_COV", AUTOPILOT),
         ("VISION_POSITION_ESTIMATE", COMPANION),
         ("PARAM_VALUE", AUTOPILOT),
     ],

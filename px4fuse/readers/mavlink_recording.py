@@ -324,8 +324,7 @@ def _frame_notes(frames: Frames, back: int) -> list[str]:
             for number, count in sorted(frames.passed_over.items())
         )
         notes.append(
-            "whole frames of messages that px4fuse does not know, or knows with other checksums, "
-            f"were passed over: {listed}"
+            f"whole frames of messages that px4fuse does not know were passed over: {listed}"
         )
     if frames.bad_stamps:
         notes.append(f"{frames.bad_stamps} times of receipt are damaged and were interpolated")

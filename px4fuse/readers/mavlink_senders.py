@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,22 +42,22 @@ def _vehicles(frames: Frames) -> dict[Address, tuple[int, int]]:
     """Type and autopilot that each sender gave in its first heartbeat."""
     rows = frames.rows("HEARTBEAT")
     beats = frames.table("HEARTBEAT", rows)
-    address = frames.system[rows].astype(np.int64) << 8 | frames.component[rows]
-    first = np.unique(address, return_index=True)[1]
-    given = zip(beats["type"][first].tolist(), beats["autopilot"][first].tolist(), strict=True)
-    return dict(zip(_addresses(address[first]), given, strict=True))
+    given = zip(beats["type"].tolist(), beats["autopilot"].tolist(), strict=True)
+    found: dict[Address, tuple[int, int]] = {}
+    for address, said in zip(_addresses(frames, rows), given, strict=True):
+        found.setdefault(address, said)
+    return found
+
+
+def _addresses(frames: Frames, rows: IntArray | slice) -> Iterator[Address]:
+    """Sender of each frame."""
+    return zip(frames.system[rows].tolist(), frames.component[rows].tolist(), strict=True)
 
 
 def _counts(frames: Frames, rows: IntArray | slice = slice(None)) -> list[tuple[Address, int]]:
     """Senders of frames and how many each sent, most first."""
-    address = frames.system[rows].astype(np.int64) << 8 | frames.component[rows]
-    numbers, counts = np.unique(address, return_counts=True)
-    most = np.argsort(-counts, kind="stable")
-    return list(zip(_addresses(numbers[most]), counts[most].tolist(), strict=True))
-
-
-def _addresses(numbers: IntArray) -> list[Address]:
-    return list(zip((numbers >> 8).tolist(), (numbers & 0xFF).tolist(), strict=True))
+    counts = Counter(_addresses(frames, rows))
+    return sorted(counts.items(), key=lambda item: (-item[1], item[0]))
 
 
 def _flies(kind: int, autopilot: int) -> bool:
