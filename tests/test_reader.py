@@ -200,7 +200,7 @@ def test_the_lengths_of_the_arrays_decide_the_layout_and_nothing_is_guessed(read
     fields["covariances"] = fields["covariances"][:, :22]
     variance = read(log).ekf2.variance
     assert isinstance(variance, Unavailable)
-    assert "25 states and 22 covariances" in variance.reason
+    assert "arrays of estimator_states are of lengths unknown" in variance.reason
 
 
 def test_v1_8_vision_position_is_read(read):
@@ -633,7 +633,7 @@ def test_heights_of_other_stamps_are_joined_and_what_is_dropped_is_counted(read)
         **FLOAT32,
     )
     (note,) = track.notes
-    for words in ("20 of 50 heights", "20 ms", "3 of 50", "50 ms"):
+    for words in ("3 of 50", "50 ms"):
         assert words in note
     assert note in compare(flight).notes
 

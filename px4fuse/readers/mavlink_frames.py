@@ -360,13 +360,11 @@ def _stamps(
     usable &= (received >= 0) & (received < 1 << 62)
     middle = int(np.median(received[usable])) if np.any(usable) else 0
     usable &= np.abs(received - middle) <= MAX_STAMP_DISTANCE_US
-    link = (received & 0x3).astype(np.uint8)
-    if not np.all(usable):
+    link = np.where(usable, received & 0x3, 0).astype(np.uint8)
+    received = np.where(usable, received, 0)
+    if np.any(usable):
         rows = np.flatnonzero(usable)
-        link[~usable] = 0
-        received, good = np.zeros_like(received), received[rows]
-        if len(rows):
-            # interpolated from the first one on, so that float64 keeps every microsecond
-            steps = np.interp(np.arange(len(start)), rows, good - good[0])
-            received = good[0] + np.rint(steps).astype(np.int64)
+        # interpolated from the first one on, so that float64 keeps every microsecond
+        steps = np.interp(np.arange(len(start)), rows, received[rows] - received[rows[0]])
+        received = received[rows[0]] + np.rint(steps).astype(np.int64)
     return received, link, int(np.count_nonzero(~usable))

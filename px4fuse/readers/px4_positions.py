@@ -188,29 +188,20 @@ def _later(samples: pd.DataFrame, by_s: float) -> pd.DataFrame:
 def _with_height(
     samples: pd.DataFrame, height: pd.DataFrame
 ) -> tuple[pd.DataFrame, tuple[str, ...]]:
-    """Add the nearest height to each horizontal position, and say what that did.
+    """Add the nearest height to each horizontal position, and say where there was none.
 
-    EKF2 stamps both with one external vision sample, but the logger thins each topic by itself,
-    and may keep another sample's height.
+    EKF2 stamps both with one external vision sample, but the logger thins each topic by itself.
     """
     joined = pd.merge_asof(
-        samples, height.assign(_at=height.index), left_index=True, right_index=True,
+        samples, height.assign(_found=True), left_index=True, right_index=True,
         direction="nearest", tolerance=HEIGHT_TOLERANCE_S,  # type: ignore[arg-type]
     )  # fmt: skip
-    apart_s = np.abs(joined.pop("_at").to_numpy() - joined.index.to_numpy())
-    moved, dropped = apart_s > SAME_TIME_US * 1e-6, int(np.count_nonzero(np.isnan(apart_s)))
-    notes = []
-    if np.any(moved):
-        notes.append(
-            f"{np.count_nonzero(moved)} of {len(joined)} heights of external vision are those of "
-            f"the sample before or after, up to {1e3 * np.nanmax(apart_s):.0f} ms away"
-        )
-    if dropped:
-        notes.append(
-            f"{dropped} of {len(joined)} positions of external vision have no height within "
-            f"{1e3 * HEIGHT_TOLERANCE_S:.0f} ms"
-        )
-    return joined, ("; ".join(notes),) if notes else ()
+    lacking = int(joined.pop("_found").isna().sum())
+    note = (
+        f"{lacking} of {len(joined)} positions of external vision have no height within "
+        f"{1e3 * HEIGHT_TOLERANCE_S:.0f} ms"
+    )
+    return joined, (note,) if lacking else ()
 
 
 def _delay_s(topics: Topics) -> float:

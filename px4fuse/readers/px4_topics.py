@@ -75,23 +75,8 @@ QUATERNION_FILTER = 4
 SENSOR_BIAS = (
     Layout("estimator_sensor_bias", elements(SPECIFIC_FORCE_COLUMNS, "accel_bias"), "v1.11"),
 )
-ACCELEROMETER_BIAS_STATE = 13
 
 SELECTOR = (Layout("estimator_selector_status", {"instance": "primary_instance"}, "v1.12"),)
-
-# Horizontal aiding besides vision position, by the flags of all releases from v1.12, and before by
-# the bits of estimator_status.control_mode_flags
-AIDING_FLAGS: Mapping[str, str] = {
-    "cs_gps": "GPS",
-    "cs_gnss_pos": "GPS position",
-    "cs_gnss_vel": "GPS velocity",
-    "cs_opt_flow": "optical flow",
-    "cs_ev_vel": "vision velocity",
-    "cs_aux_gpos": "auxiliary global position",
-    "cs_fuse_aspd": "airspeed",
-    "cs_rngbcn_fusion": "ranging beacons",
-}
-AIDING_BITS: Mapping[str, int] = {"GPS": 2, "optical flow": 3, "vision velocity": 24}
 
 LAND_DETECTED = (Layout("vehicle_land_detected", {"landed": "landed"}, "v1.8"),)
 
