@@ -203,57 +203,6 @@ def test_sample_file_is_placed_without_any_option(
     assert track.samples[POSITION_VARIANCE_COLUMNS].isna().to_numpy().all()
 
 
-def test_sample_file_with_the_true_offset_is_the_logged_track(
-    sample_flight: Flight, external: PositionRecording, true_offset_s: float
-) -> None:
-    alignment, track = placed(
-        sample_flight, external, frame="enu", clock_offset_s=true_offset_s
-    )  # fmt: skip
-    assert alignment.clock_offset_s == true_offset_s
-    assert alignment.clock_offset_sigma_s is None
-    assert alignment.clock_reason == "given with --clock-offset"
-    assert alignment.frame_reason == "given with --position-frame"
-    assert alignment.residual_rms_m == pytest.approx(0.115, abs=0.01)
-    logged = sample_flight.positions[0].samples
-    for column in POSITION_COLUMNS[:2]:
-        ours = np.interp(logged.index, track.samples.index, track.samples[column])
-        assert np.median(np.abs(ours - logged[column])) < 2e-3
-
-
-@pytest.mark.parametrize("yaw_deg", [-170.0, -90.0, 10.0, 75.0, 180.0])
-def test_turned_mirrored_and_shifted_sample_is_recovered(
-    sample_flight: Flight, external: PositionRecording, true_offset_s: float, yaw_deg: float
-) -> None:
-    origin = (3.0, -2.0, 0.5)
-    position = external.samples[["y_m", "x_m", "z_m"]].to_numpy() * [1.0, 1.0, -1.0]
-    source = replace(
-        sample_flight,
-        positions=(
-            replace(
-                sample_flight.positions[0],
-                samples=table(
-                    external.samples.index.to_numpy() + true_offset_s - BOOT_S,
-                    np.hstack([position, np.full(position.shape, np.nan)]),
-                    POSITION_COLUMNS + POSITION_VARIANCE_COLUMNS,
-                ),
-            ),
-        ),
-        log=replace(sample_flight.log, boot_time_s=BOOT_S),
-    )
-    for frame in FROM_NED:
-        file = recorded(
-            source, offset_s=true_offset_s, frame=frame, yaw_deg=yaw_deg, origin_m=origin
-        )
-        alignment, _ = placed(sample_flight, file, frame=frame, yaw_deg="auto")
-        assert turn(alignment.yaw_deg, yaw_deg) < 0.5
-        assert 0.02 < alignment.yaw_sigma_deg < 0.3
-        np.testing.assert_allclose(alignment.origin_m[:2], origin[:2], atol=0.05)
-        # EKF2's height as published, of which one reset on the ground is not undone
-        assert alignment.origin_m[2] == pytest.approx(origin[2], abs=0.05)
-        assert off_s(alignment, true_offset_s) < 0.03
-        assert alignment.warnings == ()
-
-
 # -- synthetic flights -----------------------------------------------------------------------------
 
 

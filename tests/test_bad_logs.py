@@ -15,12 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import Phase, given, settings
-from hypothesis import strategies as st
 from patience import patience
 from ulog_tools import (
     Log,
-    load,
     make_log,
     position,
     seconds_of,
@@ -36,9 +33,6 @@ from px4fuse.errors import LogError, Px4FuseError
 from px4fuse.filter.signals import make_axes
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.readers import ULOG_MAGIC, read_log
-
-# no shrinking: a hang would be waited for again and again
-damaged = settings(phases=[Phase.explicit, Phase.generate], max_examples=80)
 
 
 def outcome(path: Path) -> Flight | Px4FuseError:
@@ -86,15 +80,6 @@ def workspace(tmp_path_factory) -> Path:
 # ---- not a log --------------------------------------------------------------------------------
 
 
-def test_a_missing_file_and_a_folder(tmp_path):
-    assert "cannot be read" in refusal(tmp_path / "missing.ulg")
-    (tmp_path / "folder.ulg").mkdir()
-    assert "is a folder" in refusal(tmp_path / "folder.ulg")
-
-
-HEADER = ULOG_MAGIC + b"\x01"
-
-
 @pytest.mark.parametrize(
     ("content", "words"),
     [
@@ -120,13 +105,6 @@ def test_what_is_no_log_or_holds_nothing_of_use(tmp_path, content, words):
     path = tmp_path / "other.ulg"
     path.write_bytes(content)
     assert words in refusal(path)
-
-
-@given(content=st.binary(max_size=400))
-@damaged
-def test_random_bytes_behind_a_good_first_line(workspace, content):
-    workspace.write_bytes(HEADER + content)
-    refusal(workspace)
 
 
 def test_a_mistyped_name_and_a_table_get_the_command_that_was_meant(tmp_path):
@@ -172,11 +150,6 @@ def test_a_log_of_topics_that_are_none_of_ours(tmp_path):
         choose_source(flight)
 
 
-def test_a_log_of_other_topics_without_time_is_refused(tmp_path):
-    log = Log([topic("battery_status", np.zeros(20, np.uint64), {"voltage_v": np.ones(20)})])
-    assert "time stamp" in refusal(log.write(tmp_path / "battery.ulg"))
-
-
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", [
     "annoybot_yule_log_trig_stats", "erdemarslan380_px4-system-identification_log100",
@@ -194,12 +167,6 @@ def test_compare_on_a_log_without_anything_of_ours_is_one_line(
     assert err.startswith(f"px4fuse: {name}.ulg: no external position in this log")
     assert "SDLOG_PROFILE" in err
     assert list(tmp_path.iterdir()) == []
-
-
-def test_definitions_without_data(tmp_path):
-    log = make_log("v1.16", 2.0)
-    log.topics = [take(made, []) for made in log.topics]
-    assert "without any data" in refusal(log.write(tmp_path / "no_data.ulg"))
 
 
 def test_a_format_that_contains_itself(tmp_path):
@@ -265,13 +232,6 @@ def test_cut_within_the_header(small, workspace, at):
     refusal(workspace)
 
 
-@given(share=st.floats(0.0, 1.0))
-@damaged
-def test_cut_anywhere(small, workspace, share):
-    workspace.write_bytes(small[: 7 + int(share * (len(small) - 7))])
-    analysed(workspace)
-
-
 def test_cut_within_the_data_keeps_what_was_written(small, workspace):
     """A flight that ended in a crash is cut; what came before is still good."""
     start = first_data(small)
@@ -283,48 +243,6 @@ def test_cut_within_the_data_keeps_what_was_written(small, workspace):
     np.testing.assert_allclose(
         state[["north_m", "east_m", "down_m"]], position(state.index), rtol=1e-6, atol=1e-6
     )
-
-
-@pytest.mark.parametrize("share", [0.001, 0.01, 0.05, 0.2, 0.5, 0.8, 0.99, 0.999])
-def test_the_sample_log_cut(sample_log, sample_flight, workspace, share):
-    content = sample_log.read_bytes()
-    workspace.write_bytes(content[: int(share * len(content))])
-    flight = analysed(workspace)
-    if share >= 0.2:
-        assert flight.log.duration_s == pytest.approx(
-            share * sample_flight.log.duration_s, abs=0.1 * sample_flight.log.duration_s
-        )
-        np.testing.assert_array_equal(
-            flight.imu["down_m_s2"], sample_flight.imu["down_m_s2"].iloc[: len(flight.imu)]
-        )
-
-
-damage = st.lists(
-    st.tuples(st.floats(0.0, 1.0, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=12
-)
-
-
-@given(damage=damage, definitions=st.booleans(), one_bit=st.booleans())
-@damaged
-def test_bytes_overwritten(small, workspace, damage, definitions, one_bit):
-    """Anywhere, and in the definitions, where a byte changes the meaning of all the rest."""
-    content = bytearray(small)
-    end = first_data(small) if definitions else len(small)
-    for share, value in damage[:1] if one_bit else damage:
-        at = 7 + int(share * (end - 7))
-        content[at] = content[at] ^ 1 << value % 8 if one_bit else value
-    workspace.write_bytes(content)
-    analysed(workspace)
-
-
-@given(first=st.floats(0.0, 1.0), length=st.integers(1, 3000), value=st.sampled_from([0, 255]))
-@damaged
-def test_a_block_that_was_never_written(small, workspace, first, length, value):
-    """A card that lost a sector gives zeros or ones."""
-    at = 7 + int(first * (len(small) - 7))
-    lost = min(length, len(small) - at)
-    workspace.write_bytes(small[:at] + bytes([value]) * lost + small[at + lost :])
-    analysed(workspace)
 
 
 @pytest.mark.parametrize("at", [500_000, 1_500_000, 3_000_000])
@@ -378,15 +296,6 @@ def test_a_log_without_a_part(tmp_path, topic, part):
         assert axis.acceleration is flight.attitude
 
 
-def test_no_position(tmp_path):
-    log = make_log("v1.16", 2.0)
-    log.drop(*(n for n in log.names() if "_ev_" in n or n == "vehicle_visual_odometry"))
-    flight = read_of(log, tmp_path)
-    assert flight.positions == ()
-    with pytest.raises(Px4FuseError, match="no external position"):
-        choose_source(flight)
-
-
 @pytest.mark.parametrize("alone", sorted(make_log("v1.16", 2.0).names()))
 def test_one_topic_alone(tmp_path, alone):
     log = make_log("v1.16", 2.0)
@@ -424,13 +333,6 @@ def test_each_field_left_out_in_turn(tmp_path, name):
         log = rich_log()
         del log[name][field]
         assert analysed(log.write(tmp_path / "made.ulg")) is not None, field
-
-
-def test_every_missing_part_says_what_to_do(tmp_path):
-    flight = read_of(Log([make_log("v1.16", 2.0).topics[1]]), tmp_path)
-    for part in flight.missing:
-        assert all((part.what, part.reason, part.remedy))
-        assert "\n" not in str(part)
 
 
 # ---- impossible values ------------------------------------------------------------------------
@@ -558,14 +460,6 @@ def test_parameters_that_are_no_numbers(tmp_path, parameter, value):
         assert np.isfinite(track.samples.index).all()
 
 
-def test_a_log_of_four_tenths_of_a_second(tmp_path):
-    flight = read_of(make_log("v1.16", 0.4, imu_hz=5.0), tmp_path)
-    assert flight.log.duration_s == pytest.approx(0.2)
-    assert len(flight.imu) == 2
-    with pytest.raises(Px4FuseError):
-        choose_segment(flight, choose_source(flight)[0])
-
-
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_too_few_samples_of_everything(tmp_path, count):
     log = make_log("v1.16", 2.0)
@@ -576,15 +470,6 @@ def test_too_few_samples_of_everything(tmp_path, count):
     else:
         assert result.positions == ()
         assert isinstance(result.imu, Unavailable) == (count == 1)
-
-
-def test_the_sample_log_without_each_topic_in_turn(sample_log, tmp_path):
-    """Leaving out any one topic costs what was in it, never the whole flight."""
-    whole = load(sample_log)
-    short = Log([take(t, range(0, len(t.fields["timestamp"]), 8)) for t in whole.topics])
-    for name in sorted(short.names()):
-        less = Log([t for t in short.topics if t.name != name], whole.parameters, whole.info)
-        assert analysed(less.write(tmp_path / "less.ulg")) is not None, name
 
 
 @pytest.mark.parametrize("command", ["info", "sync", "tune", "loop"])

@@ -198,26 +198,6 @@ def test_which_means_a_clock_is_mapped_by(read, case):
     position_is_true(flight, aisle)
 
 
-@given(
-    offset=st.floats(-1e6, 1e6),
-    drift_ppm=st.floats(-100.0, 100.0),
-    seed=st.integers(0, 1000),
-)
-@settings(max_examples=8)
-def test_offset_and_drift_of_a_companion_come_back(tmp_path_factory, offset, drift_ppm, seed):
-    """A UNIX clock that is wrong by days, and drifts."""
-    aisle = Aisle(
-        seconds=60.0, asks=True, seed=seed, state=None,
-        clock=lambda boot: UNIX_S + offset + boot * (1.0 + drift_ppm * 1e-6),
-    )  # fmt: skip
-    path = tmp_path_factory.mktemp("clock") / "made.tlog"
-    path.write_bytes(aisle.record().tlog())
-    flight = read_log(path)
-    clock = flight.positions[0].clock_map
-    assert np.abs(clock_error(flight, aisle)).max() < LEAST_DELAY_S
-    assert clock.drift_ppm == pytest.approx(-drift_ppm, abs=15.0)
-
-
 def test_boot_clock_stamps_stay_although_the_companion_syncs_its_unix_clock(read):
     """The companion converts its stamps to the autopilot's clock by itself."""
     aisle = Aisle(clock=unix, asks=True)
@@ -452,16 +432,6 @@ def test_several_vehicles_are_told_apart(read):
     for system in (5, 255):
         with pytest.raises(SettingsError, match=r"autopilots in the file: 3, 7\."):
             read(recorder, system=system)
-
-
-def test_the_fortieth_vehicle_of_a_swarm_can_be_asked_for(read):
-    recorder = Recorder()
-    for system in range(1, 41):
-        Aisle(seconds=2.0 + (system < 40), system=system, state=None).record(recorder)
-    flight = read(recorder, system=40)
-    assert "system 40)" in flight.log.hardware
-    assert flight.log.duration_s == pytest.approx(2.0, abs=0.1)
-    assert len(flight.log.senders) == 32
 
 
 def test_senders_and_what_they_lost_are_described(read):

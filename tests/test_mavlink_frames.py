@@ -18,7 +18,6 @@ from mavlink_tools import (
     MESSAGES,
     Aisle,
     Heard,
-    Recorder,
     frame,
     heard_by_pymavlink,
     heartbeat,
@@ -303,13 +302,6 @@ def test_junk_between_frames_costs_itself(read, junk):
     assert frames.bad_bytes == len(junk)
 
 
-def test_junk_in_a_tlog_costs_itself(read):
-    parts = [stamp(START_US + i) + part for i, part in enumerate(beats(6))]
-    frames = read(b"".join(parts[:3]) + b"\xfd junk \xfe" + b"".join(parts[3:]))
-    assert frames.sequence.tolist() == list(range(6))
-    assert frames.received_us.tolist() == [START_US + i for i in range(6)]
-
-
 def test_a_stamp_that_looks_like_the_beginning_of_a_frame_hides_none(read):
     """Its last bytes and the true frame behind it are by chance a STATUSTEXT of MAVLink 1."""
     head = raw_frame(30, b"\x01\x02\x03", seed=0, sequence=3)[:-2]
@@ -355,15 +347,6 @@ def test_the_first_and_the_last_frame_may_be_cut(read):
         assert (np.diff(frames.received_us[1:]) == 1000).all()
 
 
-def test_mavlink_1_and_2_may_be_mixed(read):
-    parts = [frame(ATTITUDE, sequence=i, v1=bool(i % 3)) for i in range(30)]
-    for content in (stamped(*parts), b"".join(parts)):
-        frames = read(content)
-        assert frames.sequence.tolist() == list(range(30))
-        assert len(np.unique(decoded(frames, "ATTITUDE"))) == 1
-        assert set(frames.payload_length.tolist()) == {28, 16}
-
-
 def test_damaged_stamps_are_interpolated(read):
     parts = beats(9)
     times = [START_US + 1000 * i for i in range(9)]
@@ -383,14 +366,6 @@ def test_stamps_that_are_all_damaged_are_all_counted(read):
     assert frames.received_us.shape == (5,)
 
 
-def test_link_numbers_are_in_the_stamps_lowest_bits(read):
-    recorder = Recorder()
-    for i in range(8):
-        recorder.hear(START_US * 1e-6 + i, AUTOPILOT, heartbeat(), link=i % 3)
-    frames = read(recorder.tlog())
-    assert frames.link.tolist() == [i % 3 for i in range(8)]
-
-
 @pytest.mark.parametrize("with_stamps", [True, False])
 def test_one_message_is_a_recording(read, with_stamps):
     content = frame(odometry(5_000_000, [1, 2, 3], [0, 0, 0], estimator=8))
@@ -398,13 +373,6 @@ def test_one_message_is_a_recording(read, with_stamps):
     assert len(frames) == 1
     assert (frames.received_us is not None) == with_stamps
     assert frames.bad_bytes == 0
-
-
-@pytest.mark.reallogs
-def test_the_recording_of_one_message_is_read(shared_logs):
-    path = shared_logs / "mavlink" / "ArduPilot_pymavlink_capture.mav2.battery_status.tlog"
-    assert names(read_frames(path)) == ["BATTERY_STATUS"]
-    assert read_log(path).positions == ()
 
 
 @given(st.lists(st.sampled_from(["v1", "v2", "signed", "unknown", "bad", "junk"]), min_size=1))
@@ -455,26 +423,6 @@ def test_what_is_no_mavlink_is_refused_in_bounded_memory(tmp_path, name, content
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 4 * len(content) + BLOCK_BYTES, name
-
-
-def test_an_empty_file_is_refused(tmp_path):
-    path = tmp_path / "empty.tlog"
-    path.write_bytes(b"")
-    with pytest.raises(LogError, match="empty"):
-        read_log(path)
-
-
-@pytest.mark.reallogs
-@pytest.mark.parametrize(
-    ("name", "reason"),
-    [
-        ("ArduPilot_pymavlink_capture.mavlink", "0 frames with a good checksum"),
-        ("ArduPilot_pymavlink_test.BIN", "DataFlash"),
-    ],
-)
-def test_foreign_files_are_refused(shared_logs, name, reason):
-    with pytest.raises(LogError, match=reason):
-        read_log(shared_logs / "mavlink" / name)
 
 
 def test_the_scan_reads_no_byte_more_than_a_frames_length_for_each_start(tmp_path, monkeypatch):
@@ -559,21 +507,11 @@ def test_frames_cut_to_their_stamp_cost_a_bounded_amount_each(tmp_path, name, se
     assert peak < path.stat().st_size + DECODED_BYTES * count + TINY_BYTES
 
 
-@pytest.mark.reallogs
-@pytest.mark.parametrize("path", PARSABLE, ids=lambda path: path.name)
-def test_real_recordings_take_less_than_four_times_their_size(path):
-    memory_is_bounded(path)
-
-
 def test_the_sample_takes_less_than_four_times_its_size(sample_log):
-    memory_is_bounded(sample_log.with_suffix(".tlog"))
-
-
-def memory_is_bounded(path: Path) -> None:
+    path = sample_log.with_suffix(".tlog")
     read_log(path)  # tables that are made once
     tracemalloc.start()
     read_log(path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    size = path.stat().st_size
-    assert peak < 4 * size + (TINY_BYTES if size < 500_000 else 0)
+    assert peak < 4 * path.stat().st_size

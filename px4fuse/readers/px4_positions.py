@@ -406,7 +406,7 @@ def read_truth(
         velocity = geo.reindex(columns=VELOCITY_COLUMNS)
         samples = projected(geo, _local_origin(topics)).join(velocity)
         return Truth(px4.TRUTH_GLOBAL[0].topic, samples, attitude)
-    captured = motion_capture(positions, "vehicle_mocap_odometry", "att_pos_mocap")
+    captured = motion_capture(positions, "vehicle_mocap_odometry")
     if captured is None:
         return Unavailable(
             "ground truth",
@@ -432,7 +432,7 @@ def captured_truth(track: PositionTrack) -> Truth:
     return Truth(track.name, state, attitude_of(track.orientation))
 
 
-def motion_capture(positions: tuple[PositionTrack, ...], *topics: str) -> PositionTrack | None:
-    """Motion capture by its topics, where another track feeds EKF2: then it is the truth."""
+def motion_capture(positions: tuple[PositionTrack, ...], topic: str) -> PositionTrack | None:
+    """Motion capture by its topic, where another track feeds EKF2: then it is the truth."""
     fed = any(track.origin.is_vision for track in positions)
-    return next((track for track in positions if fed and track.topics[0] in topics), None)
+    return next((track for track in positions if fed and track.topics[0] == topic), None)

@@ -192,7 +192,7 @@ _OLD_ODOMETRY = (
 )
 
 
-def _odometry(topic: str, before: str) -> tuple[Layout, ...]:
+def _odometry(topic: str) -> tuple[Layout, ...]:
     return (
         Layout(
             topic,
@@ -204,7 +204,6 @@ def _odometry(topic: str, before: str) -> tuple[Layout, ...]:
             | elements(ROTATION_VARIANCE_COLUMNS, "orientation_variance"),
         ),
         Layout(topic, XYZ, "v1.9 to v1.13", _OLD_ODOMETRY),
-        Layout(before, XYZ, "v1.8"),
     )
 
 
@@ -213,13 +212,13 @@ TRACKS = (
         "vehicle_visual_odometry",
         RECEIVED,
         "external vision position as PX4 received it",
-        _odometry("vehicle_visual_odometry", "vehicle_vision_position"),
+        _odometry("vehicle_visual_odometry"),
     ),
     TrackSource(
         "vehicle_mocap_odometry",
         MOTION_CAPTURE,
         "motion capture, which EKF2 never fuses",
-        _odometry("vehicle_mocap_odometry", "att_pos_mocap"),
+        _odometry("vehicle_mocap_odometry"),
     ),
     TrackSource(
         "estimator_visual_odometry_aligned",
