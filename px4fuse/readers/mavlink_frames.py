@@ -67,8 +67,7 @@ class Frames:
     start : ndarray of int64, shape (n,)
         Offset of each frame's first byte.
     message_id : ndarray of int32, shape (n,)
-    system, component, sequence, link : ndarray of uint8, shape (n,)
-        ``link`` is the number that MAVProxy keeps in the lowest two bits of the stamp.
+    system, component, sequence : ndarray of uint8, shape (n,)
     payload_start : ndarray of int64, shape (n,)
     payload_length : ndarray of uint8, shape (n,)
     received_us : ndarray of int64, shape (n,), or None
@@ -90,7 +89,6 @@ class Frames:
     system: NDArray[np.uint8]
     component: NDArray[np.uint8]
     sequence: NDArray[np.uint8]
-    link: NDArray[np.uint8]
     payload_start: Integers
     payload_length: NDArray[np.uint8]
     received_us: Integers | None
@@ -213,9 +211,7 @@ def read_frames(path: Path) -> Frames:
     for byte in (1, 2):
         number[second] |= source[at[second] + 3 + byte].astype(np.int32) << 8 * byte
     passed_over, bad_bytes, in_frame = _between(content, start - stamp, end, stamp)
-    received, link, bad_stamps = None, np.zeros(len(start), dtype=np.uint8), 0
-    if stamp:
-        received, link, bad_stamps = _stamps(source, start, end)
+    received, bad_stamps = _stamps(source, start, end) if stamp else (None, 0)
     return Frames(
         name=name,
         content=content,
@@ -225,7 +221,6 @@ def read_frames(path: Path) -> Frames:
         system=source[at + 1],
         component=source[at + 2],
         sequence=source[at],
-        link=link,
         payload_start=start + np.where(second, HEADER_2, HEADER_1),
         payload_length=source[start + 1],
         received_us=received,
@@ -347,10 +342,8 @@ def _unknown_frames(content: bytes, at: int, high: int, stamp: int) -> Iterator[
         yield number, size
 
 
-def _stamps(
-    source: NDArray[np.uint8], start: Integers, end: Integers
-) -> tuple[Integers, NDArray[np.uint8], int]:
-    """Time of receipt (µs), link number, and how many stamps were damaged."""
+def _stamps(source: NDArray[np.uint8], start: Integers, end: Integers) -> tuple[Integers, int]:
+    """Time of receipt (µs), and how many stamps were damaged."""
     usable = start >= STAMP
     usable[1:] &= start[1:] - end[:-1] >= STAMP
     windows = np.lib.stride_tricks.sliding_window_view(source, STAMP)
@@ -360,11 +353,10 @@ def _stamps(
     usable &= (received >= 0) & (received < 1 << 62)
     middle = int(np.median(received[usable])) if np.any(usable) else 0
     usable &= np.abs(received - middle) <= MAX_STAMP_DISTANCE_US
-    link = np.where(usable, received & 0x3, 0).astype(np.uint8)
     received = np.where(usable, received, 0)
     if np.any(usable):
         rows = np.flatnonzero(usable)
         # interpolated from the first one on, so that float64 keeps every microsecond
         steps = np.interp(np.arange(len(start)), rows, received[rows] - received[rows[0]])
         received = received[rows[0]] + np.rint(steps).astype(np.int64)
-    return received, link, int(np.count_nonzero(~usable))
+    return received, int(np.count_nonzero(~usable))

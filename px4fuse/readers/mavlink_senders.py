@@ -198,16 +198,10 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
 def _lost_share(frames: Frames, address: Address) -> float | None:
     """Share of a sender's messages that its sequence numbers say are not here.
 
-    MAVProxy keeps the link's number in the stamp, and every link has its own sequence; others
-    leave the clock's own bits there. The reading that misses fewer is the right one.
+    None where it does not count them, or was heard over two links at once.
     """
     own = (frames.system == address[0]) & (frames.component == address[1])
-    sequence, link = frames.sequence[own].astype(np.int64), frames.link[own]
-    by_link = [sequence[link == number] for number in np.unique(link).tolist()]
-    lost = min(_missing(sequence), sum(_missing(part) for part in by_link))
+    sequence = frames.sequence[own].astype(np.int64)
+    lost = int(np.sum((np.diff(sequence) - 1) % 256))
     share = lost / (lost + len(sequence))
     return share if share < SEQUENCE_MEANS_NOTHING else None
-
-
-def _missing(sequence: NDArray[np.int64]) -> int:
-    return int(np.sum((np.diff(sequence) - 1) % 256))

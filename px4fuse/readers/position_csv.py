@@ -189,8 +189,8 @@ def read_position_csv(
     is_usable &= (numbers[axes].abs() < MAX_COORDINATE).all(axis=1)
     if missing := int(np.count_nonzero(~is_usable)):
         notes.insert(0, f"{_count(missing)} dropped: without a usable time or position")
-    for column in (at for at, m in enumerate(meanings) if m.kind == "tag"):
-        tags = sorted({*texts[column].dropna()})
+    for tag in (at for at, m in enumerate(meanings) if m.kind == "tag"):
+        tags = sorted({*texts[tag].dropna()})
         if tags[1:]:
             notes.append(f"several tags ({', '.join(map(quote, tags[:2]))}): keep those of one")
     numbers = numbers[is_usable]

@@ -286,19 +286,19 @@ def _read_record(
     if topic != px4.ESTIMATOR_STATES[0] or isinstance(delayed, Unavailable):
         return RECORD_NOT_LOGGED
     norm = np.linalg.norm(delayed[QUATERNION_COLUMNS], axis=1)
-    delayed = delayed[np.abs(norm - 1.0) < 0.01].copy()
-    if delayed.empty:
+    inside = delayed[np.abs(norm - 1.0) < 0.01].copy()
+    if inside.empty:
         return RECORD_NOT_LOGGED
     horizontal = POSITION_COLUMNS[:2]
-    if not delayed[horizontal].to_numpy().any():  # from v1.16 kept as latitude and longitude
-        delayed[horizontal] = np.nan
+    if not inside[horizontal].to_numpy().any():  # from v1.16 kept as latitude and longitude
+        inside[horizontal] = np.nan
         # and its height, where there is an origin, as altitude above the sea (ekf_helper.cpp)
         origin_m = local["ref_alt"].dropna() if "ref_alt" in local else pd.Series(dtype=float)
-        delayed["down_m"] += float(origin_m.iloc[-1]) if len(origin_m) else 0.0
+        inside["down_m"] += float(origin_m.iloc[-1]) if len(origin_m) else 0.0
     age = _age_s(topics, VISION).sort_index()
     return FusionRecord(
         parameters=topics.ekf2_parameters,
-        delayed=delayed,
+        delayed=inside,
         per_step_biases=attitude == px4.QUATERNION_FILTER,
         other_aiding=tuple(
             AIDS[name].label for name in OTHER_AIDING if name in meant and meant[name].any()
