@@ -360,13 +360,6 @@ def test_outliers_and_gaps_move_the_clock_little() -> None:
     np.testing.assert_allclose(alignment.origin_m[:2], 0.0, atol=0.05)
 
 
-@pytest.mark.parametrize("span_s", [(0.0, 35.0), (50.0, 80.0), (100.0, 120.0)])
-def test_a_file_of_a_part_of_the_flight(flight: Flight, span_s: Span) -> None:
-    alignment, track = placed(flight, recorded(flight, span_s=span_s), frame="enu")
-    assert off_s(alignment) < 0.05
-    assert track.samples.index[0] == pytest.approx(span_s[0], abs=0.05)
-
-
 def test_a_file_from_minutes_before_until_minutes_after_the_flight(flight: Flight) -> None:
     rng = np.random.default_rng(5)
     own = recorded(flight).samples
@@ -522,19 +515,6 @@ def test_a_flight_that_nearly_repeats_itself_is_warned_of() -> None:
     assert off_s(alignment) < 0.03
     (warning,) = alignment.warnings
     assert re.match(r"A clock offset [-+]19\.\d s from this one fits nearly as well, ", warning)
-
-
-def test_on_a_circle_any_offset_fits_with_some_yaw() -> None:
-    def circle(time_s: Array, heading_deg: float, length_m: float) -> Array:
-        angle = 2.0 * np.pi * time_s / 50.0
-        return np.stack([5.0 * np.cos(angle), 5.0 * np.sin(angle), 0.0 * angle], axis=1)
-
-    flight = flight_along(circle, duration_s=45.0)
-    file = recorded(flight)
-    with pytest.raises(MissingDataError, match=r"leaves the clock open.*Give `clock_offset_s`\.$"):
-        place(flight, file, frame="enu", yaw_deg="auto")
-    alignment, _ = placed(flight, file, frame="enu")
-    assert off_s(alignment) < 0.05
 
 
 @pytest.mark.parametrize(

@@ -150,25 +150,6 @@ def test_a_log_of_topics_that_are_none_of_ours(tmp_path):
         choose_source(flight)
 
 
-@pytest.mark.reallogs
-@pytest.mark.parametrize("name", [
-    "annoybot_yule_log_trig_stats", "erdemarslan380_px4-system-identification_log100",
-])  # fmt: skip
-def test_compare_on_a_log_without_anything_of_ours_is_one_line(
-    shared_logs, tmp_path, monkeypatch, capsys, name
-):
-    monkeypatch.chdir(tmp_path)
-    log = shared_logs / "real" / f"{name}.ulg"
-    monkeypatch.setattr("sys.argv", ["px4fuse", "compare", str(log)])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    out, err = capsys.readouterr()
-    assert (stopped.value.code, out, len(err.splitlines())) == (2, "", 1)
-    assert err.startswith(f"px4fuse: {name}.ulg: no external position in this log")
-    assert "SDLOG_PROFILE" in err
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_format_that_contains_itself(tmp_path):
     """A nested format that never ends must not end the program."""
     path = tmp_path / "nested.ulg"
@@ -224,12 +205,6 @@ def test_the_small_log_is_whole(small, workspace):
     assert flight.log.notes == ()
     assert len(flight.positions) == 3
     assert len(small) < 16_000
-
-
-@pytest.mark.parametrize("at", range(7, 60))
-def test_cut_within_the_header(small, workspace, at):
-    workspace.write_bytes(small[:at])
-    refusal(workspace)
 
 
 def test_cut_within_the_data_keeps_what_was_written(small, workspace):
@@ -294,14 +269,6 @@ def test_a_log_without_a_part(tmp_path, topic, part):
     if part == "attitude":
         axis = make_axes(flight, track, choose_segment(flight, track))[0]
         assert axis.acceleration is flight.attitude
-
-
-@pytest.mark.parametrize("alone", sorted(make_log("v1.16", 2.0).names()))
-def test_one_topic_alone(tmp_path, alone):
-    log = make_log("v1.16", 2.0)
-    flight = read_of(log.drop(*(log.names() - {alone})), tmp_path)
-    assert len(flight.missing) >= 5
-    assert analysed(tmp_path / "made.ulg") is not None
 
 
 def rich_log() -> Log:

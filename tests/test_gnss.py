@@ -40,7 +40,6 @@ from px4fuse.flight import (
     Truth,
     Unavailable,
 )
-from px4fuse.inspect.inventory import take_inventory
 from px4fuse.origin import GNSS
 from px4fuse.readers import px4_fixes, read_log
 from px4fuse.readers.px4_fixes import rebuilt_fixes
@@ -501,17 +500,6 @@ def test_fixes_that_the_logger_left_out_are_filled_in(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.samples[POSITION_COLUMNS], whole[POSITION_COLUMNS], atol=0.05)
     assert found.velocity is not None
     np.testing.assert_allclose(found.velocity.loc[found.samples.index[50], "east_m_s"], 2.0)
-
-
-def test_info_speaks_of_the_innovations_of_gnss(tmp_path: Path) -> None:
-    inventory = take_inventory(flight_of(outdoors(), tmp_path))
-    can = {ability.name: ability for ability in inventory.abilities}
-    assert can["EKF2 innovations"].possible
-    innovations = next(one for one in inventory.sources if one.part == "innovations")
-    assert innovations.topics == ("estimator_aid_src_gnss_pos",)
-    said = " ".join(advice.remedy for advice in inventory.advice)
-    assert "EKF2_EV" not in said
-    assert "vision" not in said
 
 
 def with_velocity(log: Log) -> Log:

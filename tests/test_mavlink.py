@@ -401,12 +401,6 @@ def test_estimator_status_stands_in_for_variances(read, state):
     assert any("ESTIMATOR_STATUS" in note for note in flight.ekf2.notes)
 
 
-def test_without_any_accuracy_variances_are_lacking(read):
-    flight = read(Aisle(state="LOCAL_POSITION_NED"))
-    assert isinstance(flight.ekf2.variance, Unavailable)
-    assert "no ODOMETRY with covariance" in reason(flight, "EKF2 variances")
-
-
 # ---- truth --------------------------------------------------------------------------------------
 
 EARTH_RADIUS_M = 6_371_000.0

@@ -107,15 +107,6 @@ def test_a_recording_replayed_at_another_speed_is_mapped(speed, span):
     assert np.abs(line.at(x) - 5.0 - speed * x).max() < 0.05
 
 
-def test_an_outage_of_the_link_does_not_bend_the_line():
-    """For 10 s messages are queued and arrive together."""
-    x = np.arange(0.0, 100.0, 0.05)
-    received = x + 0.01
-    received[(x > 40.0) & (x < 50.0)] = 50.01
-    line = least_delay(x, received)
-    np.testing.assert_allclose(line.at(x), x + 0.01, atol=1e-6)
-
-
 @given(st.lists(st.tuples(st.floats(-1e13, 1e13), st.floats(-1e13, 1e13)), min_size=1, max_size=60))
 # a slope of 5.5e-309, whose inverse is infinite
 @example([(0.0, 0.0), (4.0, 2.2e-308)])
@@ -196,19 +187,6 @@ def test_which_means_a_clock_is_mapped_by(read, case):
     if "second" in case and method == "SYSTEM_TIME":
         assert flight.log.start_unix_s == pytest.approx(UNIX_S + BOOT_S, abs=1e-3)
     position_is_true(flight, aisle)
-
-
-def test_boot_clock_stamps_stay_although_the_companion_syncs_its_unix_clock(read):
-    """The companion converts its stamps to the autopilot's clock by itself."""
-    aisle = Aisle(clock=unix, asks=True)
-    recorder = aisle.record()
-    converted = replace(aisle, clock=same, replies=False, asks=False).record()
-    names = ("VISION_POSITION_ESTIMATE",)
-    recorder.sent = [s for s in recorder.sent if s[2].get_type() not in names]
-    recorder.sent += [s for s in converted.sent if s[2].get_type() in names]
-    flight = read(recorder)
-    assert flight.positions[0].clock_map.method == "boot clock"
-    assert np.abs(clock_error(flight, aisle)).max() < 1e-6
 
 
 @pytest.mark.parametrize("asks", [False, True])

@@ -604,15 +604,3 @@ def test_recordings_of_uwb(shared_uwb, pattern, time, count):
         dropped = len(pd.read_csv(path)) - len(truth)
         if dropped:
             said(file, f"{dropped} rows were dropped")
-
-
-@pytest.mark.reallogs
-def test_damaged_recordings(shared_uwb, read):
-    random = np.random.default_rng(1)
-    for path in sorted(shared_uwb.glob("*/dwm1001__tag__*position.csv")):
-        content = path.read_bytes()[:20_000]
-        for _ in range(40):
-            damaged = bytearray(content[: random.integers(1, len(content))])
-            for at in random.integers(0, len(damaged), 3):
-                damaged[at] = random.integers(0, 256)
-            check_any(read, bytes(damaged), {})

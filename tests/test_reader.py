@@ -224,16 +224,6 @@ def test_a_variance_that_was_not_given_is_nan(read, value):
 # ---- time -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["vehicle_visual_odometry", "estimator_aid_src_ev_pos"])
-def test_time_is_that_of_measurement(read, name):
-    """Both topics are published 60 ms after the measurement that they describe."""
-    log = make_log("v1.16")
-    assert (log[name]["timestamp"] - log[name]["timestamp_sample"] == 60_000).all()
-    track = next(track for track in read(log).positions if track.name == name)
-    lead = HALF_PERIOD_S if name == "estimator_aid_src_ev_pos" else 0.0
-    np.testing.assert_allclose(times(track.samples), seconds_of(ev_stamps(10.0)) + lead, atol=1e-9)
-
-
 def test_accelerometer_times_follow_their_offset(read):
     log = make_log("v1.16")
     offset = log["sensor_combined"]["accelerometer_timestamp_relative"]
@@ -525,21 +515,6 @@ def test_gps_is_used_only_when_asked_for(read):
     assert choose_source(flight, "vehicle_gps_position")[0].origin == GNSS
 
 
-@pytest.mark.parametrize("generation", ["v1.12", "v1.16"])
-def test_gps_is_projected_to_metres(read, generation):
-    """On PX4's sphere of 6371 km, 0.001° of latitude is 111.195 m."""
-    log = make_log("v1.16").add(gps(generation))
-    log.parameters["EKF2_GPS_DELAY"] = 0.0
-    track = choose_source(read(log), "vehicle_gps_position")[0]
-    time = times(track.samples)
-    per_degree = 6_371_000.0 * np.pi / 180.0
-    np.testing.assert_allclose(track.samples["north_m"], 0.001 * per_degree * time, atol=0.02)
-    np.testing.assert_allclose(track.samples["east_m"], 0.0, atol=0.02)
-    np.testing.assert_allclose(track.samples["down_m"], -time, atol=1e-3)
-    np.testing.assert_allclose(track.samples["down_m2"], 9.0)
-    np.testing.assert_allclose(track.samples[["north_m2", "east_m2"]], 4.0)
-
-
 @pytest.mark.parametrize("delay_ms", [0.0, 175.0])
 def test_ekf2s_own_delay_is_added_back_to_its_observations(read, delay_ms):
     """EKF2 files a sample under its stamp less EKF2_EV_DELAY and half its update period."""
@@ -559,15 +534,6 @@ def test_ekf2s_own_delay_is_added_back_to_its_observations(read, delay_ms):
         np.tile(EV_VARIANCE, (len(expected), 1)),
         **FLOAT32,
     )
-
-
-def test_observations_without_height_leave_height_open(read):
-    log = make_log("v1.16").drop("vehicle_visual_odometry")
-    assert choose_source(read(log))[0].notes == ()
-    track, _ = choose_source(read(log.drop("estimator_aid_src_ev_hgt")))
-    assert track.name == "estimator_aid_src_ev_pos"
-    assert track.samples["down_m"].isna().all()
-    assert track.samples["north_m"].notna().all()
 
 
 def test_heights_of_other_stamps_are_joined_and_what_is_dropped_is_counted(read):
@@ -698,12 +664,6 @@ def test_each_part_names_its_topics_clock_and_file(read, generation):
     sampled = {"ekf2_state", *STREAMS[generation]}
     assert measured == {"imu"} | (set() if generation == "v1.9" else sampled)
     assert flight.log.autopilot == "PX4"
-
-
-def test_parts_that_are_missing_have_no_stream(read, sample_flight):
-    flight = read(make_log().drop("sensor_combined", "vehicle_local_position"))
-    assert set(flight.streams) == {"attitude", "airborne"}
-    assert sample_flight.streams["truth"].topics == ("vehicle_local_position_groundtruth",)
 
 
 def test_ranges_of_uwb_are_reported_as_unused(read):
