@@ -156,12 +156,17 @@ FUSED_FIXES = (
 
 @dataclass(frozen=True)
 class TrackSource:
-    """A logged position track: its name for ``--position-source``, and its layouts."""
+    """A position track of a log, by its name for ``--position-source``.
+
+    ``remedy`` says what would have logged it; ``layouts`` are those of a track that has a topic of
+    its own.
+    """
 
     name: str
     origin: Origin
     description: str
-    layouts: tuple[Layout, ...]
+    remedy: str
+    layouts: tuple[Layout, ...] = ()
 
 
 # msg/VehicleOdometry.msg: LOCAL_FRAME_* up to v1.13, POSE_FRAME_* since v1.14
@@ -194,48 +199,42 @@ def _odometry(topic: str) -> tuple[Layout, ...]:
     )
 
 
-TRACKS = (
+# Names for ``--position-source`` of what EKF2 kept of external vision, and of GNSS
+KEPT_OBSERVATION = "estimator_aid_src_ev_pos"
+RECONSTRUCTION = "ekf2_state_plus_innovation"
+GPS_POSITION = "vehicle_gps_position"
+_TRACKS = (
     TrackSource(
-        "vehicle_visual_odometry",
-        RECEIVED,
-        "external vision position as PX4 received it",
+        "vehicle_visual_odometry", RECEIVED, "external vision position as PX4 received it",
+        "Set SDLOG_PROFILE to 129 (default and vision) to log it as it arrives.",
         _odometry("vehicle_visual_odometry"),
     ),
     TrackSource(
-        "vehicle_mocap_odometry",
-        MOTION_CAPTURE,
-        "motion capture, which EKF2 never fuses",
-        _odometry("vehicle_mocap_odometry"),
+        "vehicle_mocap_odometry", MOTION_CAPTURE, "motion capture, which EKF2 never fuses",
+        "Logged when ATT_POS_MOCAP is sent to PX4.", _odometry("vehicle_mocap_odometry"),
     ),
     TrackSource(
-        "estimator_visual_odometry_aligned",
-        ALIGNED,
-        "external vision rotated into EKF2's frame",
+        "estimator_visual_odometry_aligned", ALIGNED, "external vision rotated into EKF2's frame",
+        "Logged by PX4 v1.10 to v1.13 when external vision is fused.",
         (
             Layout("estimator_visual_odometry_aligned", XYZ, _OLD_ODOMETRY),  # v1.12, v1.13
             Layout("vehicle_visual_odometry_aligned", XYZ, _OLD_POSE),  # v1.10, v1.11
         ),
     ),
-)
-
-# Names for ``--position-source`` of what EKF2 kept of external vision, and of GNSS
-KEPT_OBSERVATION = "estimator_aid_src_ev_pos"
-RECONSTRUCTION = "ekf2_state_plus_innovation"
-GPS_POSITION = "vehicle_gps_position"
-TOPIC_ORIGINS = {track.name: track.origin for track in TRACKS} | {
-    KEPT_OBSERVATION: KEPT, RECONSTRUCTION: REBUILT, GPS_POSITION: GNSS,
-}  # fmt: skip
-# What would have logged a track
-TRACK_REMEDIES: Mapping[str, str] = {
-    "vehicle_visual_odometry": "Set SDLOG_PROFILE to 129 (default and vision) to log it as it "
-    "arrives.",
-    "vehicle_mocap_odometry": "Logged when ATT_POS_MOCAP is sent to PX4.",
-    "estimator_visual_odometry_aligned": "Logged by PX4 v1.10 to v1.13 when external vision is "
-    "fused.",
-    KEPT_OBSERVATION: "Logged by default since v1.16 when EKF2 runs on external vision.",
-    RECONSTRUCTION: "Needs EKF2 innovations of external vision.",
-    GPS_POSITION: "Logged when a GPS receiver is connected.",
-}
+    TrackSource(
+        KEPT_OBSERVATION, KEPT, "the observations that EKF2 kept of external vision",
+        "Logged by default since v1.16 when EKF2 runs on external vision.",
+    ),
+    TrackSource(
+        RECONSTRUCTION, REBUILT, "EKF2's position plus its innovation",
+        "Needs EKF2 innovations of external vision.",
+    ),
+    TrackSource(
+        GPS_POSITION, GNSS, "GNSS position", "Logged when a GPS receiver is connected.", GPS
+    ),
+)  # fmt: skip
+TRACKS: Mapping[str, TrackSource] = {track.name: track for track in _TRACKS}
+TOPIC_ORIGINS = {name: track.origin for name, track in TRACKS.items()}
 # What has EKF2 fuse external vision; it starts on samples less than 0.2 s apart (ev_control.cpp)
 HOW_TO_FUSE: Mapping[str, str] = {
     "horizontal": "Send the position at 10 Hz (EKF2 starts on samples less than 0.2 s apart) and "
@@ -274,8 +273,8 @@ def topics() -> list[str]:
     """Every topic named in this table, sorted: all that a reader needs to decode."""
     groups = (
         IMU, ATTITUDE, LOCAL_POSITION, SENSOR_BIAS, SELECTOR, LAND_DETECTED, FLIGHT_MODE,
-        TRUTH_LOCAL, TRUTH_GLOBAL, TRUTH_ATTITUDE, GPS, AID_OBSERVATION_HORIZONTAL,
-        AID_OBSERVATION_VERTICAL, *(track.layouts for track in TRACKS),
+        TRUTH_LOCAL, TRUTH_GLOBAL, TRUTH_ATTITUDE, AID_OBSERVATION_HORIZONTAL,
+        AID_OBSERVATION_VERTICAL, *(track.layouts for track in _TRACKS),
     )  # fmt: skip
     named = {layout.topic for group in groups for layout in group}
     return sorted(named | UNUSED.keys() | {*ESTIMATOR_STATES})
