@@ -16,7 +16,6 @@ from exchange import replace
 from flights import Estimator, Imu, Span, Uwb, aisle_flight, table, unavailable
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from msgspec import structs
 
 from px4fuse.alignment.placement import EKF2_POSITION, IMU, place
 from px4fuse.arrays import Array
@@ -32,6 +31,7 @@ from px4fuse.flight import (
 from px4fuse.origin import GIVEN_FILE
 from px4fuse.readers import read_log
 from px4fuse.readers.position_csv import SAMPLE_COLUMNS, PositionRecording, read_position_csv
+from px4fuse.recording import InputFile
 
 BOOT_S = 2416.25
 OFFSET_S = -1795251250.2  # boot clock minus a UNIX clock
@@ -289,22 +289,15 @@ def test_variances_turn_with_the_track(flight: Flight) -> None:
 
 
 def test_the_flight_gets_the_track_the_file_and_what_its_reader_said(flight: Flight) -> None:
-    file = recorded(flight)
-    result = place(flight, file)
+    result = place(flight, recorded(flight))
     track, *others = result.positions
-    assert (track.name, track.origin, track.log) == ("uwb.csv", GIVEN_FILE, "uwb.csv")
-    assert track.topics == ("uwb.csv",)
-    assert track.frame == "NED"
-    assert track.description == "external position file, 601 samples, enu"
-    assert track.clock.startswith("the file's own UNIX clock, -1795251250.")
+    assert (track.name, track.origin, track.log, track.frame) == (
+        "uwb.csv", GIVEN_FILE, "uwb.csv", "NED",
+    )  # fmt: skip
     assert track.clock.endswith(" s to the boot clock, matched with EKF2 position")
     assert tuple(others) == flight.positions
-    assert [structs.asdict(given) for given in result.inputs] == [
-        {"name": "uwb.csv", "sha256": "f" * 64, "bytes": 1234, "role": "position"}
-    ]
+    assert result.inputs == (InputFile("uwb.csv", "f" * 64, 1234, "position"),)
     assert result.log.notes == ("uwb.csv: time: column 1", "uwb.csv: two rows dropped")
-    assert result.ekf2 is flight.ekf2
-    assert flight.inputs == ()
 
 
 # -- frames that are not EKF2's --------------------------------------------------------------------
@@ -360,24 +353,6 @@ def test_outliers_and_gaps_move_the_clock_little() -> None:
     np.testing.assert_allclose(alignment.origin_m[:2], 0.0, atol=0.05)
 
 
-def test_a_file_from_minutes_before_until_minutes_after_the_flight(flight: Flight) -> None:
-    rng = np.random.default_rng(5)
-    own = recorded(flight).samples
-    before = np.arange(own.index[0] - 400.0, own.index[0] - 0.1, 0.2)
-    after = np.arange(own.index[-1] + 0.2, own.index[-1] + 300.0, 0.2)
-    xyz = own[["x_m", "y_m", "z_m"]].to_numpy()
-    rows = [
-        rng.normal(0.0, 0.1, (len(before), 3)) + xyz[:3].mean(axis=0),
-        xyz,
-        rng.normal(0.0, 0.1, (len(after), 3)) + xyz[-3:].mean(axis=0),
-    ]
-    file = position_file(np.concatenate([before, own.index, after]), np.vstack(rows))
-    alignment, track = placed(flight, file)
-    assert off_s(alignment) < 0.03
-    assert len(track.samples) == len(file.samples)
-    assert alignment.warnings == ()
-
-
 @pytest.mark.parametrize("delta", [(3.0, -2.0, 0.5), (100.0, 40.0, 0.0)])
 def test_a_reset_of_ekf2_does_no_harm(delta: tuple[float, float, float]) -> None:
     flight = flight_along(ekf2=Estimator(resets=(Reset(70.0, "position", delta),)))
@@ -421,15 +396,6 @@ def test_the_imu_tells_the_frame_and_that_it_is_turned() -> None:
     alignment, _ = placed(still, recorded(flight), frame="enu")
     assert alignment.reference == IMU
     assert off_s(alignment) < 0.05
-
-
-def test_the_sample_flight_without_ekf2(
-    sample_flight: Flight, external: PositionRecording, true_offset_s: float
-) -> None:
-    flight = replace(sample_flight, ekf2=unavailable("EKF2"))
-    alignment, _ = placed(flight, external)
-    assert (alignment.frame, alignment.reference) == ("enu", IMU)
-    assert off_s(alignment, true_offset_s, (0.01, 0.08)) < 0.05
 
 
 # -- what cannot be placed -------------------------------------------------------------------------

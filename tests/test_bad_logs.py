@@ -107,31 +107,24 @@ def test_what_is_no_log_or_holds_nothing_of_use(tmp_path, content, words):
     assert words in refusal(path)
 
 
-def test_a_mistyped_name_and_a_table_get_the_command_that_was_meant(tmp_path):
-    log = make_log().write(tmp_path / "aisle_uwb.ulg")
-    with pytest.raises(
-        LogError, match=r"\(No such file or directory\). Did you mean aisle_uwb.ulg\?$"
-    ):
-        read_log(log.with_name("aisle_uvb.ulg"))
-    with pytest.raises(LogError, match=r"\(No such file or directory\)\.$"):
-        read_log(tmp_path / "quite another.bin")
-    table = tmp_path / "uwb.csv"
-    table.write_text("time_s,x_m,y_m,z_m\n0,1,2,3\n")
-    assert refusal(table) == (
-        "uwb.csv: a table, not a flight log. If it holds positions, give it beside the log of the "
-        "flight: px4fuse compare LOG --position uwb.csv."
-    )
-    path = tmp_path / "slam.tum"
-    path.write_text("0.0 1 2 3 0 0 0 1\n")
-    assert refusal(path) == (
-        "slam.tum: a trajectory or a pose graph, not a flight log. Score it with px4fuse evaluate, "
-        "or correct its loop: px4fuse loop slam.tum."
-    )
-    report = tmp_path / "log.pdf"
-    report.write_bytes(b"%PDF-1.7 and so on")
-    assert refusal(report) == (
-        "log.pdf: a PDF, not a flight log. To check a report: px4fuse verify log.pdf LOG."
-    )
+@pytest.mark.parametrize(
+    ("name", "content", "what", "command"),
+    [
+        ("uwb.csv", b"time_s,x_m,y_m,z_m\n0,1,2,3\n", "a table", "compare LOG --position uwb.csv"),
+        ("slam.tum", b"0.0 1 2 3 0 0 0 1\n", "a trajectory or a pose", "loop slam.tum"),
+        ("log.pdf", b"%PDF-1.7 and so on", "a PDF", "verify log.pdf LOG"),
+    ],
+)
+def test_what_is_no_log_gets_the_command_that_was_meant(tmp_path, name, content, what, command):
+    (tmp_path / name).write_bytes(content)
+    said = refusal(tmp_path / name)
+    assert said.startswith(f"{name}: {what}")
+    assert said.endswith(f"px4fuse {command}.")
+
+
+def test_a_mistyped_name_gets_the_one_that_was_meant(tmp_path):
+    make_log().write(tmp_path / "aisle_uwb.ulg")
+    assert refusal(tmp_path / "aisle_uvb.ulg").endswith("Did you mean aisle_uwb.ulg?")
 
 
 def test_a_log_of_topics_that_are_none_of_ours(tmp_path):
