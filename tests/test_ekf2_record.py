@@ -99,7 +99,7 @@ def test_every_ekf2_parameter_is_kept_and_results_hold_theirs_only(record_of, tm
     [
         ("cs_gps", ("GNSS position", "GNSS velocity")),
         ("cs_opt_flow", ("optical flow",)),
-        ("cs_ev_vel", ("external vision, velocity",)),
+        ("cs_ev_vel", ("vision velocity",)),
     ],
 )
 def test_other_horizontal_aiding_is_named(record_of, flag, names):

@@ -68,10 +68,8 @@ _STREAMS: Mapping[str, tuple[str, str, int]] = {
     "state": ("ODOMETRY", "LOCAL_POSITION_NED", 30),
 }
 _LANDED = "Have EXTENDED_SYS_STATE sent at 1 Hz, or give --start and --end."
-_ROUTER = (
-    "Record where the companion's link passes (a MAVLink router), or give the positioning system's "
-    "own file with --position"
-)
+_ROUTER = "Record where the companion's link passes (a MAVLink router), or"
+_FILE = "give the positioning system's own file with --position."
 ARDUPILOT_REPLAY = Unavailable(
     "replay of the estimator",
     "ArduPilot's estimator is another one than the one that px4fuse has a model of",
@@ -91,7 +89,7 @@ def remedies_of(autopilot: str) -> tuple[Mapping[str, str], Unavailable]:
             "landed": _LANDED,
             "variance": kept,
             "inside": kept,
-            "position": f"{_ROUTER}.",
+            "position": f"{_ROUTER} {_FILE}",
             "truth": "ArduPilot fuses motion capture itself: a real flight has no truth.",
         }, ARDUPILOT_REPLAY
     streamed = {
@@ -103,7 +101,7 @@ def remedies_of(autopilot: str) -> tuple[Mapping[str, str], Unavailable]:
         "landed": _LANDED,
         "variance": streamed["state"],
         "inside": "Give the ULog of the same flight as LOG, and this recording with --mavlink.",
-        "position": f"{_ROUTER}, or join the ULog of the flight.",
+        "position": f"{_ROUTER} join the ULog of the flight, or {_FILE}",
         "truth": "Real flights have truth only from motion capture (send ATT_POS_MOCAP).",
     }, RECORD_NOT_LOGGED
 

@@ -301,7 +301,9 @@ def _read_record(
         delayed=inside,
         per_step_biases=attitude == px4.QUATERNION_FILTER,
         other_aiding=tuple(
-            AIDS[name].label for name in OTHER_AIDING if name in meant and meant[name].any()
+            AIDS[name].label.replace("external vision,", "vision")
+            for name in OTHER_AIDING
+            if name in meant and meant[name].any()
         ),
         vision_age_s=age[~age.index.duplicated()],
     )
