@@ -403,11 +403,6 @@ def test_another_delay_turns_the_heading_back(models: dict[str, Model]) -> None:
     # 110 ms of error turn it in proportion, 200 ms were 4.7°
     logged, after = turned_deg("nominal", EKF2_GPS_DELAY=0.0)
     assert after - logged == pytest.approx(4.7 * 110.0 / 200.0, abs=0.5)
-    logged, after = turned_deg("nominal", EKF2_GPS_P_NOISE=0.8)
-    assert after == pytest.approx(logged, abs=0.15)
-    # hardly another delay is hardly another heading
-    logged, after = turned_deg("fullrate", EKF2_GPS_DELAY=110.001)
-    assert after == pytest.approx(logged, abs=0.15)
 
 
 @given(

@@ -224,17 +224,9 @@ def test_euler_angles_become_the_quaternion_that_turns_frd_into_ned(read):
     flight = read(recorder)
     assert flight.streams["attitude"].topics == ("ATTITUDE",)
     got = Rotation.from_quat(flight.attitude[QUATERNION_COLUMNS].to_numpy()[0], scalar_first=True)
-
-    def about(axis: int, angle: float) -> np.ndarray:
-        """Elementary rotation, written out."""
-        c, s = np.cos(angle), np.sin(angle)
-        turn = np.eye(3)
-        i, j = [(1, 2), (2, 0), (0, 1)][axis]
-        turn[i, i] = turn[j, j] = c
-        turn[i, j], turn[j, i] = -s, s
-        return turn
-
-    expected = about(2, yaw) @ about(1, pitch) @ about(0, roll)
+    # first about the nose, then about the wing, then about the vertical
+    about = [Rotation.from_rotvec(turn) for turn in ([roll, 0, 0], [0, pitch, 0], [0, 0, yaw])]
+    expected = about[2].as_matrix() @ about[1].as_matrix() @ about[0].as_matrix()
     np.testing.assert_allclose(got.as_matrix(), expected, atol=1e-6)
     # nose up is negative down: pitch < 0 here, so the nose points down
     assert got.as_matrix()[2, 0] == pytest.approx(-np.sin(pitch), abs=1e-6)

@@ -304,28 +304,6 @@ def test_rows_come_from_the_instance_that_was_primary(read, generation, switches
     ]
 
 
-@pytest.mark.parametrize(
-    ("name", "generation", "field"),
-    [
-        ("estimator_visual_odometry_aligned", "v1.12", "x"),
-        ("estimator_aid_src_ev_pos", "v1.16", "observation"),
-    ],
-)
-def test_positions_that_ekf2_kept_are_those_of_the_primary(read, name, generation, field):
-    """Each instance turns external vision into its own frame; the second's is 1 m further north."""
-    log = with_two_instances(generation, [(0.0, 0), (4.95, 1)])
-    if generation == "v1.12":
-        log.add(replace(odometry(name, 10.0, 12), instance=1))
-    second = next(made for made in log.topics if (made.name, made.instance) == (name, 1))
-    second.fields[field].reshape(50, -1)[:, 0] += 1.0
-    track, _ = choose_source(read(log), name)
-    time = seconds_of(ev_stamps(10.0))
-    expected = position(time)[:, 0] + ev_error(time)[:, 0] + (time >= 4.95)
-    lead = HALF_PERIOD_S if name == "estimator_aid_src_ev_pos" else 0.0
-    np.testing.assert_allclose(times(track.samples), time + lead, atol=1e-9)
-    np.testing.assert_allclose(track.samples["north_m"], expected, **FLOAT32)
-
-
 def test_a_selector_that_has_not_chosen_yet_is_passed_over(read):
     ekf2 = read(with_two_instances("v1.16", [(0.0, 255), (3.05, 1)])).ekf2
     assert ekf2.instances == ((-np.inf, 1),)
