@@ -342,6 +342,15 @@ def test_a_given_offset_is_used_and_warned_of_where_it_is_wrong(flight: Flight) 
     assert_same_track(track, flight.positions[0], 0.1)
 
 
+def test_a_height_that_runs_against_ekf2s_and_another_day_are_warned_of(flight: Flight) -> None:
+    file = recorded(flight)
+    file.samples["z_m"] *= -1.0
+    other = replace(flight, log=replace(flight.log, start_unix_s=BOOT_S - OFFSET_S - 100.0))
+    height, day = placed(other, file, frame="enu")[0].warnings
+    assert "height runs against EKF2's" in height
+    assert "file and log are 100 s apart" in day
+
+
 # -- what real files are like ----------------------------------------------------------------------
 
 

@@ -432,6 +432,7 @@ def test_senders_and_what_they_lost_are_described(read):
     assert described[GROUND].description == "ground station"
     assert described[COMPANION].lost_share == pytest.approx(0.1, abs=0.005)
     assert described[AUTOPILOT].lost_share == 0.0
+    assert [*described] == [AUTOPILOT, COMPANION, GROUND]  # most messages first
 
 
 # ---- the map itself -----------------------------------------------------------------------------
