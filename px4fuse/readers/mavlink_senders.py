@@ -97,13 +97,10 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
 
 def senders_of(recording: Recording, message: str) -> list[Address]:
     """Senders of one message that may speak to this vehicle: not it, nor another vehicle's."""
-    frames = recording.frames
-    rows = frames.rows(message)
-    rows = rows[(rows >= recording.session.start) & (rows < recording.session.stop)]
-    own = (recording.system, recording.component)
-    others = {s[0] for s, seen in _vehicles(frames).items() if _flies(*seen)} - {recording.system}
-    heard = [s for s, _ in _counts(frames, rows) if s != own and s[0] not in others]
-    return heard[:MAX_SENDERS]
+    frames, own = recording.frames, recording.address
+    others = {s[0] for s, seen in _vehicles(frames).items() if _flies(*seen)} - {own[0]}
+    counts = _counts(frames, recording.of_anybody(message))
+    return [s for s, _ in counts if s != own and s[0] not in others][:MAX_SENDERS]
 
 
 def map_senders(recording: Recording) -> dict[Address, Mapped]:
@@ -190,8 +187,8 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
             word = VEHICLE_TYPES.get(kind, f"type {kind}")
             if autopilot != NO_AUTOPILOT:
                 word = f"{AUTOPILOTS.get(autopilot, 'autopilot')} {word}"
-        chosen = address == (recording.system, recording.component)
-        described.append(Sender(*address, word, count, _lost_share(frames, address), chosen))
+        lost, chosen = _lost_share(frames, address), address == recording.address
+        described.append(Sender(*address, word, count, lost, chosen))
     return tuple(described)
 
 

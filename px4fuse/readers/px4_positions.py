@@ -358,7 +358,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
             f"{len(left_out)} positions of GNSS that the logger left out are from "
             "estimator_aid_src_gnss_pos, their heights are interpolated",
         )
-    more = {}
+    more: dict[str, Any] = {}
     if set(ANTENNA_COLUMNS) <= set(gps.columns):  # since v1.17 of each receiver
         more["place_m"] = tuple(gps[ANTENNA_COLUMNS].iloc[-1].tolist())
     found = _track(
