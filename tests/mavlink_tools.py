@@ -243,15 +243,8 @@ class Aisle:
         p, v, _ = self.path(boot_s)
         if self.state == "ODOMETRY":
             return odometry(us(boot_s), p, v, estimator=8)
-        if self.state == "LOCAL_POSITION_NED":
-            return message(self.state, time_boot_ms=ms(boot_s), **xyz(p), **xyz(v, prefix="v"))
-        covariance = np.full(45, 99.0)
-        covariance[[0, 9, 17]] = POSE_VARIANCE
-        covariance[[24, 30, 35]] = VELOCITY_VARIANCE
-        return message(
-            "LOCAL_POSITION_NED_COV", time_usec=us(boot_s), covariance=covariance.tolist(),
-            **xyz(p), **xyz(v, prefix="v"),
-        )  # fmt: skip
+        assert self.state is not None
+        return message(self.state, time_boot_ms=ms(boot_s), **xyz(p), **xyz(v, prefix="v"))
 
     def position(self, boot_s: float, rng: np.random.Generator) -> Any:
         here = self.path(boot_s)[0] + rng.normal(0.0, self.noise_m, 3)

@@ -95,10 +95,14 @@ def test_every_ekf2_parameter_is_kept_and_results_hold_theirs_only(record_of, tm
 
 
 @pytest.mark.parametrize(
-    ("flag", "name"),
-    [("cs_gps", "GPS"), ("cs_opt_flow", "optical flow"), ("cs_ev_vel", "vision velocity")],
+    ("flag", "names"),
+    [
+        ("cs_gps", ("GNSS position", "GNSS velocity")),
+        ("cs_opt_flow", ("optical flow",)),
+        ("cs_ev_vel", ("vision velocity",)),
+    ],
 )
-def test_other_horizontal_aiding_is_named(record_of, flag, name):
+def test_other_horizontal_aiding_is_named(record_of, flag, names):
     log = made_log("v1.16")
     flags = log["estimator_status_flags"]
     used = np.zeros(len(flags["timestamp"]), np.bool_)
@@ -106,7 +110,7 @@ def test_other_horizontal_aiding_is_named(record_of, flag, name):
     assert record_of(log).record.other_aiding == ()
     used[4] = True
     flags[flag] = used
-    assert record_of(log).record.other_aiding == (name,)
+    assert record_of(log).record.other_aiding == names
 
 
 def test_the_age_of_vision_is_publication_minus_measurement(record_of):

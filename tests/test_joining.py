@@ -153,18 +153,6 @@ def test_missing_names_what_still_lacks_and_nothing_else(record):
     assert len(whats) == len(set(whats))
 
 
-def test_variances_alone_are_taken_too(record):
-    poor = record(Aisle(state="LOCAL_POSITION_NED"), "poor.tlog")
-    rich = record(Aisle(seed=5), "rich.tlog")
-    assert isinstance(poor.ekf2.variance, Unavailable)
-    joined = join(poor, rich)
-    assert joined.ekf2.state is poor.ekf2.state
-    assert isinstance(joined.ekf2.variance, pd.DataFrame)
-    assert joined.streams["ekf2_variance"].log == "rich.tlog"
-    assert joined.streams["ekf2_state"].log == "poor.tlog"
-    assert "EKF2 variances" not in [part.what for part in joined.missing]
-
-
 @pytest.mark.parametrize("earlier_s", [0.0, 10.0])
 def test_senders_and_unix_time_are_taken_at_the_first_recordings_zero(record, earlier_s):
     ulog = aisle_flight(duration_s=60.0, ekf2=None, attitude_hz=None)
@@ -187,16 +175,10 @@ def test_recordings_that_do_not_overlap_are_refused_with_both_spans(record):
         join(first, second)
 
 
-def test_another_flight_is_refused_by_its_positions_and_by_its_attitude(
-    sample_flight, tlog_flight, record
-):
+def test_another_flight_is_refused_by_its_positions(sample_flight, tlog_flight):
     moved = replace(tlog_flight.ekf2, state=tlog_flight.ekf2.state + 3.0)
     with pytest.raises(MissingDataError, match="not of the same flight: EKF2's positions differ"):
         join(sample_flight, replace(tlog_flight, ekf2=moved))
-    ulog = aisle_flight(duration_s=40.0, ekf2=None)
-    ulog = replace(ulog, log=replace(ulog.log, boot_time_s=BOOT_S))
-    with pytest.raises(MissingDataError, match=r"attitudes differ by 4[0-9]°"):
-        join(ulog, record(Aisle()))
 
 
 @pytest.mark.reallogs

@@ -18,7 +18,6 @@ from mavlink_tools import (
     MESSAGES,
     Aisle,
     Heard,
-    Recorder,
     frame,
     heard_by_pymavlink,
     heartbeat,
@@ -37,11 +36,6 @@ START_US = 1_700_000_000_000_000
 BEYOND_PYMAVLINK = {
     "ArduPilot_UAVLogViewer_hist_7092460c_flight_logs.tlog": 5,
     "mbiuki_Phoenix_mission1.rlog": 17,
-}
-# "unknown" messages that pymavlink makes of such bytes
-FALSE_UNKNOWN = {
-    "ArduPilot_UAVLogViewer_hist_7092460c_flight_logs.tlog": 3,
-    "mbiuki_Phoenix_mission1.rlog": 1,
 }
 PARSABLE = [
     path
@@ -131,31 +125,8 @@ def agrees(path: Path) -> None:
         count += len(rows)
     assert (frames.received_us is not None) == with_stamps
     assert len(frames) - count == BEYOND_PYMAVLINK.get(path.name, 0)
-    assert sum(frames.passed_over.values()) == unknown - FALSE_UNKNOWN.get(path.name, 0)
-    if path.name in BEYOND_PYMAVLINK:
-        what_was_lost_follows_bad_bytes_and_is_good(
-            frames, {one.start for ones in heard.values() for one in ones}, with_stamps
-        )
-    else:
-        assert count == len(frames)
-
-
-def what_was_lost_follows_bad_bytes_and_is_good(
-    frames: Frames, theirs: set[int], with_stamps: bool
-) -> None:
-    """Checksums are recomputed here; chance would make less than one in such a file."""
-    gap = 8 if with_stamps else 0
-    ends = frames.payload_start + frames.payload_length + 2
-    previous = np.concatenate([[0], ends[:-1]])
-    lost = [row for row, start in enumerate(frames.start.tolist()) if start not in theirs]
-    # each is after bad bytes, or after one that was lost too
-    damaged = set(np.flatnonzero(frames.start - gap != previous).tolist())
-    for row in lost:
-        assert row in damaged or row - 1 in lost or row + 1 in damaged
-        begin, end = int(frames.start[row]), int(ends[row])
-        seed = MESSAGES[message_name(int(frames.message_id[row]))].crc_extra
-        body = frames.content[begin + 1 : end - 2] + bytes([seed])
-        assert mcrf4xx(body) == int.from_bytes(frames.content[end - 2 : end], "little")
+    if path.name not in BEYOND_PYMAVLINK:  # else pymavlink takes some of those for unknown ones
+        assert sum(frames.passed_over.values()) == unknown
 
 
 def test_the_sample_tlog_is_read_as_pymavlink_reads_it(sample_log):
@@ -253,23 +224,6 @@ def test_unknown_ids_are_counted_and_cost_nothing_else(read):
         assert frames.bad_bytes == 0
 
 
-@pytest.mark.parametrize("with_stamps", [True, False])
-def test_frames_of_another_dialect_are_counted_and_are_no_damage(read, with_stamps):
-    """Another definition of a message has another checksum seed (CRC_EXTRA)."""
-    number = 30  # ATTITUDE
-    foreign = [
-        raw_frame(number, bytes([i] * 28), seed=7, sequence=i % 256, v1=i % 2 == 0)
-        for i in range(40)
-    ]
-    parts = beats(20)
-    for i in range(0, 20, 2):
-        parts[i:i] = foreign[2 * i : 2 * i + 4]
-    frames = read(stamped(*parts) if with_stamps else b"".join(parts))
-    assert names(frames) == ["HEARTBEAT"] * 20
-    assert dict(frames.passed_over) == {number: 40}
-    assert frames.bad_bytes == 0
-
-
 def test_frames_of_a_known_message_that_were_changed_on_the_way_are_damage(read):
     beat = beats(10)
     beat[4] = beat[4][:-1] + bytes([beat[4][-1] ^ 1])
@@ -306,7 +260,7 @@ def test_a_recording_that_is_cut_off_says_so(tmp_path, stamped: bool, missing: i
     assert [text.startswith(wanted) for text in log.damage] == [True] * (missing > 0)
 
 
-@pytest.mark.parametrize("behind", [b"\x00" * 50, raw_frame(60_000, b"abcdefg", seed=7)])
+@pytest.mark.parametrize("behind", [b"\x00" * 50, raw_frame(40_000, b"abcdefg", seed=7)])
 def test_what_follows_the_last_frame_is_not_always_the_next(read, behind: bytes):
     """Rubbish, and a whole frame of a dialect that is not known here."""
     assert not read(b"".join(beats(6)) + behind).in_frame
@@ -318,13 +272,6 @@ def test_junk_between_frames_costs_itself(read, junk):
     frames = read(b"".join(parts[:3]) + junk + b"".join(parts[3:]))
     assert frames.sequence.tolist() == list(range(6))
     assert frames.bad_bytes == len(junk)
-
-
-def test_junk_in_a_tlog_costs_itself(read):
-    parts = [stamp(START_US + i) + part for i, part in enumerate(beats(6))]
-    frames = read(b"".join(parts[:3]) + b"\xfd junk \xfe" + b"".join(parts[3:]))
-    assert frames.sequence.tolist() == list(range(6))
-    assert frames.received_us.tolist() == [START_US + i for i in range(6)]
 
 
 def test_a_stamp_that_looks_like_the_beginning_of_a_frame_hides_none(read):
@@ -372,15 +319,6 @@ def test_the_first_and_the_last_frame_may_be_cut(read):
         assert (np.diff(frames.received_us[1:]) == 1000).all()
 
 
-def test_mavlink_1_and_2_may_be_mixed(read):
-    parts = [frame(ATTITUDE, sequence=i, v1=bool(i % 3)) for i in range(30)]
-    for content in (stamped(*parts), b"".join(parts)):
-        frames = read(content)
-        assert frames.sequence.tolist() == list(range(30))
-        assert len(np.unique(decoded(frames, "ATTITUDE"))) == 1
-        assert set(frames.payload_length.tolist()) == {28, 16}
-
-
 def test_damaged_stamps_are_interpolated(read):
     parts = beats(9)
     times = [START_US + 1000 * i for i in range(9)]
@@ -393,21 +331,6 @@ def test_damaged_stamps_are_interpolated(read):
     assert frames.received_us.tolist() == [START_US + 1000 * i for i in range(9)]
 
 
-def test_stamps_that_are_all_damaged_are_all_counted(read):
-    frames = read(b"".join(b"\xff" * 8 + part for part in beats(5)))
-    assert frames.bad_stamps == 5
-    assert frames.received_us is not None
-    assert frames.received_us.shape == (5,)
-
-
-def test_link_numbers_are_in_the_stamps_lowest_bits(read):
-    recorder = Recorder()
-    for i in range(8):
-        recorder.hear(START_US * 1e-6 + i, AUTOPILOT, heartbeat(), link=i % 3)
-    frames = read(recorder.tlog())
-    assert frames.link.tolist() == [i % 3 for i in range(8)]
-
-
 @pytest.mark.parametrize("with_stamps", [True, False])
 def test_one_message_is_a_recording(read, with_stamps):
     content = frame(odometry(5_000_000, [1, 2, 3], [0, 0, 0], estimator=8))
@@ -415,13 +338,6 @@ def test_one_message_is_a_recording(read, with_stamps):
     assert len(frames) == 1
     assert (frames.received_us is not None) == with_stamps
     assert frames.bad_bytes == 0
-
-
-@pytest.mark.reallogs
-def test_the_recording_of_one_message_is_read(shared_logs):
-    path = shared_logs / "mavlink" / "ArduPilot_pymavlink_capture.mav2.battery_status.tlog"
-    assert names(read_frames(path)) == ["BATTERY_STATUS"]
-    assert read_log(path).positions == ()
 
 
 @given(st.lists(st.sampled_from(["v1", "v2", "signed", "unknown", "bad", "junk"]), min_size=1))
@@ -472,26 +388,6 @@ def test_what_is_no_mavlink_is_refused_in_bounded_memory(tmp_path, name, content
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 4 * len(content) + BLOCK_BYTES, name
-
-
-def test_an_empty_file_is_refused(tmp_path):
-    path = tmp_path / "empty.tlog"
-    path.write_bytes(b"")
-    with pytest.raises(LogError, match="empty"):
-        read_log(path)
-
-
-@pytest.mark.reallogs
-@pytest.mark.parametrize(
-    ("name", "reason"),
-    [
-        ("ArduPilot_pymavlink_capture.mavlink", "0 frames with a good checksum"),
-        ("ArduPilot_pymavlink_test.BIN", "DataFlash"),
-    ],
-)
-def test_foreign_files_are_refused(shared_logs, name, reason):
-    with pytest.raises(LogError, match=reason):
-        read_log(shared_logs / "mavlink" / name)
 
 
 def test_the_scan_reads_no_byte_more_than_a_frames_length_for_each_start(tmp_path, monkeypatch):
@@ -552,7 +448,6 @@ def test_shortest_frames_of_random_senders_cost_a_bounded_amount_each(tmp_path, 
     [
         ("ODOMETRY", AUTOPILOT),
         ("ODOMETRY", COMPANION),
-        ("LOCAL_POSITION_NED_COV", AUTOPILOT),
         ("VISION_POSITION_ESTIMATE", COMPANION),
         ("PARAM_VALUE", AUTOPILOT),
     ],
@@ -577,21 +472,11 @@ def test_frames_cut_to_their_stamp_cost_a_bounded_amount_each(tmp_path, name, se
     assert peak < path.stat().st_size + DECODED_BYTES * count + TINY_BYTES
 
 
-@pytest.mark.reallogs
-@pytest.mark.parametrize("path", PARSABLE, ids=lambda path: path.name)
-def test_real_recordings_take_less_than_four_times_their_size(path):
-    memory_is_bounded(path)
-
-
 def test_the_sample_takes_less_than_four_times_its_size(sample_log):
-    memory_is_bounded(sample_log.with_suffix(".tlog"))
-
-
-def memory_is_bounded(path: Path) -> None:
+    path = sample_log.with_suffix(".tlog")
     read_log(path)  # tables that are made once
     tracemalloc.start()
     read_log(path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    size = path.stat().st_size
-    assert peak < 4 * size + (TINY_BYTES if size < 500_000 else 0)
+    assert peak < 4 * path.stat().st_size

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -20,6 +19,7 @@ from px4fuse.alignment.tracks import (
     continuous_track,
     placed_samples,
 )
+from px4fuse.arrays import Array
 from px4fuse.flight import Alignment, Flight, Unavailable
 
 if TYPE_CHECKING:
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
 # Another lag whose residual is not larger by this factor can hardly be told apart
 NEAR_RESIDUAL = {EKF2_POSITION: 2.0, IMU: 1.4}  # the IMU's own noise leaves 1.4 to 1.7
-LARGE_CLOCK_SIGMA_S = 0.1
-LARGE_YAW_SIGMA_DEG = 2.0
 MIN_MIRRORED = 0.8  # correlation of the heights below minus which they run against each other
 MAX_UNIX_DIFFERENCE_S = 60.0  # computers in a lab keep time better than this
 
@@ -74,11 +72,11 @@ def describe(
     placed = placed_samples(samples, frame, yaw_rad, origin_m, lag_s)
     compared = None if reference == IMU else _compare(flight, placed)
     if compared:
-        reference, correlation = EKF2_POSITION, compared.correlation
+        reference, correlation = EKF2_POSITION, compared[1]
     warnings = [
-        *(_match_warnings(match, samples, yaw_sigma_deg) if match else ()),
+        *(_match_warnings(match) if match else ()),
         *_frame_warnings(match, compared, yaw_rad, auto),
-        *([] if match and match.better_frame else _height_warnings(flight, placed)),
+        *_height_warnings(flight, placed),
         *_unix_warnings(flight, file, clock_offset_s),
     ]
     alignment = Alignment(
@@ -93,31 +91,18 @@ def describe(
         clock_reason=clock_reason,
         reference=reference,
         correlation=correlation,
-        residual_rms_m=compared.rms_m if compared else None,
+        residual_rms_m=float(np.sqrt(np.mean(compared[0] ** 2) / 2.0)) if compared else None,
         warnings=tuple(warnings),
     )
     return alignment, placed
 
 
-@dataclass(frozen=True)
-class _Comparison:
-    """The placed file against EKF2, horizontally.
+def _compare(flight: Flight, placed: pd.DataFrame) -> tuple[Array, float | None] | None:
+    """Distances (m) from EKF2 and correlation with it, horizontally.
 
-    Attributes
-    ----------
-    rms_m, capped_rms_m : float
-        Per axis.
-    correlation : float or None
-        None where EKF2 hardly moves.
+    The correlation is None where EKF2 hardly moves; all is None where it has no position at the
+    file's times.
     """
-
-    rms_m: float
-    capped_rms_m: float
-    correlation: float | None
-
-
-def _compare(flight: Flight, placed: pd.DataFrame) -> _Comparison | None:
-    """Compare at the file's times; None where EKF2 has no position there."""
     if isinstance(flight.ekf2, Unavailable):
         return None
     try:
@@ -128,21 +113,15 @@ def _compare(flight: Flight, placed: pd.DataFrame) -> _Comparison | None:
         return None
     ours = (placed["north_m"].to_numpy() + 1j * placed["east_m"].to_numpy())[known]
     theirs = (ekf2[:, 0] + 1j * ekf2[:, 1])[known]
-    distance = np.abs(ours - theirs)
+    distance_m = np.abs(ours - theirs)
     ours, theirs = ours - np.mean(ours), theirs - np.mean(theirs)
     moves = max(np.ptp(theirs.real), np.ptp(theirs.imag)) >= MIN_MOTION_M
     power = float(np.linalg.norm(ours) * np.linalg.norm(theirs))
-    return _Comparison(
-        rms_m=float(np.sqrt(np.mean(distance**2) / 2.0)),
-        capped_rms_m=capped_rms(distance) / np.sqrt(2.0),
-        correlation=float(np.vdot(ours, theirs).real) / power if moves and power > 0.0 else None,
-    )
+    return distance_m, float(np.vdot(ours, theirs).real) / power if moves and power > 0.0 else None
 
 
-def _match_warnings(
-    match: Match, samples: pd.DataFrame, yaw_sigma_deg: float | None
-) -> Iterator[str]:
-    """What is poorly determined."""
+def _match_warnings(match: Match) -> Iterator[str]:
+    """What makes the match doubtful."""
     name, fit = match.reference.name, match.clock
     if fit.concordance < GOOD_CONCORDANCE[name]:
         yield f"The file follows the {name} only roughly (concordance {fit.concordance:.2f})."
@@ -151,23 +130,6 @@ def _match_warnings(
             f"A clock offset {fit.rival_s:+.1f} s from this one fits nearly as well, with a "
             f"residual only {fit.rival_ratio:.1f} times as large: if this one is wrong, give "
             "--clock-offset SECONDS."
-        )
-    if fit.lag_sigma_s is not None:
-        if fit.lag_sigma_s > LARGE_CLOCK_SIGMA_S:
-            yield (
-                "The clock offset is poorly determined (standard deviation "
-                f"{fit.lag_sigma_s:.2f} s)."
-            )
-        spans = [float(np.ptp(times)) for times in (samples.index, match.reference.time_s)]
-        if fit.overlap_s < 0.5 * min(spans):
-            yield (
-                f"Only {fit.overlap_s:.0f} s of the file overlap the {name}: if more should, "
-                "give --clock-offset SECONDS."
-            )
-    if yaw_sigma_deg is not None and yaw_sigma_deg > LARGE_YAW_SIGMA_DEG:
-        yield (
-            f"The yaw is poorly determined (standard deviation {yaw_sigma_deg:.1f}°): the flight "
-            "is short, or nearly a point."
         )
 
 
@@ -204,30 +166,23 @@ def _unix_warnings(
 
 
 def _frame_warnings(
-    match: Match | None, compared: _Comparison | None, yaw_rad: float, auto: bool
+    match: Match | None, compared: tuple[Array, float | None] | None, yaw_rad: float, auto: bool
 ) -> Iterator[str]:
     """Whether the file's frame is EKF2's, where it was not fitted to be, and where it cannot be."""
     name = match.reference.name if match else EKF2_POSITION
+    turned, correlation = match is not None and match.turned, None
+    if compared:
+        distance_m, correlation = compared
+        rms_m = capped_rms(distance_m) / np.sqrt(2.0)
+        turned = (
+            match is not None and is_sound(match.free, name) and is_turned(rms_m, match.free, name)
+        )
     if auto:
         if name == IMU:
             yield (
                 "The IMU tells the yaw to a few degrees only (1° to 6° off on simulated flights), "
                 "and not the origin of the file's frame, which was left at 0."
             )
-        return
-    followed = 1.0
-    if compared and compared.correlation is not None:
-        followed = compared.correlation
-    turned = match is not None and match.turned
-    if match and compared:
-        turned = is_sound(match.free, EKF2_POSITION) and is_turned(
-            compared.capped_rms_m, match.free, EKF2_POSITION
-        )
-    if match and turned and match.better_frame:
-        yield (
-            f"The file does not fit the {name} as {match.frame}, but it does as "
-            f"{match.better_frame}: give --position-frame {match.better_frame}."
-        )
     elif match and turned:
         yaw = np.degrees(np.angle(np.exp(1j * (match.free.yaw_rad - yaw_rad))))
         shift = np.hypot(*match.free.origin_m[:2])
@@ -236,8 +191,8 @@ def _frame_warnings(
             f"The file's frame seems turned by {yaw:.1f}°{how} against the {name}: give "
             "--position-yaw auto."
         )
-    elif followed < MIN_CONCORDANCE[EKF2_POSITION]:
+    elif correlation is not None and correlation < MIN_CONCORDANCE[EKF2_POSITION]:
         yield (
-            f"The file hardly follows the EKF2 position (correlation {followed:.2f}): check clock "
-            "offset, frame and yaw."
+            f"The file hardly follows the EKF2 position (correlation {correlation:.2f}): check "
+            "clock offset, frame and yaw."
         )

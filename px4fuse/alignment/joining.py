@@ -9,12 +9,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from msgspec import structs
-from scipy.spatial.transform import Rotation
 
 from px4fuse.errors import MissingDataError
 from px4fuse.flight import (
     POSITION_COLUMNS,
-    QUATERNION_COLUMNS,
     Ekf2,
     Flight,
     Unavailable,
@@ -29,7 +27,6 @@ TIMES = ("time_s", "start_s", "end_s")
 MIN_OVERLAP_S = 2.0
 # EKF2's position is sent as it is logged: what is left is interpolation between samples
 MAX_POSITION_DIFFERENCE_M = 0.5
-MAX_ATTITUDE_DIFFERENCE_DEG = 10.0
 MIN_COMMON_SAMPLES = 5
 
 
@@ -69,14 +66,6 @@ def join(flight: Flight, other: Flight) -> Flight:
         if isinstance(mine, Unavailable) and not isinstance(theirs, Unavailable):
             taken[part] = theirs
             streams |= {k: v for k, v in moved.streams.items() if k.startswith(part)}
-    if (
-        isinstance(flight.ekf2, Ekf2)
-        and isinstance(flight.ekf2.variance, Unavailable)
-        and isinstance(moved.ekf2, Ekf2)
-        and isinstance(moved.ekf2.variance, pd.DataFrame)
-    ):
-        taken["ekf2"] = replace(flight.ekf2, variance=moved.ekf2.variance)
-        streams["ekf2_variance"] = moved.streams["ekf2_variance"]
     joined = replace(flight, **taken)
     lacking = missing_parts(joined.imu, joined.attitude, joined.ekf2, joined.truth)
     log, given = flight.log, other.log
@@ -158,27 +147,10 @@ def _agreement(flight: Flight, other: Flight) -> str:
             apart = np.linalg.norm(ours - theirs.loc[at, POSITION_COLUMNS].to_numpy(), axis=1)
             median = float(np.median(apart))
             if median > MAX_POSITION_DIFFERENCE_M:
-                raise _not_one(flight, other, f"EKF2's positions differ by {median:.2f} m")
+                raise MissingDataError(
+                    f"{flight.log.name} and {other.log.name} are not of the same flight: EKF2's "
+                    f"positions differ by {median:.2f} m (median).",
+                    "Give the recordings of one flight.",
+                )
             return f"their EKF2 positions differ by {median:.3f} m (median)"
-    if isinstance(flight.attitude, pd.DataFrame) and isinstance(other.attitude, pd.DataFrame):
-        nearest = pd.merge_asof(
-            flight.attitude, other.attitude, left_index=True, right_index=True,
-            direction="nearest", tolerance=0.1,  # type: ignore[arg-type]
-        ).dropna()  # fmt: skip
-        if len(nearest) >= MIN_COMMON_SAMPLES:
-            first, second = (
-                Rotation.from_quat(nearest[columns].to_numpy(copy=True), scalar_first=True)
-                for columns in ([c + suffix for c in QUATERNION_COLUMNS] for suffix in ("_x", "_y"))
-            )
-            angle = float(np.degrees(np.median((first.inv() * second).magnitude())))
-            if angle > MAX_ATTITUDE_DIFFERENCE_DEG:
-                raise _not_one(flight, other, f"their attitudes differ by {angle:.0f}°")
-            return f"their attitudes differ by {angle:.1f}° (median)"
-    return "that they are of the same flight could not be checked: nothing is in both"
-
-
-def _not_one(flight: Flight, other: Flight, why: str) -> MissingDataError:
-    return MissingDataError(
-        f"{flight.log.name} and {other.log.name} are not of the same flight: {why} (median). Give "
-        "the recordings of one flight."
-    )
+    return "that they are of the same flight could not be checked: no EKF2 in both"

@@ -19,6 +19,7 @@ from px4fuse.ekf2_parameters import (
     EV_POS,
     GNSS_MODE,
     GNSS_POS,
+    GNSS_VEL,
     Aid,
     fuses_by_mask,
     settings_in_force,
@@ -48,8 +49,7 @@ ROTATE_VISION_BIT = 64  # EKF2_AID_MASK, up to v1.13
 # The aid-source topics carry the time of measurement, as EKF2 takes it, to about a millisecond
 SAME_SAMPLE_S = 0.006
 GNSS_VELOCITY_BIT = 4  # of EKF2_GPS_CTRL; before v1.14 both are always fused
-# What a log calls the aiding by GNSS
-OF_GNSS = ("GPS", "GPS position", "GPS velocity")
+OF_GNSS = (GNSS_POS.label, GNSS_VEL.label)
 # vehicle_local_position is logged every 0.1 s
 RESET_SHOWS_S = 0.2
 # Predictions of more than this lose turns and vibration inside a step; EKF2's own are 8 to 13 ms

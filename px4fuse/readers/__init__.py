@@ -10,9 +10,18 @@ from px4fuse.reading import read_head, shown
 
 _SNIFF_BYTES = 16
 ULOG_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
-TRAJECTORIES = (".tum", ".g2o")
-TABLES = (".csv", ".tsv")
-DATAFLASH_MAGIC = b"\xa3\x95"  # libraries/AP_Logger/LogStructure.h
+# What is given for a log by mistake: how it begins, or the ends of its name; and what it is for
+_FOREIGN = (
+    # libraries/AP_Logger/LogStructure.h
+    (b"\xa3\x95", (), "an ArduPilot DataFlash log, not a PX4 ULog",
+     "Give the .tlog that the ground station wrote."),
+    (b"%PDF-", (), "a PDF, not a flight log", "To check a report: px4fuse verify {name} LOG."),
+    (b"", (".csv", ".tsv"), "a table, not a flight log",
+     "If it holds positions, give it beside the log of the flight: px4fuse compare LOG --position "
+     "{name}."),
+    (b"", (".tum", ".g2o"), "a trajectory or a pose graph, not a flight log",
+     "Score it with px4fuse evaluate, or correct its loop: px4fuse loop {name}."),
+)  # fmt: skip
 
 
 def read_log(path: str | Path, *, system: int | None = None) -> Flight:
@@ -44,26 +53,10 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
         from px4fuse.readers.ulog import read_ulog  # noqa: PLC0415
 
         return read_ulog(path)
-    if head.startswith(DATAFLASH_MAGIC):
-        raise LogError(
-            f"{name}: not a PX4 ULog but an ArduPilot DataFlash log, which px4fuse does not read",
-            "Give the .tlog that the ground station wrote.",
-        )
-    if path.suffix.lower() in TABLES and head.isascii():
-        raise LogError(
-            f"{name}: a table, not a flight log",
-            "If it holds positions, give it beside the log of the flight: px4fuse compare LOG "
-            f"--position {name}.",
-        )
-    if head.startswith(b"%PDF-"):
-        raise LogError(
-            f"{name}: a PDF, not a flight log", f"To check a report: px4fuse verify {name} LOG."
-        )
-    if path.suffix.lower() in TRAJECTORIES and head.isascii():
-        raise LogError(
-            f"{name}: a trajectory or a pose graph, not a flight log",
-            f"Score it with px4fuse evaluate, or correct its loop: px4fuse loop {name}.",
-        )
+    for magic, suffixes, what, remedy in _FOREIGN:
+        named_so = path.suffix.lower() in suffixes and head.isascii()
+        if named_so or (magic and head.startswith(magic)):
+            raise LogError(f"{name}: {what}", remedy.format(name=name))
     from px4fuse.readers.mavlink import read_mavlink  # noqa: PLC0415
 
     return read_mavlink(path, system)

@@ -18,8 +18,6 @@ class Layout:
         A PX4 topic or a MAVLink message.
     columns : mapping
         Our column name to the field's name, ``name[i]`` for an element; all must be present.
-    since : str
-        The PX4 releases that log it so.
     optional : mapping
         Further columns, read where the topic has them.
     scale : mapping
@@ -28,7 +26,6 @@ class Layout:
 
     topic: str
     columns: Mapping[str, str]
-    since: str = ""
     optional: Mapping[str, str] = field(default_factory=dict)
     scale: Mapping[str, float] = field(default_factory=dict)
 

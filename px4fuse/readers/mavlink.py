@@ -318,7 +318,7 @@ def _describe(
         format="MAVLink stream" if frames.received_us is None else "MAVLink tlog",
         firmware=firmware,
         firmware_hash=firmware_hash,
-        hardware=f"{kind} (MAVLink system {recording.system})",
+        hardware=f"{kind} (MAVLink system {recording.address[0]})",
         boot_time_s=recording.zero_s,
         duration_s=recording.duration_s,
         parameters=parameters,

@@ -11,7 +11,7 @@ Sources: MAVLink developer guide, "Packet Serialization"; pymavlink's generated 
 from __future__ import annotations
 
 import hashlib
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -67,15 +67,13 @@ class Frames:
     start : ndarray of int64, shape (n,)
         Offset of each frame's first byte.
     message_id : ndarray of int32, shape (n,)
-    system, component, sequence, link : ndarray of uint8, shape (n,)
-        ``link`` is the number that MAVProxy keeps in the lowest two bits of the stamp.
+    system, component, sequence : ndarray of uint8, shape (n,)
     payload_start : ndarray of int64, shape (n,)
     payload_length : ndarray of uint8, shape (n,)
     received_us : ndarray of int64, shape (n,), or None
         Time of receipt, µs UNIX, of a recording with stamps (damaged ones interpolated).
     passed_over : mapping from message id to count
-        Whole frames of messages that the dialect does not know, or defines otherwise: of those that
-        a sender sent of one message most have another checksum than its definition gives.
+        Whole frames of messages that the dialect does not know.
     bad_bytes : int
         Bytes that belong to no frame.
     in_frame : bool
@@ -91,7 +89,6 @@ class Frames:
     system: NDArray[np.uint8]
     component: NDArray[np.uint8]
     sequence: NDArray[np.uint8]
-    link: NDArray[np.uint8]
     payload_start: Integers
     payload_length: NDArray[np.uint8]
     received_us: Integers | None
@@ -213,29 +210,23 @@ def read_frames(path: Path) -> Frames:
     number = source[at + 3].astype(np.int32)
     for byte in (1, 2):
         number[second] |= source[at[second] + 3 + byte].astype(np.int32) << 8 * byte
-    system, component = source[at + 1], source[at + 2]
-    passed_over, bad_bytes = _between(
-        content, start - stamp, end, stamp, (system, component, number)
-    )
-    received, link, bad_stamps = None, np.zeros(len(start), dtype=np.uint8), 0
-    if stamp:
-        received, link, bad_stamps = _stamps(source, start, end)
+    passed_over, bad_bytes, in_frame = _between(content, start - stamp, end, stamp)
+    received, bad_stamps = _stamps(source, start, end) if stamp else (None, 0)
     return Frames(
         name=name,
         content=content,
         sha256=hashlib.sha256(content).hexdigest(),
         start=start,
         message_id=number,
-        system=system,
-        component=component,
+        system=source[at + 1],
+        component=source[at + 2],
         sequence=source[at],
-        link=link,
         payload_start=start + np.where(second, HEADER_2, HEADER_1),
         payload_length=source[start + 1],
         received_us=received,
         passed_over=passed_over,
         bad_bytes=bad_bytes,
-        in_frame=_is_begun(content[int(end[-1]) :], stamp),
+        in_frame=in_frame,
         bad_stamps=bad_stamps,
     )
 
@@ -274,13 +265,6 @@ def _without_overlap(start: Integers, end: Integers) -> tuple[Integers, Integers
     return start[keep], end[keep]
 
 
-def _is_begun(rest: bytes, stamp: int) -> bool:
-    """Whether what follows the last good frame ends with the beginning of another one."""
-    rest = rest[sum(size for _, size in _whole_frames(rest, 0, len(rest), stamp)) :]
-    begun = rest[stamp : stamp + 1] in (b"", bytes([MAGIC_1]), bytes([MAGIC_2]))
-    return 0 < len(rest) < stamp + LONGEST_FRAME and begun
-
-
 def _any_of(values: tuple[int, ...], increasing: Integers) -> bool:
     """Whether one of some values is among increasing ones."""
     at = np.searchsorted(increasing[:-1], values)
@@ -316,64 +300,50 @@ def _is_stamped(start: Integers, end: Integers) -> bool:
     return bool(stamped > bare) if stamped + bare else bool(start[0] == STAMP)
 
 
-def _whole_frames(
-    content: bytes, at: int, high: int, stamp: int
-) -> Iterator[tuple[tuple[int, int, int], int]]:
-    """Frames that follow one another between two places, by their headers alone.
+def _between(
+    content: bytes, start: Integers, end: Integers, stamp: int
+) -> tuple[Counter[int], int, bool]:
+    """What lies between the good frames, of which ``start`` is with the stamp.
 
-    Yields
-    ------
-    tuple of int
-        System, component and message.
+    Returns
+    -------
+    Counter
+        Whole frames of messages that the dialect does not know, by message id.
     int
-        Size in bytes, with the stamp.
+        Bytes that belong to no frame.
+    bool
+        Whether the last of them begin one.
     """
+    passed_over: Counter[int] = Counter()
+    bad, rest = 0, b""
+    lows, highs = np.append(0, end), np.append(start, len(content))
+    for low, high in np.column_stack([lows, highs])[lows < highs].tolist():
+        at = low
+        for number, size in _unknown_frames(content, low, high, stamp):
+            passed_over[number] += 1
+            at += size
+        bad += high - at
+        rest = content[at:high] if high == len(content) else b""
+    begun = rest[stamp : stamp + 1] in (b"", bytes([MAGIC_1]), bytes([MAGIC_2]))
+    return passed_over, bad, 0 < len(rest) < stamp + LONGEST_FRAME and begun
+
+
+def _unknown_frames(content: bytes, at: int, high: int, stamp: int) -> Iterator[tuple[int, int]]:
+    """Message id and size of unknown frames that follow one another, by their headers alone."""
     while at + stamp + HEADER_1 + CHECKSUM <= high:
         head = content[at + stamp : at + stamp + HEADER_2]
-        if head[0] == MAGIC_2 and len(head) == HEADER_2:
-            size = head[1] + HEADER_2 + CHECKSUM + SIGNATURE * (head[2] & SIGNED)
-            kind = head[5], head[6], int.from_bytes(head[7:10], "little")
-        elif head[0] == MAGIC_1:
-            size, kind = head[1] + HEADER_1 + CHECKSUM, (head[3], head[4], head[5])
-        else:
+        number, size = head[5], stamp + head[1] + HEADER_1 + CHECKSUM
+        if head[0] == MAGIC_2:
+            number = int.from_bytes(head[7:10], "little")
+            size += HEADER_2 - HEADER_1 + SIGNATURE * (head[2] & SIGNED)
+        at += size
+        if head[0] not in (MAGIC_1, MAGIC_2) or number in dialect.mavlink_map or at > high:
             return
-        at += stamp + size
-        if at > high:
-            return
-        yield kind, stamp + size
+        yield number, size
 
 
-def _between(
-    content: bytes,
-    start: Integers,
-    end: Integers,
-    stamp: int,
-    kinds: tuple[NDArray[Any], NDArray[Any], NDArray[Any]],
-) -> tuple[dict[int, int], int]:
-    """Whole frames between the good ones by message, and how many bytes belong to no frame.
-
-    ``start`` is with the stamp; ``kinds`` are system, component and message of the good ones.
-    """
-    lows, highs = np.append(0, end), np.append(start, len(content))
-    bad = int(np.sum(np.maximum(highs - lows, 0)))
-    found: defaultdict[tuple[int, int, int], list[int]] = defaultdict(list)
-    for gap in np.flatnonzero(highs > lows).tolist():
-        for kind, size in _whole_frames(content, int(lows[gap]), int(highs[gap]), stamp):
-            found[kind].append(size)
-    passed_over: Counter[int] = Counter()
-    for kind, sizes in found.items():
-        known = kind[2] in dialect.mavlink_map
-        good = np.logical_and.reduce([part == one for part, one in zip(kinds, kind, strict=True)])
-        if not known or len(sizes) > max(int(np.count_nonzero(good)), 1):
-            passed_over[kind[2]] += len(sizes)
-            bad -= sum(sizes)
-    return dict(passed_over), bad
-
-
-def _stamps(
-    source: NDArray[np.uint8], start: Integers, end: Integers
-) -> tuple[Integers, NDArray[np.uint8], int]:
-    """Time of receipt (µs), link number, and how many stamps were damaged."""
+def _stamps(source: NDArray[np.uint8], start: Integers, end: Integers) -> tuple[Integers, int]:
+    """Time of receipt (µs), and how many stamps were damaged."""
     usable = start >= STAMP
     usable[1:] &= start[1:] - end[:-1] >= STAMP
     windows = np.lib.stride_tricks.sliding_window_view(source, STAMP)
@@ -383,13 +353,10 @@ def _stamps(
     usable &= (received >= 0) & (received < 1 << 62)
     middle = int(np.median(received[usable])) if np.any(usable) else 0
     usable &= np.abs(received - middle) <= MAX_STAMP_DISTANCE_US
-    link = (received & 0x3).astype(np.uint8)
-    if not np.all(usable):
+    received = np.where(usable, received, 0)
+    if np.any(usable):
         rows = np.flatnonzero(usable)
-        link[~usable] = 0
-        received, good = np.zeros_like(received), received[rows]
-        if len(rows):
-            # interpolated from the first one on, so that float64 keeps every microsecond
-            steps = np.interp(np.arange(len(start)), rows, good - good[0])
-            received = good[0] + np.rint(steps).astype(np.int64)
-    return received, link, int(np.count_nonzero(~usable))
+        # interpolated from the first one on, so that float64 keeps every microsecond
+        steps = np.interp(np.arange(len(start)), rows, received[rows] - received[rows[0]])
+        received = received[rows[0]] + np.rint(steps).astype(np.int64)
+    return received, int(np.count_nonzero(~usable))

@@ -61,37 +61,15 @@ NO_MODES = Unavailable(
     "flight modes", "no HEARTBEAT of a PX4 autopilot", "Record the link of a PX4 vehicle."
 )
 
-# What would have put each part of a flight into a recording, by the autopilot's own means
-_JOIN = "Give the ULog of the same flight as LOG, and this recording with --mavlink."
+# By part of a flight: the message that carries it from PX4 and from ArduPilot, and how often (Hz)
+_STREAMS: Mapping[str, tuple[str, str, int]] = {
+    "imu": ("HIGHRES_IMU", "SCALED_IMU2", 50),
+    "attitude": ("ATTITUDE_QUATERNION", "ATTITUDE", 20),
+    "state": ("ODOMETRY", "LOCAL_POSITION_NED", 30),
+}
+_LANDED = "Have EXTENDED_SYS_STATE sent at 1 Hz, or give --start and --end."
+_ROUTER = "Record where the companion's link passes (a MAVLink router), or"
 _FILE = "give the positioning system's own file with --position."
-_PX4_STATE = "Set the stream rate of ODOMETRY to 30 Hz or more, or join the ULog."
-PX4_REMEDIES: Mapping[str, str] = {
-    "imu": "Set the stream rate of HIGHRES_IMU to 50 Hz or more (in PX4's console: mavlink stream "
-    "-d DEVICE -s HIGHRES_IMU -r 100), or join the ULog.",
-    "attitude": "Set the stream rate of ATTITUDE_QUATERNION to 20 Hz or more, or join the ULog.",
-    "state": _PX4_STATE,
-    "variance": _PX4_STATE,
-    "inside": _JOIN,
-    "landed": "Set the stream rate of EXTENDED_SYS_STATE to 1 Hz, or give --start and --end.",
-    "position": "Record where the companion's link passes (a MAVLink router), or join the ULog of "
-    f"the flight, or {_FILE}",
-    "truth": "Real flights have truth only from motion capture (send ATT_POS_MOCAP).",
-}
-# Its own log is DataFlash (.BIN), and SRn_ parameters set the streams of its serial port n
-ARDUPILOT_REMEDIES: Mapping[str, str] = {
-    "imu": "Ask the autopilot for SCALED_IMU2 at 50 Hz (MAV_CMD_SET_MESSAGE_INTERVAL, or "
-    "SRn_RAW_SENS of the recorded link).",
-    "attitude": "Ask the autopilot for ATTITUDE at 20 Hz (MAV_CMD_SET_MESSAGE_INTERVAL, or "
-    "SRn_EXTRA1 of the recorded link).",
-    "state": "Ask the autopilot for LOCAL_POSITION_NED at 10 Hz (MAV_CMD_SET_MESSAGE_INTERVAL, or "
-    "SRn_POSITION of the recorded link).",
-    "variance": "ArduPilot sends no variances; px4fuse does not read its DataFlash log (.BIN).",
-    "inside": "ArduPilot keeps them in its DataFlash log (.BIN), which px4fuse does not read.",
-    "landed": "Ask for EXTENDED_SYS_STATE at 1 Hz, or give --start and --end.",
-    "position": f"Record where the companion's link passes (a MAVLink router), or {_FILE}",
-    "truth": "ArduPilot fuses motion capture itself, so that a real flight's recording has no "
-    "truth.",
-}
 ARDUPILOT_REPLAY = Unavailable(
     "replay of the estimator",
     "ArduPilot's estimator is another one than the one that px4fuse has a model of",
@@ -100,10 +78,32 @@ ARDUPILOT_REPLAY = Unavailable(
 
 
 def remedies_of(autopilot: str) -> tuple[Mapping[str, str], Unavailable]:
-    """Remedies by part, and why EKF2 is not replayed; PX4's for all but ArduPilot."""
+    """What would have recorded each part, and why EKF2 is not replayed; PX4's but for ArduPilot."""
     if autopilot == "ArduPilot":
-        return ARDUPILOT_REMEDIES, ARDUPILOT_REPLAY
-    return PX4_REMEDIES, RECORD_NOT_LOGGED
+        kept = "ArduPilot keeps them in its DataFlash log (.BIN), which px4fuse does not read."
+        asked = {
+            part: f"Ask the autopilot for {name} at {hz} Hz (MAV_CMD_SET_MESSAGE_INTERVAL)."
+            for part, (_, name, hz) in _STREAMS.items()
+        }
+        return asked | {
+            "landed": _LANDED,
+            "variance": kept,
+            "inside": kept,
+            "position": f"{_ROUTER} {_FILE}",
+            "truth": "ArduPilot fuses motion capture itself: a real flight has no truth.",
+        }, ARDUPILOT_REPLAY
+    streamed = {
+        part: f"Set the stream rate of {name} to {hz} Hz or more (in PX4's console: mavlink stream "
+        f"-d DEVICE -s {name} -r {hz}), or join the ULog."
+        for part, (name, _, hz) in _STREAMS.items()
+    }
+    return streamed | {
+        "landed": _LANDED,
+        "variance": streamed["state"],
+        "inside": "Give the ULog of the same flight as LOG, and this recording with --mavlink.",
+        "position": f"{_ROUTER} join the ULog of the flight, or {_FILE}",
+        "truth": "Real flights have truth only from motion capture (send ATT_POS_MOCAP).",
+    }, RECORD_NOT_LOGGED
 
 
 _IMU_COLUMNS = SPECIFIC_FORCE_COLUMNS + ANGULAR_RATE_COLUMNS
@@ -147,26 +147,13 @@ ODOMETRY = Layout(
     | elements(VELOCITY_VARIANCE_COLUMNS, "velocity_covariance", POSE_DIAGONAL)
     | {name: name for name in ("frame_id", "child_frame_id", "reset_counter")},
 )
-# EKF2's state, those with variances first: of row-major upper triangles of 9×9 matrices
-STATES = (
-    ODOMETRY,
-    Layout(
-        "LOCAL_POSITION_NED_COV",
-        POSITION_AND_VELOCITY
-        | elements(
-            POSITION_VARIANCE_COLUMNS + VELOCITY_VARIANCE_COLUMNS,
-            "covariance",
-            (0, 9, 17, 24, 30, 35),
-        ),
-    ),
-    Layout("LOCAL_POSITION_NED", POSITION_AND_VELOCITY),
-)
+# EKF2's state, that with variances first
+STATES = (ODOMETRY, Layout("LOCAL_POSITION_NED", POSITION_AND_VELOCITY))
 ACCURACY = Layout(
     "ESTIMATOR_STATUS", {"horizontal_m": "pos_horiz_accuracy", "vertical_m": "pos_vert_accuracy"}
 )
 
 _DEGREES = {"latitude_deg": 1e-7, "longitude_deg": 1e-7}
-_SPEED = dict(zip(VELOCITY_COLUMNS, ("vn", "ve", "vd"), strict=True))
 # Simulation truth; ArduPilot's SIMSTATE has no height and no velocity
 TRUTH = (
     Layout(
@@ -175,16 +162,6 @@ TRUTH = (
         | dict(zip(VELOCITY_COLUMNS, ("vx", "vy", "vz"), strict=True))
         | elements(QUATERNION_COLUMNS, "attitude_quaternion"),
         scale={**_DEGREES, "altitude_m": 1e-3, **dict.fromkeys(VELOCITY_COLUMNS, 1e-2)},
-    ),
-    *(
-        Layout(
-            "SIM_STATE",
-            {"latitude_deg": f"lat{fine}", "longitude_deg": f"lon{fine}", "altitude_m": "alt"}
-            | _SPEED
-            | {name: f"q{i}" for i, name in enumerate(QUATERNION_COLUMNS, 1)},
-            scale=scale,
-        )
-        for fine, scale in (("_int", _DEGREES), ("", {}))
     ),
     Layout("SIMSTATE", {"latitude_deg": "lat", "longitude_deg": "lng"}, scale=_DEGREES),
 )

@@ -54,7 +54,7 @@ class Recording:
     Attributes
     ----------
     frames : Frames
-    system, component : int
+    address : Address
         Of the autopilot whose flight this is.
     session : slice
         The frames between two restarts of the autopilot.
@@ -77,8 +77,7 @@ class Recording:
     """
 
     frames: Frames
-    system: int
-    component: int
+    address: Address
     session: slice
     received_s: Array
     boot_of_receipt: Line
@@ -91,11 +90,16 @@ class Recording:
     dropped: dict[str, int] = field(default_factory=dict)
     streams: dict[str, Stream] = field(default_factory=dict)
 
+    def of_anybody(self, message: str) -> IntArray:
+        """Frames of one message within the session, whoever sent it."""
+        rows = self.frames.rows(message)
+        within: IntArray = rows[(rows >= self.session.start) & (rows < self.session.stop)]
+        return within
+
     def rows(self, message: str, address: Address | None = None) -> IntArray:
         """Frames of one message within the session, from the autopilot unless said otherwise."""
-        system, component = address or (self.system, self.component)
-        rows = self.frames.rows(message)
-        rows = rows[(rows >= self.session.start) & (rows < self.session.stop)]
+        system, component = address or self.address
+        rows = self.of_anybody(message)
         own = (self.frames.system[rows] == system) & (self.frames.component[rows] == component)
         chosen: IntArray = rows[own]
         return chosen
@@ -303,7 +307,7 @@ def settle_clocks(frames: Frames, address: Address) -> Recording:
     span = stamps if len(stamps) else np.array([0.0, received.max()])
     zero_s, end_s = float(span[0]), float(span[-1])
     return Recording(
-        frames, *address, session, received, line, zero_s, end_s - zero_s, notes, damage,
+        frames, address, session, received, line, zero_s, end_s - zero_s, notes, damage,
         len(restarts) or None, back or None,
     )  # fmt: skip
 
@@ -324,8 +328,7 @@ def _frame_notes(frames: Frames, back: int) -> list[str]:
             for number, count in sorted(frames.passed_over.items())
         )
         notes.append(
-            "whole frames of messages that px4fuse does not know, or knows with other checksums, "
-            f"were passed over: {listed}"
+            f"whole frames of messages that px4fuse does not know were passed over: {listed}"
         )
     if frames.bad_stamps:
         notes.append(f"{frames.bad_stamps} times of receipt are damaged and were interpolated")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,22 +42,22 @@ def _vehicles(frames: Frames) -> dict[Address, tuple[int, int]]:
     """Type and autopilot that each sender gave in its first heartbeat."""
     rows = frames.rows("HEARTBEAT")
     beats = frames.table("HEARTBEAT", rows)
-    address = frames.system[rows].astype(np.int64) << 8 | frames.component[rows]
-    first = np.unique(address, return_index=True)[1]
-    given = zip(beats["type"][first].tolist(), beats["autopilot"][first].tolist(), strict=True)
-    return dict(zip(_addresses(address[first]), given, strict=True))
+    given = zip(beats["type"].tolist(), beats["autopilot"].tolist(), strict=True)
+    found: dict[Address, tuple[int, int]] = {}
+    for address, said in zip(_addresses(frames, rows), given, strict=True):
+        found.setdefault(address, said)
+    return found
+
+
+def _addresses(frames: Frames, rows: IntArray | slice) -> Iterator[Address]:
+    """Sender of each frame."""
+    return zip(frames.system[rows].tolist(), frames.component[rows].tolist(), strict=True)
 
 
 def _counts(frames: Frames, rows: IntArray | slice = slice(None)) -> list[tuple[Address, int]]:
     """Senders of frames and how many each sent, most first."""
-    address = frames.system[rows].astype(np.int64) << 8 | frames.component[rows]
-    numbers, counts = np.unique(address, return_counts=True)
-    most = np.argsort(-counts, kind="stable")
-    return list(zip(_addresses(numbers[most]), counts[most].tolist(), strict=True))
-
-
-def _addresses(numbers: IntArray) -> list[Address]:
-    return list(zip((numbers >> 8).tolist(), (numbers & 0xFF).tolist(), strict=True))
+    counts = Counter(_addresses(frames, rows))
+    return sorted(counts.items(), key=lambda item: (-item[1], item[0]))
 
 
 def _flies(kind: int, autopilot: int) -> bool:
@@ -94,13 +97,10 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
 
 def senders_of(recording: Recording, message: str) -> list[Address]:
     """Senders of one message that may speak to this vehicle: not it, nor another vehicle's."""
-    frames = recording.frames
-    rows = frames.rows(message)
-    rows = rows[(rows >= recording.session.start) & (rows < recording.session.stop)]
-    own = (recording.system, recording.component)
-    others = {s[0] for s, seen in _vehicles(frames).items() if _flies(*seen)} - {recording.system}
-    heard = [s for s, _ in _counts(frames, rows) if s != own and s[0] not in others]
-    return heard[:MAX_SENDERS]
+    frames, own = recording.frames, recording.address
+    others = {s[0] for s, seen in _vehicles(frames).items() if _flies(*seen)} - {own[0]}
+    counts = _counts(frames, recording.of_anybody(message))
+    return [s for s, _ in counts if s != own and s[0] not in others][:MAX_SENDERS]
 
 
 def map_senders(recording: Recording) -> dict[Address, Mapped]:
@@ -187,24 +187,18 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
             word = VEHICLE_TYPES.get(kind, f"type {kind}")
             if autopilot != NO_AUTOPILOT:
                 word = f"{AUTOPILOTS.get(autopilot, 'autopilot')} {word}"
-        chosen = address == (recording.system, recording.component)
-        described.append(Sender(*address, word, count, _lost_share(frames, address), chosen))
+        lost, chosen = _lost_share(frames, address), address == recording.address
+        described.append(Sender(*address, word, count, lost, chosen))
     return tuple(described)
 
 
 def _lost_share(frames: Frames, address: Address) -> float | None:
     """Share of a sender's messages that its sequence numbers say are not here.
 
-    MAVProxy keeps the link's number in the stamp, and every link has its own sequence; others
-    leave the clock's own bits there. The reading that misses fewer is the right one.
+    None where it does not count them, or was heard over two links at once.
     """
     own = (frames.system == address[0]) & (frames.component == address[1])
-    sequence, link = frames.sequence[own].astype(np.int64), frames.link[own]
-    by_link = [sequence[link == number] for number in np.unique(link).tolist()]
-    lost = min(_missing(sequence), sum(_missing(part) for part in by_link))
+    sequence = frames.sequence[own].astype(np.int64)
+    lost = int(np.sum((np.diff(sequence) - 1) % 256))
     share = lost / (lost + len(sequence))
     return share if share < SEQUENCE_MEANS_NOTHING else None
-
-
-def _missing(sequence: NDArray[np.int64]) -> int:
-    return int(np.sum((np.diff(sequence) - 1) % 256))

@@ -1,9 +1,9 @@
 """An external UWB positioning log (CSV) to samples on its own clock and in its own frame.
 
 The documented format is a header and ``time, x, y, z`` in seconds and metres, with ``sigma`` or
-``sigma_x, sigma_y, sigma_z`` or ``quality`` where the system gives them. Vendors write others, so
-separator, names and units are detected. Every decision is stated, and every decision that a person
-might have to correct has an option.
+``sigma_x, sigma_y, sigma_z`` where the system gives them. Vendors write others, so separator, names
+and units are detected. Every decision is stated, and every decision that a person might have to
+correct has an option.
 """
 
 from __future__ import annotations
@@ -12,14 +12,15 @@ import csv
 import hashlib
 import io
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import pandas as pd
 
+from px4fuse.arrays import Array
 from px4fuse.errors import LogError, SettingsError
 from px4fuse.readers.position_names import (
     LENGTH_UNITS,
@@ -30,19 +31,12 @@ from px4fuse.readers.position_names import (
     find_sigma,
     meaning,
 )
-from px4fuse.readers.text_table import (
-    UNIX_END_S,
-    UNIX_START_S,
-    at_line,
-    quote,
-    seconds_of,
-    text_of,
-)
+from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S, quote, text_of
 from px4fuse.readers.ulog_topics import increasing
 from px4fuse.reading import read_whole, shown
 
-SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", "sigma_x_m", "sigma_y_m", "sigma_z_m", "quality"]
-SIGMA_COLUMNS = SAMPLE_COLUMNS[3:6]
+SIGMA_COLUMNS = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
+SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", *SIGMA_COLUMNS]
 
 MAX_FILE_BYTES = 500_000_000  # days of any UWB system
 MIN_ROWS = 3
@@ -51,16 +45,13 @@ MIN_INTERVAL_S, MAX_INTERVAL_S = 0.9 / 200, 1.1 / 0.2
 # A boot clock in µs after half an hour has the magnitude of UNIX time in s; its intervals have not
 MAX_UNIX_INTERVAL_S = 60.0
 # What an indoor flight spans
-MIN_SPREAD_M, MAX_SPREAD_M = 0.2, 200.0
+MAX_SPREAD_M = 200.0
 MAX_COORDINATE = 1e9  # in any unit; beyond it stands a time stamp, or damage
-MAX_TICKS = 2**61  # of a time stamp in its own unit; differences must fit into int64
 # The header is looked for in so much of the file
 HEAD_LINES, HEAD_CHARS = 1000, 200_000
 MAX_COLUMNS = 200
 _COLUMNS = "`columns` TIME,X,Y,Z"
 _SEPARATORS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "space"}
-_MISSING = ["", "-", "--", "nan", "-nan", "nan(ind)", "-nan(ind)", "inf", "+inf", "-inf"]
-_MISSING += ["na", "n/a", "null", "none"]
 
 
 @dataclass(frozen=True)
@@ -74,11 +65,11 @@ class PositionRecording:
     sha256 : str
         Of the file's bytes.
     size_bytes : int
-    samples : DataFrame, shape (n, 7)
-        ``x_m, y_m, z_m, sigma_x_m, sigma_y_m, sigma_z_m`` (m) and ``quality`` (no unit, as given),
-        NaN where the file has none. The index ``time_s`` is in seconds on the file's own clock and
-        strictly increasing. In frame "ned" x is north, y east, z down; in "enu" x is east, y
-        north, z up; whatever the order of the columns was.
+    samples : DataFrame, shape (n, 6)
+        ``x_m, y_m, z_m, sigma_x_m, sigma_y_m, sigma_z_m`` (m), NaN where the file has none. The
+        index ``time_s`` is in seconds on the file's own clock and strictly increasing. In frame
+        "ned" x is north, y east, z down; in "enu" x is east, y north, z up; whatever the order of
+        the columns was.
     clock : "UNIX" or "local"
         "UNIX" where the stamps are between 2000 and 2100.
     frame : str or None
@@ -110,7 +101,7 @@ class _Table:
     separator: str
     names: list[str]  # of the columns
     body: str  # whole lines after the header
-    first_line: int  # number of the body's first line
+    header_line: int
 
     def label(self, *columns: int | None) -> str:
         """Names of some columns for a person, each once."""
@@ -121,9 +112,9 @@ class _Table:
         )
         return ", ".join([*some][:12]) + (", ..." if len(some) > 12 else "")
 
-    def texts(self, columns: Iterable[int], rows: int | None = None) -> pd.DataFrame:
-        """Texts of some columns; None where a value is missing."""
-        used = sorted(set(columns))
+    def texts(self, columns: Iterable[int]) -> pd.DataFrame:
+        """Texts of some columns, without rows that have none."""
+        used = sorted({*columns})
         try:
             texts = pd.read_csv(
                 io.StringIO(self.body),
@@ -133,20 +124,14 @@ class _Table:
                 names=range(used[-1] + 1),
                 usecols=used,
                 dtype=str,
-                nrows=rows,
-                keep_default_na=False,
-                skip_blank_lines=False,  # so that rows are lines
+                skipinitialspace=True,
                 quoting=csv.QUOTE_NONE,
             )
         except ValueError as error:
             raise LogError(
                 f"{self.file}: no table of numbers", "Export it as CSV again."
             ) from error
-        texts = texts.apply(lambda column: column.str.strip())
-        made: pd.DataFrame = texts.mask(
-            texts.apply(lambda column: column.str.lower().isin(_MISSING)), None
-        )
-        return made
+        return texts.dropna(how="all")
 
 
 @dataclass(frozen=True)
@@ -156,21 +141,8 @@ class _Choice:
     time: int
     position: tuple[int | None, ...]
     sigma: tuple[int | None, ...]
-    quality: int | None
-    tag: int | None
     frame: str | None
-    meanings: list[Meaning]
     time_words: str
-
-    @property
-    def sources(self) -> tuple[int | None, ...]:
-        """Columns in the order of SAMPLE_COLUMNS."""
-        return (*self.position, *self.sigma, self.quality)
-
-    def unit(self, column: int, units: Iterable[str]) -> str | None:
-        """Unit that a column's name gives."""
-        said = self.meanings[column].unit
-        return said if said in units else None
 
 
 def read_position_csv(
@@ -198,7 +170,7 @@ def read_position_csv(
     ------
     LogError
         The file cannot be read, is no text table, has no columns for time and position or more
-        columns than its header names, text where a number belongs, or fewer than three usable rows.
+        columns than its header names, or fewer than three usable rows.
     SettingsError
         An option's value is not among those above, or names a column that the file has not.
     """
@@ -206,12 +178,28 @@ def read_position_csv(
     path = Path(path)
     content = read_whole(path, LogError, MAX_FILE_BYTES, again="Copy it again")
     table, notes = _find_table(shown(path), content, columns)
-    choice = _choose(table, columns)
-    ticks, numbers = _read_rows(table, choice, notes)
-    unit, unit_words = _time_unit(ticks, choice, time_unit)
-    seconds = seconds_of(ticks, round(1.0 / TIME_UNITS[unit]))
+    meanings = [meaning(name) for name in table.names]
+    told = _resolve(table, columns or ())
+    texts = table.texts([*told, *(at for at, m in enumerate(meanings) if m.kind)])
+    numbers = texts.apply(pd.to_numeric, errors="coerce").astype(np.float64)
+    choice = _choose(table, meanings, told, numbers)
+    axes = [at for at in choice.position if at is not None]
+    # 1e999 reads as infinity
+    is_usable = np.isfinite(numbers[choice.time])
+    is_usable &= (numbers[axes].abs() < MAX_COORDINATE).all(axis=1)
+    if missing := int(np.count_nonzero(~is_usable)):
+        notes.insert(0, f"{_count(missing)} dropped: without a usable time or position")
+    for tag in (at for at, m in enumerate(meanings) if m.kind == "tag"):
+        tags = sorted({*texts[tag].dropna()})
+        if tags[1:]:
+            notes.append(f"several tags ({', '.join(map(quote, tags[:2]))}): keep those of one")
+    numbers = numbers[is_usable]
+    ticks = numbers[choice.time].to_numpy()
+    named = meanings[choice.time].unit
+    unit, unit_words = _time_unit(ticks, named if named in TIME_UNITS else "", time_unit)
+    seconds = ticks / round(1.0 / TIME_UNITS[unit])
     usable = np.flatnonzero(np.abs(seconds) < UNIX_END_S)
-    # by rank: stamps that are apart as integers can be one float
+    # by rank: they may be before zero
     ranks = np.unique(seconds[usable], return_inverse=True)[1].astype(np.int64)
     keep = usable[increasing(ranks + 1)]
     if dropped := len(seconds) - len(keep):
@@ -220,7 +208,7 @@ def read_position_csv(
         raise LogError(
             f"{table.file}: usable rows: {len(keep)}, at least {MIN_ROWS} are needed"
             f"{''.join('; ' + note for note in notes)}",
-            f"Copy the file again, or say where time and position are with {_COLUMNS}.",
+            f"Export it with decimal points, or say where time and position are with {_COLUMNS}.",
         )
     numbers = numbers.iloc[keep].set_index(pd.Index(seconds[keep], name="time_s"))
     step = float(np.median(np.diff(numbers.index)))
@@ -229,35 +217,35 @@ def read_position_csv(
             f"one sample in {step:.3g} s (median) is not a rate of a UWB: check "
             "--position-time-unit"
         )
-    scales, length_words = _length_units(numbers, choice, length_unit)
+    scales, length_words = _length_units(numbers, axes, meanings, length_unit)
     samples = pd.DataFrame(np.nan, index=numbers.index, columns=SAMPLE_COLUMNS)
-    for column, index in zip(SAMPLE_COLUMNS, choice.sources, strict=True):
+    sources = (*choice.position, *choice.sigma)
+    for column, index in zip(SAMPLE_COLUMNS, sources, strict=True):
         if index is not None:
-            samples[column] = numbers[index] * (1.0 if column == "quality" else scales[index])
+            samples[column] = numbers[index] * scales[index]
+    samples = samples.where(np.isfinite(samples))
     wrong = samples[SIGMA_COLUMNS] <= 0.0
     if rows := int(wrong.any(axis=1).sum()):
         notes.append(f"sigma is not above zero in {rows} rows and was left out there")
         samples[SIGMA_COLUMNS] = samples[SIGMA_COLUMNS].mask(wrong)
     is_unix = UNIX_START_S <= float(np.median(numbers.index)) < UNIX_END_S
     clock: Literal["UNIX", "local"] = "UNIX" if is_unix else "local"
-    axes = choice.frame.upper() if choice.frame else "x, y, z"
-    height = "" if choice.position[2] is not None else " without height"
-    quality = f"{table.label(choice.quality)}, as given" if choice.quality is not None else "none"
+    names = choice.frame.upper() if choice.frame else "x, y, z"
+    height = "" if len(axes) == 3 else " without height"
     return PositionRecording(
         name=table.file,
         sha256=hashlib.sha256(content).hexdigest(),
         size_bytes=len(content),
-        samples=samples.where(np.isfinite(samples)),  # 1e999 reads as infinity
+        samples=samples,
         clock=clock,
         frame=choice.frame,
         dropped=dropped,
         detected=(
             f"table: {_SEPARATORS[table.separator]} between columns, header in line "
-            f"{table.first_line - 1}",
+            f"{table.header_line}",
             f"time: {choice.time_words}, {clock} clock, in {unit_words}",
-            f"position: {table.label(*choice.position)} as {axes}{height}, in {length_words}",
+            f"position: {table.label(*choice.position)} as {names}{height}, in {length_words}",
             f"sigma: {table.label(*choice.sigma) or 'none'}",
-            f"quality: {quality}",
         ),
         notes=tuple(notes),
     )
@@ -273,8 +261,8 @@ def _check_options(
     ):
         if value is not None and value not in units:
             raise SettingsError(f"`{name}`: {value!r} is not one of {', '.join(units)}.")
-    given = [column.strip().casefold() for column in columns or ("1", "2", "3")]
-    if not 3 <= len(given) <= 5 or "" in given or len(set(given)) < len(given):
+    given = columns or ("1", "2", "3")
+    if "" in given or not 3 <= len({*given}) == len(given) <= 5:
         raise SettingsError(
             f"{_COLUMNS}[,SIGMA]: {','.join(given)!r} does not name four or five different "
             "columns (three where there is no height)."
@@ -306,8 +294,7 @@ def _find_table(
     whole, _, last = text.replace('"', "").rpartition("\n")
     text = f"{whole}\n"
     if last.strip():
-        number = text.count("\n") + 1
-        notes.append(f"line {number}, the last one, was dropped: it may be cut, as it has no end")
+        notes.append("the last line was dropped: it may be cut, as it has no end")
     lines = text[: text.rfind("\n", 0, HEAD_CHARS) + 1].split("\n")[:HEAD_LINES]
     wanted = {column.strip().casefold() for column in columns or () if not column.isdecimal()}
     headers = (
@@ -317,7 +304,7 @@ def _find_table(
         for names in [_split(line.strip("#% "), separator)]
         if len(names) <= MAX_COLUMNS and _is_header(names, wanted)
     )
-    start, separator, names = next(headers, (0, "", []))
+    line, separator, names = next(headers, (0, "", []))
     if not names:
         told = ", ".join(map(quote, sorted(wanted))) or "time, x, y, z"
         raise LogError(
@@ -325,7 +312,7 @@ def _find_table(
             f"the first is {quote(lines[0])}",
             f"Give a CSV file with a header, or name its columns with {_COLUMNS}.",
         )
-    body = re.sub(r"(?m)^[ \t]*[#%].*", "", text.split("\n", start)[start])
+    body = re.sub(r"(?m)^[ \t]*[#%].*", "", text.split("\n", line)[line])
     head = body[:HEAD_CHARS].lstrip("\n").partition("\n")[0].rstrip(f"{separator} ")
     width = len(_split(head, separator))
     if width > len(names):
@@ -333,7 +320,7 @@ def _find_table(
             f"{file}: the header names {len(names)} columns, but rows have {width}",
             "Export it with decimal points, and with a name for every column.",
         )
-    return _Table(file, separator, names, body, start + 1), notes
+    return _Table(file, separator, names, body, line), notes
 
 
 def _is_header(fields: list[str], wanted: set[str]) -> bool:
@@ -345,106 +332,63 @@ def _is_header(fields: list[str], wanted: set[str]) -> bool:
     return has_time and find_position(meanings) is not None
 
 
-def _choose(table: _Table, columns: tuple[str, ...] | None) -> _Choice:
-    """Choose the columns: those that the option tells, else by name."""
-    meanings = [meaning(name) for name in table.names]
-    told = _resolve(table, columns) if columns else []
-    shown = [m if not told or i in told[1:4] else Meaning() for i, m in enumerate(meanings)]
-    found = find_position(shown)
-    if told:
-        time, words = told[0], table.label(told[0])
-        position: tuple[int | None, ...] = (*told[1:4], None)[:3]
-        # the order of the names is that of their frame, as far as they are of one
-        frame, position = found if found and {*found[1]} == {*position} else (None, position)
-    else:
-        time, words = _choose_time(table, meanings)
-        frame, position = found or (None, ())
-    if position[2] is not None and table.texts([position[2]], HEAD_LINES).isna().all(axis=None):
-        position = (*position[:2], None)
-    backwards = [*enumerate(meanings)][::-1]  # of several with one meaning the first is kept
-    sigmas = {m.key: i for i, m in backwards if m.kind == "sigma"}
-    sigma = (told[4],) * 3 if len(told) > 4 else find_sigma(sigmas, frame)
-    kinds = {m.kind: i for i, m in backwards}
-    quality, tag = kinds.get("quality"), kinds.get("tag")
-    return _Choice(time, position, sigma, quality, tag, frame, meanings, words)
-
-
 def _resolve(table: _Table, columns: tuple[str, ...]) -> list[int]:
     """Columns that the option names, by index."""
     names = [name.casefold() for name in table.names]
+    numbers = [str(at + 1) for at in range(len(names))]
     found = []
     for column in columns:
         wanted = column.strip().casefold()
-        if wanted not in names and not (wanted.isdecimal() and 1 <= float(wanted) <= len(names)):
+        if wanted not in names + numbers:
             raise SettingsError(
                 f"{table.file}: no column {quote(column)} found (the columns are "
                 f"{table.label(*range(len(names)))})",
                 f"Name them with {_COLUMNS}.",
             )
-        found.append(names.index(wanted) if wanted in names else int(wanted) - 1)
+        found.append((names if wanted in names else numbers).index(wanted))
     if len({*found}) < len(found):
         raise SettingsError(f"{_COLUMNS}: {quote(','.join(columns))} names one column twice.")
     return found
 
 
-def _choose_time(table: _Table, meanings: list[Meaning]) -> tuple[int, str]:
-    """Column of time, and the words on it: of measurement before that of recording, if filled."""
-    times = [index for index, column in enumerate(meanings) if column.kind == "time"]
-    texts = table.texts(times, HEAD_LINES)
+def _choose(
+    table: _Table, meanings: Sequence[Meaning], told: list[int], numbers: pd.DataFrame
+) -> _Choice:
+    """Choose the columns: those that the option tells, else by name.
 
-    def rank(index: int) -> tuple[bool, int]:
-        is_filled = texts[index].str.strip("+-0.").fillna("").ne("")
-        return bool(is_filled.mean() <= 0.5), TIME_KINDS.index(meanings[index].key)
-
-    first, *others = sorted(times, key=rank)
-    words = f", the {meanings[first].key} (not used: {table.label(*others)})" if others else ""
-    return first, table.label(first) + words
-
-
-def _read_rows(table: _Table, choice: _Choice, notes: list[str]) -> tuple[Any, pd.DataFrame]:
-    """Times in their own unit, and the other columns by index, of rows with time and position."""
-    used = dict.fromkeys(index for index in (choice.time, *choice.sources) if index is not None)
-    texts = table.texts(used)
-    # integers stay exact where some are missing
-    exact: dict[str, Any] = {"errors": "coerce", "dtype_backend": "numpy_nullable"}
-    numbers = {index: pd.to_numeric(texts[index], **exact) for index in used}
-    bad = [
-        (int(row), index)
-        for index, values in numbers.items()
-        if index != choice.quality
-        for row in np.flatnonzero(texts[index].notna() & values.isna())[:1]
-    ]
-    if bad:
-        row, column = min(bad)
-        text, kind = str(texts[column].iloc[row]), "time" if column == choice.time else "number"
-        what = f"{table.label(column)}: {quote(text)} is not a {kind}"
-        remedy = f"Correct or remove that line, or say where time and position are with {_COLUMNS}."
-        raise LogError(at_line(table.file, table.first_line + row, what, remedy))
-    times = numbers.pop(choice.time)
-    others = pd.DataFrame({at: values.astype("float64") for at, values in numbers.items()})
-    axes = [index for index in choice.position if index is not None]
-    is_usable = times.between(-MAX_TICKS, MAX_TICKS).fillna(False)
-    is_usable &= (others[axes].abs() < MAX_COORDINATE).all(axis=1)
-    filled = texts.notna().any(axis=1)  # others are blank lines
-    if missing := int(filled.sum() - is_usable.sum()):
-        notes.insert(0, f"{_count(missing)} dropped: without a usable time or position")
-    if choice.tag is not None:
-        tags = sorted({*table.texts([choice.tag], HEAD_LINES)[choice.tag].dropna()})
-        if tags[1:]:
-            notes.append(f"several tags ({', '.join(map(quote, tags[:2]))}): keep those of one")
-    dtype = "int64" if times.dtype.kind == "i" else "float64"
-    return times[is_usable].to_numpy(dtype=dtype), others[is_usable]
+    Of several times that of measurement goes before that of recording, if it is filled.
+    """
+    if told:
+        time, words = told[0], table.label(told[0])
+        # the names may tell the frame, and with it the order of the axes
+        found = find_position(
+            [m if at in told[1:4] else Meaning() for at, m in enumerate(meanings)]
+        )
+        position: tuple[int | None, ...] = (*told[1:4], None)[:3]
+        frame, position = found if found and {*found[1]} == {*position} else (None, position)
+    else:
+        times = [at for at, column in enumerate(meanings) if column.kind == "time"]
+        empty = numbers[times].fillna(0.0).eq(0.0).mean() >= 0.5
+        time, *others = sorted(
+            times, key=lambda at: (bool(empty[at]), TIME_KINDS.index(meanings[at].key))
+        )
+        words = table.label(time)
+        if others:
+            words += f", the {meanings[time].key} (not used: {table.label(*others)})"
+        frame, position = find_position(meanings) or (None, ())
+    if position[2] is not None and numbers[position[2]].isna().all():
+        position = (*position[:2], None)
+    sigma = (told[4],) * 3 if len(told) > 4 else find_sigma(meanings, frame)
+    return _Choice(time, position, sigma, frame, words)
 
 
-def _time_unit(ticks: Any, choice: _Choice, option: str | None) -> tuple[str, str]:
+def _time_unit(ticks: Array, named: str, option: str | None) -> tuple[str, str]:
     """Unit of the time column, and the words on it."""
     if option is not None:
         return option, f"{option} as --position-time-unit says"
     middle = float(np.median(ticks)) if len(ticks) else 0.0
-    named = choice.unit(choice.time, TIME_UNITS)
     if named and abs(middle) * TIME_UNITS[named] < UNIX_END_S:
         return named, f"{named} from its name"
-    contradiction = f"; its name says {named}, which cannot be" if named else ""
     steps = np.diff(ticks)
     steps = steps[steps > 0]
     step = float(np.median(steps)) if len(steps) else 0.0
@@ -452,7 +396,7 @@ def _time_unit(ticks: Any, choice: _Choice, option: str | None) -> tuple[str, st
     for unit, scale in TIME_UNITS.items():
         is_unix = UNIX_START_S <= middle * scale < UNIX_END_S
         if is_unix and step * scale <= MAX_UNIX_INTERVAL_S:
-            return unit, f"{unit} from its magnitude{contradiction}"
+            return unit, f"{unit} from its magnitude"
         if MIN_INTERVAL_S <= step * scale <= MAX_INTERVAL_S:
             fits.append(unit)
     if not fits:
@@ -460,33 +404,29 @@ def _time_unit(ticks: Any, choice: _Choice, option: str | None) -> tuple[str, st
     words = f"{fits[0]} from its interval of {step * TIME_UNITS[fits[0]]:.3g} s"
     if fits[1:]:
         words += f" ({fits[1]} would do as well: then give --position-time-unit)"
-    return fits[0], words + contradiction
+    return fits[0], words
 
 
 def _length_units(
-    numbers: pd.DataFrame, choice: _Choice, option: str | None
+    numbers: pd.DataFrame, axes: list[int], meanings: Sequence[Meaning], option: str | None
 ) -> tuple[dict[int, float], str]:
     """Metres per unit of each column of numbers, and the words on those of position."""
-    axes = [index for index in choice.position if index is not None]
+    named = {at: m.unit for at, m in enumerate(meanings) if m.unit in LENGTH_UNITS}
     # outliers must not decide
     spreads = numbers[axes].quantile(0.95) - numbers[axes].quantile(0.05)
     spread = float(spreads.max())
-    named = [unit for index in axes if (unit := choice.unit(index, LENGTH_UNITS))]
+    unit, reason = "m", "no unit in the names"
     if option is not None:
-        unit, reason = option, "as --position-unit says"
-    elif named:
-        unit, reason = named[0], "from the names"
-    elif spread <= MAX_SPREAD_M:
-        unit, reason = "m", "no unit in the names"
-    elif MIN_SPREAD_M <= spread * LENGTH_UNITS["mm"] <= MAX_SPREAD_M:
+        unit, named, reason = option, {}, "as --position-unit says"
+    elif some := [named[at] for at in axes if at in named]:
+        unit, reason = some[0], "from the names"
+    elif MAX_SPREAD_M < spread <= MAX_SPREAD_M / LENGTH_UNITS["mm"]:
         unit = "mm"
         reason = f"as {spread:.0f} m is not an indoor flight; if cm, give --position-unit"
-    else:
-        unit, reason = "m", "assumed, as no unit gives an indoor flight: else give --position-unit"
-    units = {
-        at: option or choice.unit(at, LENGTH_UNITS) or unit for at in map(int, numbers.columns)
-    }
+    elif spread > MAX_SPREAD_M:
+        reason = "assumed, as no unit gives an indoor flight: else give --position-unit"
+    units = {at: named.get(at, unit) for at in map(int, numbers.columns)}
     scales = {at: LENGTH_UNITS[name] for at, name in units.items()}
-    span = max(float(spreads[index]) * scales[index] for index in axes)
-    used = ", ".join(dict.fromkeys(units[index] for index in axes))
+    span = max(float(spreads[at]) * scales[at] for at in axes)
+    used = ", ".join(dict.fromkeys(units[at] for at in axes))
     return scales, f"{used} ({reason}), nine tenths of it within {span:.3g} m"

@@ -1,4 +1,4 @@
-"""What the names of columns mean in the position logs of UWB vendors, rosbag and rostopic."""
+"""What the names of columns mean in position logs: "x_m", "position.x", "East [mm]", "bag_time"."""
 
 from __future__ import annotations
 
@@ -21,33 +21,13 @@ def _words(table: Mapping[str, str]) -> dict[str, str]:
 # Names are read in lower case and as words: "position.x_m" is position, x, m
 _UNITS = _words(
     {
-        "s": "s sec secs second seconds",
-        "ms": "ms msec msecs millis millisecond milliseconds",
-        "us": "us usec usecs micros microsecond microseconds",
-        "ns": "ns nsec nsecs nanos nanosec nanosecs nanosecond nanoseconds",
+        "s": "s sec secs seconds",
+        "ms": "ms msec msecs millis milliseconds",
+        "us": "us usec usecs micros microseconds",
+        "ns": "ns nsec nsecs nanos nanoseconds",
         "m": "m meter meters metre metres",
-        "cm": "cm centimeter centimeters centimetre centimetres",
-        "mm": "mm millimeter millimeters millimetre millimetres",
-    }
-)
-# Words without what stands between them, in order of preference
-_TIMES = _words(
-    {
-        "time of measurement": "headerstamp headertimestamp headertime measurementtime sampletime "
-        "measurementtimestamp sensortime timestampsample",
-        "time": "timestamp time t ts stamp unix unixtime unixtimestamp timestampunix timeunix "
-        "epoch epochtime datetime utc utctime timeutc timestamputc elapsed elapsedtime",
-        "time of recording": "bagtime bagtimestamp bagstamp rosbagtime rosbagtimestamp recvtime "
-        "receivetime receivetimestamp receivedtime rxtime arrivaltime logtime logtimestamp "
-        "recordtime recordingtime hosttime hosttimestamp pctime systemtime",
-    }
-)
-TIME_KINDS = list(dict.fromkeys(_TIMES.values()))
-_TIME_CONTEXT = ("field", "msg", "data", "uwb", "tag", "since", "start", "boot")
-_WHOLE_NAMES = _words(
-    {
-        "quality": "quality q qf qualityfactor positionquality confidence",
-        "tag": "tag tagid id serial address node nodeid deviceid",
+        "cm": "cm centimeters centimetres",
+        "mm": "mm millimeters millimetres",
     }
 )
 _AXES = _words(
@@ -61,15 +41,19 @@ _AXES = _words(
         "up": "u up height altitude alt",
     }
 )
-_ROLES = _words(
-    {
-        "sigma": "sigma std stdev stddev sd s accuracy uncertainty deviation",
-        "context": "p t pos position positions pose point translation transform location loc coord "
-        "coordinate coordinates field msg data uwb rtls tag est estimate estimated measured raw "
-        "filtered local world map",
-    }
-)
-_GLUED = re.compile(r"(pos|position|p|t|sigma|std|stddev|s)([xyzneud])|([xyz])(pos|std|sigma)")
+_TEXTS = {
+    "time": "time timestamp stamp t ts unix unixtime epoch utc elapsed",
+    "measured": "header measurement sample sensor",
+    "recorded": "bag rosbag recv receive received rx arrival log record host",
+    "sigma": "sigma std stddev sd s accuracy uncertainty",
+    "context": "p t pos position pose point translation transform location coord coordinate field "
+    "msg data uwb rtls tag est estimate estimated measured raw filtered local world map",
+}
+_ROLES = {role: {*words.split()} for role, words in _TEXTS.items()}
+_TIME_ROLES = _ROLES["time"] | _ROLES["measured"] | _ROLES["recorded"] | _ROLES["context"]
+# Whose time it is, in order of preference
+TIME_KINDS = ["time of measurement", "time", "time of recording"]
+_GLUED = re.compile(r"(pos|p|t|sigma|std|s)([xyzneud])|([xyz])(pos|std|sigma)")
 # Frame, and the names of its axes in order; the first whose horizontal names are there is taken
 _FRAMES: tuple[tuple[str | None, tuple[str, str, str]], ...] = (
     ("ned", ("north", "east", "down")),
@@ -84,7 +68,7 @@ _FRAMES: tuple[tuple[str | None, tuple[str, str, str]], ...] = (
 class Meaning:
     """What one column's name says; all "" where it says nothing."""
 
-    kind: str = ""  # "time", "position", "sigma", "quality" or "tag"
+    kind: str = ""  # "time", "position", "sigma" or "tag"
     key: str = ""  # name of the axis, or which time of `TIME_KINDS`
     unit: str = ""
     group: str = ""  # what else a position's name holds, which its x, y and z share
@@ -95,29 +79,23 @@ def meaning(name: str) -> Meaning:
     plain = unicodedata.normalize("NFKC", name).replace("μ", "u")
     plain = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", plain).lower()
     words = re.findall(r"[^\W_]+", plain)
-    unit = _UNITS.get(words[-1], "") if words else ""
-    if unit and len(words) > 1:
-        words.pop()
-    elif unit in TIME_UNITS:
-        words = ["time"]  # a column named "secs" or "millis"
-    else:
-        unit = ""
-    key = "".join(word for word in words if word not in _TIME_CONTEXT)
-    if key in _TIMES and unit not in LENGTH_UNITS:
-        return Meaning("time", _TIMES[key], unit)
-    whole = "".join(word for word in words if not word.isdecimal())  # "quality (0-100)"
-    if whole in _WHOLE_NAMES and not unit:
-        return Meaning(_WHOLE_NAMES[whole])
+    unit = _UNITS.get(words[-1], "") if len(words) > 1 else ""
+    words = words[:-1] if unit else words
+    told = {*words}
+    if told & _ROLES["time"] and told <= _TIME_ROLES and unit not in LENGTH_UNITS:
+        kinds = [bool(told & _ROLES["measured"]), not told & _ROLES["recorded"], True]
+        return Meaning("time", TIME_KINDS[kinds.index(True)], unit)
+    if told and told <= {"tag", "id"}:
+        return Meaning("tag")
     parts: list[str] = []
     for word in words:
-        glued = None if word in _ROLES or word in _AXES else _GLUED.fullmatch(word)
+        glued = None if word in _ROLES["sigma"] | _ROLES["context"] else _GLUED.fullmatch(word)
         parts += [part for part in glued.groups() if part] if glued else [word]
     axes = [_AXES[part] for part in parts if part in _AXES]
     rest = [part for part in parts if part not in _AXES]
-    roles = {_ROLES.get(part.rstrip("0123456789")) for part in rest}
-    if unit in TIME_UNITS or len(axes) > 1 or None in roles:
+    if unit in TIME_UNITS or len(axes) > 1 or not {*rest} <= _ROLES["sigma"] | _ROLES["context"]:
         return Meaning()
-    if "sigma" in roles:
+    if {*rest} & _ROLES["sigma"]:
         return Meaning("sigma", "".join(axes), unit)
     return Meaning("position", axes[0], unit, ".".join(rest)) if axes else Meaning()
 
@@ -136,8 +114,9 @@ def find_position(meanings: Sequence[Meaning]) -> tuple[str | None, Position] | 
     return None
 
 
-def find_sigma(sigmas: Mapping[str, int], frame: str | None) -> tuple[int | None, ...]:
-    """Columns of sigma of the frame's axes, from those by axis; "" is one for all of them."""
+def find_sigma(meanings: Sequence[Meaning], frame: str | None) -> tuple[int | None, ...]:
+    """Columns of sigma of the frame's axes; one without an axis is for all of them."""
+    sigmas = {m.key: at for at, m in enumerate(meanings) if m.kind == "sigma"}
     axes = next(axes for name, axes in _FRAMES if name == frame)
     return tuple(
         sigmas.get(axis, sigmas.get(letter, sigmas.get("")))

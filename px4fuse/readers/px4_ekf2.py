@@ -13,8 +13,9 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array
-from px4fuse.ekf2_parameters import EV_POS, settings_in_force
+from px4fuse.ekf2_parameters import AIDS, EV_POS, settings_in_force
 from px4fuse.flight import (
+    ACCELEROMETER_BIAS_COLUMNS,
     BIAS_NOT_LOGGED,
     DELAYED_STATE_COLUMNS,
     DELAYED_VARIANCE_COLUMNS,
@@ -22,6 +23,7 @@ from px4fuse.flight import (
     HORIZON_NOT_LOGGED,
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
+    QUATERNION_COLUMNS,
     RECORD_NOT_LOGGED,
     SPECIFIC_FORCE_COLUMNS,
     STATE_COLUMNS,
@@ -32,7 +34,7 @@ from px4fuse.flight import (
     Unavailable,
 )
 from px4fuse.readers import px4_topics as px4
-from px4fuse.readers.layouts import Layout, elements
+from px4fuse.readers.layouts import Layout
 from px4fuse.readers.px4_aid_sources import STATUS, STATUS_FLAGS
 from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S, intentions, read_aids
 from px4fuse.readers.px4_innovations import innovations_of
@@ -40,6 +42,13 @@ from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 
 VISION = "vehicle_visual_odometry"
 STATES = 16  # attitude, velocity, position and both biases; the rest does not concern position
+# Horizontal aiding besides vision position
+OTHER_AIDING = ("gnss_pos", "gnss_vel", "optical_flow", "ev_vel", "aux_global_position", "airspeed")
+VARIANCES_NOT_LOGGED = Unavailable(
+    "EKF2 variances",
+    "no usable topic estimator_states (estimator_status before v1.12)",
+    "Record with SDLOG_PROFILE bit 0 (default), or EKF2 had not started.",
+)
 _RESETS: tuple[tuple[Literal["position", "velocity"], str, tuple[str, str, str]], ...] = (
     ("position", "xy_reset_counter", ("delta_north_m", "delta_east_m", "")),
     ("position", "z_reset_counter", ("", "", "delta_down_m")),
@@ -85,9 +94,10 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         if log.left_out
     ]
     step_s = _step_s(topics)
+    delayed = _read_delayed(topics, step_s)
     return Ekf2(
         state=state,
-        variance=_read_variance(topics),
+        variance=_variance(delayed),
         innovations=innovations,
         innovation_topics=innovation_topics,
         fusing=fusing,
@@ -95,10 +105,10 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         instances=topics.primary,
         gate=gate,
         notes=tuple(notes),
-        accelerometer_bias=_read_accelerometer_bias(topics, step_s),
+        accelerometer_bias=_accelerometer_bias(topics, delayed),
         step_s=step_s,
         horizon_s=_horizon_s(topics, step_s),
-        record=_read_record(topics, step_s, local),
+        record=_read_record(topics, delayed, local, meant),
         aids=aids,
     )
 
@@ -111,48 +121,62 @@ def ekf2_topics(topics: Topics, ekf2: Ekf2 | Unavailable) -> Mapping[str, tuple[
         "ekf2_state": tuple(layout.topic for layout in px4.LOCAL_POSITION),
         "ekf2_variance": ()
         if isinstance(ekf2.variance, Unavailable)
-        else tuple(_state_vectors(topics))[:1],
+        else (_state_vector(topics)[0],),
         "ekf2_innovations": ekf2.innovation_topics,
         "ekf2_fusing": () if isinstance(ekf2.fusing, Unavailable) else (_flags_topic(topics),),
     }
 
 
-def _state_vectors(topics: Topics) -> Mapping[str, tuple[int, int]]:
-    """Numbers of states and of variances of each topic that has both, best first."""
-    return {
-        topic: (
-            sum(name.startswith("states[") for name in table),
-            sum(name.startswith("covariances[") for name in table),
+def _state_vector(topics: Topics) -> tuple[str, int]:
+    """The topic with EKF2's state vector, and how many variances attitude has in it.
+
+    "" where there is none; 0 where the lengths of its arrays are of no known layout.
+    """
+    for topic in px4.ESTIMATOR_STATES:
+        for table in topics.of(topic)[:1]:
+            states = sum(name.startswith("states[") for name in table)
+            variances = sum(name.startswith("covariances[") for name in table)
+            if variances:
+                return topic, px4.ATTITUDE_VARIANCES.get((states, variances), 0)
+    return "", 0
+
+
+def _read_delayed(topics: Topics, step_s: float) -> pd.DataFrame | Unavailable:
+    """EKF2's state and variances at its fusion horizon, in one layout and unit for all releases.
+
+    ``step_s`` is the time between two predictions, for releases that keep biases per prediction.
+    """
+    topic, attitude = _state_vector(topics)
+    if not topic:
+        return VARIANCES_NOT_LOGGED
+    if not attitude:
+        return Unavailable(
+            "EKF2 variances",
+            f"the arrays of {topic} are of lengths unknown here",
+            "Report the PX4 version to the authors of px4fuse.",
         )
-        for topic in px4.ESTIMATOR_STATES
-        for table in topics.of(topic)[:1]
-        if "covariances[0]" in table
-    }
-
-
-def _read_variance(topics: Topics) -> pd.DataFrame | Unavailable:
-    """Velocity and position variances, their place decided by the lengths of the arrays."""
-    for topic, length in _state_vectors(topics).items():
-        first = px4.ATTITUDE_VARIANCES.get(length)
-        if first is None:
-            return Unavailable(
-                "EKF2 variances",
-                f"{topic} has {length[0]} states and {length[1]} covariances, a layout unknown "
-                "here",
-                "Report the PX4 version to the authors of px4fuse.",
-            )
-        columns = elements(
-            POSITION_VARIANCE_COLUMNS, "covariances", range(first + 3, first + 6)
-        ) | elements(VELOCITY_VARIANCE_COLUMNS, "covariances", range(first, first + 3))
-        frame = topics.of_primary(Layout(topic, columns))
-        frame = frame[(frame > 0.0).all(axis=1)]
-        if len(frame):
-            return frame
-    return Unavailable(
-        "EKF2 variances",
-        "no usable topic estimator_states (estimator_status before v1.12)",
-        "Record with SDLOG_PROFILE bit 0 (default), or EKF2 had not started.",
+    states = [f"states[{i}]" for i in range(STATES)]
+    variances = [f"covariances[{i}]" for i in range(STATES - 4 + attitude)]
+    raw = topics.of_primary(Layout(topic, {name: name for name in states + variances})).dropna()
+    state, variance = raw[states].to_numpy(copy=True), raw[variances].to_numpy(copy=True)
+    if attitude == px4.QUATERNION_FILTER:
+        state[:, 10:16] /= step_s
+        variance = np.hstack([_attitude_variance(state[:, :4], variance[:, :4]), variance[:, 4:]])
+        variance[:, 9:15] /= step_s**2
+    return pd.DataFrame(
+        np.hstack([state, variance]),
+        index=raw.index,
+        columns=DELAYED_STATE_COLUMNS + DELAYED_VARIANCE_COLUMNS,
     )
+
+
+def _variance(delayed: pd.DataFrame | Unavailable) -> pd.DataFrame | Unavailable:
+    """Variances of position and velocity."""
+    if isinstance(delayed, Unavailable):
+        return delayed
+    found = delayed[POSITION_VARIANCE_COLUMNS + VELOCITY_VARIANCE_COLUMNS]
+    found = found[(found > 0.0).all(axis=1)]
+    return found if len(found) else VARIANCES_NOT_LOGGED
 
 
 def target_step_s(topics: Topics) -> float:
@@ -180,26 +204,16 @@ def samples_per_step(target_s: float, interval_s: float) -> int:
     return max(int(target_s / interval_s + 0.5 + 1e-6), 1)
 
 
-def _read_accelerometer_bias(topics: Topics, step_s: float) -> pd.DataFrame | Unavailable:
-    """Accelerometer bias from its own topic, or else from the state vector.
-
-    The quaternion filter's state vector holds it per prediction step: divided by that step.
-    """
+def _accelerometer_bias(
+    topics: Topics, delayed: pd.DataFrame | Unavailable
+) -> pd.DataFrame | Unavailable:
+    """Accelerometer bias from its own topic, or else from the state vector."""
     layout = topics.find(px4.SENSOR_BIAS)
-    if layout is not None:
-        own = topics.of_primary(layout).dropna()
-        if len(own):
-            return own
-    first = px4.ACCELEROMETER_BIAS_STATE
-    columns = elements(SPECIFIC_FORCE_COLUMNS, "states", range(first, first + 3))
-    for topic, length in _state_vectors(topics).items():
-        attitude = px4.ATTITUDE_VARIANCES.get(length)
-        if attitude is None:
-            continue
-        frame = topics.of_primary(Layout(topic, columns)).dropna()
-        if len(frame):
-            return frame / (step_s if attitude == px4.QUATERNION_FILTER else 1.0)
-    return BIAS_NOT_LOGGED
+    if layout is not None and len(own := topics.of_primary(layout).dropna()):
+        return own
+    if isinstance(delayed, Unavailable) or delayed.empty:
+        return BIAS_NOT_LOGGED
+    return delayed[ACCELEROMETER_BIAS_COLUMNS].set_axis(SPECIFIC_FORCE_COLUMNS, axis=1)
 
 
 def _horizon_s(topics: Topics, step_s: float) -> float | Unavailable:
@@ -208,10 +222,9 @@ def _horizon_s(topics: Topics, step_s: float) -> float | Unavailable:
     Releases before v1.13 stamp it with the newest IMU sample instead, so that what is left is less
     than a prediction step.
     """
-    for topic in _state_vectors(topics):
-        age = _age_s(topics, topic)
-        if len(age) and (lag := float(age.median())) > step_s:
-            return lag
+    age = _age_s(topics, _state_vector(topics)[0])
+    if len(age) and (lag := float(age.median())) > step_s:
+        return lag
     return HORIZON_NOT_LOGGED
 
 
@@ -262,46 +275,36 @@ def read_resets(local: pd.DataFrame) -> tuple[Reset, ...]:
     return tuple(sorted(resets, key=lambda reset: reset.time_s))
 
 
-def _read_record(topics: Topics, step_s: float, local: pd.DataFrame) -> FusionRecord | Unavailable:
-    """What the log tells of the inside of EKF2's filter, in one layout and unit for all releases.
-
-    ``step_s`` is the time between two predictions, for releases that keep biases per prediction;
-    ``local`` is the published position, with the altitude of its origin where it has one.
-    """
-    topic = px4.ESTIMATOR_STATES[0]
-    attitude = px4.ATTITUDE_VARIANCES.get(_state_vectors(topics).get(topic, (0, 0)))
-    if attitude is None:
+def _read_record(
+    topics: Topics,
+    delayed: pd.DataFrame | Unavailable,
+    local: pd.DataFrame,
+    meant: Mapping[str, pd.Series[float]],
+) -> FusionRecord | Unavailable:
+    """What the log tells of the inside of EKF2's filter; ``local`` is the published position."""
+    topic, attitude = _state_vector(topics)
+    if topic != px4.ESTIMATOR_STATES[0] or isinstance(delayed, Unavailable):
         return RECORD_NOT_LOGGED
-    states = [f"states[{i}]" for i in range(STATES)]
-    variances = [f"covariances[{i}]" for i in range(STATES - 4 + attitude)]
-    layout = Layout(topic, {name: name for name in states + variances})
-    raw = topics.of_primary(layout).dropna()
-    raw = raw[np.abs(np.linalg.norm(raw[states[:4]], axis=1) - 1.0) < 0.01]
-    if raw.empty:
+    norm = np.linalg.norm(delayed[QUATERNION_COLUMNS], axis=1)
+    inside = delayed[np.abs(norm - 1.0) < 0.01].copy()
+    if inside.empty:
         return RECORD_NOT_LOGGED
-    state, variance = raw[states].to_numpy(copy=True), raw[variances].to_numpy(copy=True)
-    per_step = attitude == px4.QUATERNION_FILTER
-    if per_step:
-        state[:, 10:16] /= step_s
-        variance = np.hstack([_attitude_variance(state[:, :4], variance[:, :4]), variance[:, 4:]])
-        variance[:, 9:15] /= step_s**2
-    delayed = pd.DataFrame(
-        np.hstack([state, variance]),
-        index=raw.index,
-        columns=DELAYED_STATE_COLUMNS + DELAYED_VARIANCE_COLUMNS,
-    )
     horizontal = POSITION_COLUMNS[:2]
-    if not delayed[horizontal].to_numpy().any():  # from v1.16 kept as latitude and longitude
-        delayed[horizontal] = np.nan
+    if not inside[horizontal].to_numpy().any():  # from v1.16 kept as latitude and longitude
+        inside[horizontal] = np.nan
         # and its height, where there is an origin, as altitude above the sea (ekf_helper.cpp)
         origin_m = local["ref_alt"].dropna() if "ref_alt" in local else pd.Series(dtype=float)
-        delayed["down_m"] += float(origin_m.iloc[-1]) if len(origin_m) else 0.0
+        inside["down_m"] += float(origin_m.iloc[-1]) if len(origin_m) else 0.0
     age = _age_s(topics, VISION).sort_index()
     return FusionRecord(
         parameters=topics.ekf2_parameters,
-        delayed=delayed,
-        per_step_biases=per_step,
-        other_aiding=_other_aiding(topics),
+        delayed=inside,
+        per_step_biases=attitude == px4.QUATERNION_FILTER,
+        other_aiding=tuple(
+            AIDS[name].label.replace("external vision,", "vision")
+            for name in OTHER_AIDING
+            if name in meant and meant[name].any()
+        ),
         vision_age_s=age[~age.index.duplicated()],
     )
 
@@ -315,21 +318,3 @@ def _attitude_variance(quaternion: Array, variance: Array) -> Array:
     turns = np.array([[-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]])
     squared: Array = 4.0 * np.einsum("ijn,nj->ni", turns**2, variance)
     return squared
-
-
-def _other_aiding(topics: Topics) -> tuple[str, ...]:
-    """Horizontal aiding besides vision position that was used at any time."""
-    flags = topics.of("estimator_status_flags")
-    found = [
-        name
-        for table in flags
-        for flag, name in px4.AIDING_FLAGS.items()
-        if flag in table and np.any(table[flag])
-    ]
-    found += [
-        name
-        for table in ([] if flags else topics.of("estimator_status"))
-        for name, bit in px4.AIDING_BITS.items()
-        if np.any(table["control_mode_flags"].astype(np.int64) >> bit & 1)
-    ]
-    return tuple(dict.fromkeys(found))

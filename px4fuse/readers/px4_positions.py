@@ -50,6 +50,10 @@ ARRIVAL_SHARE = 0.9
 HEIGHT_TOLERANCE_S = 0.05
 # Logged no faster than this, a receiver's positions were thinned: they give 5 to 20 a second
 THINNED_HZ = 4.0
+# Tracks that are read as they are logged
+LOGGED = (
+    "vehicle_visual_odometry", "vehicle_mocap_odometry", "estimator_visual_odometry_aligned",
+)  # fmt: skip
 AUTOPILOT_CLOCK = "autopilot boot clock (as PX4 mapped the sender's stamp)"
 
 
@@ -61,7 +65,7 @@ def read_positions(
     # of what EKF2 kept, a source that EKF2 took a heading from counts as an odometry
     turns = isinstance(fusing, pd.DataFrame) and bool((fusing["yaw"] > 0).any())
     found = [
-        *(_read_logged(topics, source) for source in px4.TRACKS),
+        *(_read_logged(topics, name) for name in LOGGED),
         _read_kept(topics, turns),
         _rebuild(topics, ekf2, turns),
         _read_gps(topics, ekf2),
@@ -71,7 +75,7 @@ def read_positions(
 
 
 def _unavailable(name: str, reason: str) -> Unavailable:
-    return Unavailable(f"position source {name}", reason, px4.TRACK_REMEDIES[name], source=name)
+    return Unavailable(f"position source {name}", reason, px4.TRACKS[name].remedy, source=name)
 
 
 def clean_positions(samples: pd.DataFrame, axes: list[str]) -> pd.DataFrame:
@@ -87,7 +91,6 @@ def clean_positions(samples: pd.DataFrame, axes: list[str]) -> pd.DataFrame:
 def _track(
     topics: Topics,
     name: str,
-    description: str,
     samples: pd.DataFrame,
     used: tuple[str, ...],
     *,
@@ -104,11 +107,11 @@ def _track(
     samples = clean_positions(samples, needed)
     if len(samples) < MIN_TRACK_SAMPLES:
         return _unavailable(name, f"{len(samples)} finite samples are too few")
-    origin = with_orientation(px4.TOPIC_ORIGINS[name], turns=turns)
-    log, place = topics.log.name, {"place_m": _place_m(topics, origin.aid)}
-    return PositionTrack(
-        name, origin, description, samples, frame, clock, used, log, **place | more
-    )
+    source = px4.TRACKS[name]
+    origin = with_orientation(source.origin, turns=turns)
+    more = {"place_m": _place_m(topics, origin.aid)} | more
+    log = topics.log.name
+    return PositionTrack(name, origin, source.description, samples, frame, clock, used, log, **more)
 
 
 def _place_m(topics: Topics, aid: Aid | None) -> tuple[float, float, float]:
@@ -118,30 +121,23 @@ def _place_m(topics: Topics, aid: Aid | None) -> tuple[float, float, float]:
     return forward, right, down
 
 
-def _read_logged(topics: Topics, source: px4.TrackSource) -> PositionTrack | Unavailable:
-    layout = topics.find(source.layouts)
+def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
+    layout = topics.find(px4.TRACKS[name].layouts)
     if layout is None:
-        return _unavailable(source.name, f"no topic {source.name} in the log")
+        return _unavailable(name, f"no topic {name} in the log")
     is_ekf2 = layout.topic.startswith("estimator_")  # only EKF2's own topics have its instances
     samples = topics.of_primary(layout) if is_ekf2 else topics.frame(layout)
     frame = "unknown"
     for field, names in px4.FRAMES.items():
         if field in samples and len(samples):
             frame = names.get(int(samples[field].iloc[-1]), "unknown")
-    if source.name == "estimator_visual_odometry_aligned":
+    if name == "estimator_visual_odometry_aligned":
         frame = "NED"  # rotated by EKF2 itself, whatever the field still says
     orientation = orientation_of(samples)
     return _track(
-        topics,
-        source.name,
-        source.description,
-        samples,
-        (layout.topic,),
-        turns=orientation is not None,
-        frame=frame,
-        clock_map=_arrival(topics, layout.topic),
-        orientation=orientation,
-    )
+        topics, name, samples, (layout.topic,), turns=orientation is not None, frame=frame,
+        clock_map=_arrival(topics, layout.topic), orientation=orientation,
+    )  # fmt: skip
 
 
 def _arrival(topics: Topics, topic: str) -> ClockMap | None:
@@ -174,9 +170,8 @@ def _read_kept(topics: Topics, turns: bool) -> PositionTrack | Unavailable:
     # EKF2 stamps its buffer entries earlier than the sender did: by its delay and by half its
     # update period (estimator_interface.cpp)
     samples = _later(samples, _delay_s(topics) + 0.5 * target_step_s(topics))
-    description = "the observations that EKF2 kept of external vision"
     return _track(
-        topics, KEPT_OBSERVATION, description, samples, tuple(used),
+        topics, KEPT_OBSERVATION, samples, tuple(used),
         turns=turns, needed=POSITION_COLUMNS[:2], notes=notes,
     )  # fmt: skip
 
@@ -188,29 +183,20 @@ def _later(samples: pd.DataFrame, by_s: float) -> pd.DataFrame:
 def _with_height(
     samples: pd.DataFrame, height: pd.DataFrame
 ) -> tuple[pd.DataFrame, tuple[str, ...]]:
-    """Add the nearest height to each horizontal position, and say what that did.
+    """Add the nearest height to each horizontal position, and say where there was none.
 
-    EKF2 stamps both with one external vision sample, but the logger thins each topic by itself,
-    and may keep another sample's height.
+    EKF2 stamps both with one external vision sample, but the logger thins each topic by itself.
     """
     joined = pd.merge_asof(
-        samples, height.assign(_at=height.index), left_index=True, right_index=True,
+        samples, height.assign(_found=True), left_index=True, right_index=True,
         direction="nearest", tolerance=HEIGHT_TOLERANCE_S,  # type: ignore[arg-type]
     )  # fmt: skip
-    apart_s = np.abs(joined.pop("_at").to_numpy() - joined.index.to_numpy())
-    moved, dropped = apart_s > SAME_TIME_US * 1e-6, int(np.count_nonzero(np.isnan(apart_s)))
-    notes = []
-    if np.any(moved):
-        notes.append(
-            f"{np.count_nonzero(moved)} of {len(joined)} heights of external vision are those of "
-            f"the sample before or after, up to {1e3 * np.nanmax(apart_s):.0f} ms away"
-        )
-    if dropped:
-        notes.append(
-            f"{dropped} of {len(joined)} positions of external vision have no height within "
-            f"{1e3 * HEIGHT_TOLERANCE_S:.0f} ms"
-        )
-    return joined, ("; ".join(notes),) if notes else ()
+    lacking = int(joined.pop("_found").isna().sum())
+    note = (
+        f"{lacking} of {len(joined)} positions of external vision have no height within "
+        f"{1e3 * HEIGHT_TOLERANCE_S:.0f} ms"
+    )
+    return joined, (note,) if lacking else ()
 
 
 def _delay_s(topics: Topics) -> float:
@@ -240,8 +226,8 @@ def _rebuild(topics: Topics, ekf2: Ekf2 | Unavailable, turns: bool) -> PositionT
     if "down_m" in tracks:
         samples, notes = _with_height(samples, tracks["down_m"].to_frame("down_m"))
     return _track(
-        topics, RECONSTRUCTION, "EKF2's position plus its innovation",
-        _later(samples, _delay_s(topics)), ("vehicle_local_position", *ekf2.innovation_topics),
+        topics, RECONSTRUCTION, _later(samples, _delay_s(topics)),
+        ("vehicle_local_position", *ekf2.innovation_topics),
         turns=turns, needed=POSITION_COLUMNS[:2], notes=notes,
         clock=f"EKF2's time plus {EV_POS.delay}; late by up to one interval of the source",
     )  # fmt: skip
@@ -361,12 +347,6 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     if rate_hz < THINNED_HZ and not len(left_out):
         made, notes = rebuilt_fixes(samples, ekf2, delay_ms * 1e-3)
         samples = pd.concat([samples, made]).sort_index() if len(made) else samples
-    found = _track(topics, GPS_POSITION, "GNSS position", samples, (layout.topic,), clock=clock)
-    if isinstance(found, Unavailable):
-        return found
-    if set(ANTENNA_COLUMNS) <= set(gps.columns):  # since v1.17 of each receiver
-        forward, right, down = gps[ANTENNA_COLUMNS].iloc[-1].tolist()
-        found = replace(found, place_m=(forward, right, down))
     if rate_hz < THINNED_HZ:
         notes = (
             f"the log holds {rate_hz:.1f} positions of GNSS a second, fewer than receivers "
@@ -378,13 +358,17 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
             f"{len(left_out)} positions of GNSS that the logger left out are from "
             "estimator_aid_src_gnss_pos, their heights are interpolated",
         )
-    return replace(
-        found,
-        origin=structs.replace(found.origin, automatic=fuses_gnss(ekf2)),
-        velocity=samples[VELOCITY_COLUMNS + VELOCITY_VARIANCE_COLUMNS],
-        age_s=delay_ms * 1e-3,
-        notes=found.notes + notes,
-    )
+    more: dict[str, Any] = {}
+    if set(ANTENNA_COLUMNS) <= set(gps.columns):  # since v1.17 of each receiver
+        more["place_m"] = tuple(gps[ANTENNA_COLUMNS].iloc[-1].tolist())
+    found = _track(
+        topics, GPS_POSITION, samples, (layout.topic,), clock=clock, notes=notes,
+        velocity=samples[VELOCITY_COLUMNS + VELOCITY_VARIANCE_COLUMNS], age_s=delay_ms * 1e-3,
+        **more,
+    )  # fmt: skip
+    if isinstance(found, Unavailable):
+        return found
+    return replace(found, origin=structs.replace(found.origin, automatic=fuses_gnss(ekf2)))
 
 
 def _velocity(gps: pd.DataFrame) -> pd.DataFrame:
@@ -415,7 +399,7 @@ def read_truth(
         velocity = geo.reindex(columns=VELOCITY_COLUMNS)
         samples = projected(geo, _local_origin(topics)).join(velocity)
         return Truth(px4.TRUTH_GLOBAL[0].topic, samples, attitude)
-    captured = motion_capture(positions, "vehicle_mocap_odometry", "att_pos_mocap")
+    captured = motion_capture(positions, "vehicle_mocap_odometry")
     if captured is None:
         return Unavailable(
             "ground truth",
@@ -441,7 +425,7 @@ def captured_truth(track: PositionTrack) -> Truth:
     return Truth(track.name, state, attitude_of(track.orientation))
 
 
-def motion_capture(positions: tuple[PositionTrack, ...], *topics: str) -> PositionTrack | None:
-    """Motion capture by its topics, where another track feeds EKF2: then it is the truth."""
+def motion_capture(positions: tuple[PositionTrack, ...], topic: str) -> PositionTrack | None:
+    """Motion capture by its topic, where another track feeds EKF2: then it is the truth."""
     fed = any(track.origin.is_vision for track in positions)
-    return next((track for track in positions if fed and track.topics[0] in topics), None)
+    return next((track for track in positions if fed and track.topics[0] == topic), None)

@@ -2,7 +2,7 @@
 
 Each quantity lists the layouts in which PX4 has logged it, best first. A reader takes the first
 whose topic holds all its ``columns``; ``optional`` columns are read where they exist. Names are
-from PX4-Autopilot's ``msg/*.msg`` at the release tags named in ``since``.
+from PX4-Autopilot's ``msg/*.msg`` at the release tags that its comments name.
 """
 
 from __future__ import annotations
@@ -35,19 +35,17 @@ IMU = (
         "sensor_combined",
         elements(SPECIFIC_FORCE_COLUMNS, "accelerometer_m_s2")
         | elements(ANGULAR_RATE_COLUMNS, "gyro_rad"),
-        "v1.8",
         {"accelerometer_offset_us": "accelerometer_timestamp_relative"},
     ),
 )
 
-ATTITUDE = (Layout("vehicle_attitude", elements(QUATERNION_COLUMNS, "q"), "v1.8"),)
+ATTITUDE = (Layout("vehicle_attitude", elements(QUATERNION_COLUMNS, "q")),)
 
 _RESETS = ("xy_reset_counter", "z_reset_counter", "vxy_reset_counter", "vz_reset_counter")
 LOCAL_POSITION = (
     Layout(
         "vehicle_local_position",
         POSITION_AND_VELOCITY,
-        "v1.8",
         {name: name for name in (*_RESETS, "ref_lat", "ref_lon", "ref_alt")}
         | {"delta_down_m": "delta_z", "delta_down_m_s": "delta_vz"}
         | elements(["delta_north_m", "delta_east_m"], "delta_xy")
@@ -72,30 +70,13 @@ ATTITUDE_VARIANCES: Mapping[tuple[int, int], int] = {
 QUATERNION_FILTER = 4
 
 # EKF2's accelerometer bias in m/s², whatever the generation of the state vector
-SENSOR_BIAS = (
-    Layout("estimator_sensor_bias", elements(SPECIFIC_FORCE_COLUMNS, "accel_bias"), "v1.11"),
-)
-ACCELEROMETER_BIAS_STATE = 13
+SENSOR_BIAS = (Layout("estimator_sensor_bias", elements(SPECIFIC_FORCE_COLUMNS, "accel_bias")),)
 
-SELECTOR = (Layout("estimator_selector_status", {"instance": "primary_instance"}, "v1.12"),)
+SELECTOR = (Layout("estimator_selector_status", {"instance": "primary_instance"}),)  # v1.12
 
-# Horizontal aiding besides vision position, by the flags of all releases from v1.12, and before by
-# the bits of estimator_status.control_mode_flags
-AIDING_FLAGS: Mapping[str, str] = {
-    "cs_gps": "GPS",
-    "cs_gnss_pos": "GPS position",
-    "cs_gnss_vel": "GPS velocity",
-    "cs_opt_flow": "optical flow",
-    "cs_ev_vel": "vision velocity",
-    "cs_aux_gpos": "auxiliary global position",
-    "cs_fuse_aspd": "airspeed",
-    "cs_rngbcn_fusion": "ranging beacons",
-}
-AIDING_BITS: Mapping[str, int] = {"GPS": 2, "optical flow": 3, "vision velocity": 24}
+LAND_DETECTED = (Layout("vehicle_land_detected", {"landed": "landed"}),)
 
-LAND_DETECTED = (Layout("vehicle_land_detected", {"landed": "landed"}, "v1.8"),)
-
-FLIGHT_MODE = (Layout("vehicle_status", {"nav_state": "nav_state"}, "v1.8"),)
+FLIGHT_MODE = (Layout("vehicle_status", {"nav_state": "nav_state"}),)
 # vehicle_status.nav_state as QGroundControl names it, msg/VehicleStatus.msg; the numbers that are
 # missing here were never flown in v1.12 to v1.16
 NAV_STATES: Mapping[int, str] = {
@@ -106,18 +87,15 @@ NAV_STATES: Mapping[int, str] = {
     **{22 + number: f"External {number}" for number in range(1, 9)},
 }  # fmt: skip
 
-TRUTH_LOCAL = (Layout("vehicle_local_position_groundtruth", POSITION_AND_VELOCITY, "simulation"),)
+TRUTH_LOCAL = (Layout("vehicle_local_position_groundtruth", POSITION_AND_VELOCITY),)
 TRUTH_GLOBAL = (
     Layout(
         "vehicle_global_position_groundtruth",
         {"latitude_deg": "lat", "longitude_deg": "lon", "altitude_m": "alt"},
-        "simulation",
         {"north_m_s": "vel_n", "east_m_s": "vel_e", "down_m_s": "vel_d"},
     ),
 )
-TRUTH_ATTITUDE = (
-    Layout("vehicle_attitude_groundtruth", elements(QUATERNION_COLUMNS, "q"), "simulation"),
-)
+TRUTH_ATTITUDE = (Layout("vehicle_attitude_groundtruth", elements(QUATERNION_COLUMNS, "q")),)
 
 _GPS_OPTIONAL = {
     "eph_m": "eph", "epv_m": "epv", "fix_type": "fix_type", "utc_us": "time_utc_usec",
@@ -125,47 +103,43 @@ _GPS_OPTIONAL = {
     "down_m_s": "vel_d_m_s", "speed_accuracy_m_s": "s_variance_m_s",
 }  # fmt: skip
 ANTENNA_COLUMNS = ["antenna_forward_m", "antenna_right_m", "antenna_down_m"]
-_RECEIVER = "receiver."
+
+
+def _of_receiver(**names: str) -> dict[str, str]:
+    """Fields of the receiver's message inside another."""
+    return {ours: f"receiver.{px4}" for ours, px4 in names.items()}
+
+
 GPS = (
-    Layout(
+    Layout(  # main of 2026
         "vehicle_gnss",
-        {
-            "latitude_deg": f"{_RECEIVER}latitude",
-            "longitude_deg": f"{_RECEIVER}longitude",
-            "altitude_m": f"{_RECEIVER}altitude_msl",
-        },
-        "main of 2026",
-        {
-            "eph_m": f"{_RECEIVER}eph",
-            "epv_m": f"{_RECEIVER}epv",
-            "fix_type": f"{_RECEIVER}fix_type",
-            "utc_us": f"{_RECEIVER}time_utc_usec",
-            "published_us": f"{_RECEIVER}timestamp",
-            "north_m_s": f"{_RECEIVER}vel_north",
-            "east_m_s": f"{_RECEIVER}vel_east",
-            "down_m_s": f"{_RECEIVER}vel_down",
-            "speed_accuracy_m_s": f"{_RECEIVER}speed_accuracy",
-            **elements(ANTENNA_COLUMNS, "antenna_offset"),
-        },
+        _of_receiver(latitude_deg="latitude", longitude_deg="longitude", altitude_m="altitude_msl"),
+        _of_receiver(
+            eph_m="eph",
+            epv_m="epv",
+            fix_type="fix_type",
+            utc_us="time_utc_usec",
+            published_us="timestamp",
+            north_m_s="vel_north",
+            east_m_s="vel_east",
+            down_m_s="vel_down",
+            speed_accuracy_m_s="speed_accuracy",
+        )
+        | elements(ANTENNA_COLUMNS, "antenna_offset"),
     ),
-    Layout(
+    Layout(  # v1.14
         "vehicle_gps_position",
         {
             "latitude_deg": "latitude_deg",
             "longitude_deg": "longitude_deg",
             "altitude_m": "altitude_msl_m",
         },
-        "v1.14",
         _GPS_OPTIONAL
-        | {
-            name: f"antenna_offset_{axis}"
-            for name, axis in zip(ANTENNA_COLUMNS, "xyz", strict=True)
-        },
+        | dict(zip(ANTENNA_COLUMNS, (f"antenna_offset_{axis}" for axis in "xyz"), strict=True)),
     ),
-    Layout(
+    Layout(  # v1.8 to v1.13
         "vehicle_gps_position",
         {"latitude_deg": "lat", "longitude_deg": "lon", "altitude_m": "alt"},
-        "v1.8 to v1.13",
         _GPS_OPTIONAL,
         {"latitude_deg": 1e-7, "longitude_deg": 1e-7, "altitude_m": 1e-3},
     ),
@@ -174,21 +148,25 @@ GPS = (
 FUSED_FIXES = (
     Layout(
         "estimator_aid_src_gnss_pos",
-        {"latitude_deg": "observation[0]", "longitude_deg": "observation[1]"},
-        "v1.16",
+        {"latitude_deg": "observation[0]", "longitude_deg": "observation[1]"},  # v1.16
     ),
-    Layout("estimator_aid_src_gnss_vel", elements(VELOCITY_COLUMNS, "observation"), "v1.14"),
+    Layout("estimator_aid_src_gnss_vel", elements(VELOCITY_COLUMNS, "observation")),
 )
 
 
 @dataclass(frozen=True)
 class TrackSource:
-    """A logged position track: its name for ``--position-source``, and its layouts."""
+    """A position track of a log, by its name for ``--position-source``.
+
+    ``remedy`` says what would have logged it; ``layouts`` are those of a track that has a topic of
+    its own.
+    """
 
     name: str
     origin: Origin
     description: str
-    layouts: tuple[Layout, ...]
+    remedy: str
+    layouts: tuple[Layout, ...] = ()
 
 
 # msg/VehicleOdometry.msg: LOCAL_FRAME_* up to v1.13, POSE_FRAME_* since v1.14
@@ -207,64 +185,56 @@ _OLD_ODOMETRY = (
 )
 
 
-def _odometry(topic: str, before: str) -> tuple[Layout, ...]:
+def _odometry(topic: str) -> tuple[Layout, ...]:
     return (
-        Layout(
+        Layout(  # v1.14
             topic,
             elements(POSITION_COLUMNS, "position"),
-            "v1.14",
             elements(POSITION_VARIANCE_COLUMNS, "position_variance")
             | {"pose_frame": "pose_frame"}
             | elements(QUATERNION_COLUMNS, "q")
             | elements(ROTATION_VARIANCE_COLUMNS, "orientation_variance"),
         ),
-        Layout(topic, XYZ, "v1.9 to v1.13", _OLD_ODOMETRY),
-        Layout(before, XYZ, "v1.8"),
+        Layout(topic, XYZ, _OLD_ODOMETRY),  # v1.9 to v1.13
     )
 
-
-TRACKS = (
-    TrackSource(
-        "vehicle_visual_odometry",
-        RECEIVED,
-        "external vision position as PX4 received it",
-        _odometry("vehicle_visual_odometry", "vehicle_vision_position"),
-    ),
-    TrackSource(
-        "vehicle_mocap_odometry",
-        MOTION_CAPTURE,
-        "motion capture, which EKF2 never fuses",
-        _odometry("vehicle_mocap_odometry", "att_pos_mocap"),
-    ),
-    TrackSource(
-        "estimator_visual_odometry_aligned",
-        ALIGNED,
-        "external vision rotated into EKF2's frame",
-        (
-            Layout("estimator_visual_odometry_aligned", XYZ, "v1.12 to v1.13", _OLD_ODOMETRY),
-            Layout("vehicle_visual_odometry_aligned", XYZ, "v1.10 to v1.11", _OLD_POSE),
-        ),
-    ),
-)
 
 # Names for ``--position-source`` of what EKF2 kept of external vision, and of GNSS
 KEPT_OBSERVATION = "estimator_aid_src_ev_pos"
 RECONSTRUCTION = "ekf2_state_plus_innovation"
 GPS_POSITION = "vehicle_gps_position"
-TOPIC_ORIGINS = {track.name: track.origin for track in TRACKS} | {
-    KEPT_OBSERVATION: KEPT, RECONSTRUCTION: REBUILT, GPS_POSITION: GNSS,
-}  # fmt: skip
-# What would have logged a track
-TRACK_REMEDIES: Mapping[str, str] = {
-    "vehicle_visual_odometry": "Set SDLOG_PROFILE to 129 (default and vision) to log it as it "
-    "arrives.",
-    "vehicle_mocap_odometry": "Logged when ATT_POS_MOCAP is sent to PX4.",
-    "estimator_visual_odometry_aligned": "Logged by PX4 v1.10 to v1.13 when external vision is "
-    "fused.",
-    KEPT_OBSERVATION: "Logged by default since v1.16 when EKF2 runs on external vision.",
-    RECONSTRUCTION: "Needs EKF2 innovations of external vision.",
-    GPS_POSITION: "Logged when a GPS receiver is connected.",
-}
+_TRACKS = (
+    TrackSource(
+        "vehicle_visual_odometry", RECEIVED, "external vision position as PX4 received it",
+        "Set SDLOG_PROFILE to 129 (default and vision) to log it as it arrives.",
+        _odometry("vehicle_visual_odometry"),
+    ),
+    TrackSource(
+        "vehicle_mocap_odometry", MOTION_CAPTURE, "motion capture, which EKF2 never fuses",
+        "Logged when ATT_POS_MOCAP is sent to PX4.", _odometry("vehicle_mocap_odometry"),
+    ),
+    TrackSource(
+        "estimator_visual_odometry_aligned", ALIGNED, "external vision rotated into EKF2's frame",
+        "Logged by PX4 v1.10 to v1.13 when external vision is fused.",
+        (
+            Layout("estimator_visual_odometry_aligned", XYZ, _OLD_ODOMETRY),  # v1.12, v1.13
+            Layout("vehicle_visual_odometry_aligned", XYZ, _OLD_POSE),  # v1.10, v1.11
+        ),
+    ),
+    TrackSource(
+        KEPT_OBSERVATION, KEPT, "the observations that EKF2 kept of external vision",
+        "Logged by default since v1.16 when EKF2 runs on external vision.",
+    ),
+    TrackSource(
+        RECONSTRUCTION, REBUILT, "EKF2's position plus its innovation",
+        "Needs EKF2 innovations of external vision.",
+    ),
+    TrackSource(
+        GPS_POSITION, GNSS, "GNSS position", "Logged when a GPS receiver is connected.", GPS
+    ),
+)  # fmt: skip
+TRACKS: Mapping[str, TrackSource] = {track.name: track for track in _TRACKS}
+TOPIC_ORIGINS = {name: track.origin for name, track in TRACKS.items()}
 # What has EKF2 fuse external vision; it starts on samples less than 0.2 s apart (ev_control.cpp)
 HOW_TO_FUSE: Mapping[str, str] = {
     "horizontal": "Send the position at 10 Hz (EKF2 starts on samples less than 0.2 s apart) and "
@@ -277,7 +247,7 @@ AID_OBSERVATION_HORIZONTAL = (
     Layout(
         KEPT_OBSERVATION,
         elements(POSITION_COLUMNS[:2], "observation"),
-        "v1.14",
+        # v1.14
         elements(POSITION_VARIANCE_COLUMNS[:2], "observation_variance"),
     ),
 )
@@ -285,7 +255,7 @@ AID_OBSERVATION_VERTICAL = (
     Layout(
         "estimator_aid_src_ev_hgt",
         {"down_m": "observation"},
-        "v1.14",
+        # v1.14
         {"down_m2": "observation_variance"},
     ),
 )
@@ -303,8 +273,8 @@ def topics() -> list[str]:
     """Every topic named in this table, sorted: all that a reader needs to decode."""
     groups = (
         IMU, ATTITUDE, LOCAL_POSITION, SENSOR_BIAS, SELECTOR, LAND_DETECTED, FLIGHT_MODE,
-        TRUTH_LOCAL, TRUTH_GLOBAL, TRUTH_ATTITUDE, GPS, AID_OBSERVATION_HORIZONTAL,
-        AID_OBSERVATION_VERTICAL, *(track.layouts for track in TRACKS),
+        TRUTH_LOCAL, TRUTH_GLOBAL, TRUTH_ATTITUDE, AID_OBSERVATION_HORIZONTAL,
+        AID_OBSERVATION_VERTICAL, *(track.layouts for track in _TRACKS),
     )  # fmt: skip
     named = {layout.topic for group in groups for layout in group}
     return sorted(named | UNUSED.keys() | {*ESTIMATOR_STATES})

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from pyulog import ULog
 from pyulog.exceptions import ULogException
 
-from px4fuse.arrays import Array, IntArray
+from px4fuse.arrays import IntArray
 from px4fuse.ekf2_parameters import REPORTED
 from px4fuse.errors import LogError
 from px4fuse.readers.layouts import Layout
@@ -147,11 +147,12 @@ class Topics:
         with np.errstate(invalid="ignore"):  # damaged bytes can be signalling NaNs
             frame = pd.DataFrame(
                 {
-                    ours: _usable(table[px4][keep]) * layout.scale.get(ours, 1.0)
+                    ours: table[px4][keep].astype(np.float64) * layout.scale.get(ours, 1.0)
                     for ours, px4 in columns.items()
                 },
                 index=pd.Index((time_us[keep] - self.zero_us) * _MICROSECOND, name="time_s"),
             )
+        frame = frame.where(np.isfinite(frame))  # an infinite value is as unusable as NaN
         return frame if step else self.window(frame)
 
     def read(self, layouts: tuple[Layout, ...], *, step: bool = False) -> pd.DataFrame | None:
@@ -218,13 +219,6 @@ def measurement_time_us(table: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
     if np.count_nonzero(plausible) * 2 < len(plausible):
         return published
     return np.where(plausible, sampled, published)
-
-
-def _usable(values: NDArray[Any]) -> Array:
-    """As float64; an infinite value is as unusable as NaN."""
-    usable: Array = values.astype(np.float64)
-    usable[np.isinf(usable)] = np.nan
-    return usable
 
 
 def increasing(time_us: NDArray[np.int64]) -> IntArray:
