@@ -34,6 +34,8 @@ from px4fuse.recording import ClockMap, Sender
 MAX_SENDERS = 32
 # A sender that seems to lose more than this does not count its messages
 SEQUENCE_MEANS_NOTHING = 0.9
+# A message that comes after so many later ones of its sender came over a slower link
+MOST_LATE = 16
 # Stamps of one sender further apart than this are of two clocks
 OTHER_CLOCK_S = 1e5
 
@@ -195,10 +197,11 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
 def _lost_share(frames: Frames, address: Address) -> float | None:
     """Share of a sender's messages that its sequence numbers say are not here.
 
-    None where it does not count them, or was heard over two links at once.
+    A message that came again, or a little late, is not lost. None where the sender does not count
+    its messages, or counts them apart on each of two links.
     """
     own = (frames.system == address[0]) & (frames.component == address[1])
-    sequence = frames.sequence[own].astype(np.int64)
-    lost = int(np.sum((np.diff(sequence) - 1) % 256))
-    share = lost / (lost + len(sequence))
+    step = (np.diff(frames.sequence[own].astype(np.int64)) + MOST_LATE) % 256 - MOST_LATE
+    place = np.append(0, np.cumsum(step))
+    share = float(1.0 - len(np.unique(place)) / (np.ptp(place) + 1))
     return share if share < SEQUENCE_MEANS_NOTHING else None
