@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from pypdf import PdfReader
 
 from px4fuse.answers import Answers, Claim
-from px4fuse.grading.anonymous import NAME, Veil
+from px4fuse.grading.anonymous import NAME
 from px4fuse.grading.class_page import html_text
 from px4fuse.grading.model import Entry, Graded, Item, Override
 from px4fuse.verification.model import Mismatch, Verdict
@@ -61,18 +61,17 @@ def graded(name: str, points: float | None, **more: Any) -> Graded:
     )  # fmt: skip
 
 
+OF_ENTRY = ("handed_in_at", "late_s", "deduction", "overrides", "comment", "total", "pseudonym",
+            "others")  # fmt: skip
+
+
 def row(name: str, points: float | None, **more: Any) -> Entry:
     """A student with one report; what Entry has goes there, the rest to the report."""
-    own = {
-        key: more.pop(key)
-        for key in ("handed_in_at", "late_s", "deduction", "overrides", "comment", "total",
-                    "pseudonym", "others", "remarks")
-        if key in more
-    }  # fmt: skip
+    own = {key: more.pop(key) for key in OF_ENTRY if key in more}
     one = graded(name, points, **more)
     own["handed_in"] = own.pop("handed_in_at", "")
     own.setdefault("total", None if points is None else one.counted)
-    return Entry(name, one.student_id, one, of=one.of, **own)
+    return Entry(name, one.student_id, one, of=one.of, flags=one.flags, **own)
 
 
 FORM = Answers(
@@ -86,9 +85,9 @@ CLASS = (
     row("Émile", 9.0, id="1010", numbers={"mean NIS": 0.5}),
     row("Bo", 20.0, id="99", numbers={"mean NIS": -3.0}),
     row("", None, file="broken.pdf", status="cannot verify", reasons=("Not a PDF.",)),
-    row(MARKUP, 5.0, id=FORMULA, file=BREAKOUT, flags=(MARKUP,), handed_in=b"<svg onload=x>",
+    row(MARKUP, 5.0, id=FORMULA, file=BREAKOUT, flags=(MARKUP, MARKUP), handed_in=b"<svg onload=x>",
         notes=BREAKOUT, reasons=(BREAKOUT,), numbers={MARKUP: 1.0}, pending=MARKUP,
-        form=FORM, mistakes={MARKUP: False}, remarks=(MARKUP,),
+        form=FORM, mistakes={MARKUP: False},
         sheets=("//example.org/x.png",), redrawn_name="javascript:alert(1)", comment=BREAKOUT,
         items=(Item(BREAKOUT, 5.0, 20.0, MARKUP, by_hand=True, waits=True),), handed_in_at=MARKUP,
         overrides={BREAKOUT: Override(None, MARKUP)}),
@@ -119,7 +118,7 @@ def test_the_page_holds_what_it_held() -> None:
     agrees("class_page", [line[:300] for line in lines])
 
 
-def test_every_inline_block_is_what_the_policy_allows() -> None:
+def test_the_policy_allows_the_inline_blocks_and_nothing_hangs_on_an_attribute() -> None:
     text = html_text(CLASS, "Class", "px4fuse 1")
     policy = next(a["content"] or "" for t, a in Elements(text).found if a.get("http-equiv"))
     assert "default-src 'none'" in policy
@@ -129,10 +128,7 @@ def test_every_inline_block_is_what_the_policy_allows() -> None:
         assert block is not None
         digest = base64.b64encode(hashlib.sha256(block[1].encode()).digest()).decode()
         assert f"{tag}-src 'sha256-{digest}'" in policy
-
-
-def test_nothing_is_loaded_and_nothing_hangs_on_an_attribute() -> None:
-    for tag, attributes in Elements(html_text(CLASS, "Class", "px4fuse 1")).found:
+    for tag, attributes in Elements(text).found:
         assert tag not in ("img", "iframe", "object", "embed", "a", "base")
         assert not any(name.startswith("on") or name in ("src", "style") for name in attributes)
         assert attributes.get("href") in (None, "data:,")
@@ -191,18 +187,6 @@ def test_what_is_absent_not_finite_too_long_or_too_much() -> None:
     assert "axes.50" not in text
 
 
-def test_texts_that_are_alike_stand_below_each_other() -> None:
-    entries = [
-        row("Ada", 9.0, id="1", notes=f"I begin here. {SHARED} and I end."),
-        row("Bo", 9.0, id="2", notes=f"Another start: {SHARED.upper()}."),
-        row("Cy", 9.0, id="3", notes=" ".join(f"own{n}" for n in range(60))),
-    ]
-    made = content(html_text(entries, "Class", "px4fuse 1"))["rows"]
-    shown = [[part[1] for part in one[2]] for one in made]
-    assert any(re.fullmatch(r"Text of Bo, which shares \d+%", title) for title in shown[0])
-    assert not any(title.startswith("Text of") for title in shown[2])
-
-
 PEOPLE = (
     ("Ada Lovelace", "10017", "Lovelace Ada_4711_assignsubmission_file_/ada report.pdf"),
     ("Émile du Châtelet", "s-2031", "chatelet/Émile_du_Châtelet.pdf"),
@@ -216,13 +200,13 @@ def anonymous_class() -> list[Entry]:
     entries = []
     for number, (name, student_id, file) in enumerate(PEOPLE):
         others = [one for one in PEOPLE if one[0] != name]
-        flag = f"The same log as {others[0][0]}, {others[0][1]} ({others[0][2] or 'x'})."
+        flag = f"The same log as {others[0][0]}, {others[0][1]} ({others[0][2] or 'x'}). {SAYS}"
         said = f"Your report names {name}, {student_id}. {SAYS}"
         entry = row(
             name, 9.0, id=student_id, file=file, flags=(flag,), reasons=(said,), pending=said,
             notes=f"{name} ({student_id}): {SHARED} {SAYS} 王小明", form=FORM,
             numbers={f"NIS of {name}": 1.0}, items=(Item(f"For {name}", 9.0, 20.0, said),),
-            mistakes={"positions that jump": False}, comment=said, remarks=(said,),
+            mistakes={"positions that jump": False}, comment=said,
             overrides={f"For {name}": Override(10.0, said)},
             others=(graded(name, 3.0, file=f"old/{file}"),),
             sheets=("pages/0123-001-of-001.png",), redrawn_name=f"reports/{student_id}.pdf",
@@ -325,7 +309,7 @@ def test_filters_by_text_and_status_with_a_count(page: Browser) -> None:
     ):
         page.choose("#filter-0", status)
         assert page.names() == names
-    page.choose("#filter-1", "missed:outliers")
+    page.choose("#filter-0", "missed: outliers")
     assert page.names() == ["ada"]
     assert page.complaints() == []
 
@@ -453,12 +437,3 @@ def test_points_and_words_of_the_instructor_are_downloaded_as_a_table(page: Brow
     assert rows[0] == ["id", "item", "points", "comment"]
     assert ["1007", "total", "7.5", '\'=1+1, "well"'] in rows
     assert ["'" + FORMULA, BREAKOUT, "", MARKUP] in rows  # what was said before stays
-
-
-def test_a_students_own_words_keep_short_numbers_that_are_ids() -> None:
-    """Id 12 is hidden where the tool speaks of a student, not in "12 outliers"."""
-    entry = row("Ada Lovelace", 9.0, id="12", file="12.pdf", pseudonym="Student 001")
-    veil = Veil([entry])
-    assert veil.hide("12 and Ada") == f"Student 001 and {NAME}"
-    assert veil.hide("12 outliers, by Ada", own_words=True) == f"12 outliers, by {NAME}"
-    assert Veil([]).hide("12 and Ada") == "12 and Ada"

@@ -41,7 +41,7 @@ def graded(text: str, numbers: dict[str, float] | None = None, points: float = 1
         items=(Item(text, points, 2.0, text),), flags=(text, text), numbers=numbers or {},
         log_sha256="ab" * 32,
     )  # fmt: skip
-    return entry(one, others=(one,), handed_in=text, comment=text, remarks=(text, text))
+    return entry(one, others=(one,), handed_in=text, comment=text, flags=(text, text))
 
 
 def cells(text: str, delimiter: str = ",") -> list[list[str]]:
@@ -84,7 +84,7 @@ def test_read_back_it_is_what_was_made_safe(rows: list[tuple[str, dict[str, floa
         said = [neutral(text)] * 2 + [neutral_id(text), "cannot verify", "1", "", "2", "", "1"]
         assert row[: len(FIRST)] == said
         both = neutral(f"{text} | {text}")
-        said = [neutral(text), "", "", neutral(text), both, both, neutral(text), both, "ab" * 32]
+        said = [neutral(text), "", "", neutral(text), both, neutral(text), both, "ab" * 32]
         assert row[-len(LAST) :] == said
         found = sorted(float(cell) for cell in row[len(FIRST) : -len(LAST)] if cell)
         assert found == pytest.approx(sorted([*numbers.values(), 1.0]), rel=1e-9, abs=1e-300)
@@ -130,14 +130,6 @@ def test_numbers_stay_numbers_and_what_is_none_is_empty() -> None:
     assert first[4:9] == ["0.3", "", "2", "", "0.3"]
     assert first[own] == ["0.3", "", "-0.125", ""]
     assert second[own] == ["", "1", "", "1e-07"]
-
-
-def test_items_of_one_title_keep_a_column_each() -> None:
-    items = (Item("notes", 1.0, 2.0, ""), Item("notes", 2.0, 2.0, ""), Item("=x", 0.0, 1.0, ""))
-    one = Graded("a.pdf", "A", "1", Verdict("verified", (), True), items)
-    head, row = cells(csv_text([entry(one)]))
-    assert head[len(FIRST) : -len(LAST)] == ["notes", "notes (2)", "'=x"]
-    assert row[len(FIRST) : -len(LAST)] == ["1", "2", "0"]
 
 
 def test_late_overridden_pending_and_missing_ones_say_so() -> None:

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import csv
 import io
-import zipfile
 from pathlib import Path
 
 import pytest
-from class_tools import entry, graded
+from class_tools import entry
 
 from px4fuse.assignment.roster import Person, people_of_sheet
 from px4fuse.assignment.sheet import read_sheet
 from px4fuse.errors import SettingsError
-from px4fuse.grading.exports import as_html, filled, grade_column, moodle_feedback
-from px4fuse.grading.model import Entry, Submission
-from px4fuse.grading.platforms import ExportOrigin
+from px4fuse.grading.exports import filled, grade_column
 from px4fuse.grading.roster import Register
 
 # As mod/assign/gradingtable.php of Moodle writes it
@@ -150,29 +147,3 @@ def test_the_column_of_the_grade_is_named_or_the_only_one(tmp_path, text, column
     with pytest.raises(SettingsError, match=says) as caught:
         grade_column(table(tmp_path, text), column)
     assert "\n" not in str(caught.value)
-
-
-def test_moodles_feedback_zip_has_the_folders_that_it_reads_back() -> None:
-    """The rule of importziplib.php: split at "_", the second part is the participant."""
-    origins = {
-        "a.pdf": ExportOrigin("moodle", "4711", "Doe_Jane"),
-        "b.pdf": ExportOrigin("moodle", "4712", "../=Roe"),
-        "c.pdf": ExportOrigin("canvas", "5", "pat"),
-    }
-    entries = tuple(
-        Entry(name, name, graded(f"{name}.pdf", 1.0), total=1.0) for name in ("a", "b", "c")
-    )
-    files = {n: Submission(Path("x.zip"), n, n, None, one) for n, one in origins.items()}
-    content = moodle_feedback(entries, files, TEXTS)
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        found = {}
-        for name in archive.namelist():
-            folder, file = name.split("/")
-            _, number, kind, plugin, _ = folder.split("_", 4)
-            assert (kind, plugin, file) == ("assignfeedback", "file", "feedback.txt")
-            found[number] = archive.read(name).decode("utf-8-sig")
-    assert found == {"4711": TEXTS[0], "4712": TEXTS[1]}
-
-
-def test_html_of_feedback_holds_no_markup() -> None:
-    assert as_html("<script>&\n\n  x\n") == "&lt;script&gt;&amp;<br><br>&nbsp;&nbsp;x"

@@ -168,20 +168,6 @@ def test_a_log_that_was_handed_out_and_is_not_at_hand_costs_nobody_everything(tm
         assert "aisle_uwb.ulg" in one.pending
 
 
-@pytest.mark.usefixtures("at_once")
-def test_what_an_earlier_run_left_is_told(tmp_path) -> None:
-    (tmp_path / "in").mkdir()
-    for name in ("old.pdf", "new.pdf"):
-        (tmp_path / "in" / name).write_bytes(b"none")
-    output = tmp_path / "out"
-    assert not grade([tmp_path / "in"], [], read_rubric(None), output, processes=1).notes
-    (tmp_path / "in" / "old.pdf").unlink()
-    (note,) = grade([tmp_path / "in"], [], read_rubric(None), output, processes=1).notes
-    assert "1 of an earlier run" in note
-    assert "old" in note
-    assert (output / "feedback" / "old.txt").is_file()
-
-
 def test_what_the_command_says(tmp_path, monkeypatch) -> None:
     """Names on one line each, and of an interrupted run that it can go on."""
     import px4fuse.grading.grade as module
@@ -228,12 +214,12 @@ def test_names_of_files_are_safe_and_unique() -> None:
     [
         (["grade"], "nothing to grade"),
         (["grade", "in"], "say with -o"),
-        (["grade", "missing", "-o", "out"], "no such file or folder"),
+        (["grade", "missing", "-o", "out"], "no regular file, and no folder"),
         (["grade", "in", "-o", "in/out"], "lies inside"),
         (["grade", "in", "-o", "in/a.pdf"], "is not a folder"),
         (["grade", "in", "-o", "out", "--rubric", "missing.toml"], "missing.toml"),
         (["grade", "in", "-o", "out", "--key", "missing.json"], "missing.json"),
-        (["grade", "in", "-o", "out", "--logs", "missing"], "no such file or folder"),
+        (["grade", "in", "-o", "out", "--logs", "missing"], "missing: cannot be read"),
         (["grade", "in", "-o", "out", "--roster", "missing"], "cannot be read"),
         (["grade", "in", "-o", "out", "--worksheet", "missing"], "cannot be read"),
         (["grade", "in", "-o", "out", "--late", "10%/day"], "--due"),

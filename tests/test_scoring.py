@@ -16,7 +16,7 @@ from px4fuse.assignment.truth import FormTruth, VerdictTruth, Wrong
 from px4fuse.errors import ResultsError
 from px4fuse.findings import NAMES
 from px4fuse.grading.feedback import returned_text
-from px4fuse.grading.flags import chosen_settings, class_flags, own_flags, text_flags
+from px4fuse.grading.flags import class_flags, own_flags, text_flags
 from px4fuse.grading.model import Entry, Graded, Item
 from px4fuse.grading.rubric import parse_rubric, read_rubric
 from px4fuse.grading.scoring import assess, refused
@@ -62,18 +62,12 @@ def filled(kinds, results=EXAMPLE, **values):
 
 
 def test_a_file_that_is_not_at_hand():
-    read = read_report((ROOT / "reports" / "aisle_uwb.pdf").read_bytes(), "aisle_uwb.pdf")
-    verdict = verify(read)
-    points, comment = checked("verified", verdict=verdict)
-    assert points == 0.5
-    assert "not at hand (aisle_uwb.ulg)" in comment
-    text = fed_back(graded(verdict=verdict))
-    assert "was not at hand" in text
-    assert "Make it again" not in text
+    verdict = verify(read_report((ROOT / "reports" / "aisle_uwb.pdf").read_bytes(), "a.pdf"))
+    assert checked("verified", verdict=verdict)[0] == 0.5
+    assert "Hand in aisle_uwb.ulg" in fed_back(graded(verdict=verdict))
     other = replace(verdict, reasons=("made with another version",), missing="")
     points, comment = checked("verified", verdict=other)
-    assert points == 0.0
-    assert comment == "Your report could not be verified (made with another version)."
+    assert (points, comment[-28:]) == (0.0, "(made with another version).")
 
 
 RMSE = "axes.north.filters.kf.truth.position_rmse_m"
@@ -88,17 +82,12 @@ WORSE = {"slam.tum": to_plain(correction(0.5, 1.4))["scores"]["slam.tum"]}
 REJECTED = changed(LOOP, loop__closures=[{**LOOP["loop"]["closures"][0], "accepted": False}])
 # Check, results, parameters, the points of 1, and what the comment says
 CHECKED = [
-    ("verified", EXAMPLE, {}, 1.0, "computed again"),
+    ("verified", EXAMPLE, {}, 1.0, "verified (all 900"),
     ("student", changed(student={"name": "Ann", "id": "7", "notes": ""}), {}, 1.0, "Ann, 7"),
     ("student", changed(student__name="Ann"), {}, 0.5, "--id"),
     ("student", EXAMPLE, {}, 0.0, "--student"),
-    ("student", changed(LOOP, student__name="Ann", student__id="7"), {}, 1.0, "Ann"),
     ("student", changed(student__name="Ann"), {"id": False}, 1.0, "Ann"),
-    ("sections", EXAMPLE, {"results": ["axes.*.filters.kf", "clock"]}, 1.0, "2 of 2"),
-    ("sections", EXAMPLE, {"results": ["loop", "axes.north"]}, 0.5,
-     "no external vision with orientation"),
     ("tuning", EXAMPLE, {"settings": ["sigma_z_m"]}, 1.0, "within"),
-    ("tuning", EXAMPLE, {"settings": ["sigma_a_m_s2"]}, 0.72, "0.5 m/s² is above"),
     ("tuning", EXAMPLE, {}, 0.86, "SIGMA_A"),
     ("tuning", changed(settings__sigma_a_m_s2=0.1), {"settings": ["sigma_a_m_s2"]}, 0.0, "below"),
     ("tuning", changed(**{SIGMA_Z: ..., f"{SIGMA_Z}_interval": [0.0, 0.2]}),
@@ -112,14 +101,12 @@ CHECKED = [
     ("number", EXAMPLE, {"path": RMSE, "at_least": 0.07, "zero_at": 0.06}, 0.5, ""),
     ("number", EXAMPLE, {"path": "axes.*.filters.kf.nis_mean", "at_least": 0.82}, 0.0,
      "axes.north"),  # the worst of several
-    ("number", EXAMPLE, {"path": ["nothing.here", "log.duration_s"], "at_least": 100}, 1.0, ""),
     ("number", LOOP, {"path": 'loop.corrections.by_distance.scores."slam.tum".ate.translation_m.'
                               "rmse", "at_most": 0.3}, 1.0, ""),
     ("number", EXAMPLE, {"path": "clock.interval_s.1", "at_most": 0.1}, 1.0, ""),
-    *(("number", BLIND, {"path": path, "at_most": 1.0}, 0.0, "has no number for")
-      for path in ("log", "log.name", "log.dropouts", "nothing")),
+    ("number", BLIND, {"path": "log.name", "at_most": 1.0}, 0.0, "has no number for"),
     ("number", BLIND, {"path": RMSE, "at_most": 1.0}, 0.0,
-     f"Your report has no number for {RMSE} (too few of them)."),
+     f"Your report has no number for the number {RMSE} (too few of them)."),
     ("number", NORTH, {"path": "tuning.horizontal.held_out.gain_nats", "at_most": 1.0}, 0.0,
      "leave --axis out"),
     ("consistent", changed(horizontal__kf__verdict="consistent"), {}, 1.0, "is consistent"),
@@ -133,13 +120,13 @@ CHECKED = [
      "what is left no setting fixes"),
     ("clock", EXAMPLE, {}, 1.0, "what the data ask for"),
     ("clock", changed(clock__applied_s=0.25), {}, 0.0, "0.250 s"),
-    ("clock", UNCLEAR, {}, 0.5, "no acceleration); fly"),
+    ("clock", UNCLEAR, {}, 0.5, "no acceleration)."),
     ("clock", changed(clock=NONE), {}, 0.0, "too few of them"),
-    ("clock", LOOP, {}, 0.0, "nothing about the clock"),
+    ("clock", LOOP, {}, 0.0, "compares no filters"),
     ("clock", changed(**JUMPS), {}, 0.5, "say in your form"),
     ("clock", filled(["clock-jump"], **JUMPS), {}, 1.0, "as your form says"),
     ("clock", filled(["dropout"], **JUMPS), {}, 0.5, "say in your form"),
-    ("loop", LOOP, {}, 1.0, "from 0.41 m to 0.26 m"),
+    ("loop", LOOP, {}, 1.0, "went from 0.41 m to 0.26 m"),
     ("loop", changed(LOOP, **{f"{AFTER}__scores": WORSE}), {}, 0.67, "makes it worse"),
     ("loop", changed(LOOP, **{f"{AFTER}__scores": {}}), {}, 0.83, "--reference"),
     ("loop", changed(LOOP, **{AFTER: NONE}), {}, 0.33, "not corrected"),
@@ -165,9 +152,7 @@ def test_what_a_check_gives(check, results, given, points, said):
 
 
 def test_the_clock_of_a_flight_that_was_handed_out_is_not_the_student_s_choice():
-    points, comment = checked("clock", UNCLEAR, key=key())
-    assert points == 1.0
-    assert "fly" not in comment.replace("flight", "")
+    assert checked("clock", UNCLEAR, key=key())[0] == 1.0
 
 
 # ------------------------------------------------------------------ mistakes
@@ -217,7 +202,7 @@ class TestForm:
         assert points == 0.0
         assert said in comment
 
-    def test_another_log_an_unknown_id_and_no_id(self):
+    def test_another_log_and_an_unknown_id(self):
         other = key(sha256="c" * 64)
         points, comment = checked("answers", filled(["dropout"], student__id="s01"), key=other)
         assert points == 0.0
@@ -231,12 +216,6 @@ class TestForm:
             assert (made.counted is None) is waits
             assert made.items[-1].points == 0.0
 
-    def test_ids_without_their_leading_zeros(self):
-        answers = AnswerKey("aisle", (Answer("0042", "", "", SHA), Answer("7", "", "", "b" * 64)))
-        assert answers.of_student("42").student_id == "0042"
-        assert answers.of_student("") is None
-        assert answers.of_log("") is None
-
 
 # ------------------------------------------------------------------ the whole
 
@@ -244,8 +223,8 @@ class TestForm:
 class TestScore:
     def test_example(self):
         items = assessed().items
-        assert sum(item.of for item in items) == 65
-        assert 35 < sum(item.points for item in items) < 60
+        assert sum(item.of for item in items) == 60
+        assert 30 < sum(item.points for item in items) < 55
 
     def test_refuted_reports_get_nothing(self):
         verdict = Verdict("numbers differ", ("SIGMA_A is 0.5",), with_log=True)
@@ -274,22 +253,21 @@ class TestScore:
     )  # fmt: skip
     def test_somebody_else_s_log_is_pending_unless_the_rubric_says_so(self, student_id, said):
         rubric, given = read_rubric(None), changed(student__id=student_id)
-        made = assessed(given, key=key("source_gap"), rubric=rubric)
+        made = assessed(given, key=key(), rubric=rubric)
         assert said in made.pending
         for rule, counts, points in (("zero", True, False), ("count", True, True)):
             rubric = replace(rubric, others_log=rule)
-            made = assessed(given, key=key("source_gap"), rubric=rubric)
+            made = assessed(given, key=key(), rubric=rubric)
             assert (made.pending == "") == counts
             assert any(item.points for item in made.items) == points
         mine = changed(student__id="s01")
-        assert assessed(mine, key=key("source_gap")).pending == ""
+        assert assessed(mine, key=key()).pending == ""
         # the platform says whose it is
-        made = assessed(key=key("source_gap"), owner_id="s01")
+        made = assessed(key=key(), owner_id="s01")
         assert made.pending == ""
 
     def test_a_log_that_nobody_was_given(self):
-        answers = key("source_gap", sha256="c" * 64)
-        made = assessed(noted("", student__id="s01"), key=answers)
+        made = assessed(noted("", student__id="s01"), key=key(sha256="c" * 64))
         assert "Ask for a report on the log that was handed out" in made.pending
 
     def test_altered_pages(self):
@@ -303,7 +281,7 @@ class TestScore:
 
     def test_refused_file_has_every_item_with_nothing(self):
         items = refused(read_rubric(None), None, Refused("not a PDF")).items
-        assert sum(item.of for item in items) == 65
+        assert sum(item.of for item in items) == 60
         assert {item.points for item in items} == {0.0}
 
     @pytest.mark.parametrize("results", [EXAMPLE, LOOP], ids=["compare", "loop"])
@@ -331,7 +309,7 @@ class TestScore:
             except ResultsError:
                 continue
             read += 1
-            for item in assess(found, VERIFIED, rubric, key("source_gap")).items:
+            for item in assess(found, VERIFIED, rubric, key()).items:
                 assert 0.0 <= item.points <= item.of
                 assert len(item.comment) < 1500
                 assert item.comment.isprintable()
@@ -363,18 +341,11 @@ class TestWhatStudentsRead:
         ("values", "there", "absent"),
         [
             ({"items": assessed().items, "flags": ("copied",)},
-             ("Lab 2 Report a.pdf Student Ann Lee, 1001", "You can still gain most points here"),
-             "copied"),
-            ({"verdict": Verdict("cannot verify", ("Not a PDF.",), False)},
-             ("could not be verified: Not a PDF. Make it again", "hand in the PDF"), "points"),
-            ({"verdict": Verdict("cannot verify", ("one", "page 3: two"), True)},
-             ("verified: one; page 3: two. Make it again",), "at hand"),
-            ({"verdict": Verdict("other log", ("none of the 7 files given is the log",), False)},
-             ("that your instructor has: none of the 7 files given is the log.",), "again"),
+             ("Lab 2 Report a.pdf Student Ann Lee, 1001",), "copied"),
+            ({"verdict": Verdict("cannot verify", ("one", "page 3: two"), False)},
+             ("could not be verified: one; page 3: two. Make it again",), "Points"),
             ({"student": "=cmd|' /C calc'!A0\n<script>", "student_id": "\x1b[31m"},
              ("=cmd|' /C calc'!A0 <script>",), "\x1b"),
-            ({"verdict": Verdict("cannot verify", ("why",), False, missing="uwb.csv")},
-             ("was not at hand (uwb.csv)", "Hand it in too"), "--logs"),
             ({"items": assessed().items, "pending": "Add uwb.csv to --logs."},
              ("pending: they do not count yet",), "--logs"),
         ],
@@ -470,67 +441,39 @@ def of(number, **values):
 class TestClassFlags:
     def test_an_honest_class(self):
         assert class_flags([of(n, notes=text_of(n)) for n in range(12)]) == {}
-        assert class_flags([]) == {}
 
-    def test_logs_ids_files_and_versions(self):
+    def test_logs_ids_and_files(self):
         made = class_flags(
-            [of(1, log_sha256="x"), of(2, log_sha256="x"), of(3, version="0.0.9"), of(4), of(5),
-             of(6, student_id="1005"), of(7, sha256="y"), of(8, sha256="y")]
+            [of(1, log_sha256="x"), of(2, log_sha256="x"), of(4), of(5), of(6, student_id="1005"),
+             of(7, sha256="y"), of(8, sha256="y")]
         )  # fmt: skip
-        assert set(made) == {0, 1, 2, 4, 5, 6, 7}
-        assert "same log as Student2" in made[0][0]
-        assert "0.0.9" in made[2][0]
-        assert "same student id" in made[4][0]
-        assert "same file" in made[7][0]
+        assert set(made) == {f"{n}.pdf" for n in (1, 2, 5, 6, 7, 8)}
+        assert "same log as Student2" in made["1.pdf"][0]
+        assert "same student id" in made["5.pdf"][0]
+        assert "same file" in made["8.pdf"][0]
 
     def test_two_reports_of_one_student_on_one_log(self):
-        assert class_flags(
-            [of(1, log_sha256="x"), of(1, log_sha256="x", sha256="z", submission="b.pdf")]
-        ) == {
-            0: ("The same student id as in Student1 Name1, 1001 (b.pdf).",),
-            1: ("The same student id as in Student1 Name1, 1001 (1.pdf).",),
+        two = [of(1, log_sha256="x"), of(1, log_sha256="x", sha256="z", submission="b.pdf")]
+        assert class_flags(two) == {
+            "1.pdf": ["The same student id as in Student1 Name1, 1001 (b.pdf)."],
+            "b.pdf": ["The same student id as in Student1 Name1, 1001 (1.pdf)."],
         }
-
-    def test_settings_to_the_last_digit(self):
-        def chosen(**values):
-            changes = {f"settings__{name}": value for name, value in values.items()}
-            return chosen_settings(decoded(changed(**changes)))
-
-        typed = {"sigma_a_m_s2": 0.362, "sigma_z_m": 0.097}
-        assert chosen() == chosen(sigma_a_m_s2=0.3, sigma_z_m=0.2) == ""
-        assert (
-            chosen(**typed, start_s=1.0)
-            == chosen(**typed)
-            == ("sigma_a_m_s2 0.362, sigma_z_m 0.097")
-        )
-        assert chosen_settings(decoded(LOOP)) == ""
-        same = class_flags(
-            [of(1, settings=chosen(**typed)), of(2, settings=chosen(**typed)), of(3)]
-        )
-        assert set(same) == {0, 1}
-        assert "sigma_a_m_s2 0.362" in same[0][0]
-
-    def test_notes_copied(self):
-        own = text_of(1)
-        words = own.split()
-        words[10] = words[60] = "CHANGED"
-        changed_ = " ".join(words).upper() + "!"
-        made = class_flags([of(1, notes=own), of(2, notes=changed_), of(3, notes=text_of(3))])
-        assert set(made) == {0, 1}
-        assert "whole passages" in made[0][0]
 
     @pytest.mark.parametrize(
         "disguise",
         [
+            lambda words: words,
             lambda words: [w + "x" * (n % 5 == 4) for n, w in enumerate(words)],  # a typo in each 5
             lambda words: [p for n, w in enumerate(words) for p in (w, "well")[: 1 + (n % 4 == 3)]],
             lambda words: [w.replace("o", "o\u200b").upper() for w in words],
             lambda words: [w.translate({97 + n: 0x1D41A + n for n in range(26)}) for w in words],
         ],
     )
-    def test_disguised_copies(self, disguise):
-        made = class_flags([of(1, notes=WRITTEN), of(2, notes=" ".join(disguise(WRITTEN.split())))])
-        assert set(made) == {0, 1}
+    def test_copies_however_disguised(self, disguise):
+        copy = " ".join(disguise(WRITTEN.split()))
+        made = class_flags([of(1, notes=WRITTEN), of(2, notes=copy), of(3, notes=text_of(3))])
+        assert set(made) == {"1.pdf", "2.pdf"}
+        assert "whole passages" in made["1.pdf"][0]
 
     def test_the_same_numbers_in_two_forms(self):
         claim = Claim(
@@ -538,8 +481,8 @@ class TestClassFlags:
         )
         same = Answers(log_sha256=SHA, mistakes=(claim,), quantities=(0.123, 0.45, None))
         made = class_flags([of(1, form=same), of(2, form=same), of(3)])
-        assert set(made) == {0, 1}
-        assert "The form has the numbers of" in made[0][0]
+        assert set(made) == {"1.pdf", "2.pdf"}
+        assert "The form has the numbers of" in made["1.pdf"][0]
 
     def test_short_notes_and_a_template_are_not(self):
         assert class_flags([of(1, notes="All is well."), of(2, notes="All is well.")]) == {}
@@ -547,32 +490,17 @@ class TestClassFlags:
         made = class_flags([of(n, notes=f"{template} {text_of(n)}") for n in range(8)])
         assert made == {}
         copies = [of(n, notes=f"{template} {text_of(min(n, 6))}") for n in range(8)]
-        assert set(class_flags(copies)) == {6, 7}
-
-    @pytest.mark.parametrize(
-        ("file", "flagged"),
-        [
-            ("1002_lab.pdf", True),
-            ("Student2 Name2_88_assignsubmission_file_report.pdf", True),
-            ("Student1_Name1/1002.pdf", False),
-            ("1001.pdf", False),
-            ("lab report.pdf", False),
-            ("report-1002-1001.pdf", False),
-            ("", False),
-            ("/", False),
-        ],
-    )
-    def test_file_of_another_name(self, file, flagged):
-        made = class_flags([of(1, submission=file), of(2)])
-        assert (0 in made) == flagged
+        assert set(class_flags(copies)) == {"6.pdf", "7.pdf"}
 
     def test_three_hundred_take_seconds(self):
         many = [of(n, notes=text_of(n % 290, 1500), log_sha256=f"{n}") for n in range(300)]
         made = class_flags(many)
-        assert set(made) >= {0, 290}
-        assert 20 not in made
+        assert set(made) >= {"0.pdf", "290.pdf"}
+        assert "20.pdf" not in made
 
 
 def test_flags_are_sentences():
-    for flags in class_flags([of(1, log_sha256="x\n<b>"), of(2, log_sha256="x\n<b>")]).values():
+    for flags in class_flags(
+        [of(1, student="x\n<b>", log_sha256="x"), of(2, log_sha256="x")]
+    ).values():
         assert all(re.fullmatch(r"[A-Z].*\.", flag) and flag.isprintable() for flag in flags)

@@ -27,10 +27,6 @@ MOODLE, CANVAS, BLACKBOARD = range(1, 16), range(16, 28), range(28, 39)  # 39 an
 LATE, RESUBMITTED, COPIED, HOSTILE, INTRUDER = 30, 31, 20, 5, 9
 # Whose feedback is kept
 SHOWN = ("0001", "0005", "0009", "0020", "0030", "0031", "0039")
-WORDS = (
-    "I looked at the innovations of both axes. The source has outliers, which are rejected by the "
-    "gate. The noise fits the data and the filter is consistent."
-)
 HEADS = {
     "moodle": ["Identifier", "Full name", "ID number", "Email address", "Status", "Grade",
                "Maximum Grade", "Grade can be changed", "Last modified (submission)",
@@ -196,7 +192,6 @@ def everyone_has_a_row(outcome: GradeOutcome) -> None:
     assert len(outcome.graded) == 40
     usual = of(outcome, 1)
     assert usual.counting.status == "verified"
-    assert usual.remarks == ()
 
 
 def late_and_resubmitted(outcome: GradeOutcome) -> None:
@@ -207,7 +202,7 @@ def late_and_resubmitted(outcome: GradeOutcome) -> None:
     assert late.late_s == 47 * 3600.0
     assert late.deduction == pytest.approx(0.2 * late.of)
     assert late.total == pytest.approx(max(late.counting.points - late.deduction, 0.0))
-    assert "Canvas marks it as late" in of(outcome, 17).remarks[0]
+    assert "Canvas marks it as late" in of(outcome, 17).flags[0]
     again = of(outcome, RESUBMITTED)
     assert "11-30-00" in again.counting.submission
     assert len(again.others) == 1
@@ -216,8 +211,8 @@ def late_and_resubmitted(outcome: GradeOutcome) -> None:
 def copied_and_hostile(outcome: GradeOutcome) -> None:
     """A copy is its owner's by the platform's word and earns less; what is no report, nothing."""
     copied = of(outcome, COPIED)
-    assert "gives the id of 0003" in copied.remarks[0]
-    assert any("The same file" in flag for flag in copied.counting.flags)
+    assert "gives the id of 0003" in copied.flags[0]
+    assert any("The same file" in flag for flag in copied.flags)
     assert copied.total is None
     assert "given to 0003" in copied.counting.pending
     assert "0020 handed it in" in copied.counting.pending
@@ -258,8 +253,9 @@ def the_instructors_word(lab: Lab, outcome: GradeOutcome) -> GradeOutcome:
     changed = {key for key, value in points(third).items() if value != points(outcome)[key]}
     assert changed == {"0001", "0040"}
     text = (lab.output / "feedback" / "0001.txt").read_text(encoding="utf-8")
-    assert "Well argued." in text
-    assert "Not shown." in text
+    words = " ".join(text.split())
+    assert "Well argued." in words
+    assert "Your instructor: Not shown." in words
     table_of = (lab.output / "class.csv").read_bytes()
     assert lab.grade().entries == third.entries
     assert (lab.output / "class.csv").read_bytes() == table_of
@@ -290,9 +286,6 @@ def imported(lab: Lab, outcome: GradeOutcome) -> None:
             assert value == ("" if total is None else f"{total:.10g}"), (platform, key)
     names = {row["Full name"] for row in lab.filled("worksheet.csv")}
     assert name(HOSTILE) in names  # Moodle's own cells stay as they were
-    with zipfile.ZipFile(lab.output / "grades" / "moodle_feedback.zip") as archive:
-        folders = {one.split("/")[0].split("_")[1] for one in archive.namelist()}
-    assert folders == {str(9000 + n) for n in MOODLE}
     table_of = (lab.output / "class.csv").read_text(encoding="utf-8-sig")
     assert not re.search(r"(?m)(^|,)\"?[=+@]", table_of)
 

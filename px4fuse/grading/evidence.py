@@ -25,7 +25,7 @@ from px4fuse.verification.rerun import log_sha256
 MAX_QUOTE = 160
 # Lists are cut where a comment would become longer than a sentence
 NAMED = 4
-NOT_BOTH = " (it needs the axes north and east, which were not both analysed: leave --axis out)"
+NOT_BOTH = " (it needs the axes north and east: leave --axis out)"
 # A step of a path: in quotes where it has dots
 STEP = re.compile(r'"([^"]*)"|([^."]+)')
 
@@ -113,24 +113,32 @@ class Evidence:
 
     @cached_property
     def form(self) -> Answers | str:
-        """The form about this log, or why there is none: the end of "your form ..."."""
+        """The form about this log, or why there is none."""
         answers = self.results.student.answers
         if not isinstance(answers, Answers):
-            return "is not in your report: make it with --answers answers.toml"
+            return "your form is not in your report: make it with --answers answers.toml"
         try:
             check(answers)
         except ValueError as error:
-            return f"cannot be read ({text_of(str(error))})"
+            return f"your form cannot be read ({text_of(str(error))})"
         if answers.log_sha256 != log_sha256(self.results):
-            return "was made for another log"
+            return "your form was made for another log"
         return answers
 
     @cached_property
-    def form_points(self) -> FormPoints | None:
-        """What the form is worth; None without an answer key for this log, or without a form."""
-        truth = None if self.answer is None else self.answer.form
-        known = truth is not None and isinstance(self.form, Answers)
-        return form_points(self.form, truth) if known else None  # type: ignore[arg-type]
+    def form_points(self) -> FormPoints | str:
+        """What the form is worth, or why nothing."""
+        theirs = self.key and self.key.of_student(self.results.student.id)
+        if self.answer is None or (theirs and theirs.sha256 != self.answer.sha256):
+            given = f" ({text_of(theirs.file)})" if theirs else ""
+            return (
+                f"this report is not about the log that you were given{given}: make it of that "
+                "log, with your --id"
+            )
+        if isinstance(self.form, str):
+            return self.form
+        truth = self.answer.form
+        return "the answer key has no answers" if truth is None else form_points(self.form, truth)
 
     def claims(self, *kinds: str) -> bool:
         """Whether the form names one of these mistakes."""
@@ -147,10 +155,7 @@ class Evidence:
         for end in range(len(steps), 0, -1):
             for _, reason in values_at(self.plain, ".".join((*steps[:end], "reason"))):
                 return f" ({text_of(reason).rstrip('.')})"
-        axes = self.comparison and self.comparison.axes
-        if HORIZONTAL in path and axes and not {"north", "east"} <= set(axes):
-            return NOT_BOTH
-        return ""
+        return NOT_BOTH if HORIZONTAL in path else ""
 
 
 def values_at(results: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:

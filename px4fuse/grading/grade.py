@@ -16,7 +16,7 @@ from px4fuse.grading import submissions
 from px4fuse.grading.entries import Course, class_entries
 from px4fuse.grading.evidence import values_at
 from px4fuse.grading.exports import grade_column, kind_of
-from px4fuse.grading.flags import chosen_settings, class_flags, own_flags
+from px4fuse.grading.flags import own_flags
 from px4fuse.grading.lateness import moodle_time
 from px4fuse.grading.model import Entry, Graded, Submission
 from px4fuse.grading.outputs import write_class
@@ -117,7 +117,6 @@ def grade(
     records = output / RECORDS
     graded, reused = grade_all(found, logs, rubric, records, key, register, processes, progress)
     entries, unknown = class_entries(graded, found, register, course, times, overrides)
-    entries = _flagged(entries, key)
     written, more = write_class(
         entries,
         {one.name: one for one in found},
@@ -156,18 +155,6 @@ def register_of(
     return register, times
 
 
-def _flagged(entries: Sequence[Entry], key: AnswerKey | None) -> tuple[Entry, ...]:
-    """With what stands out between the reports that count."""
-    places = [place for place, entry in enumerate(entries) if entry.counting]
-    flags = class_flags([one for entry in entries if (one := entry.counting)], key)
-    made = list(entries)
-    for index, said in flags.items():
-        entry = made[places[index]]
-        one = entry.counting
-        made[places[index]] = replace(entry, counting=one and replace(one, flags=one.flags + said))
-    return tuple(made)
-
-
 def grade_all(
     found: Sequence[Submission],
     logs: Sequence[Path],
@@ -184,37 +171,31 @@ def grade_all(
         place = register.by_platform(submission.origin) if register else None
         owner = register.people[place].student_id if register and place is not None else ""
         jobs.append((submission, owner))
-    graded: dict[int, Graded] = {}
+    scored = partial(
+        grade_one,
+        logs=files_by_sha256(logs),
+        rubric=rubric,
+        key=key,
+        records=records,
+        largest_log_bytes=max_log_bytes.get(),
+    )
+    made: dict[int, Graded] = {}
     reused = 0
     progress(0, len(found))
-    work = run_bounded(
-        partial(
-            grade_one,
-            logs=files_by_sha256(logs),
-            rubric=rubric,
-            key=key,
-            records=records,
-            largest_log_bytes=max_log_bytes.get(),
-        ),
-        jobs,
-        processes=processes,
-    )
-    with closing(work):
+    with closing(run_bounded(scored, jobs, processes=processes)) as work:
         for index, result in work:
             if isinstance(result, Failed):
                 why = Refused(f"Grading it failed: {result.reason}", FAILED)
-                result = refused(rubric, key, why), False  # noqa: PLW2901
-            one, recalled = result
+                one, recalled = refused(rubric, key, why), False
+            else:
+                one, recalled = result
             submission = found[index]
-            nameless = not one.student and not one.student_id
-            graded[index] = replace(
-                one,
-                submission=submission.name,
-                student=submission.origin.name if nameless else one.student,
-            )
+            known = one.student or one.student_id
+            student = one.student if known else submission.origin.name
+            made[index] = replace(one, submission=submission.name, student=student)
             reused += recalled
-            progress(len(graded), len(found))
-    return tuple(graded[index] for index in range(len(found))), reused
+            progress(len(made), len(found))
+    return tuple(made[index] for index in range(len(found))), reused
 
 
 def grade_one(
@@ -244,7 +225,6 @@ def grade_one(
         flags=(*_page_flags(verdict), *own_flags(results, key is not None), *made.flags),
         numbers={title: float(n) for title, path in NUMBERS for _, n in values_at(plain, path)},
         sha256=sha256,
-        settings=chosen_settings(results),
         page=page,
     )
     return whole, recalled

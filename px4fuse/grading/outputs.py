@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import io
 import itertools
 import random
@@ -19,13 +18,12 @@ from px4fuse.grading.class_page import html_text
 from px4fuse.grading.class_table import csv_text
 from px4fuse.grading.entries import Course
 from px4fuse.grading.feedback import returned_text
-from px4fuse.grading.model import Entry, Graded, Submission
+from px4fuse.grading.model import Entry, Submission
 from px4fuse.grading.names import distinct, file_names
 from px4fuse.grading.overrides import NAME, TEMPLATE
 from px4fuse.grading.records import HANDED_IN, REDRAWN, file_of
 from px4fuse.grading.roster import Register
 from px4fuse.grading.sheets import draw_sheets
-from px4fuse.plain import few_words
 from px4fuse.spreadsheet import neutral, neutral_id
 from px4fuse.writing import write_all
 
@@ -71,13 +69,13 @@ def write_class(
     OutputError
         The folder cannot be written.
     """
-    names = file_names([_identity(entry, stem=True) for entry in entries])
+    stems = file_names([_identity(entry, stem=True) for entry in entries])
     shown = [
-        _with_files(entry, name, files, output, records)
-        for entry, name in zip(entries, names, strict=True)
+        _with_files(entry, stem, files, output, records)
+        for entry, stem in zip(entries, stems, strict=True)
     ]
     shown = _with_sheets(shown, output, course.anonymous, processes)
-    drawn = any(one.redrawn_name for entry in shown for one in entry.files)
+    drawn = any(entry.counting and entry.counting.redrawn_name for entry in shown)
     texts = [returned_text(entry, title) for entry in entries]
     contents = {"class.csv": csv_text(entries).encode()}
     if course.anonymous:
@@ -87,21 +85,18 @@ def write_class(
     contents["class.html"] = html_text(shown, title, made_with).encode()
     if not (output / NAME).exists():
         contents[NAME] = TEMPLATE.encode()
-    for name, text in zip(names, texts, strict=True):
-        contents[f"{FEEDBACK}/{name}.txt"] = text.encode()
+    for stem, text in zip(stems, texts, strict=True):
+        contents[f"{FEEDBACK}/{stem}.txt"] = text.encode()
     notes: list[str] = []
-    stems = distinct((sheet.path.stem for sheet in course.worksheets), "{}-{}")
-    for sheet, stem in zip(course.worksheets, stems, strict=True):
+    names = distinct((sheet.path.name for sheet in course.worksheets), "{1}-{0}")
+    for sheet, name in zip(course.worksheets, names, strict=True):
         made, said = exports.filled(sheet, entries, register, course.column, texts)
-        contents[f"{GRADES}/{stem}{sheet.path.suffix}"] = made.content()
+        contents[f"{GRADES}/{name}"] = made.content()
         notes += said
-    if moodle := exports.moodle_feedback(entries, files, texts):
-        contents[f"{GRADES}/moodle_feedback.zip"] = moodle
     write_all({output / name: content for name, content in contents.items()})
-    folders = [REPORTS, SHEETS] * drawn + [FEEDBACK]
-    folders += [GRADES] * any(name.startswith(GRADES) for name in contents)
+    folders = [REPORTS, SHEETS] * drawn + [FEEDBACK] + [GRADES] * bool(course.worksheets)
     written = tuple(output / name for name in ("class.csv", "class.html", *folders, NAME))
-    return written, (*notes, *_left_over(output, names))
+    return written, tuple(notes)
 
 
 def _identity(entry: Entry, stem: bool = False) -> str:
@@ -111,41 +106,29 @@ def _identity(entry: Entry, stem: bool = False) -> str:
 
 
 def _with_files(
-    entry: Entry, name: str, files: Mapping[str, Submission], output: Path, records: Path
+    entry: Entry, stem: str, files: Mapping[str, Submission], output: Path, records: Path
 ) -> Entry:
-    """With the redrawn reports, and what was handed in, in folders to read them."""
-
-    def whole(one: Graded, stem: str) -> Graded:
-        if not one.sha256:
-            return one
-        handed_in, redrawn = (
-            _content(file_of(records, one.sha256, end)) for end in (HANDED_IN, REDRAWN)
-        )
-        where, original = f"{REPORTS}/{stem}.pdf", f"{ORIGINALS}/{stem}.pdf"
-        if redrawn:
-            write_all({output / where: redrawn})
-        there = _copied(one, files[one.submission], output / original)
-        return replace(
-            one,
-            handed_in=handed_in,
-            redrawn_name=where if redrawn else "",
-            handed_in_name=original if there else "",
-        )
-
-    others = (whole(one, f"{name}_other_{at}") for at, one in enumerate(entry.others, start=1))
-    counting = whole(entry.counting, name) if entry.counting else None
-    return replace(entry, counting=counting, others=tuple(others))
-
-
-def _copied(one: Graded, submission: Submission, to: Path) -> bool:
-    """Whether the student's own PDF stands where the class page leads to it."""
-    if hashlib.sha256(_content(to)).hexdigest() == one.sha256:
-        return True
-    content = submissions.read(submission)
-    if not isinstance(content, bytes) or not content.startswith(b"%PDF"):
-        return False
-    write_all({to: content})
-    return True
+    """With the redrawn report, and what was handed in, in folders to read them."""
+    one = entry.counting
+    if one is None or not one.sha256:
+        return entry
+    handed_in, redrawn = (
+        path.read_bytes() if path.is_file() else b""
+        for path in (file_of(records, one.sha256, end) for end in (HANDED_IN, REDRAWN))
+    )
+    original = submissions.read(files[one.submission])
+    contents = {f"{REPORTS}/{stem}.pdf": redrawn, f"{ORIGINALS}/{stem}.pdf": original}
+    there = {
+        name: content
+        for name, content in contents.items()
+        if isinstance(content, bytes) and content.startswith(b"%PDF")
+    }
+    write_all({output / name: content for name, content in there.items()})
+    redrawn_name, handed_in_name = (name if name in there else "" for name in contents)
+    one = replace(
+        one, handed_in=handed_in, redrawn_name=redrawn_name, handed_in_name=handed_in_name
+    )
+    return replace(entry, counting=one)
 
 
 def _with_sheets(
@@ -170,20 +153,17 @@ def _with_sheets(
     return made
 
 
-def _content(path: Path) -> bytes:
-    return path.read_bytes() if path.is_file() else b""
-
-
 def _pseudonyms(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]:
-    """Entries under other names, in their order, and the list of who is who.
+    """Entries under other names, and the list of who is who.
 
     A second run keeps the pseudonyms of the first; their order says nothing of the names.
     """
     kept: dict[str, tuple[str, str]] = {}
-    sheet = read_sheet(path) if path.exists() else None
-    for row in sheet.rows if sheet else ():
-        name, who, student = (sheet.cell(row, (title,)).removeprefix("'") for title in NAMES_HEAD)  # type: ignore[union-attr]
-        kept[who] = name, student
+    if path.exists():
+        sheet = read_sheet(path)
+        for row in sheet.rows:
+            name, who, student = (sheet.cell(row, (t,)).removeprefix("'") for t in NAMES_HEAD)
+            kept[who] = name, student
     taken = {name for name, _ in kept.values()}
     numbered = (f"Student {number:03}" for number in itertools.count(1))
     free = (name for name in numbered if name not in taken)
@@ -196,15 +176,4 @@ def _pseudonyms(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]
     for who, (name, student) in sorted(kept.items(), key=lambda pair: pair[1]):
         writer.writerow((name, neutral_id(who), neutral(student)))
     made = [replace(entry, pseudonym=kept[_identity(entry)][0]) for entry in entries]
-    return sorted(made, key=lambda entry: entry.pseudonym), "\ufeff" + out.getvalue()
-
-
-def _left_over(output: Path, names: Sequence[str]) -> tuple[str, ...]:
-    """What an earlier run wrote for others: never taken away, but told."""
-    others = sorted(p.stem for p in (output / FEEDBACK).glob("*.txt") if p.stem not in names)
-    if not others:
-        return ()
-    return (
-        f"feedback also holds {len(others)} of an earlier run, which are not among "
-        f"these submissions: {few_words(others, 4)}. Delete them if they are out of date.",
-    )
+    return made, "\ufeff" + out.getvalue()
