@@ -271,19 +271,6 @@ def test_sorts_both_ways_and_keeps_the_order_of_equals(page: Browser) -> None:
     assert page.complaints() == []
 
 
-def test_sorts_text_as_people_do_and_by_keyboard(page: Browser) -> None:
-    page.ask(f"document.querySelector({json.dumps(head('Id'))}).focus()")
-    page.press("Enter", "\r")
-    ids = page.ask(
-        "[...document.querySelectorAll('.list > tbody > tr > :nth-child(2)')]"
-        ".map((cell) => cell.textContent)"
-    )
-    assert ids == [FORMULA, "5", "6", "99", "1001", "1007", "1010", "1011", ""]
-    page.click(head("Student"))
-    names = [name for name in page.names() if name in ("ada", "Bo", "Émile", "Zoë", "Mia")]
-    assert names == ["ada", "Bo", "Émile", "Mia", "Zoë"]
-
-
 def test_filters_by_text_and_status_with_a_count(page: Browser) -> None:
     count = "document.querySelector('.count').textContent"
     assert page.ask(count) == f"Showing {len(CLASS)} of {len(CLASS)}"
