@@ -210,7 +210,7 @@ def anonymous_class() -> list[Entry]:
             overrides={f"For {name}": Override(10.0, said)},
             others=(graded(name, 3.0, file=f"old/{file}"),),
             sheets=("pages/0123-001-of-001.png",), redrawn_name=f"reports/{student_id}.pdf",
-            handed_in=png(), handed_in_name=f"handed_in/{student_id}.pdf", sha256="ab" * 32,
+            handed_in=png(), sha256="ab" * 32,
             pseudonym=f"Student {(7 * number) % 4 + 1:03}",
         )  # fmt: skip
         entries.append(entry if file else Entry(name, student_id, None, pseudonym=entry.pseudonym))
@@ -345,7 +345,7 @@ def test_keys_step_through_the_reports(page: Browser) -> None:
 
 def test_a_page_that_differs_stands_beside_the_redrawn_one() -> None:
     one = row("Zoë", 18.5, sheets=("pages/1.png", "pages/2.png"), handed_in=png(4), page=2,
-              redrawn_name="reports/1.pdf", handed_in_name="handed_in/1.pdf")  # fmt: skip
+              redrawn_name="reports/1.pdf")  # fmt: skip
     made = content(html_text([one, row("Bo", 1.0, handed_in=png())], "Class", "px4fuse 1"))
     both, every = (part for part in made["rows"][0][3] if part[0] == "pictures")
     assert [said for said, *_ in both[2]] == ["Page 2 of 2", "Page 2, as handed in: not verified"]
@@ -353,7 +353,7 @@ def test_a_page_that_differs_stands_beside_the_redrawn_one() -> None:
     assert base64.b64decode(both[2][1][2].split(",")[1]) == png(4)
     assert [source for *_, source in every[2]] == ["pages/1.png", "pages/2.png"]
     (leads,) = (part for part in made["rows"][0][3] if part[0] == "links")
-    assert [to for _, to in leads[2]] == ["reports/1.pdf", "handed_in/1.pdf"]
+    assert [to for _, to in leads[2]] == ["reports/1.pdf"]
     (only,) = made["rows"][1][3]
     assert [said for said, *_ in only[2]] == ["Page 1, as handed in: not verified"]
 

@@ -136,11 +136,8 @@ CHECKED = [
     ("loop", filled(["open-end"], REJECTED), {}, 1.0, "as your form says"),
     ("loop", changed(LOOP, loop__closure_error_m=..., loop__known_end=NONE), {}, 0.0,
      "too few of them"),
-    ("flight", EXAMPLE, {}, 1.0, "which is enough"),
-    ("flight", LOOP, {}, 1.0, "m of path"),
-    ("flight", changed(settings__end_s=31.848858), {}, 0.5, "30 s"),
-    ("flight", LOOP, {"min_path_m": 175.4}, 0.5, "175.4 m of path"),
-    ("flight", changed(findings=[finding("no_motion")]), {}, 0.0, "hardly moved"),
+    ("number", changed(axes__north__updates__count=50), {"path": "axes.*.updates.count",
+     "at_least": 100, "zero_at": 0}, 0.5, "axes.north"),
 ]  # fmt: skip
 
 

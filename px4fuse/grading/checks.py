@@ -104,61 +104,18 @@ class NumberItem(RubricItem, frozen=True, kw_only=True, tag="number"):
 
     def score(self, evidence: Evidence) -> Scored:
         """1 within the bounds, falling to 0 at ``zero_at``."""
-        found = {
-            name: float(one) for name, one in values_at(evidence.plain, self.path) if is_number(one)
-        }
-        what = self.name or f"the number {self.path}"
+        values = values_at(evidence.values, self.path)
+        found = {name: float(one) for name, one in values if is_number(one)}
         if not found:
+            what = self.name or f"the number {self.path}"
             return 0.0, f"Your report has no number for {what}{evidence.why_absent(self.path)}."
         name, number = min(found.items(), key=lambda pair: self._share(pair[1]))
-        share = self._share(number)
+        share, what = self._share(number), self.name or f"the number {text_of(name)}"
         bounds = (("at least", self.at_least), ("at most", self.at_most))
         limits = [f"{word} {bound:.4g}" for word, bound in bounds if math.isfinite(bound)]
-        which = f" ({text_of(name)})" if len(found) > 1 else ""
-        shown = f"{number:.4g} {self.unit}".strip()
+        said = f"{capital(what)} is {f'{number:.4g} {self.unit}'.strip()}"
         advice = f" {self.advice}" if share < 1.0 and self.advice else ""
-        asked = f"{' and '.join(limits)} was asked for.{advice}"
-        return share, f"{capital(what)}{which} is {shown}; {asked}"
-
-
-class FlightItem(RubricItem, frozen=True, kw_only=True, tag="flight"):
-    """The flight is enough to judge from.
-
-    Attributes
-    ----------
-    min_path_m : float
-        Of a loop, in place of ``min_measurements``.
-    handed_out : float
-        Of a flight of an answer key, whose length the student did not choose, this share is enough.
-    """
-
-    min_duration_s: Annotated[float, Meta(ge=0.0, le=1e5)] = 60.0
-    min_measurements: Annotated[int, Meta(ge=0, le=10_000_000)] = 100
-    min_path_m: Annotated[float, Meta(ge=0.0, le=1e6)] = 20.0
-    handed_out: Share = 0.4
-
-    def score(self, evidence: Evidence) -> Scored:
-        """Share of what is asked for, of the length or the count, whichever is less."""
-        results = evidence.results
-        if evidence.has("no_motion"):
-            return 0.0, "Your vehicle hardly moved; fly several passes of 5 m or more."
-        if isinstance(results, LoopResults):
-            length_s = results.loop.end_s - results.loop.start_s
-            value, least, unit = results.loop.path_length_m, self.min_path_m, "m of path"
-        else:
-            length_s = results.settings.end_s - results.settings.start_s
-            value = float(max(axis.updates.count for axis in results.axes.values()))
-            least, unit = float(self.min_measurements), "measurements"
-        least_s = self.min_duration_s
-        if evidence.answer is not None:
-            whole_s = evidence.answer.truth.get("duration_s", least_s)
-            least_s = min(least_s, self.handed_out * whole_s)
-        pairs = ((length_s, least_s), (value, least))
-        share = min(1.0 if given >= asked else max(given, 0.0) / asked for given, asked in pairs)
-        said = f"You analysed {length_s:.3g} s with {value:.4g} {unit}"
-        if share == 1.0:
-            return 1.0, f"{said}, which is enough."
-        return share, f"{said}; {least_s:.3g} s and {least:g} {unit} were asked for."
+        return share, f"{said}; {' and '.join(limits)} was asked for.{advice}"
 
 
 class AnswersItem(RubricItem, frozen=True, kw_only=True, tag="answers"):

@@ -243,9 +243,6 @@ def _beside(entry: Entry, one: Graded) -> tuple[Part, ...]:
         # the redrawn one stands beside it
         handed_in = drawn[one.page - 1 : one.page]
         handed_in += [(said, f"Page {one.page} {whose}, as handed in", source)]
-    report = (
-        ("Drawn again from the log (PDF): read this one", local_link(one.redrawn_name)),
-        ("As it was handed in (PDF): the student's own file", local_link(one.handed_in_name)),
-    )
+    report = [("Drawn again from the log (PDF)", local_link(one.redrawn_name))]
     title = "The page that differs" if drawn else "As handed in"
     return frame.links("The report", report), frame.pictures(title, handed_in), every

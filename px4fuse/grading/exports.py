@@ -71,21 +71,18 @@ def grade_column(sheet: Sheet, wanted: str) -> int:
         if (kind != "canvas" or CANVAS.match(title))
         and not any(READ_ONLY in row[at] for row in sheet.rows[:3])
     }
+    usual = [*titles]
+    if kind != "canvas":
+        usual = [at for at in [sheet.column(GRADE)] if at is not None]
     named = [at for at, title in titles.items()
              if folded(wanted) in (folded(title), folded(sheet.head[at]))]  # fmt: skip
-    usual = sheet.column(GRADE)
-    if kind == "canvas":
-        found = named if wanted else [*titles]
-    else:
-        may_be_usual = usual is not None and (not wanted or kind == "moodle")
-        found = named or [usual] * may_be_usual  # type: ignore[list-item]
+    # the title may be meant for another table than Moodle's
+    found = named if wanted and (named or kind != "moodle") else usual
     if len(found) == 1:
         return found[0]
     several = "several columns for the grade" if found else "no column for the grade"
-    others = ", ".join(one_line(title, 40) for title in titles.values())
-    raise SettingsError(
-        f"{sheet.path}: {several}", f"Name one with --column: {one_line(others, 300)}."
-    )
+    others = one_line(", ".join(one_line(title, 40) for title in titles.values()), 300)
+    raise SettingsError(f"{sheet.path}: {several}", f"Name one with --column: {others}.")
 
 
 def filled(

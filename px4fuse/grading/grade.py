@@ -14,7 +14,7 @@ from px4fuse.assignment.key import AnswerKey
 from px4fuse.assignment.roster import people_of_sheet, person_of_row
 from px4fuse.grading import submissions
 from px4fuse.grading.entries import Course, class_entries
-from px4fuse.grading.evidence import values_at
+from px4fuse.grading.evidence import flattened
 from px4fuse.grading.exports import grade_column, kind_of
 from px4fuse.grading.flags import own_flags
 from px4fuse.grading.lateness import moodle_time
@@ -119,7 +119,6 @@ def grade(
     entries, unknown = class_entries(graded, found, register, course, times, overrides)
     written, more = write_class(
         entries,
-        {one.name: one for one in found},
         register or Register([]),
         course,
         title or rubric.title or "Class",
@@ -218,12 +217,12 @@ def grade_one(
     if isinstance(found, Refused):
         return replace(refused(rubric, key, found), sha256=sha256), recalled
     results, verdict, page = found
-    plain = to_plain(results)
+    values = dict(flattened(to_plain(results)))
     made = assess(results, verdict, rubric, key, owner_id)
     whole = replace(
         made,
         flags=(*_page_flags(verdict), *own_flags(results, key is not None), *made.flags),
-        numbers={title: float(n) for title, path in NUMBERS for _, n in values_at(plain, path)},
+        numbers={title: float(values[path]) for title, path in NUMBERS if path in values},
         sha256=sha256,
         page=page,
     )

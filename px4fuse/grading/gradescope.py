@@ -62,28 +62,17 @@ MAX_METADATA = 5_000_000
 
 
 def results(entry: Entry, text: str) -> dict[str, Any]:
-    """``results.json`` of one student, who reads ``text`` about all of it."""
+    """``results.json`` of one student, who reads ``text``; flags are the instructor's alone."""
     graded = entry.counting
-    tests: list[dict[str, Any]] = [
-        {
-            "name": one_line(item.title, 200),
-            "output": item.comment,
-            "visibility": VISIBLE,
-            "score": item.points,
-            "max_score": item.of,
-        }
-        for item in (graded.items if graded else ())
-    ]
     pending = [f"Pending: {graded.pending}"] if graded and graded.pending else []
-    if said := [*pending, *entry.flags]:
-        output = "\n".join(map(cleaned, said))
-        tests.append({"name": "For the instructor", "output": output, "visibility": "hidden"})
+    said = "\n".join(map(cleaned, (*pending, *entry.flags)))
+    hidden = {"name": "For the instructor", "output": said, "visibility": "hidden"}
     return {
         "score": entry.total or 0.0,
         "output": text,
         "visibility": VISIBLE,
         "stdout_visibility": "hidden",
-        "tests": tests,
+        "tests": [hidden] if said else [],
     }
 
 

@@ -87,9 +87,8 @@ class Graded:
         that differs most.
     page : int
         Which page that is, counted from 1.
-    sheets, handed_in_name, redrawn_name : tuple of str, str, str
-        Where pictures of the redrawn pages, the PDF that was handed in and the redrawn one stand,
-        relative to the class page.
+    sheets, redrawn_name : tuple of str, str
+        Where pictures of the redrawn pages, and the redrawn PDF, stand, relative to the class page.
     """
 
     submission: str
@@ -110,7 +109,6 @@ class Graded:
     page: int = 1
     redrawn_name: str = ""
     sheets: tuple[str, ...] = ()
-    handed_in_name: str = ""
 
     @property
     def status(self) -> str:

@@ -6,19 +6,19 @@ import csv
 import io
 import itertools
 import random
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 
 from px4fuse.assignment.sheet import read_sheet
-from px4fuse.grading import exports, submissions
+from px4fuse.grading import exports
 from px4fuse.grading.anonymous import hidden_words
 from px4fuse.grading.class_page import html_text
 from px4fuse.grading.class_table import csv_text
 from px4fuse.grading.entries import Course
 from px4fuse.grading.feedback import returned_text
-from px4fuse.grading.model import Entry, Submission
+from px4fuse.grading.model import Entry
 from px4fuse.grading.names import distinct, file_names
 from px4fuse.grading.overrides import NAME, TEMPLATE
 from px4fuse.grading.records import HANDED_IN, REDRAWN, file_of
@@ -29,9 +29,8 @@ from px4fuse.writing import write_all
 
 # Reports drawn again from their logs: what to read instead of what was handed in
 REPORTS = "reports"
-# Pictures of their pages, and the students' own files, both for the class page
+# Pictures of their pages, for the class page
 SHEETS = "pages"
-ORIGINALS = "handed_in"
 FEEDBACK = "feedback"
 GRADES = "grades"
 NAMES = "names.csv"
@@ -40,7 +39,6 @@ NAMES_HEAD = ("pseudonym", "id", "name")
 
 def write_class(
     entries: Sequence[Entry],
-    files: Mapping[str, Submission],
     register: Register,
     course: Course,
     title: str,
@@ -54,8 +52,6 @@ def write_class(
 
     Parameters
     ----------
-    files : mapping
-        Name of a submission to where it is read.
     register : Register
         Its people are those of the first entries.
 
@@ -71,7 +67,7 @@ def write_class(
     """
     stems = file_names([_identity(entry, stem=True) for entry in entries])
     shown = [
-        _with_files(entry, stem, files, output, records)
+        _with_files(entry, stem, output, records)
         for entry, stem in zip(entries, stems, strict=True)
     ]
     shown = _with_sheets(shown, output, course.anonymous, processes)
@@ -105,10 +101,8 @@ def _identity(entry: Entry, stem: bool = False) -> str:
     return entry.student_id or (Path(file).stem if stem else entry.student or file)
 
 
-def _with_files(
-    entry: Entry, stem: str, files: Mapping[str, Submission], output: Path, records: Path
-) -> Entry:
-    """With the redrawn report, and what was handed in, in folders to read them."""
+def _with_files(entry: Entry, stem: str, output: Path, records: Path) -> Entry:
+    """With the redrawn report in its folder, and the picture of what was handed in."""
     one = entry.counting
     if one is None or not one.sha256:
         return entry
@@ -116,40 +110,26 @@ def _with_files(
         path.read_bytes() if path.is_file() else b""
         for path in (file_of(records, one.sha256, end) for end in (HANDED_IN, REDRAWN))
     )
-    original = submissions.read(files[one.submission])
-    contents = {f"{REPORTS}/{stem}.pdf": redrawn, f"{ORIGINALS}/{stem}.pdf": original}
-    there = {
-        name: content
-        for name, content in contents.items()
-        if isinstance(content, bytes) and content.startswith(b"%PDF")
-    }
-    write_all({output / name: content for name, content in there.items()})
-    redrawn_name, handed_in_name = (name if name in there else "" for name in contents)
-    one = replace(
-        one, handed_in=handed_in, redrawn_name=redrawn_name, handed_in_name=handed_in_name
-    )
-    return replace(entry, counting=one)
+    name = f"{REPORTS}/{stem}.pdf" if redrawn else ""
+    if redrawn:
+        write_all({output / name: redrawn})
+    return replace(entry, counting=replace(one, handed_in=handed_in, redrawn_name=name))
 
 
 def _with_sheets(
     entries: Sequence[Entry], output: Path, anonymous: bool, processes: int | None
 ) -> list[Entry]:
     """With pictures of every page of the redrawn reports that count."""
+    counting = {at: one for at, entry in enumerate(entries) if (one := entry.counting)}
     reports = {
-        one.redrawn_name: (
-            output / one.redrawn_name,
-            hidden_words(entry, one) if anonymous else (),
-        )
-        for entry in entries
-        if (one := entry.counting) and one.redrawn_name
+        at: (output / one.redrawn_name, hidden_words(entries[at], one) if anonymous else ())
+        for at, one in counting.items()
+        if one.redrawn_name
     }
-    drawn = draw_sheets(reports, output / SHEETS, processes)
-    made = []
-    for entry in entries:
-        if one := entry.counting:
-            sheets = tuple(f"{SHEETS}/{name}" for name in drawn.get(one.redrawn_name, ()))
-            entry = replace(entry, counting=replace(one, sheets=sheets))  # noqa: PLW2901
-        made.append(entry)
+    made = list(entries)
+    for at, drawn in draw_sheets(reports, output / SHEETS, processes).items():
+        sheets = tuple(f"{SHEETS}/{name}" for name in drawn)
+        made[at] = replace(entries[at], counting=replace(counting[at], sheets=sheets))
     return made
 
 

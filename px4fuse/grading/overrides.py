@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -68,7 +67,7 @@ def _points(text: str) -> float | None:
         value = float(text.replace(",", "."))
     except ValueError:
         return None
-    return value if math.isfinite(value) and 0.0 <= value <= MOST else None
+    return value if 0.0 <= value <= MOST else None
 
 
 def matched(
