@@ -152,39 +152,29 @@ def test_text_makes_no_elements(text: str) -> None:
 
 
 def test_pending_points_stand_apart_from_those_that_count() -> None:
-    entries = [
-        row("Ada", 10.0),
-        row("Bo", 20.0),
-        row("Cy", 12.0, pending="Run with px4fuse 0.1.1."),
-        row("Di", 13.0, overrides={"Notes": Override(9.0, "Good.")}, total=13.0),
-    ]
+    said = {"Notes": Override(9.0, "Good.")}
+    entries = [row("Ada", 10.0), row("Bo", 20.0), row("Cy", 12.0, pending="Run 0.1.1."),
+               row("Di", 13.0, overrides=said, total=13.0)]  # fmt: skip
     text = html_text(entries, "Class", "px4fuse 1")
     assert "14.3 <small>of 20" in text  # of 10, 20 and 13
     assert "1 <small>12 points, not counted" in text
-    cells = [row[0][3] for row in content(text)["rows"]]
-    assert cells[2] == ["pending", "", "12 proposed"]
-    assert cells[3][:3] == ["13 / 20", 13.0, "said by you"]
-    waits = next(part for part in content(text)["rows"][2][2] if part[1].startswith("Pending"))
-    assert waits[2] == ["Run with px4fuse 0.1.1."]
     # of 16 points for notes those that count had 6, 16 and 9
     assert "10.3&nbsp;/&nbsp;16" in text
+    cells = [row[0][3] for row in content(text)["rows"]]
+    assert cells[2:] == [["pending", "", "12 proposed"],
+                         ["13 / 20", 13.0, "said by you", "", [0.65]]]  # fmt: skip
 
 
-SHARED = " ".join(f"word{n}" for n in range(60))
-
-
-def test_what_is_absent_not_finite_too_long_or_too_much() -> None:
-    assert "0 students" in html_text([], "Class", "px4fuse 1")
-    odd = row("Odd", 3.0, numbers={"NIS": float("nan"), "gap": float("inf")})
-    assert "nan" not in html_text([odd], "Class", "px4fuse 1").lower().split("<script>")[0]
-    text = html_text([row("x" * 10**6, 3.0, notes="y" * 10**6)], "Class", "px4fuse 1")
+def test_what_is_not_finite_too_long_or_too_much() -> None:
+    odd = row("x" * 10**6, 3.0, notes="y" * 10**6, numbers={"NIS": float("nan")})
+    text = html_text([odd], "Class", "px4fuse 1")
+    assert "nan" not in text.lower().split("<script>")[0]
     assert len(text) < 16 * MAX_CHARACTERS
     apart = tuple(Mismatch(f"axes.{n}", "1.0", "2.0") for n in range(60))
     one = Graded("a.pdf", "Ada", "1", Verdict("numbers differ", ("60.",), True, apart))
     text = html_text([Entry("Ada", "1", one)], "Class", "px4fuse 1")
-    assert "axes.49" in text
     assert "and 10 more" in text
-    assert "axes.50" not in text
+    assert ("axes.49" in text, "axes.50" in text) == (True, False)
 
 
 PEOPLE = (
@@ -204,7 +194,7 @@ def anonymous_class() -> list[Entry]:
         said = f"Your report names {name}, {student_id}. {SAYS}"
         entry = row(
             name, 9.0, id=student_id, file=file, flags=(flag,), reasons=(said,), pending=said,
-            notes=f"{name} ({student_id}): {SHARED} {SAYS} 王小明", form=FORM,
+            notes=f"{name} ({student_id}): {SAYS} 王小明", form=FORM,
             numbers={f"NIS of {name}": 1.0}, items=(Item(f"For {name}", 9.0, 20.0, said),),
             mistakes={"positions that jump": False}, comment=said,
             overrides={f"For {name}": Override(10.0, said)},
@@ -284,16 +274,8 @@ def test_filters_by_text_and_status_with_a_count(page: Browser) -> None:
     assert page.ask("document.querySelector('.none').checkVisibility()")
     page.click("#all")
     assert len(page.names()) == len(CLASS)
-    for status, names in (
-        ("numbers differ", ["ada"]),
-        ("flagged", ["ada", MARKUP]),
-        ("cannot verify", ["no name"]),
-        ("pending", [MARKUP]),
-        ("to read", [MARKUP]),
-        ("late", ["ada"]),
-        ("nothing handed in", ["Mia"]),
-        ("", [TURNED if one.student == REVERSED else one.called for one in CLASS]),
-    ):
+    for status, names in (("numbers differ", ["ada"]), ("flagged", ["ada", MARKUP]),
+                          ("to read", [MARKUP]), ("nothing handed in", ["Mia"])):  # fmt: skip
         page.choose("#filter-0", status)
         assert page.names() == names
     page.choose("#filter-0", "missed: outliers")
@@ -328,19 +310,16 @@ def test_a_row_unfolds_with_all_its_pages(page: Browser) -> None:
 
 def test_keys_step_through_the_reports(page: Browser) -> None:
     opened = "[...document.querySelectorAll('tr.open .name')].map((name) => name.textContent)"
-    for key, names in (("j", ["Zoë"]), ("n", ["ada"]), ("j", ["Émile"]), ("k", ["ada"]),
-                       ("p", ["Zoë"]), ("k", ["Zoë"])):  # fmt: skip
+    for key, name in (("j", "Zoë"), ("n", "ada"), ("j", "Émile"), ("k", "ada"), ("p", "Zoë")):
         page.press(key, key)
-        assert page.ask(opened) == names
+        assert page.ask(opened) == [name]
     assert page.ask("document.activeElement.textContent") == "Zoë"
     page.press("Escape")
-    assert page.ask(opened) == []
     # what is typed into the search is text
     page.press("/", "/")
     page.press("j", "j")
     assert page.ask("document.activeElement.id + document.activeElement.value") == "textj"
     assert page.ask(opened) == []
-    assert "next student" in page.ask("document.querySelector('.keys').innerText")
 
 
 def test_a_page_that_differs_stands_beside_the_redrawn_one() -> None:

@@ -32,6 +32,7 @@ CANVAS = (
     '"Roe, Max",12346,43,mroe,A,7.00,,1,80\n'
     '"Pat, Pending",12347,44,ppat,A,7.00,,1,80\n'
 )
+TITLE = "Lab 3 [Total Pts: 100 Score] |1281892"
 BLACKBOARD = (
     '"Last Name"\t"First Name"\t"Username"\t"Student ID"\t"Lab 3 [Total Pts: 100 Score] |1281892"\t'
     '"Grading Notes"\t"Notes Format"\t"Feedback to Learner"\t"Feedback Format"\n'
@@ -68,18 +69,13 @@ def register(sheet) -> Register:
     return made
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
 @pytest.mark.parametrize(
     ("text", "column", "title", "feedback"),
     [
         (MOODLE, "", "Grade", "Feedback comments"),
         (CANVAS, "Lab 3", "Lab 3 (9)", None),
-        (
-            BLACKBOARD,
-            "Lab 3 [Total Pts: 100 Score] |1281892",
-            "Lab 3 [Total Pts: 100 Score] |1281892",
-            "Feedback to Learner",
-        ),
+        (BLACKBOARD, TITLE, TITLE, "Feedback to Learner"),
     ],
 )
 def test_a_platforms_table_comes_back_with_two_columns_filled(
@@ -93,12 +89,9 @@ def test_a_platforms_table_comes_back_with_two_columns_filled(
     before, after = rows(text, separator), rows(content.decode(encoding), separator)
     assert list(after[0]) == list(before[0])
     assert len(after) == len(before)
-    changed = {title, feedback}
     people = after[2:] if text is CANVAS else after
     for old, new in zip(before, after, strict=True):
-        assert {k: v for k, v in old.items() if k not in changed} == {
-            k: v for k, v in new.items() if k not in changed
-        }
+        assert {key for key in old if old[key] != new[key]} <= {title, feedback}
     grades = [row[title] for row in people]
     assert grades[:2] == ["87.5", "104"]
     # who has no grade keeps what is there: an empty cell would delete, a zero would count

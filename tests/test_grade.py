@@ -233,29 +233,25 @@ def test_bad_input_is_one_line(tmp_path, monkeypatch, arguments, says) -> None:
 def test_the_options_of_a_term_reach_it(tmp_path, monkeypatch) -> None:
     import px4fuse.grading.grade as module
 
-    given = {}
-
-    def noted(*_: object, **named: object) -> GradeOutcome:
-        given.update(named)
-        return GradeOutcome((), (), 0, ())
-
+    noted = Mock(return_value=GradeOutcome((), (), 0, ()))
     monkeypatch.setattr(module, "grade", noted)
     monkeypatch.chdir(tmp_path)
     shutil.copy(REPORT, "a.pdf")
-    Path("roster.csv").write_text("id,name\n0042,Jane Doe\n")
     Path("sheet.csv").write_text("id,Grade\n0042,\n")
-    words = [
-        "grade", "a.pdf", "-o", "out", "--roster", "roster.csv", "--worksheet", "sheet.csv",
-        "--column", "Grade", "--attempt", "best", "--due", "2026-11-20 23:59 +01:00",
-        "--late", "5%/hour", "--anonymous",
-    ]  # fmt: skip
-    assert CliRunner().invoke(cli, words).exit_code == 0
+    words = (
+        "grade a.pdf -o out --roster sheet.csv --worksheet sheet.csv --column Grade --attempt best "
+        "--late 5%/hour --anonymous --title Lab --jobs 3 --due"
+    )
+    result = CliRunner().invoke(cli, [*words.split(), "2026-11-20 23:59 +01:00"])
+    assert result.exit_code == 0, result.exception
+    given = noted.call_args.kwargs
     course = given["course"]
+    assert (given["title"], given["processes"]) == ("Lab", 3)
     assert [person.student_id for person in course.roster] == ["0042"]
     assert course.worksheets[0].head == ("id", "Grade")
     assert (course.column, course.anonymous, course.attempt) == ("Grade", True, "best")
     assert course.due.isoformat() == "2026-11-20T23:59:59+01:00"
-    assert course.late.text == "5%/hour"
+    assert (course.late.text, course.include_pending) == ("5%/hour", False)
 
 
 def test_the_default_rubric_is_written_to_be_edited(tmp_path, monkeypatch) -> None:

@@ -86,7 +86,6 @@ CHECKED = [
     ("student", changed(student={"name": "Ann", "id": "7", "notes": ""}), {}, 1.0, "Ann, 7"),
     ("student", changed(student__name="Ann"), {}, 0.5, "--id"),
     ("student", EXAMPLE, {}, 0.0, "--student"),
-    ("student", changed(student__name="Ann"), {"id": False}, 1.0, "Ann"),
     ("tuning", EXAMPLE, {"settings": ["sigma_z_m"]}, 1.0, "within"),
     ("tuning", EXAMPLE, {}, 0.86, "SIGMA_A"),
     ("tuning", changed(settings__sigma_a_m_s2=0.1), {"settings": ["sigma_a_m_s2"]}, 0.0, "below"),
@@ -94,7 +93,6 @@ CHECKED = [
      {"settings": ["sigma_z_m"]}, 1.0, "within"),
     ("tuning", changed(tuning__horizontal=NONE), {}, 0.0, "too few of them"),
     ("tuning", NORTH, {"settings": ["sigma_z_m"]}, 0.0, "leave --axis out"),
-    ("number", EXAMPLE, {"path": RMSE, "at_most": 0.15}, 1.0, RMSE),
     ("number", EXAMPLE, {"path": RMSE, "at_most": 0.05, "name": "the error"}, 0.0,
      "The error is 0.06499; at most 0.05 was asked for."),
     ("number", EXAMPLE, {"path": RMSE, "at_most": 0.06, "zero_at": 0.07}, 0.5, ""),
@@ -105,8 +103,6 @@ CHECKED = [
                               "rmse", "at_most": 0.3}, 1.0, ""),
     ("number", EXAMPLE, {"path": "clock.interval_s.1", "at_most": 0.1}, 1.0, ""),
     ("number", BLIND, {"path": "log.name", "at_most": 1.0}, 0.0, "has no number for"),
-    ("number", BLIND, {"path": RMSE, "at_most": 1.0}, 0.0,
-     f"Your report has no number for the number {RMSE} (too few of them)."),
     ("number", NORTH, {"path": "tuning.horizontal.held_out.gain_nats", "at_most": 1.0}, 0.0,
      "leave --axis out"),
     ("consistent", changed(horizontal__kf__verdict="consistent"), {}, 1.0, "is consistent"),
@@ -114,7 +110,6 @@ CHECKED = [
     ("consistent", changed(horizontal__kf__nis_mean=2.0), {}, 0.0, "1.41 times in σ"),
     ("consistent", EXAMPLE, {"filter": "ekf2", "axes": ["horizontal", "east"]}, 1.0, "EKF2"),
     ("consistent", EXAMPLE, {"filter": "ekf2", "axes": ["down"]}, 0.0, "never fused"),
-    ("consistent", NORTH, {}, 0.0, "leave --axis out"),
     ("consistent", changed(**UNDERSTATED), {}, 0.0, "understated "),
     ("consistent", changed(**UNDERSTATED, settings__sigma_a_m_s2=0.36), {}, 1.0,
      "what is left no setting fixes"),
@@ -242,7 +237,14 @@ class TestScore:
 
     @pytest.mark.parametrize(
         ("student_id", "said"),
-        [("s02", "the id s02"), ("s77", "the id s77"), ("", "no id")],
+        [
+            ("s02", "the id s02"),
+            ("S02", "the id S02"),
+            ("ѕ02", "the id ѕ02"),
+            ("s77", "the id s77"),
+            ("", "no id"),
+            (" ", "no id"),
+        ],
     )
     def test_somebody_else_s_log_is_pending_unless_the_rubric_says_so(self, student_id, said):
         given = changed(student__id=student_id)
