@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from px4fuse.assignment.roster import Person, read_people
@@ -23,12 +21,6 @@ BLACKBOARD = '"Last Name","First Name","Username","Student ID"\n"Doe","Jane","jd
 ILIAS = "Nachname;Vorname;Benutzername;Matrikelnummer\nDoe;Jane;jdoe;0042\n"
 
 
-def people(tmp_path: Path, content: bytes) -> tuple[Person, ...]:
-    path = tmp_path / "roster.csv"
-    path.write_bytes(content)
-    return read_people(path)
-
-
 @pytest.mark.parametrize(
     ("text", "is_"),
     [
@@ -36,15 +28,15 @@ def people(tmp_path: Path, content: bytes) -> tuple[Person, ...]:
         (CANVAS, Person("0042", "Doe, Jane", "", "jdoe", {"canvas": "12345"})),
         (BLACKBOARD, Person("0042", "Jane Doe", "", "jdoe")),
         (ILIAS, Person("0042", "Jane Doe", "", "jdoe")),
-        ("id,name\n0042,Jane Doe\n", Person("0042", "Jane Doe")),
         ("name\nJane Doe\n", Person("", "Jane Doe")),
         ("Email\njane@x.edu\n", Person("jane@x.edu", "", "jane@x.edu")),
     ],
 )
 def test_columns_are_found_by_the_titles_that_platforms_write(tmp_path, text, is_) -> None:
-    assert people(tmp_path, text.encode()) == (is_,)
-    assert people(tmp_path, b"\xef\xbb\xbf" + text.encode()) == (is_,)
-    assert people(tmp_path, text.encode("utf-16")) == (is_,)
+    for encoding in ("utf-8", "utf-8-sig", "utf-16"):
+        path = tmp_path / "roster.csv"
+        path.write_text(text, encoding)
+        assert read_people(path) == (is_,)
 
 
 CLASS = Register(
@@ -85,13 +77,7 @@ def test_whose_a_file_is_by_what_the_platform_says(origin, place) -> None:
 
 @pytest.mark.parametrize(
     ("student_id", "name", "place"),
-    [
-        ("42", "Max Roe", 0),
-        ("0043", "", 1),
-        ("", "Roe, Max", 1),
-        ("99", "Jane Doe", 0),
-        ("", "", None),
-    ],
+    [("42", "Max Roe", 0), ("", "Roe, Max", 1), ("99", "Jane Doe", 0), ("", "", None)],
 )
 def test_whose_a_report_is_by_id_then_by_name(student_id, name, place) -> None:
     assert CLASS.place(Person(student_id, name)) == place
