@@ -296,6 +296,7 @@ LOOPS: dict[str, tuple[Any, str, dict[str, Any], dict[str, Any], float, float]] 
     "left open although it came back": (CLOSED, ELSEWHERE, {"came_back": False}, NO_END, 0, 0),
     "a drift that explains everything": (OPEN, "", {"position_drift_m": 50.0}, {}, 0, 10),
     "the same, without a key": (None, "", {"position_drift_m": 50.0}, {}, 0, 10),
+    "thrice the usual drift, without a key": (None, "", {"position_drift_m": 3.0}, {}, 30, 30),
     "a heading that drifts by a right angle": (OPEN, "", {"heading_drift_deg": 90.0}, {}, 0, 10),
     "honest, drift as it was": (OPEN, ELSEWHERE, {"position_drift_m": 1.2}, REJECTED, 40, 40),
     "a drift of nothing": (CLOSED, "", {"position_drift_m": 0.01}, REJECTED, 0, 10),
