@@ -183,7 +183,7 @@ PEOPLE = (
     ("王小明", "30044", "30044.pdf"),
     ("Quirin Mikkelsen", "30055", ""),
 )
-SAYS = "With Ada and LOVELACE, s-2031 and 30044; by E\u0301mile du Cha\u0302telet, ask ada (lab_Ada_2)."
+SAYS = "Ada and LOVELACE, s-2031 and 30044; by E\u0301mile du Cha\u0302telet, see lab_Ada_2."
 
 
 def anonymous_class() -> list[Entry]:
