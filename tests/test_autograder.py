@@ -130,7 +130,7 @@ def test_its_metadata_says_who_and_when(tmp_path) -> None:
     assert submission_metadata(tmp_path) == (NOBODY, None)
     path.write_text(json.dumps(METADATA))
     origin, due = submission_metadata(tmp_path)
-    assert (origin.name, origin.email) == ("Ada Lovelace", "ada@example.com")
+    assert (origin.person.name, origin.person.email) == ("Ada Lovelace", "ada@example.com")
     assert (origin.time - due).total_seconds() == pytest.approx(15.3756 * 3600, abs=1.0)
     path.write_text('{"users": 3}')
     with pytest.raises(SettingsError, match=r"submission_metadata\.json"):

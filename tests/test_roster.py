@@ -51,24 +51,29 @@ CLASS = Register(
 )
 
 
+def at(platform: str, number: str = "", name: str = "", **more: str) -> ExportOrigin:
+    """A file of a student whom a platform knows by its number."""
+    person = Person(more.pop("student_id", ""), name, numbers={platform: number}, **more)
+    return ExportOrigin(platform, person)
+
+
 @pytest.mark.parametrize(
     ("origin", "place"),
     [
         # the participant, not the student of that id
-        (ExportOrigin("moodle", "4711", "Nobody"), 0),
-        (ExportOrigin("moodle", "42", "Nobody"), 1),
-        (ExportOrigin("moodle", "99", "doe JANE"), 0),
-        (ExportOrigin("canvas", "12345", "x"), 0),
-        (ExportOrigin("canvas", "99", "roemax"), 1),
-        (ExportOrigin("moodle", "99", "Zoe\u0308 Doe"), 2),  # the same letter, written as two
-        (ExportOrigin("blackboard", login="JDoe"), 0),
-        (ExportOrigin("ilias", "7", "Roe Max", "mroe"), 1),
-        (ExportOrigin("ilias", "7", "?", "45"), 4),
-        (ExportOrigin("gradescope", "7", student_id="42"), 0),
-        (ExportOrigin("gradescope", "7", email="Jane@X.edu"), 0),
-        (ExportOrigin("moodle", "99", "Kim Min"), None),  # two of that name
-        (ExportOrigin("moodle", "99", "Jane"), None),
-        (ExportOrigin(name="Jane Doe"), None),
+        (at("moodle", "4711", "Nobody"), 0),
+        (at("moodle", "42", "Nobody"), 1),
+        (at("moodle", "99", "doe JANE"), 0),
+        (at("canvas", "12345", "x"), 0),
+        (at("canvas", "99", "roemax"), 1),
+        (at("moodle", "99", "Zoe\u0308 Doe"), 2),  # the same letter, written as two
+        (at("blackboard", login="JDoe"), 0),
+        (at("ilias", "7", "?", login="45"), 4),
+        (at("gradescope", "7", student_id="42"), 0),
+        (at("gradescope", "7", email="Jane@X.edu"), 0),
+        (at("moodle", "99", "Kim Min"), None),  # two of that name
+        (at("moodle", "99", "Jane"), None),
+        (ExportOrigin(person=Person("", "Jane Doe")), None),
     ],
 )
 def test_whose_a_file_is_by_what_the_platform_says(origin, place) -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from px4fuse.assignment.roster import Person
 from px4fuse.errors import SettingsError
 from px4fuse.grading import submissions
 from px4fuse.grading.model import Submission
@@ -48,7 +49,7 @@ def reason(submission: Submission) -> str:
 
 def who(name: str) -> tuple[str, str]:
     origin = origin_of(name)
-    return origin.name, origin.number
+    return origin.person.name, "".join(origin.person.numbers.values())
 
 
 def only(path: Path) -> Submission:
@@ -94,10 +95,10 @@ def test_who_handed_in_is_what_the_platform_wrote(name, is_):
 
 def test_logins_and_times_in_names():
     blackboard = origin_of("Lab 3_roe1_attempt_2026-11-20-12-34-56_Lab_doe1_attempt_x.pdf")
-    assert (blackboard.login, blackboard.platform) == ("roe1", "blackboard")
+    assert (blackboard.person.login, blackboard.platform) == ("roe1", "blackboard")
     assert origin_of("Lab_roe1_attempt_2026-99-20-12-34-56_r.pdf").time is None
     ilias = origin_of("Lab 3/Roe_Max_roe1_77/Late Submission - r.pdf")
-    assert (ilias.platform, ilias.login, ilias.late) == ("ilias", "roe1", True)
+    assert (ilias.platform, ilias.person.login, ilias.late) == ("ilias", "roe1", True)
 
 
 METADATA = """---
@@ -128,7 +129,7 @@ def test_a_name_that_a_student_chose_does_not_change_platform_or_time():
     ]
     origins = origins_of([(Path("export.zip"), name) for name in (*usual, *forged)], {})
     assert {one.platform for one in origins} == {"blackboard"}
-    assert [one.login for one in origins[3:]] == ["eve", "mal"]
+    assert [one.person.login for one in origins[3:]] == ["eve", "mal"]
     assert {one.time.day for one in origins[3:]} == {23}
 
 
@@ -147,16 +148,18 @@ def test_gradescope_says_who_and_when_beside_its_submissions(tmp_path):
     write(tmp_path / "unpacked" / "submission_31" / "report.pdf", PDF)
     for place in (path, tmp_path / "unpacked"):
         (found,), notes = collect([place])
-        one = found.origin
+        person = found.origin.person
         assert notes == ("Files passed over that are not PDFs: 1.",)
-        assert (one.name, one.student_id, one.email) == ("Doe, Jane", "0042", "jane@example.edu")
-        assert one.time.isoformat() == "2026-11-20T22:59:01.123456+00:00"
+        assert person == Person(
+            "0042", "Doe, Jane", "jane@example.edu", numbers={"gradescope": "31"}
+        )
+        assert found.origin.time.isoformat() == "2026-11-20T22:59:01.123456+00:00"
 
 
 def test_metadata_that_cannot_be_read_is_said(tmp_path):
     bomb = zipped({"submission_metadata.yml": b" " * 5_000_000, "submission_3.pdf": PDF})
     (found,), (note,) = collect([write(tmp_path / "export.zip", bomb)])
-    assert (found.origin.number, found.origin.name) == ("3", "")
+    assert found.origin.person == Person("", numbers={"gradescope": "3"})
     assert note.startswith("submission_metadata.yml: passed over: it shrinks more than 100 times")
 
 

@@ -118,16 +118,17 @@ def _named(graded: Sequence[Graded], submissions: Sequence[Submission]) -> list[
     """Without a roster: everyone whom a platform, else a report, names; each once."""
     register = Register([])
     for one, submission in zip(graded, submissions, strict=True):
-        origin = submission.origin
+        person = submission.origin.person
         claimed = register.place(Person(one.student_id)) if one.student_id else None
-        if origin.platform and (origin.number or origin.login):
-            if register.by_platform(origin) is not None:
+        if person.numbers or person.login:
+            if register.place(person) is not None:
                 continue
             # two students may not hand in under one id: the second is known by the platform alone
-            student_id = origin.student_id or ("" if claimed is not None else one.student_id)
-            name = one_line(one.student if student_id else origin.name, 200) or origin.name
-            known_by = student_id or origin.login or origin.number
-            register.people.append(replace(origin.person, student_id=known_by, name=name))
+            student_id = person.student_id or ("" if claimed is not None else one.student_id)
+            name = one_line(one.student if student_id else person.name, 200) or person.name
+            known_by = (student_id, person.login, *person.numbers.values())
+            student_id = next(filter(None, known_by))
+            register.people.append(replace(person, student_id=student_id, name=name))
         elif one.student_id and claimed is None:
             register.people.append(Person(one.student_id, one_line(one.student, 200)))
     return register.people
@@ -167,7 +168,7 @@ def _attempt(
         )
     person = Person(graded.student_id) if place is None else register.people[place]
     entry = Entry(
-        person.name or one_line(graded.student or origin.name, 200),
+        person.name or one_line(graded.student or origin.person.name, 200),
         person.student_id,
         graded,
         (),

@@ -190,7 +190,7 @@ def grade_all(
                 one, recalled = result
             submission = found[index]
             known = one.student or one.student_id
-            student = one.student if known else submission.origin.name
+            student = one.student if known else submission.origin.person.name
             made[index] = replace(one, submission=submission.name, student=student)
             reused += recalled
             progress(len(made), len(found))

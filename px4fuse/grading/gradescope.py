@@ -26,6 +26,7 @@ from typing import Any
 import msgspec
 
 from px4fuse.assignment.key import key_text, read_key
+from px4fuse.assignment.roster import Person
 from px4fuse.errors import SettingsError
 from px4fuse.grading.entries import Course, class_entries
 from px4fuse.grading.feedback import returned_text
@@ -113,7 +114,7 @@ def submission_metadata(folder: Path) -> tuple[ExportOrigin, datetime | None]:
         raise SettingsError(f"{path.name}: not what Gradescope writes.") from error
     user = said.users[0] if said.users else _User()
     name, email = (one_line(one or "", 200) for one in (user.name, user.email))
-    origin = ExportOrigin("gradescope", name=name, email=email, time=said.created_at)
+    origin = ExportOrigin("gradescope", Person("", name, email), said.created_at)
     return origin if name else NOBODY, said.assignment.due_date
 
 
@@ -201,7 +202,7 @@ def run_autograder(folder: Path, late: LateRule | None) -> None:
         found, _ = collect([folder / "submission"])
     except SettingsError as error:  # an empty folder, or other files than PDFs
         of = sum(item.points for item in rubric.items)
-        entry = Entry(origin.name, "", None, email=origin.email, of=of)
+        entry = Entry(origin.person.name, "", None, email=origin.person.email, of=of)
         text = str(error)
     else:
         found = tuple(replace(one, origin=origin) for one in found)
@@ -214,7 +215,7 @@ def run_autograder(folder: Path, late: LateRule | None) -> None:
         )
         text = returned_text(entry)
         if register and register.by_platform(origin) is None:
-            name = origin.name or "(none)"
+            name = origin.person.name or "(none)"
             unknown = f"The answer key has nobody of the name {name}: compare the report's."
             entry = replace(entry, flags=(unknown, *entry.flags))
     content = json.dumps(results(entry, text), ensure_ascii=False, indent=2)
