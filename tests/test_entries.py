@@ -32,8 +32,7 @@ def laid_out(files, term=LATEST, overrides=None, people=PEOPLE, packed=None):
         Submission(Path("x.zip"), name, name, (packed or {}).get(name), origin_of(name))
         for name in files
     ]
-    register = None if people is None else Register(people)
-    return class_entries(reports, found, register, term, {}, overrides or {})
+    return class_entries(reports, found, Register(people), term, overrides or {})
 
 
 def blackboard(login: str, stamp: str, name: str = "r.pdf") -> str:
@@ -142,7 +141,7 @@ def test_without_a_roster_everyone_who_is_named_has_one_row() -> None:
         "c.pdf": graded("", 4.0, student="Kim", student_id="44"),
         "d.pdf": graded("", 5.0),
     }
-    entries, _ = laid_out(files, people=None)
+    entries, _ = laid_out(files, people=())
     assert [(one.student, one.student_id, one.total) for one in entries] == [
         ("Jane", "42", 1.0), ("Roe Max", "6", 2.0), ("Kim", "44", 4.0), ("", "", 5.0)
     ]  # fmt: skip

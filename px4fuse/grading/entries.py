@@ -61,9 +61,8 @@ Attempt = tuple[tuple[float, float], Graded, Entry]
 def class_entries(
     graded: Sequence[Graded],
     submissions: Sequence[Submission],
-    register: Register | None,
+    register: Register,
     course: Course,
-    times: Mapping[int, datetime],
     overrides: Overrides,
 ) -> tuple[tuple[Entry, ...], tuple[str, ...]]:
     """Lay out a class: everyone in the register, then what belongs to nobody in it.
@@ -76,8 +75,8 @@ def class_entries(
     ----------
     graded, submissions : sequences
         Of every file, in one order.
-    times : mapping
-        Index of a person in the register to when Moodle says that the work was handed in.
+    register : Register
+        Without people where nobody knows who is in the class.
 
     Returns
     -------
@@ -85,15 +84,17 @@ def class_entries(
     notes : tuple of str
         On overrides that fit nobody.
     """
-    everyone = register or Register(_named(graded, submissions))
+    everyone = register if register.people else Register(_named(graded, submissions))
     attempts: dict[int, list[Attempt]] = defaultdict(list)
     strangers = []
-    note = "Not in the roster." if register else "Neither the report nor the platform names anyone."
+    note = "Neither the report nor the platform names anyone."
+    if register.people:
+        note = "Not in the roster."
     for one, submission in zip(graded, submissions, strict=True):
         place = everyone.by_platform(submission.origin)
         if place is None:
             place = everyone.place(Person(one.student_id, one.student))
-        attempt = _attempt(one, submission, times, course, place, everyone)
+        attempt = _attempt(one, submission, course, place, everyone)
         if place is not None:
             attempts[place].append(attempt)
         else:
@@ -116,7 +117,7 @@ def class_entries(
 
 def _named(graded: Sequence[Graded], submissions: Sequence[Submission]) -> list[Person]:
     """Without a roster: everyone whom a platform, else a report, names; each once."""
-    register = Register([])
+    register = Register()
     for one, submission in zip(graded, submissions, strict=True):
         person = submission.origin.person
         claimed = register.place(Person(one.student_id)) if one.student_id else None
@@ -137,7 +138,6 @@ def _named(graded: Sequence[Graded], submissions: Sequence[Submission]) -> list[
 def _attempt(
     graded: Graded,
     submission: Submission,
-    times: Mapping[int, datetime],
     course: Course,
     place: int | None,
     register: Register,
@@ -145,7 +145,7 @@ def _attempt(
     """One file as if it were the only one of its student."""
     origin, due = submission.origin, course.due
     platform = origin.platform.capitalize()
-    said = origin.time or (None if place is None else times.get(place))
+    said = origin.time or (None if place is None else register.times.get(place))
     time, packed = (one and in_zone_of(one, due) for one in (said, submission.time))
     late_s = None
     flags = []

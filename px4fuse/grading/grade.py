@@ -6,7 +6,6 @@ import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 
@@ -21,7 +20,7 @@ from px4fuse.grading.lateness import moodle_time
 from px4fuse.grading.model import Entry, Graded, Submission
 from px4fuse.grading.outputs import write_class
 from px4fuse.grading.overrides import NAME, read_overrides
-from px4fuse.grading.records import verified
+from px4fuse.grading.records import RECORDS, verified
 from px4fuse.grading.roster import Register, people_of_key
 from px4fuse.grading.rubric import Rubric
 from px4fuse.grading.scoring import assess, refused
@@ -30,7 +29,6 @@ from px4fuse.results.contract import to_plain
 from px4fuse.verification.model import Refused, Verdict
 from px4fuse.verification.workers import Failed, run_bounded
 
-RECORDS = "records"
 FAILED = "Do not open it: ask for the report as px4fuse wrote it."
 # For the class table: column title, and where in the results
 NUMBERS = (
@@ -113,35 +111,20 @@ def grade(
     for sheet in course.worksheets:
         grade_column(sheet, course.column)
     found, notes = submissions.collect(paths)
-    register, times = register_of(course, key)
+    register = register_of(course, key)
     records = output / RECORDS
     graded, reused = grade_all(found, logs, rubric, records, key, register, processes, progress)
-    entries, unknown = class_entries(graded, found, register, course, times, overrides)
-    written, more = write_class(
-        entries,
-        register or Register([]),
-        course,
-        title or rubric.title or "Class",
-        output,
-        records,
-        processes,
-    )
+    entries, unknown = class_entries(graded, found, register, course, overrides)
+    name = title or rubric.title or "Class"
+    written, more = write_class(entries, register, course, name, output, processes)
     return GradeOutcome(entries, (*notes, *unknown, *more), reused, written)
 
 
-def register_of(
-    course: Course, key: AnswerKey | None
-) -> tuple[Register | None, dict[int, datetime]]:
-    """Who is in the class, and when Moodle's worksheets say that each of them handed in.
-
-    With what all worksheets know of them; None where nothing says who is in it.
-    """
+def register_of(course: Course, key: AnswerKey | None) -> Register:
+    """Who is in the class, with what all worksheets know of them."""
     listed = [people_of_sheet(sheet) for sheet in course.worksheets]
-    people = course.roster or (people_of_key(key) if key else next(iter(listed), None))
-    if people is None:
-        return None, {}
+    people = course.roster or (people_of_key(key) if key else next(iter(listed), ()))
     register = Register(people)
-    times = {}
     for others in listed:
         register.add(others)
     for sheet in course.worksheets:
@@ -150,8 +133,8 @@ def register_of(
             person = person_of_row(sheet, row)
             place = register.place(person) if person else None
             if time is not None and place is not None:
-                times[place] = time
-    return register, times
+                register.times[place] = time
+    return register
 
 
 def grade_all(
@@ -160,15 +143,15 @@ def grade_all(
     rubric: Rubric,
     records: Path,
     key: AnswerKey | None,
-    register: Register | None,
+    register: Register,
     processes: int | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> tuple[tuple[Graded, ...], int]:
     """Verify, or recall, and score every file, each within bounds; and how many were recalled."""
     jobs = []
     for submission in found:
-        place = register.by_platform(submission.origin) if register else None
-        owner = register.people[place].student_id if register and place is not None else ""
+        place = register.by_platform(submission.origin)
+        owner = "" if place is None else register.people[place].student_id
         jobs.append((submission, owner))
     scored = partial(
         grade_one,

@@ -197,7 +197,7 @@ def run_autograder(folder: Path, late: LateRule | None) -> None:
     key = read_key(key_path) if key_path.exists() else None
     origin, due = submission_metadata(folder)
     course = Course(due=due, late=late)
-    register, times = register_of(course, key)
+    register = register_of(course, key)
     try:
         found, _ = collect([folder / "submission"])
     except SettingsError as error:  # an empty folder, or other files than PDFs
@@ -208,13 +208,13 @@ def run_autograder(folder: Path, late: LateRule | None) -> None:
         found = tuple(replace(one, origin=origin) for one in found)
         with tempfile.TemporaryDirectory(prefix="px4fuse-") as records:
             graded, _ = grade_all(found, [source / "logs"], rubric, Path(records), key, register, 1)
-        entries, _ = class_entries(graded, found, register, course, times, {})
+        entries, _ = class_entries(graded, found, register, course, {})
         entry = max(
             (one for one in entries if one.counting),
             key=lambda one: -1.0 if one.total is None else one.total,
         )
         text = returned_text(entry)
-        if register and register.by_platform(origin) is None:
+        if register.people and register.by_platform(origin) is None:
             name = origin.person.name or "(none)"
             unknown = f"The answer key has nobody of the name {name}: compare the report's."
             entry = replace(entry, flags=(unknown, *entry.flags))

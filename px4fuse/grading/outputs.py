@@ -21,7 +21,7 @@ from px4fuse.grading.feedback import returned_text
 from px4fuse.grading.model import Entry
 from px4fuse.grading.names import distinct, file_names
 from px4fuse.grading.overrides import NAME, TEMPLATE
-from px4fuse.grading.records import HANDED_IN, REDRAWN, file_of
+from px4fuse.grading.records import HANDED_IN, RECORDS, REDRAWN, file_of
 from px4fuse.grading.roster import Register
 from px4fuse.grading.sheets import draw_sheets
 from px4fuse.spreadsheet import neutral, neutral_id
@@ -43,7 +43,6 @@ def write_class(
     course: Course,
     title: str,
     output: Path,
-    records: Path,
     processes: int | None = None,
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """Write everything, and say what could not be entered.
@@ -66,10 +65,7 @@ def write_class(
         The folder cannot be written.
     """
     stems = file_names([_identity(entry, stem=True) for entry in entries])
-    shown = [
-        _with_files(entry, stem, output, records)
-        for entry, stem in zip(entries, stems, strict=True)
-    ]
+    shown = [_with_files(entry, stem, output) for entry, stem in zip(entries, stems, strict=True)]
     shown = _with_sheets(shown, output, course.anonymous, processes)
     drawn = any(entry.counting and entry.counting.redrawn_name for entry in shown)
     texts = [returned_text(entry, title) for entry in entries]
@@ -101,14 +97,14 @@ def _identity(entry: Entry, stem: bool = False) -> str:
     return entry.student_id or (Path(file).stem if stem else entry.student or file)
 
 
-def _with_files(entry: Entry, stem: str, output: Path, records: Path) -> Entry:
+def _with_files(entry: Entry, stem: str, output: Path) -> Entry:
     """With the redrawn report in its folder, and the picture of what was handed in."""
     one = entry.counting
     if one is None or not one.sha256:
         return entry
     handed_in, redrawn = (
         path.read_bytes() if path.is_file() else b""
-        for path in (file_of(records, one.sha256, end) for end in (HANDED_IN, REDRAWN))
+        for path in (file_of(output / RECORDS, one.sha256, end) for end in (HANDED_IN, REDRAWN))
     )
     name = f"{REPORTS}/{stem}.pdf" if redrawn else ""
     if redrawn:

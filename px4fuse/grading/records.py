@@ -29,6 +29,8 @@ from px4fuse.verification.verification import verify
 from px4fuse.verification.workers import bounded
 from px4fuse.writing import write_all
 
+# In the folder of a class
+RECORDS = "records"
 HANDED_IN, REDRAWN = ".handed-in.png", ".pdf"
 MADE_WITH = ("px4fuse", "numpy", "scipy", "matplotlib", "pypdfium2", "pillow")
 _SHA256 = re.compile(r'"([0-9a-f]{64})"')
