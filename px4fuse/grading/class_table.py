@@ -60,3 +60,11 @@ def number(value: float | None) -> str:
     ('7', '0.3', '')
     """
     return "" if value is None or not math.isfinite(value) else f"{value:.10g}"
+
+
+def decimal(text: str) -> float | None:
+    """A number as people type it in tables, also with a comma; None for anything else."""
+    try:
+        return float(text.replace(",", "."))
+    except ValueError:
+        return None

@@ -84,7 +84,7 @@ def class_entries(
     notes : tuple of str
         On overrides that fit nobody.
     """
-    everyone = register if register.people else Register(_named(graded, submissions))
+    everyone = register if register.people else _named(graded, submissions)
     attempts: dict[int, list[Attempt]] = defaultdict(list)
     strangers = []
     note = "Neither the report nor the platform names anyone."
@@ -115,7 +115,7 @@ def class_entries(
     return tuple(settled), notes
 
 
-def _named(graded: Sequence[Graded], submissions: Sequence[Submission]) -> list[Person]:
+def _named(graded: Sequence[Graded], submissions: Sequence[Submission]) -> Register:
     """Without a roster: everyone whom a platform, else a report, names; each once."""
     register = Register()
     for one, submission in zip(graded, submissions, strict=True):
@@ -132,7 +132,7 @@ def _named(graded: Sequence[Graded], submissions: Sequence[Submission]) -> list[
             register.people.append(replace(person, student_id=student_id, name=name))
         elif one.student_id and claimed is None:
             register.people.append(Person(one.student_id, one_line(one.student, 200)))
-    return register.people
+    return register
 
 
 def _attempt(

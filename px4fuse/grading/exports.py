@@ -28,7 +28,7 @@ from px4fuse.assignment.key import folded
 from px4fuse.assignment.roster import person_of_row
 from px4fuse.assignment.sheet import Sheet
 from px4fuse.errors import SettingsError
-from px4fuse.grading.class_table import number
+from px4fuse.grading.class_table import decimal, number
 from px4fuse.grading.model import Entry
 from px4fuse.grading.roster import Register
 from px4fuse.plain import few_words
@@ -142,11 +142,7 @@ def filled(
 def _most(sheet: Sheet, row: Sequence[str], place: int) -> float | None:
     """The most points that the platform takes, where the table says it."""
     possible = (one[place] for one in sheet.rows[:3] if "points possible" in one[0].casefold())
-    said = next(possible, sheet.cell(row, MAX_GRADE))
-    try:
-        return float(said.replace(",", "."))
-    except ValueError:
-        return None
+    return decimal(next(possible, sheet.cell(row, MAX_GRADE)))
 
 
 def _who(entry: Entry) -> str:

@@ -201,9 +201,7 @@ def run_autograder(folder: Path, late: LateRule | None) -> None:
     try:
         found, _ = collect([folder / "submission"])
     except SettingsError as error:  # an empty folder, or other files than PDFs
-        of = sum(item.points for item in rubric.items)
-        entry = Entry(origin.person.name, "", None, email=origin.person.email, of=of)
-        text = str(error)
+        entry, text = Entry(origin.person.name, "", None), str(error)
     else:
         found = tuple(replace(one, origin=origin) for one in found)
         with tempfile.TemporaryDirectory(prefix="px4fuse-") as records:

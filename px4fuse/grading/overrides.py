@@ -9,6 +9,7 @@ from pathlib import Path
 from px4fuse.assignment.key import folded
 from px4fuse.assignment.sheet import read_sheet
 from px4fuse.errors import SettingsError
+from px4fuse.grading.class_table import decimal
 from px4fuse.grading.model import Entry, Override
 from px4fuse.grading.roster import only_place, same_id
 from px4fuse.results.reading import cleaned, one_line
@@ -48,26 +49,17 @@ def read_overrides(path: Path) -> Overrides:
         student, item, points, comment = (
             sheet.cell(row, (title,)).removeprefix("'") for title in TITLES
         )
-        value = _points(points)
+        value = decimal(points)
         wrong = ""
         if item in found[student]:
             wrong = f"{one_line(student, 40)}, {one_line(item, 40) or 'all'} stands there twice"
-        elif points and (value is None or not item):
+        elif points and (value is None or not 0.0 <= value <= MOST or not item):
             given = one_line(points, 20)
             wrong = f"points {given!r}: give a number from 0 up, and an item or total"
         if wrong:
             raise SettingsError(f"{path}: row {number}: {wrong}.")
         found[student][item] = Override(value, cleaned(comment[:MAX_COMMENT]))
     return found
-
-
-def _points(text: str) -> float | None:
-    try:
-        # 7,5 in a table that is separated by semicolons
-        value = float(text.replace(",", "."))
-    except ValueError:
-        return None
-    return value if 0.0 <= value <= MOST else None
 
 
 def matched(
