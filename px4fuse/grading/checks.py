@@ -174,7 +174,8 @@ class TuningItem(RubricItem, frozen=True, kw_only=True, tag="tuning"):
         comparison = evidence.comparison
         if comparison is None:
             return NO_COMPARISON
-        return _mean(_tuned(evidence, comparison, name, self) for name in self.settings)
+        factor = self.factor
+        return _mean(_tuned(evidence, comparison, one, self.axis, factor) for one in self.settings)
 
 
 def _mean(found: Iterator[Scored]) -> Scored:
@@ -183,13 +184,17 @@ def _mean(found: Iterator[Scored]) -> Scored:
 
 
 def _tuned(
-    evidence: Evidence, comparison: ComparisonResults, name: Sigma, item: TuningItem
+    evidence: Evidence,
+    comparison: ComparisonResults,
+    name: Sigma,
+    axis: str = HORIZONTAL,
+    factor: float = 2.0,
 ) -> Scored:
     label, unit, option = SIGMAS[name]
     chosen: float = getattr(comparison.settings, name)
-    interval = getattr(comparison.tuning.get(item.axis), f"{ASKED[name]}_interval", None)
+    interval = getattr(comparison.tuning.get(axis), f"{ASKED[name]}_interval", None)
     if interval is None or interval[1] is None:
-        why = evidence.why_absent(f"tuning.{item.axis}")
+        why = evidence.why_absent(f"tuning.{axis}")
         return 0.0, f"your report has no interval for {label}{why}"
     low, high = interval
     if name == "sigma_z_m" and evidence.has("source_may_drift"):
@@ -201,7 +206,7 @@ def _tuned(
     if off == 1.0:
         return 1.0, f"{said} within {wanted}"
     side = "above" if chosen > high else "below"
-    return falling(off, item.factor), (
+    return falling(off, factor), (
         f"{said} {side} {wanted}, by a factor of {factor_words(off)}: try a value between with "
         f"{option}"
     )
@@ -243,8 +248,7 @@ class ConsistencyItem(RubricItem, frozen=True, kw_only=True, tag="consistent"):
         if judged.verdict == "consistent":
             return 1.0, f"{owner} is consistent ({axis})"
         said = f"{judged.verdict} {factor_words(judged.times_off)} times in σ ({owner}, {axis})"
-        usual = TuningItem(title="-", points=0.0)
-        if all(_tuned(evidence, comparison, name, usual)[0] == 1.0 for name in SIGMAS):
+        if all(_tuned(evidence, comparison, name)[0] == 1.0 for name in SIGMAS):
             return 1.0, (
                 f"{said}, with the noises that the data ask for: what is left no setting fixes"
             )
