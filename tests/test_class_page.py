@@ -181,7 +181,7 @@ PEOPLE = (
     ("Ada Lovelace", "10017", "Lovelace Ada_4711_assignsubmission_file_/ada report.pdf"),
     ("Émile du Châtelet", "s-2031", "chatelet/Émile_du_Châtelet.pdf"),
     ("王小明", "30044", "30044.pdf"),
-    ("Quirin Mikkelsen", "30055", ""),
+    ("Quirin Mikkelsen", "20", ""),
 )
 SAYS = "Ada and LOVELACE, s-2031 and 30044; by E\u0301mile du Cha\u0302telet, see lab_Ada_2."
 
@@ -216,6 +216,14 @@ def test_an_anonymous_class_names_nobody() -> None:
                 assert word.casefold() not in written.casefold(), word
     assert NAME in written
     assert "Student 003" in written
+    # an id may be a number of points
+    points = [
+        part[3]
+        for one in content(text)["rows"]
+        for part in one[2]
+        if part[1] == "Points (proposed)"
+    ]
+    assert {(row[1], row[2]) for rows in points for row in rows} == {("9", "20")}
     # no link to a PDF, which names its student, and no picture of what was handed in
     assert ".pdf" not in written
     assert "data:image/png" not in written

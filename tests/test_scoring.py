@@ -230,21 +230,11 @@ class TestScore:
         assert {item.points for item in zero.items} == {0.0}
         assert zero.pending == ""
 
-    @pytest.mark.parametrize(
-        ("student_id", "said"),
-        [
-            ("s02", "the id s02"),
-            ("S02", "the id S02"),
-            ("ѕ02", "the id ѕ02"),
-            ("s77", "the id s77"),
-            ("", "no id"),
-            (" ", "no id"),
-        ],
-    )
-    def test_somebody_else_s_log_is_pending_unless_the_rubric_says_so(self, student_id, said):
+    @pytest.mark.parametrize("student_id", ["s02", "S02", "ѕ02", "s77", "", " "])
+    def test_somebody_else_s_log_is_pending_unless_the_rubric_says_so(self, student_id):
         given = changed(student__id=student_id)
-        pending = assessed(given, key=key()).pending
-        assert f"given to s01, the report gives {said}" in pending
+        said = f"the id {student_id}" if student_id.strip() else "no id"
+        assert f"given to s01, the report gives {said}" in assessed(given, key=key()).pending
         for rule, earns in (("zero", False), ("count", True)):
             rubric = replace(read_rubric(None), others_log=rule)
             made = assessed(given, key=key(), rubric=rubric)

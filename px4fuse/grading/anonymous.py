@@ -14,6 +14,8 @@ from px4fuse.webpage.frame import Part
 SHORTEST_WORD = 3
 # Shorter parts of a file's name as well
 SHORTEST_PART = 4
+# A cell that is one number, which may be somebody's id
+POINTS = re.compile(r"\d{1,3}(\.\d+)?")
 NAME = "[name]"
 
 
@@ -49,7 +51,7 @@ class Veil:
 
     def _hidden(self, value: Any) -> Any:
         if isinstance(value, str):
-            return self.hide(value)
+            return value if POINTS.fullmatch(value) else self.hide(value)
         return [*map(self._hidden, value)] if isinstance(value, list | tuple) else value
 
 
