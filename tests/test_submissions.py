@@ -229,8 +229,6 @@ def test_hostile_names_are_shown_and_never_used(tmp_path):
     shown_as = {
         "../../../etc/x.pdf": "etc/x.pdf",
         "C:\\Windows\\system32\\y.pdf": "Windows/system32/y.pdf",
-        "=cmd|' /C calc'!A0.pdf": "_cmd_' /C calc'!A0.pdf",
-        "<img src=x onerror=alert(1)>.pdf": "_img src=x onerror=alert(1)_.pdf",
         "a\x1b[2J\u202egnp.pdf": "a[2Jgnp.pdf",
         "new\nline.pdf": "new line.pdf",
         "n" * 5000 + ".pdf": "n" * 100 + "…" + "n" * 95 + ".pdf",

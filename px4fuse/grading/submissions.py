@@ -305,11 +305,8 @@ def _unpacked(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
 
 
 def _shown(name: str) -> str:
-    """A name that does nothing wherever it is shown, with its end, where the file's name is."""
+    """A name on one line, with its end, where the file's name is."""
     line = " ".join(cleaned(name[-10 * MAX_NAME :]).split())
-    line = re.sub(r'[<>"`|]', "_", line)
-    if line[:1] in set("=+-@"):  # a formula to a spreadsheet
-        line = f"_{line[1:]}"
     if len(line) > MAX_NAME:
         line = f"{line[: MAX_NAME // 2]}…{line[-(MAX_NAME - MAX_NAME // 2 - 1) :]}"
     return line or "nameless"
