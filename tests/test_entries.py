@@ -32,8 +32,7 @@ def laid_out(files, term=LATEST, overrides=None, people=PEOPLE, packed=None):
         Submission(Path("x.zip"), name, name, (packed or {}).get(name), origin_of(name))
         for name in files
     ]
-    register = None if people is None else Register(people)
-    return class_entries(reports, found, register, term, {}, overrides or {})
+    return class_entries(reports, found, Register(people), term, overrides or {})
 
 
 def blackboard(login: str, stamp: str, name: str = "r.pdf") -> str:
@@ -82,25 +81,18 @@ def test_what_is_taken_off(due, rule, late_s, off) -> None:
     assert ada.total == 0.0
 
 
-def test_a_late_mark_without_a_time_takes_nothing_off_and_is_said() -> None:
-    term = Course(due=DUE, late=late_rule("10%/day"))
-    (_, grace), _ = laid_out({"hoppergrace_LATE_7_8_r.pdf": graded("", 7.0)}, term)
-    assert (grace.late_s, grace.total) == (None, 7.0)
-    assert "Canvas marks it as late" in grace.remarks[0]
-
-
 def test_a_zip_files_time_orders_attempts_and_costs_nothing() -> None:
+    first, second = "hoppergrace_7_8_b.pdf", "hoppergrace_7_9_a.pdf"
+    packed = {first: datetime(2026, 11, 24), second: datetime(2026, 11, 25)}
+    files = {second: graded("", 7.0), first: graded("", 9.0)}
     term = Course(due=DUE, late=late_rule("10%/day"))
-    files = {
-        "hoppergrace_7_9_a.pdf": graded("", 7.0), "hoppergrace_7_8_b.pdf": graded("", 9.0)
-    }  # fmt: skip
-    packed = {
-        "hoppergrace_7_9_a.pdf": datetime(2026, 11, 25),
-        "hoppergrace_7_8_b.pdf": datetime(2026, 11, 24),
-    }
     (_, grace), _ = laid_out(files, term, packed=packed)
     assert (grace.total, grace.late_s, grace.handed_in) == (7.0, None, "")
-    assert "nothing was taken off" in grace.remarks[0]
+    assert "nothing was taken off" in grace.flags[0]
+    # nor does a mark without a time
+    (_, grace), _ = laid_out({"hoppergrace_LATE_7_8_r.pdf": graded("", 7.0)}, term)
+    assert (grace.late_s, grace.total) == (None, 7.0)
+    assert "Canvas marks it as late" in grace.flags[0]
 
 
 def test_what_is_no_report_counts_only_where_nothing_else_is_there() -> None:
@@ -109,7 +101,7 @@ def test_what_is_no_report_counts_only_where_nothing_else_is_there() -> None:
              blackboard("ada", "20-10-00-00"): essay}  # fmt: skip
     (ada, _), _ = laid_out(files)
     assert ada.total == 4.0
-    assert "cannot be read as a report" in ada.remarks[0]
+    assert "cannot be read as a report" in ada.flags[0]
     (ada, _), _ = laid_out({blackboard("ada", "20-10-00-00"): essay})
     assert ada.total == 0.0
 
@@ -127,7 +119,7 @@ def test_who_handed_in_is_the_platforms_word_and_a_false_id_is_said() -> None:
     (ada, grace), _ = laid_out(files)
     assert ada.counting is None
     assert grace.total == 8.0
-    assert "gives the id of 1 (Ada Lovelace)" in grace.remarks[0]
+    assert "gives the id of 1 (Ada Lovelace)" in grace.flags[0]
 
 
 def test_who_is_not_in_the_roster_has_a_row_that_says_so() -> None:
@@ -138,7 +130,7 @@ def test_who_is_not_in_the_roster_has_a_row_that_says_so() -> None:
     (ada, grace, stranger), _ = laid_out(files)
     assert (ada.total, grace.total) == (3.0, None)
     assert (stranger.student, stranger.student_id, stranger.total) == ("Mallory", "9", 8.0)
-    assert stranger.remarks == ("Not in the roster.",)
+    assert stranger.flags[0] == "Not in the roster."
 
 
 def test_without_a_roster_everyone_who_is_named_has_one_row() -> None:
@@ -149,7 +141,7 @@ def test_without_a_roster_everyone_who_is_named_has_one_row() -> None:
         "c.pdf": graded("", 4.0, student="Kim", student_id="44"),
         "d.pdf": graded("", 5.0),
     }
-    entries, _ = laid_out(files, people=None)
+    entries, _ = laid_out(files, people=())
     assert [(one.student, one.student_id, one.total) for one in entries] == [
         ("Jane", "42", 1.0), ("Roe Max", "6", 2.0), ("Kim", "44", 4.0), ("", "", 5.0)
     ]  # fmt: skip
@@ -169,30 +161,23 @@ TWO = {"1.pdf": graded("", 4.0, 6.0, student_id="1"), "2.pdf": graded("", 1.0, s
 
 def test_the_instructors_word_is_the_last(tmp_path) -> None:
     rows = said(
-        tmp_path, "1,a,9.5,A good idea.", "01,,,Come and see me.", "2,total,3,", "3,total,1,",
-        "1,C,1,", '2,B,2,"x"',
+        tmp_path, "1,a,9.5,A good idea.", '01,,,"Come and', 'see me."', "1,total,8,Agreed.",
+        "2,total,3,", "3,total,1,", "1,C,1,", '2,B,2,"x"',
     )  # fmt: skip
     (ada, grace), notes = laid_out(TWO, overrides=rows)
-    assert ada.overrides == {"A": Override(9.5, "A good idea.")}
-    assert (ada.total, grace.total) == (15.5, 3.0)
+    assert ada.overrides == {"A": Override(9.5, "A good idea."), "total": Override(8.0, "Agreed.")}
+    assert (ada.counting.points, ada.total, grace.total) == (15.5, 8.0, 3.0)
     assert notes == (
         "overrides.csv: 1 has no item 'C'.",
         "overrides.csv: 2 has no item 'B'.",
         "overrides.csv: nobody has the id 3.",
     )
-    assert ada.comment == "Come and see me."
     text = returned_text(ada, "Lab")
-    assert "9.5 of 10" in text
-    assert "A good idea." in text
-
-
-def test_own_comments_and_feedback_stand_in_one_text(tmp_path) -> None:
-    rows = said(tmp_path, '1,,,"First line.', 'Second."', "1,total,8,Agreed.")
-    (ada, _), _ = laid_out(TWO, overrides=rows)
-    text = returned_text(ada)
-    assert "Because." in text
+    assert (
+        "9.5 of 10  A\n    Because. Your instructor: A good idea. (Your instructor gave 9.5" in text
+    )
     assert text.endswith(
-        "Total    8 of 20\n\nFrom your instructor:\n\nFirst line.\nSecond.\nAgreed.\n"
+        "Total    8 of 20\n\nFrom your instructor:\n\nCome and\nsee me.\nAgreed.\n"
     )
 
 
@@ -213,16 +198,15 @@ def test_who_handed_in_nothing_can_be_given_points(tmp_path) -> None:
 def test_a_semicolon_table_with_decimal_commas_is_read(tmp_path) -> None:
     rows = said(tmp_path, "1;A;7,5;", head="\ufeffid;item;points;comment")
     assert rows == {"1": {"A": Override(7.5)}}
-    assert read_overrides(tmp_path / "none.csv") == {}
 
 
 @pytest.mark.parametrize(
     ("row", "says"),
     [
-        ("1,A,abc,", "row 2: points 'abc' are not a number"),
-        ("1,A,-1,", "not a number from 0 up"),
-        ("1,A,nan,", "not a number"),
-        ("1,,5,", "without an item"),
+        ("1,A,abc,", "row 2: points 'abc': give a number from 0 up"),
+        ("1,A,-1,", "give a number"),
+        ("1,A,nan,", "give a number"),
+        ("1,,5,", "and an item or total"),
         ("1,A,5,\n1,A,6,", "stands there twice"),
     ],
 )

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import csv
 import io
-import zipfile
 from pathlib import Path
 
 import pytest
-from class_tools import entry, graded
+from class_tools import entry
 
 from px4fuse.assignment.roster import Person, people_of_sheet
 from px4fuse.assignment.sheet import read_sheet
 from px4fuse.errors import SettingsError
-from px4fuse.grading.exports import as_html, filled, grade_column, moodle_feedback
-from px4fuse.grading.model import Entry, Submission
-from px4fuse.grading.platforms import ExportOrigin
+from px4fuse.grading.exports import filled, grade_column
 from px4fuse.grading.roster import Register
 
 # As mod/assign/gradingtable.php of Moodle writes it
@@ -35,6 +32,7 @@ CANVAS = (
     '"Roe, Max",12346,43,mroe,A,7.00,,1,80\n'
     '"Pat, Pending",12347,44,ppat,A,7.00,,1,80\n'
 )
+TITLE = "Lab 3 [Total Pts: 100 Score] |1281892"
 BLACKBOARD = (
     '"Last Name"\t"First Name"\t"Username"\t"Student ID"\t"Lab 3 [Total Pts: 100 Score] |1281892"\t'
     '"Grading Notes"\t"Notes Format"\t"Feedback to Learner"\t"Feedback Format"\n'
@@ -71,18 +69,13 @@ def register(sheet) -> Register:
     return made
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
 @pytest.mark.parametrize(
     ("text", "column", "title", "feedback"),
     [
         (MOODLE, "", "Grade", "Feedback comments"),
         (CANVAS, "Lab 3", "Lab 3 (9)", None),
-        (
-            BLACKBOARD,
-            "Lab 3 [Total Pts: 100 Score] |1281892",
-            "Lab 3 [Total Pts: 100 Score] |1281892",
-            "Feedback to Learner",
-        ),
+        (BLACKBOARD, TITLE, TITLE, "Feedback to Learner"),
     ],
 )
 def test_a_platforms_table_comes_back_with_two_columns_filled(
@@ -96,12 +89,9 @@ def test_a_platforms_table_comes_back_with_two_columns_filled(
     before, after = rows(text, separator), rows(content.decode(encoding), separator)
     assert list(after[0]) == list(before[0])
     assert len(after) == len(before)
-    changed = {title, feedback}
     people = after[2:] if text is CANVAS else after
     for old, new in zip(before, after, strict=True):
-        assert {k: v for k, v in old.items() if k not in changed} == {
-            k: v for k, v in new.items() if k not in changed
-        }
+        assert {key for key in old if old[key] != new[key]} <= {title, feedback}
     grades = [row[title] for row in people]
     assert grades[:2] == ["87.5", "104"]
     # who has no grade keeps what is there: an empty cell would delete, a zero would count
@@ -150,29 +140,3 @@ def test_the_column_of_the_grade_is_named_or_the_only_one(tmp_path, text, column
     with pytest.raises(SettingsError, match=says) as caught:
         grade_column(table(tmp_path, text), column)
     assert "\n" not in str(caught.value)
-
-
-def test_moodles_feedback_zip_has_the_folders_that_it_reads_back() -> None:
-    """The rule of importziplib.php: split at "_", the second part is the participant."""
-    origins = {
-        "a.pdf": ExportOrigin("moodle", "4711", "Doe_Jane"),
-        "b.pdf": ExportOrigin("moodle", "4712", "../=Roe"),
-        "c.pdf": ExportOrigin("canvas", "5", "pat"),
-    }
-    entries = tuple(
-        Entry(name, name, graded(f"{name}.pdf", 1.0), total=1.0) for name in ("a", "b", "c")
-    )
-    files = {n: Submission(Path("x.zip"), n, n, None, one) for n, one in origins.items()}
-    content = moodle_feedback(entries, files, TEXTS)
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        found = {}
-        for name in archive.namelist():
-            folder, file = name.split("/")
-            _, number, kind, plugin, _ = folder.split("_", 4)
-            assert (kind, plugin, file) == ("assignfeedback", "file", "feedback.txt")
-            found[number] = archive.read(name).decode("utf-8-sig")
-    assert found == {"4711": TEXTS[0], "4712": TEXTS[1]}
-
-
-def test_html_of_feedback_holds_no_markup() -> None:
-    assert as_html("<script>&\n\n  x\n") == "&lt;script&gt;&amp;<br><br>&nbsp;&nbsp;x"

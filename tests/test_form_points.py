@@ -82,8 +82,7 @@ def test_every_mistake_that_a_flight_can_have_can_be_named_seen_and_cured() -> N
 
 
 def test_all_right_is_everything_and_a_blank_form_nothing() -> None:
-    assert parts(RIGHT) == [30.0, 15.0, 10.0, 15.0, 15.0, 15.0]
-    assert form_points(RIGHT, TRUTH).share == 1.0
+    assert form_points(RIGHT, TRUTH).parts == FULL
     assert parts(Answers(log_sha256=SHA256)) == [0.0] * 6
     assert form_points(RIGHT, TRUTH).named == {"clock-offset": True, "dropout": True}
 

@@ -16,8 +16,8 @@ from px4fuse.assignment.truth import FormTruth, VerdictTruth, Wrong
 from px4fuse.errors import ResultsError
 from px4fuse.findings import NAMES
 from px4fuse.grading.feedback import returned_text
-from px4fuse.grading.flags import chosen_settings, class_flags, own_flags, text_flags
-from px4fuse.grading.model import Entry, Graded, Item
+from px4fuse.grading.flags import class_flags, own_flags, text_flags
+from px4fuse.grading.model import Entry, Graded
 from px4fuse.grading.rubric import parse_rubric, read_rubric
 from px4fuse.grading.scoring import assess, refused
 from px4fuse.results.contract import to_plain
@@ -62,18 +62,12 @@ def filled(kinds, results=EXAMPLE, **values):
 
 
 def test_a_file_that_is_not_at_hand():
-    read = read_report((ROOT / "reports" / "aisle_uwb.pdf").read_bytes(), "aisle_uwb.pdf")
-    verdict = verify(read)
-    points, comment = checked("verified", verdict=verdict)
-    assert points == 0.5
-    assert "not at hand (aisle_uwb.ulg)" in comment
-    text = fed_back(graded(verdict=verdict))
-    assert "was not at hand" in text
-    assert "Make it again" not in text
+    verdict = verify(read_report((ROOT / "reports" / "aisle_uwb.pdf").read_bytes(), "a.pdf"))
+    assert checked("verified", verdict=verdict)[0] == 0.5
+    assert "Hand in aisle_uwb.ulg" in fed_back(graded(verdict=verdict))
     other = replace(verdict, reasons=("made with another version",), missing="")
     points, comment = checked("verified", verdict=other)
-    assert points == 0.0
-    assert comment == "Your report could not be verified (made with another version)."
+    assert (points, comment[-28:]) == (0.0, "(made with another version).")
 
 
 RMSE = "axes.north.filters.kf.truth.position_rmse_m"
@@ -88,38 +82,27 @@ WORSE = {"slam.tum": to_plain(correction(0.5, 1.4))["scores"]["slam.tum"]}
 REJECTED = changed(LOOP, loop__closures=[{**LOOP["loop"]["closures"][0], "accepted": False}])
 # Check, results, parameters, the points of 1, and what the comment says
 CHECKED = [
-    ("verified", EXAMPLE, {}, 1.0, "computed again"),
+    ("verified", EXAMPLE, {}, 1.0, "verified (all 900"),
     ("student", changed(student={"name": "Ann", "id": "7", "notes": ""}), {}, 1.0, "Ann, 7"),
     ("student", changed(student__name="Ann"), {}, 0.5, "--id"),
     ("student", EXAMPLE, {}, 0.0, "--student"),
-    ("student", changed(LOOP, student__name="Ann", student__id="7"), {}, 1.0, "Ann"),
-    ("student", changed(student__name="Ann"), {"id": False}, 1.0, "Ann"),
-    ("sections", EXAMPLE, {"results": ["axes.*.filters.kf", "clock"]}, 1.0, "2 of 2"),
-    ("sections", EXAMPLE, {"results": ["loop", "axes.north"]}, 0.5,
-     "no external vision with orientation"),
     ("tuning", EXAMPLE, {"settings": ["sigma_z_m"]}, 1.0, "within"),
-    ("tuning", EXAMPLE, {"settings": ["sigma_a_m_s2"]}, 0.72, "0.5 m/s² is above"),
     ("tuning", EXAMPLE, {}, 0.86, "SIGMA_A"),
     ("tuning", changed(settings__sigma_a_m_s2=0.1), {"settings": ["sigma_a_m_s2"]}, 0.0, "below"),
     ("tuning", changed(**{SIGMA_Z: ..., f"{SIGMA_Z}_interval": [0.0, 0.2]}),
      {"settings": ["sigma_z_m"]}, 1.0, "within"),
     ("tuning", changed(tuning__horizontal=NONE), {}, 0.0, "too few of them"),
     ("tuning", NORTH, {"settings": ["sigma_z_m"]}, 0.0, "leave --axis out"),
-    ("number", EXAMPLE, {"path": RMSE, "at_most": 0.15}, 1.0, RMSE),
     ("number", EXAMPLE, {"path": RMSE, "at_most": 0.05, "name": "the error"}, 0.0,
      "The error is 0.06499; at most 0.05 was asked for."),
     ("number", EXAMPLE, {"path": RMSE, "at_most": 0.06, "zero_at": 0.07}, 0.5, ""),
     ("number", EXAMPLE, {"path": RMSE, "at_least": 0.07, "zero_at": 0.06}, 0.5, ""),
     ("number", EXAMPLE, {"path": "axes.*.filters.kf.nis_mean", "at_least": 0.82}, 0.0,
      "axes.north"),  # the worst of several
-    ("number", EXAMPLE, {"path": ["nothing.here", "log.duration_s"], "at_least": 100}, 1.0, ""),
     ("number", LOOP, {"path": 'loop.corrections.by_distance.scores."slam.tum".ate.translation_m.'
                               "rmse", "at_most": 0.3}, 1.0, ""),
     ("number", EXAMPLE, {"path": "clock.interval_s.1", "at_most": 0.1}, 1.0, ""),
-    *(("number", BLIND, {"path": path, "at_most": 1.0}, 0.0, "has no number for")
-      for path in ("log", "log.name", "log.dropouts", "nothing")),
-    ("number", BLIND, {"path": RMSE, "at_most": 1.0}, 0.0,
-     f"Your report has no number for {RMSE} (too few of them)."),
+    ("number", BLIND, {"path": "log.name", "at_most": 1.0}, 0.0, "has no number for"),
     ("number", NORTH, {"path": "tuning.horizontal.held_out.gain_nats", "at_most": 1.0}, 0.0,
      "leave --axis out"),
     ("consistent", changed(horizontal__kf__verdict="consistent"), {}, 1.0, "is consistent"),
@@ -127,19 +110,18 @@ CHECKED = [
     ("consistent", changed(horizontal__kf__nis_mean=2.0), {}, 0.0, "1.41 times in σ"),
     ("consistent", EXAMPLE, {"filter": "ekf2", "axes": ["horizontal", "east"]}, 1.0, "EKF2"),
     ("consistent", EXAMPLE, {"filter": "ekf2", "axes": ["down"]}, 0.0, "never fused"),
-    ("consistent", NORTH, {}, 0.0, "leave --axis out"),
     ("consistent", changed(**UNDERSTATED), {}, 0.0, "understated "),
     ("consistent", changed(**UNDERSTATED, settings__sigma_a_m_s2=0.36), {}, 1.0,
      "what is left no setting fixes"),
     ("clock", EXAMPLE, {}, 1.0, "what the data ask for"),
     ("clock", changed(clock__applied_s=0.25), {}, 0.0, "0.250 s"),
-    ("clock", UNCLEAR, {}, 0.5, "no acceleration); fly"),
+    ("clock", UNCLEAR, {}, 0.5, "no acceleration)."),
     ("clock", changed(clock=NONE), {}, 0.0, "too few of them"),
-    ("clock", LOOP, {}, 0.0, "nothing about the clock"),
+    ("clock", LOOP, {}, 0.0, "compares no filters"),
     ("clock", changed(**JUMPS), {}, 0.5, "say in your form"),
     ("clock", filled(["clock-jump"], **JUMPS), {}, 1.0, "as your form says"),
     ("clock", filled(["dropout"], **JUMPS), {}, 0.5, "say in your form"),
-    ("loop", LOOP, {}, 1.0, "from 0.41 m to 0.26 m"),
+    ("loop", LOOP, {}, 1.0, "went from 0.41 m to 0.26 m"),
     ("loop", changed(LOOP, **{f"{AFTER}__scores": WORSE}), {}, 0.67, "makes it worse"),
     ("loop", changed(LOOP, **{f"{AFTER}__scores": {}}), {}, 0.83, "--reference"),
     ("loop", changed(LOOP, **{AFTER: NONE}), {}, 0.33, "not corrected"),
@@ -149,11 +131,8 @@ CHECKED = [
     ("loop", filled(["open-end"], REJECTED), {}, 1.0, "as your form says"),
     ("loop", changed(LOOP, loop__closure_error_m=..., loop__known_end=NONE), {}, 0.0,
      "too few of them"),
-    ("flight", EXAMPLE, {}, 1.0, "which is enough"),
-    ("flight", LOOP, {}, 1.0, "m of path"),
-    ("flight", changed(settings__end_s=31.848858), {}, 0.5, "30 s"),
-    ("flight", LOOP, {"min_path_m": 175.4}, 0.5, "175.4 m of path"),
-    ("flight", changed(findings=[finding("no_motion")]), {}, 0.0, "hardly moved"),
+    ("number", changed(axes__north__updates__count=50), {"path": "axes.*.updates.count",
+     "at_least": 100, "zero_at": 0}, 0.5, "axes.north"),
 ]  # fmt: skip
 
 
@@ -165,9 +144,7 @@ def test_what_a_check_gives(check, results, given, points, said):
 
 
 def test_the_clock_of_a_flight_that_was_handed_out_is_not_the_student_s_choice():
-    points, comment = checked("clock", UNCLEAR, key=key())
-    assert points == 1.0
-    assert "fly" not in comment.replace("flight", "")
+    assert checked("clock", UNCLEAR, key=key())[0] == 1.0
 
 
 # ------------------------------------------------------------------ mistakes
@@ -186,11 +163,6 @@ def key(*mistakes, sha256=SHA, **values):
 
 
 class TestForm:
-    def test_without_a_key_it_is_left_out(self):
-        for answers, there in ((None, False), (key(), True)):
-            items = assessed(key=answers).items
-            assert ("What is wrong with your flight" in [item.title for item in items]) is there
-
     def test_points_by_the_key(self):
         found = filled(["dropout"], student__id="S01 ")
         points, comment = checked("answers", found, key=key())
@@ -217,12 +189,12 @@ class TestForm:
         assert points == 0.0
         assert said in comment
 
-    def test_another_log_an_unknown_id_and_no_id(self):
-        other = key(sha256="c" * 64)
-        points, comment = checked("answers", filled(["dropout"], student__id="s01"), key=other)
+    @pytest.mark.parametrize("student_id", ["s01", "zz"])
+    def test_another_log_and_an_unknown_id(self, student_id):
+        results = filled(["dropout"], student__id=student_id)
+        points, comment = checked("answers", results, key=key(sha256="c" * 64))
         assert points == 0.0
-        assert "s01.ulg" in comment
-        assert checked("answers", filled(["dropout"], student__id="zz"), key=other)[0] == 0.0
+        assert "not about the log that you were given" in comment
 
     def test_a_text_waits_for_the_instructor(self):
         for notes, waits in (("", False), ("I saw a gap.", True)):
@@ -231,12 +203,6 @@ class TestForm:
             assert (made.counted is None) is waits
             assert made.items[-1].points == 0.0
 
-    def test_ids_without_their_leading_zeros(self):
-        answers = AnswerKey("aisle", (Answer("0042", "", "", SHA), Answer("7", "", "", "b" * 64)))
-        assert answers.of_student("42").student_id == "0042"
-        assert answers.of_student("") is None
-        assert answers.of_log("") is None
-
 
 # ------------------------------------------------------------------ the whole
 
@@ -244,8 +210,8 @@ class TestForm:
 class TestScore:
     def test_example(self):
         items = assessed().items
-        assert sum(item.of for item in items) == 65
-        assert 35 < sum(item.points for item in items) < 60
+        assert sum(item.of for item in items) == 60
+        assert 30 < sum(item.points for item in items) < 55
 
     def test_refuted_reports_get_nothing(self):
         verdict = Verdict("numbers differ", ("SIGMA_A is 0.5",), with_log=True)
@@ -254,57 +220,37 @@ class TestScore:
         assert all("SIGMA_A is 0.5" in item.comment for item in made.items)
         assert made.pending == ""
 
-    @pytest.mark.parametrize("status", ["other log", "cannot verify"])
-    def test_what_cannot_be_verified_is_pending_unless_the_rubric_says_so(self, status):
-        rubric = read_rubric(None)
-        verdict = Verdict(status, ("no log",), False, remedy="Look.")
+    def test_what_cannot_be_verified_is_pending_unless_the_rubric_says_so(self):
+        verdict = Verdict("other log", ("no log",), False, remedy="Look.")
         made = assessed(verdict=verdict)
         assert made.items[0].points == 0.0
         assert sum(item.points for item in made.items) > 30
         assert made.pending == "Look."
-        zero = assessed(verdict=verdict, rubric=replace(rubric, unverified="zero"))
+        zero = assessed(verdict=verdict, rubric=replace(read_rubric(None), unverified="zero"))
         assert {item.points for item in zero.items} == {0.0}
         assert zero.pending == ""
 
-    @pytest.mark.parametrize(
-        ("student_id", "said"),
-        [("s02", "given to s01, the report gives the id s02"),
-         ("s77", "given to s01, the report gives the id s77"),
-         ("", "given to s01, the report gives no id")],
-    )  # fmt: skip
-    def test_somebody_else_s_log_is_pending_unless_the_rubric_says_so(self, student_id, said):
-        rubric, given = read_rubric(None), changed(student__id=student_id)
-        made = assessed(given, key=key("source_gap"), rubric=rubric)
-        assert said in made.pending
-        for rule, counts, points in (("zero", True, False), ("count", True, True)):
-            rubric = replace(rubric, others_log=rule)
-            made = assessed(given, key=key("source_gap"), rubric=rubric)
-            assert (made.pending == "") == counts
-            assert any(item.points for item in made.items) == points
-        mine = changed(student__id="s01")
-        assert assessed(mine, key=key("source_gap")).pending == ""
+    @pytest.mark.parametrize("student_id", ["s02", "S02", "ѕ02", "s77", "", " "])
+    def test_somebody_else_s_log_is_pending_unless_the_rubric_says_so(self, student_id):
+        given = changed(student__id=student_id)
+        said = f"the id {student_id}" if student_id.strip() else "no id"
+        assert f"given to s01, the report gives {said}" in assessed(given, key=key()).pending
+        for rule, earns in (("zero", False), ("count", True)):
+            rubric = replace(read_rubric(None), others_log=rule)
+            made = assessed(given, key=key(), rubric=rubric)
+            assert (made.pending, any(item.points for item in made.items)) == ("", earns)
         # the platform says whose it is
-        made = assessed(key=key("source_gap"), owner_id="s01")
-        assert made.pending == ""
+        assert assessed(given, key=key(), owner_id="s01").pending == ""
 
     def test_a_log_that_nobody_was_given(self):
-        answers = key("source_gap", sha256="c" * 64)
-        made = assessed(noted("", student__id="s01"), key=answers)
+        made = assessed(noted("", student__id="s01"), key=key(sha256="c" * 64))
         assert "Ask for a report on the log that was handed out" in made.pending
-
-    def test_altered_pages(self):
-        verdict = Verdict("verified", (), True, page_status="differ")
-        rubric = read_rubric(None)
-        assert assessed(verdict=verdict).pending == ""
-        waiting = assessed(verdict=verdict, rubric=replace(rubric, pages="pending"))
-        assert "redrawn" in waiting.pending
-        none = assessed(verdict=verdict, rubric=replace(rubric, pages="zero"))
-        assert {item.points for item in none.items} == {0.0}
 
     def test_refused_file_has_every_item_with_nothing(self):
         items = refused(read_rubric(None), None, Refused("not a PDF")).items
-        assert sum(item.of for item in items) == 65
-        assert {item.points for item in items} == {0.0}
+        assert [(item.points, item.title) for item in items] == [
+            (0.0, item.title) for item in assessed().items
+        ]
 
     @pytest.mark.parametrize("results", [EXAMPLE, LOOP], ids=["compare", "loop"])
     def test_whatever_can_be_read_can_be_scored(self, results):
@@ -331,7 +277,7 @@ class TestScore:
             except ResultsError:
                 continue
             read += 1
-            for item in assess(found, VERIFIED, rubric, key("source_gap")).items:
+            for item in assess(found, VERIFIED, rubric, key()).items:
                 assert 0.0 <= item.points <= item.of
                 assert len(item.comment) < 1500
                 assert item.comment.isprintable()
@@ -351,30 +297,16 @@ def graded(items=(), **values):
     return Graded(**{**given, "verdict": VERIFIED, "items": tuple(items), **values})
 
 
-def test_pending_points_do_not_count():
-    items = (Item("T", 3.0, 5.0, "Why."),)
-    assert (graded(items).points, graded(items).counted) == (3.0, 3.0)
-    waiting = graded(items, pending="Add uwb.csv to --logs.")
-    assert (waiting.points, waiting.counted) == (3.0, None)
-
-
 class TestWhatStudentsRead:
     @pytest.mark.parametrize(
         ("values", "there", "absent"),
         [
             ({"items": assessed().items, "flags": ("copied",)},
-             ("Lab 2 Report a.pdf Student Ann Lee, 1001", "You can still gain most points here"),
-             "copied"),
-            ({"verdict": Verdict("cannot verify", ("Not a PDF.",), False)},
-             ("could not be verified: Not a PDF. Make it again", "hand in the PDF"), "points"),
-            ({"verdict": Verdict("cannot verify", ("one", "page 3: two"), True)},
-             ("verified: one; page 3: two. Make it again",), "at hand"),
-            ({"verdict": Verdict("other log", ("none of the 7 files given is the log",), False)},
-             ("that your instructor has: none of the 7 files given is the log.",), "again"),
+             ("Lab 2 Report a.pdf Student Ann Lee, 1001",), "copied"),
+            ({"verdict": Verdict("cannot verify", ("one", "page 3: two"), False)},
+             ("could not be verified: one; page 3: two. Make it again",), "Points"),
             ({"student": "=cmd|' /C calc'!A0\n<script>", "student_id": "\x1b[31m"},
              ("=cmd|' /C calc'!A0 <script>",), "\x1b"),
-            ({"verdict": Verdict("cannot verify", ("why",), False, missing="uwb.csv")},
-             ("was not at hand (uwb.csv)", "Hand it in too"), "--logs"),
             ({"items": assessed().items, "pending": "Add uwb.csv to --logs."},
              ("pending: they do not count yet",), "--logs"),
         ],
@@ -470,67 +402,43 @@ def of(number, **values):
 class TestClassFlags:
     def test_an_honest_class(self):
         assert class_flags([of(n, notes=text_of(n)) for n in range(12)]) == {}
-        assert class_flags([]) == {}
 
-    def test_logs_ids_files_and_versions(self):
+    def test_logs_ids_and_files(self):
         made = class_flags(
-            [of(1, log_sha256="x"), of(2, log_sha256="x"), of(3, version="0.0.9"), of(4), of(5),
-             of(6, student_id="1005"), of(7, sha256="y"), of(8, sha256="y")]
+            [of(1, student="a\n<b>", log_sha256="x"), of(2, log_sha256="x"), of(4), of(5),
+             of(6, student_id="1005"),
+             of(7, sha256="y"), of(8, sha256="y")]
         )  # fmt: skip
-        assert set(made) == {0, 1, 2, 4, 5, 6, 7}
-        assert "same log as Student2" in made[0][0]
-        assert "0.0.9" in made[2][0]
-        assert "same student id" in made[4][0]
-        assert "same file" in made[7][0]
+        assert set(made) == {f"{n}.pdf" for n in (1, 2, 5, 6, 7, 8)}
+        assert "same log as Student2" in made["1.pdf"][0]
+        for flag in (flag for flags in made.values() for flag in flags):
+            assert re.fullmatch(r"[A-Z].*\.", flag)
+            assert flag.isprintable()
+        assert "same student id" in made["5.pdf"][0]
+        assert "same file" in made["8.pdf"][0]
 
     def test_two_reports_of_one_student_on_one_log(self):
-        assert class_flags(
-            [of(1, log_sha256="x"), of(1, log_sha256="x", sha256="z", submission="b.pdf")]
-        ) == {
-            0: ("The same student id as in Student1 Name1, 1001 (b.pdf).",),
-            1: ("The same student id as in Student1 Name1, 1001 (1.pdf).",),
+        two = [of(1, log_sha256="x"), of(1, log_sha256="x", sha256="z", submission="b.pdf")]
+        assert class_flags(two) == {
+            "1.pdf": ["The same student id as in Student1 Name1, 1001 (b.pdf)."],
+            "b.pdf": ["The same student id as in Student1 Name1, 1001 (1.pdf)."],
         }
-
-    def test_settings_to_the_last_digit(self):
-        def chosen(**values):
-            changes = {f"settings__{name}": value for name, value in values.items()}
-            return chosen_settings(decoded(changed(**changes)))
-
-        typed = {"sigma_a_m_s2": 0.362, "sigma_z_m": 0.097}
-        assert chosen() == chosen(sigma_a_m_s2=0.3, sigma_z_m=0.2) == ""
-        assert (
-            chosen(**typed, start_s=1.0)
-            == chosen(**typed)
-            == ("sigma_a_m_s2 0.362, sigma_z_m 0.097")
-        )
-        assert chosen_settings(decoded(LOOP)) == ""
-        same = class_flags(
-            [of(1, settings=chosen(**typed)), of(2, settings=chosen(**typed)), of(3)]
-        )
-        assert set(same) == {0, 1}
-        assert "sigma_a_m_s2 0.362" in same[0][0]
-
-    def test_notes_copied(self):
-        own = text_of(1)
-        words = own.split()
-        words[10] = words[60] = "CHANGED"
-        changed_ = " ".join(words).upper() + "!"
-        made = class_flags([of(1, notes=own), of(2, notes=changed_), of(3, notes=text_of(3))])
-        assert set(made) == {0, 1}
-        assert "whole passages" in made[0][0]
 
     @pytest.mark.parametrize(
         "disguise",
         [
+            lambda words: words,
             lambda words: [w + "x" * (n % 5 == 4) for n, w in enumerate(words)],  # a typo in each 5
             lambda words: [p for n, w in enumerate(words) for p in (w, "well")[: 1 + (n % 4 == 3)]],
             lambda words: [w.replace("o", "o\u200b").upper() for w in words],
             lambda words: [w.translate({97 + n: 0x1D41A + n for n in range(26)}) for w in words],
         ],
     )
-    def test_disguised_copies(self, disguise):
-        made = class_flags([of(1, notes=WRITTEN), of(2, notes=" ".join(disguise(WRITTEN.split())))])
-        assert set(made) == {0, 1}
+    def test_copies_however_disguised(self, disguise):
+        copy = " ".join(disguise(WRITTEN.split()))
+        made = class_flags([of(1, notes=WRITTEN), of(2, notes=copy), of(3, notes=text_of(3))])
+        assert set(made) == {"1.pdf", "2.pdf"}
+        assert "whole passages" in made["1.pdf"][0]
 
     def test_the_same_numbers_in_two_forms(self):
         claim = Claim(
@@ -538,8 +446,8 @@ class TestClassFlags:
         )
         same = Answers(log_sha256=SHA, mistakes=(claim,), quantities=(0.123, 0.45, None))
         made = class_flags([of(1, form=same), of(2, form=same), of(3)])
-        assert set(made) == {0, 1}
-        assert "The form has the numbers of" in made[0][0]
+        assert set(made) == {"1.pdf", "2.pdf"}
+        assert "The form has the numbers of" in made["1.pdf"][0]
 
     def test_short_notes_and_a_template_are_not(self):
         assert class_flags([of(1, notes="All is well."), of(2, notes="All is well.")]) == {}
@@ -547,32 +455,10 @@ class TestClassFlags:
         made = class_flags([of(n, notes=f"{template} {text_of(n)}") for n in range(8)])
         assert made == {}
         copies = [of(n, notes=f"{template} {text_of(min(n, 6))}") for n in range(8)]
-        assert set(class_flags(copies)) == {6, 7}
-
-    @pytest.mark.parametrize(
-        ("file", "flagged"),
-        [
-            ("1002_lab.pdf", True),
-            ("Student2 Name2_88_assignsubmission_file_report.pdf", True),
-            ("Student1_Name1/1002.pdf", False),
-            ("1001.pdf", False),
-            ("lab report.pdf", False),
-            ("report-1002-1001.pdf", False),
-            ("", False),
-            ("/", False),
-        ],
-    )
-    def test_file_of_another_name(self, file, flagged):
-        made = class_flags([of(1, submission=file), of(2)])
-        assert (0 in made) == flagged
+        assert set(class_flags(copies)) == {"6.pdf", "7.pdf"}
 
     def test_three_hundred_take_seconds(self):
         many = [of(n, notes=text_of(n % 290, 1500), log_sha256=f"{n}") for n in range(300)]
         made = class_flags(many)
-        assert set(made) >= {0, 290}
-        assert 20 not in made
-
-
-def test_flags_are_sentences():
-    for flags in class_flags([of(1, log_sha256="x\n<b>"), of(2, log_sha256="x\n<b>")]).values():
-        assert all(re.fullmatch(r"[A-Z].*\.", flag) and flag.isprintable() for flag in flags)
+        assert set(made) >= {"0.pdf", "290.pdf"}
+        assert "20.pdf" not in made

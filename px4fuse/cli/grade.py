@@ -86,19 +86,7 @@ if TYPE_CHECKING:
 )
 @path_option("--gradescope", metavar="DIR", help="Run inside that autograder, on its folder.")
 @open_option
-def grade(
-    submissions: tuple[Path, ...],
-    logs: tuple[Path, ...],
-    rubric: Path | None,
-    key: Path | None,
-    output: Path | None,
-    due: str | None,
-    late: str | None,
-    write_rubric: Path | None,
-    write_autograder: Path | None,
-    gradescope: Path | None,
-    **given: Any,
-) -> None:
+def grade(submissions: tuple[Path, ...], output: Path | None, **given: Any) -> None:
     """Verify and score reports: PDFs, folders of them, and zip files of learning platforms.
 
     Writes class.csv, class.html, a feedback text per student and files that learning platforms
@@ -107,6 +95,7 @@ def grade(
     a new rubric takes seconds. What students hand in is read within bounds of time and memory, and
     nothing in it is executed.
     """
+    from px4fuse.assignment.key import read_key
     from px4fuse.assignment.roster import read_people
     from px4fuse.assignment.sheet import read_sheet
     from px4fuse.grading.entries import Course
@@ -114,40 +103,37 @@ def grade(
     from px4fuse.grading.lateness import due_time, late_rule
     from px4fuse.grading.rubric import read_rubric, rubric_text
 
-    if write_rubric is not None:
-        write_new(write_rubric, rubric_text().encode())
+    if given["write_rubric"] is not None:
+        write_new(given["write_rubric"], rubric_text().encode())
         return
-    rule = late_rule(late) if late else None
-    if gradescope is not None:
+    late = late_rule(given["late"]) if given["late"] else None
+    if given["gradescope"] is not None:
         from px4fuse.grading.gradescope import run_autograder
 
-        run_autograder(gradescope, rule)
+        run_autograder(given["gradescope"], late)
         return
-    if write_autograder is not None:
+    if given["write_autograder"] is not None:
         from px4fuse.grading.gradescope import autograder_zip
 
-        write_new(write_autograder, autograder_zip(logs, rubric, key, rule))
+        content = autograder_zip(given["logs"], given["rubric"], given["key"], late)
+        write_new(given["write_autograder"], content)
         return
-    if rule is not None and due is None:
+    if late is not None and given["due"] is None:
         raise SettingsError("--late: say with --due when it was due.")
     if not submissions:
         raise SettingsError("nothing to grade: give PDFs, folders or zip files.")
     if output is None:
         raise SettingsError("say with -o where the class table goes.")
-    _check_places(output, (*submissions, *logs))
-    answers = None
-    if key is not None:
-        from px4fuse.assignment.key import read_key
-
-        answers = read_key(key)
-    chosen = read_rubric(rubric)
+    _check_place(output, (*submissions, *given["logs"]))
+    key = None if given["key"] is None else read_key(given["key"])
+    rubric = read_rubric(given["rubric"])
     course = Course(
         roster=None if given["roster"] is None else read_people(given["roster"]),
         worksheets=tuple(map(read_sheet, given["worksheet"])),
         column=given["column"] or "",
         attempt=given["attempt"],
-        due=due_time(due) if due else None,
-        late=rule,
+        due=due_time(given["due"]) if given["due"] else None,
+        late=late,
         include_pending=given["include_pending"],
         anonymous=given["anonymous"],
     )
@@ -155,10 +141,10 @@ def grade(
         with progress() as step:
             outcome = grade_all(
                 submissions,
-                logs,
-                chosen,
+                given["logs"],
+                rubric,
                 output,
-                key=answers,
+                key=key,
                 course=course,
                 title=given["title"],
                 processes=given["jobs"],
@@ -171,16 +157,10 @@ def grade(
     open_written(output / "class.html")
 
 
-def _check_places(output: Path, given: tuple[Path, ...]) -> None:
+def _check_place(output: Path, given: tuple[Path, ...]) -> None:
     if output.exists() and not output.is_dir():
         raise OutputError(f"-o {output}: is not a folder. Give another place.")
     for path in given:
-        if not path.exists():
-            raise SettingsError(f"{path}: no such file or folder.")
-        if not path.is_file() and not path.is_dir():
-            raise SettingsError(
-                f"{path}: not a regular file (a device, pipe or socket)", "Give a file or folder."
-            )
         if path.is_dir() and output.resolve().is_relative_to(path.resolve()):
             raise OutputError(
                 f"-o {output}: lies inside {path}, which is read; its own output would be graded. "
@@ -199,19 +179,13 @@ def _print(outcome: GradeOutcome) -> None:
     page, rows = Page(), []
     for entry in outcome.entries:
         one = entry.counting
-        status = one.status if one else "missing"
-        if one and entry.total is None:
-            status += ", pending"
+        pending = ", pending" if one and entry.total is None else ""
+        status = one.status + pending if one else "missing"
+        look = GOOD if status == "verified" else SEVERITY_COLOURS["warning"]
         total = "–" if entry.total is None else f"{entry.total:g}"
-        rows.append(
-            (
-                one_line(entry.student or entry.student_id, 60),
-                one.submission if one else "",
-                (status, GOOD if status == "verified" else SEVERITY_COLOURS["warning"]),
-                f"{total} / {entry.of:g}",
-                f"{len(entry.flags) or ''}",
-            )
-        )
+        name = one_line(entry.student or entry.student_id, 60)
+        file, flags = one.submission if one else "", f"{len(entry.flags) or ''}"
+        rows.append((name, file, (status, look), f"{total} / {entry.of:g}", flags))
     page.table(("student", "submission", "status", "points", "flags"), rows, right=(3, 4))
     counts = Counter(one.status for one in outcome.graded)
     said = ", ".join(f"{count} {status}" for status, count in counts.most_common())

@@ -5,13 +5,17 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 from px4fuse.grading.model import Entry, Graded
+from px4fuse.webpage.frame import Part
 
 # Shorter words are in every text
 SHORTEST_WORD = 3
-# Shorter ids are numbers that notes are full of
-SHORTEST_ID = 4
+# Shorter parts of a file's name as well
+SHORTEST_PART = 4
+# A cell that is one number, which may be somebody's id
+POINTS = re.compile(r"\d{1,3}(\.\d+)?")
 NAME = "[name]"
 
 
@@ -28,19 +32,27 @@ class Veil:
         self._instead |= {
             _key(text): entry.pseudonym for entry in veiled for text in _identities(entry)
         }
-        self._every = _pattern([*self._instead])
-        self._without_short_ids = _pattern(
-            [text for text in self._instead
-             if len(text) >= SHORTEST_ID or not any(map(str.isdigit, text))]
-        )  # fmt: skip
+        longest_first = sorted(self._instead, key=lambda text: (-len(text), text))
+        # an underscore parts words in names of files
+        self._names = re.compile(
+            rf"(?<![^\W_])(?:{'|'.join(map(re.escape, longest_first))})(?![^\W_])", re.IGNORECASE
+        )
 
-    def hide(self, text: str, *, own_words: bool = False) -> str:
-        """A text without names; ``own_words`` are a student's, in which short ids are numbers."""
-        pattern = self._without_short_ids if own_words else self._every
-        if pattern is None:
+    def hide(self, text: str) -> str:
+        """A text without names."""
+        if not self._instead:
             return text
         composed = unicodedata.normalize("NFC", text)
-        return pattern.sub(lambda found: self._instead[_key(found[0])], composed)
+        return self._names.sub(lambda found: self._instead[_key(found[0])], composed)
+
+    def of_part(self, part: Part) -> Part:
+        """What a row unfolds to, with every text in it without names; its kind stays."""
+        return [part[0], *map(self._hidden, part[1:])]
+
+    def _hidden(self, value: Any) -> Any:
+        if isinstance(value, str):
+            return value if POINTS.fullmatch(value) else self.hide(value)
+        return [*map(self._hidden, value)] if isinstance(value, list | tuple) else value
 
 
 def hidden_words(entry: Entry, one: Graded) -> tuple[str, ...]:
@@ -57,9 +69,9 @@ def _identities(entry: Entry) -> Iterator[str]:
         name = one.submission
         yield name
         # the log's name is often the id's, the file's is often the student's
-        yield from (part for part in re.split(r"[/\\]", name) if len(part) > SHORTEST_ID)
+        yield from (part for part in re.split(r"[/\\]", name) if len(part) > SHORTEST_PART)
         stem = name.rpartition("/")[2].rpartition(".")[0]
-        if len(stem) >= SHORTEST_ID and stem.casefold() not in ("report", "result", "results"):
+        if len(stem) >= SHORTEST_PART and stem.casefold() not in ("report", "result", "results"):
             yield stem
 
 
@@ -72,13 +84,3 @@ def _words(entry: Entry) -> Iterator[str]:
 
 def _key(text: str) -> str:
     return unicodedata.normalize("NFC", text).casefold()
-
-
-def _pattern(texts: Sequence[str]) -> re.Pattern[str] | None:
-    if not texts:
-        return None
-    longest_first = sorted(texts, key=lambda text: (-len(text), text))
-    # an underscore parts words in names of files
-    return re.compile(
-        rf"(?<![^\W_])(?:{'|'.join(map(re.escape, longest_first))})(?![^\W_])", re.IGNORECASE
-    )

@@ -18,7 +18,6 @@ from px4fuse.filter.clock import Clock
 from px4fuse.filter.consistency import SIGMA_OFF, HorizontalNis
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.grading.evidence import (
-    NAMED,
     Bound,
     Evidence,
     Factor,
@@ -32,26 +31,15 @@ from px4fuse.grading.evidence import (
     values_at,
 )
 from px4fuse.loop.model import Correction, LoopPart, Way
-from px4fuse.plain import capital, factor_words, few_words, length_words, p_words
+from px4fuse.plain import capital, factor_words, length_words, p_words
 from px4fuse.record import Maybe, Share
-from px4fuse.request import LoopRequest
 from px4fuse.results.comparison import ASKED
 from px4fuse.results.contract import ComparisonResults, LoopResults
 from px4fuse.trajectory.evaluation import Score
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
-from px4fuse.verification.rerun import log_sha256
 from px4fuse.verification.verification import is_number
 
-Paths = Annotated[tuple[Text, ...], Meta(min_length=1, max_length=100)]
-# What places in the results are called that the default rubric asks for
-PARTS: Mapping[str, str] = {
-    "axes.*.filters.kf": "the consistency of the filter",
-    "loop.path_length_m": "the length of the path",
-    "loop.corrections": "the corrected paths",
-    "tuning": "the noises that the data ask for",
-    "tuning.horizontal.held_out.gain_nats": "what tuning would still gain",
-    "why": "why EKF2 differs",
-}
+NO_COMPARISON: Scored = (0.0, "Your report compares no filters.")
 
 
 class VerifiedItem(RubricItem, frozen=True, kw_only=True, tag="verified"):
@@ -62,15 +50,8 @@ class VerifiedItem(RubricItem, frozen=True, kw_only=True, tag="verified"):
     def score(self, evidence: Evidence) -> Scored:
         """All or nothing but for a missing file."""
         verdict = evidence.verdict
-        if verdict.waits_for_file:
-            return self.without_log, (
-                f"A file of your report was not at hand ({text_of(verdict.missing)}), so that its "
-                "numbers could not be computed again."
-            )
-        if verdict.status == "verified":
-            return 1.0, "Your report's numbers were computed again from its log and agree."
-        status = "" if verdict.status == "cannot verify" else f": {verdict.status}"
-        return 0.0, f"Your report could not be verified{status}{reason_of(verdict)}."
+        share = self.without_log if verdict.waits_for_file else verdict.status == "verified"
+        return share, f"Verification says: {verdict.status}{reason_of(verdict)}."
 
 
 class StudentItem(RubricItem, frozen=True, kw_only=True, tag="student"):
@@ -85,136 +66,56 @@ class StudentItem(RubricItem, frozen=True, kw_only=True, tag="student"):
         asked = {"name (--student)": student.name} if self.name else {}
         asked |= {"student id (--id)": student.id} if self.id else {}
         missing = [what for what, value in asked.items() if not text_of(value)]
-        if not missing:
-            named = ", ".join(map(text_of, asked.values()))
-            return 1.0, f"Your report names {named or 'nobody'}."
-        said = " and ".join(missing)
-        return 1.0 - len(missing) / len(asked), f"Your report does not give your {said}."
-
-
-class SectionsItem(RubricItem, frozen=True, kw_only=True, tag="sections"):
-    """The report has the parts that were asked for: places in its results that hold something."""
-
-    results: Paths
-
-    def score(self, evidence: Evidence) -> Scored:
-        """Share of the parts."""
-        asked = len(self.results)
-        missing = [
-            f"{PARTS.get(path, path)}{evidence.why_absent(path)}"
-            for path in self.results
-            if not any(map(_is_there, values_at(evidence.plain, path)))
-        ]
-        said = f"Your report has {asked - len(missing)} of {asked} parts that were asked for"
         if missing:
-            said = f"{said}; missing: {few_words(missing, NAMED)}"
-        return 1.0 - len(missing) / asked, f"{said}."
-
-
-def _is_there(found: tuple[str, object]) -> bool:
-    value = found[1]
-    unavailable = isinstance(value, Mapping) and {"what", "reason", "remedy"} <= value.keys()
-    return bool(value) and not unavailable
+            said = " and ".join(missing)
+            return 1.0 - len(missing) / len(asked), f"Your report does not give your {said}."
+        return 1.0, f"Your report names {', '.join(map(text_of, asked.values())) or 'nobody'}."
 
 
 class NumberItem(RubricItem, frozen=True, kw_only=True, tag="number"):
-    """A number of the report is between bounds; of several the one that is worst counts.
+    """A number of the report is between bounds; where ``path`` has several the worst counts.
 
-    Attributes
-    ----------
-    path : str or tuple of str
-        Where it stands; of several the first that is there.
-    zero_at : float or None
-        From where on there are no points; None for none outside the bounds.
+    ``zero_at`` says from where on there are no points; without it there are none out of bounds.
     """
 
-    path: Text | Paths
+    path: Text
     name: Text = ""
     unit: Text = ""
-    at_least: Bound | None = None
-    at_most: Bound | None = None
+    at_least: Bound = -math.inf
+    at_most: Bound = math.inf
     zero_at: Bound | None = None
     advice: Text = ""
 
     def __post_init__(self) -> None:
-        low, high, zero = self.at_least, self.at_most, self.zero_at
-        if low is None and high is None:
-            raise ValueError("no bound; give at_least, at_most or both")
-        if low is not None and high is not None and (low > high or zero is not None):
-            raise ValueError("give at_least below at_most, and zero_at with one of them alone")
-        beyond = zero is None or (zero > high if low is None else zero < low)  # type: ignore[operator]
-        if not beyond:
-            raise ValueError("zero_at is on the good side of the bound; put it beyond")
+        bounded = math.isfinite(self.at_least) or math.isfinite(self.at_most)
+        if not bounded or self.at_least > self.at_most or self._width() < 0.0:
+            raise ValueError("give at_least, at_most or both, in this order, and zero_at beyond")
+
+    def _width(self) -> float:
+        """How far beyond a bound there are no points any more."""
+        zero = self.zero_at
+        return 0.0 if zero is None else max(self.at_least - zero, zero - self.at_most)
+
+    def _share(self, number: float) -> float:
+        off = max(self.at_least - number, number - self.at_most, 0.0)
+        if off == 0.0:
+            return 1.0
+        return max(1.0 - off / self._width(), 0.0) if self._width() > 0.0 else 0.0
 
     def score(self, evidence: Evidence) -> Scored:
         """1 within the bounds, falling to 0 at ``zero_at``."""
-        paths = (self.path,) if isinstance(self.path, str) else self.path
-        found: list[tuple[str, float]] = []
-        for path in paths:
-            values = values_at(evidence.plain, path)
-            found = found or [(name, float(one)) for name, one in values if is_number(one)]
+        values = values_at(evidence.values, self.path)
+        found = {name: float(one) for name, one in values if is_number(one)}
         if not found:
-            why = next(filter(None, map(evidence.why_absent, paths)), "")
-            what = self.name or PARTS.get(paths[0], paths[0])
-            return 0.0, f"Your report has no number for {what}{why}."
-        name, number = min(found, key=lambda pair: self._share(pair[1]))
-        share = self._share(number)
+            what = self.name or f"the number {self.path}"
+            return 0.0, f"Your report has no number for {what}{evidence.why_absent(self.path)}."
+        name, number = min(found.items(), key=lambda pair: self._share(pair[1]))
+        share, what = self._share(number), self.name or f"the number {text_of(name)}"
         bounds = (("at least", self.at_least), ("at most", self.at_most))
-        limits = " and ".join(f"{word} {bound:.4g}" for word, bound in bounds if bound is not None)
-        what = self.name or f"the number {text_of(name)}"
-        what += f" ({text_of(name)})" * (bool(self.name) and len(found) > 1)
-        shown = f"{number:.4g} {self.unit}".strip()
+        limits = [f"{word} {bound:.4g}" for word, bound in bounds if math.isfinite(bound)]
+        said = f"{capital(what)} is {f'{number:.4g} {self.unit}'.strip()}"
         advice = f" {self.advice}" if share < 1.0 and self.advice else ""
-        return share, f"{capital(what)} is {shown}; {limits} was asked for.{advice}"
-
-    def _share(self, number: float) -> float:
-        low, high, zero = self.at_least, self.at_most, self.zero_at
-        if (low is None or number >= low) and (high is None or number <= high):
-            return 1.0
-        bound = high if low is None else low
-        if zero is None or bound is None:
-            return 0.0
-        return min(max((number - zero) / (bound - zero), 0.0), 1.0)
-
-
-class FlightItem(RubricItem, frozen=True, kw_only=True, tag="flight"):
-    """The flight is enough to judge from.
-
-    Attributes
-    ----------
-    min_path_m : float
-        Of a loop, in place of ``min_measurements``.
-    handed_out : float
-        Of a flight of an answer key, whose length the student did not choose, this share is enough.
-    """
-
-    min_duration_s: Annotated[float, Meta(ge=0.0, le=1e5)] = 60.0
-    min_measurements: Annotated[int, Meta(ge=0, le=10_000_000)] = 100
-    min_path_m: Annotated[float, Meta(ge=0.0, le=1e6)] = 20.0
-    handed_out: Share = 0.4
-
-    def score(self, evidence: Evidence) -> Scored:
-        """Share of what is asked for, of the length or the count, whichever is less."""
-        results = evidence.results
-        if evidence.has("no_motion"):
-            return 0.0, "Your vehicle hardly moved; fly several passes of 5 m or more."
-        if isinstance(results, LoopResults):
-            start_s, end_s = results.loop.start_s, results.loop.end_s
-            value, least, unit = results.loop.path_length_m, self.min_path_m, "m of path"
-        else:
-            start_s, end_s = results.settings.start_s, results.settings.end_s
-            value = float(max(axis.updates.count for axis in results.axes.values()))
-            least, unit = float(self.min_measurements), "measurements"
-        least_s = self.min_duration_s
-        if evidence.answer is not None:
-            whole_s = evidence.answer.truth.get("duration_s", least_s)
-            least_s = min(least_s, self.handed_out * whole_s)
-        pairs = ((end_s - start_s, least_s), (value, least))
-        share = min(1.0 if given >= asked else max(given, 0.0) / asked for given, asked in pairs)
-        said = f"You analysed {end_s - start_s:.3g} s with {value:.4g} {unit}"
-        if share == 1.0:
-            return 1.0, f"{said}, which is enough."
-        return share, f"{said}; {least_s:.3g} s and {least:g} {unit} were asked for."
+        return share, f"{said}; {' and '.join(limits)} was asked for.{advice}"
 
 
 class AnswersItem(RubricItem, frozen=True, kw_only=True, tag="answers"):
@@ -224,23 +125,9 @@ class AnswersItem(RubricItem, frozen=True, kw_only=True, tag="answers"):
 
     def score(self, evidence: Evidence) -> Scored:
         """Share of the points of :mod:`px4fuse.grading.form_points`."""
-        student_id, form = evidence.results.student.id, evidence.form
-        theirs = None if evidence.key is None else evidence.key.of_student(student_id)
-        if theirs is not None and theirs.sha256 != log_sha256(evidence.results):
-            file = text_of(theirs.file)
-            return 0.0, f"This report is not about the log that you were given, {file}."
-        if evidence.answer is None:
-            said = text_of(student_id) or "none is given"
-            return 0.0, (
-                f"Neither your id ({said}) nor your log is in the answer key; make the report of "
-                "the log that you were given, with your --id."
-            )
         found = evidence.form_points
-        if isinstance(form, str) or found is None:
-            known = (
-                f"Your form {form}" if isinstance(form, str) else "The answer key has no answers"
-            )
-            return 0.0, f"{known}."
+        if isinstance(found, str):
+            return 0.0, f"{capital(found)}."
         parts = [
             f"{name} {points:.3g} of {found.of[name]:g}"
             for name, points in found.parts.items()
@@ -284,23 +171,31 @@ class TuningItem(RubricItem, frozen=True, kw_only=True, tag="tuning"):
 
     def score(self, evidence: Evidence) -> Scored:
         """Mean over the settings."""
-        found = [_tuned(evidence, self.axis, name, self.factor) for name in self.settings]
-        mean = sum(share for share, _ in found) / len(found)
-        return mean, f"{'; '.join(said for _, said in found)}."
+        comparison = evidence.comparison
+        if comparison is None:
+            return NO_COMPARISON
+        factor = self.factor
+        return _mean(_tuned(evidence, comparison, one, self.axis, factor) for one in self.settings)
 
 
-def _tuned(evidence: Evidence, axis: str, name: Sigma, factor: float) -> Scored:
+def _mean(found: Iterator[Scored]) -> Scored:
+    shares, said = zip(*found, strict=True)
+    return sum(shares) / len(shares), f"{capital('; '.join(said))}."
+
+
+def _tuned(
+    evidence: Evidence,
+    comparison: ComparisonResults,
+    name: Sigma,
+    axis: str = HORIZONTAL,
+    factor: float = 2.0,
+) -> Scored:
     label, unit, option = SIGMAS[name]
-    comparison = evidence.comparison
-    if comparison is None:
-        return 0.0, f"your report does not say which {label} you chose"
     chosen: float = getattr(comparison.settings, name)
     interval = getattr(comparison.tuning.get(axis), f"{ASKED[name]}_interval", None)
     if interval is None or interval[1] is None:
-        return (
-            0.0,
-            f"your report has no interval for {label}{evidence.why_absent(f'tuning.{axis}')}",
-        )
+        why = evidence.why_absent(f"tuning.{axis}")
+        return 0.0, f"your report has no interval for {label}{why}"
     low, high = interval
     if name == "sigma_z_m" and evidence.has("source_may_drift"):
         # small innovations do not make a drifting source trustworthy: up to its error is right
@@ -335,27 +230,25 @@ class ConsistencyItem(RubricItem, frozen=True, kw_only=True, tag="consistent"):
 
     def score(self, evidence: Evidence) -> Scored:
         """Mean over the axes."""
-        found = [self._of_axis(evidence, axis) for axis in self.axes]
-        mean = sum(share for share, _ in found) / len(found)
-        return mean, f"{capital('; '.join(said for _, said in found))}."
-
-    def _of_axis(self, evidence: Evidence, axis: str) -> Scored:
-        owner = "your filter" if self.filter == "kf" else "EKF2"
         comparison = evidence.comparison
-        judged: object = None
-        path = f"{HORIZONTAL}.{self.filter}"
-        if comparison is not None and axis == HORIZONTAL:
-            judged = comparison.horizontal.get(self.filter)
-        elif comparison is not None:
-            path = f"axes.{axis}.filters.{self.filter}"
+        if comparison is None:
+            return NO_COMPARISON
+        return _mean(self._of_axis(evidence, comparison, axis) for axis in self.axes)
+
+    def _of_axis(self, evidence: Evidence, comparison: ComparisonResults, axis: str) -> Scored:
+        owner = "your filter" if self.filter == "kf" else "EKF2"
+        path, filters = HORIZONTAL, comparison.horizontal
+        if axis != HORIZONTAL:
             analysed = comparison.axes.get(axis)  # type: ignore[call-overload]
-            judged = analysed and analysed.filters.get(self.filter)
+            path, filters = f"axes.{axis}.filters", analysed.filters if analysed else {}
+        judged = filters.get(self.filter)
         if not isinstance(judged, FilterSummary | HorizontalNis):
-            return 0.0, f"there is no verdict on {owner} ({axis}){evidence.why_absent(path)}"
+            why = evidence.why_absent(f"{path}.{self.filter}")
+            return 0.0, f"there is no verdict on {owner} ({axis}){why}"
         if judged.verdict == "consistent":
             return 1.0, f"{owner} is consistent ({axis})"
         said = f"{judged.verdict} {factor_words(judged.times_off)} times in σ ({owner}, {axis})"
-        if all(_tuned(evidence, HORIZONTAL, name, 2.0)[0] == 1.0 for name in SIGMAS):
+        if all(_tuned(evidence, comparison, name)[0] == 1.0 for name in SIGMAS):
             return 1.0, (
                 f"{said}, with the noises that the data ask for: what is left no setting fixes"
             )
@@ -366,7 +259,11 @@ class ConsistencyItem(RubricItem, frozen=True, kw_only=True, tag="consistent"):
 
 
 class ClockItem(RubricItem, frozen=True, kw_only=True, tag="clock"):
-    """The clock offset that was applied is what the data ask for."""
+    """The clock offset that was applied is what the data ask for.
+
+    ``undeterminable`` is the share of the points where the flight does not tell; of a flight that
+    was handed out, which the student did not choose, all of them.
+    """
 
     margin_s: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.03
     undeterminable: Share = 0.5
@@ -374,31 +271,25 @@ class ClockItem(RubricItem, frozen=True, kw_only=True, tag="clock"):
     def score(self, evidence: Evidence) -> Scored:
         """All or nothing, ``undeterminable`` where the flight does not tell."""
         comparison, handed_out = evidence.comparison, evidence.answer is not None
-        clock = None if comparison is None else comparison.clock
+        if comparison is None:
+            return NO_COMPARISON
+        clock = comparison.clock
+        said = "Your flight does not determine the clock offset"
         if not isinstance(clock, Clock):
-            excused = comparison is not None and handed_out
-            said = f"Your report says nothing about the clock offset{absence(clock)}"
-            return float(excused), f"{said}{', which is not your choice' * excused}."
+            return float(handed_out), f"{said}{absence(clock)}."
         if not clock.determinable:
-            said = "Your flight does not determine the clock offset"
-            said += f" ({text_of(clock.reason).rstrip('.')})" if clock.reason else ""
-            advice = ", which is not your choice" if handed_out else "; fly clear starts and stops"
-            return 1.0 if handed_out else self.undeterminable, f"{said}{advice}."
+            why = f" ({text_of(clock.reason).rstrip('.')})" if clock.reason else ""
+            return 1.0 if handed_out else self.undeterminable, f"{said}{why}."
         (low, high), applied = clock.interval_s, clock.applied_s
         said = f"You applied a clock offset of {applied:.3f} s"
         if low - self.margin_s <= applied <= high + self.margin_s:
             return 1.0, f"{said}, which is what the data ask for ({low:.3f} to {high:.3f} s)."
         if any(map(evidence.has, CHANGING)):
-            said = (
-                "The offset of the position stamps changes in your flight: no single one is right"
-            )
+            said = "The offset of the position stamps changes in your flight"
             known = evidence.claims("clock-jump", "clock-drift")
             advice = ", as your form says" if known else "; say in your form from when on it holds"
             return 1.0 if known else self.undeterminable, f"{said}{advice}."
-        return 0.0, (
-            f"{said} where the data ask for {low:.3f} to {high:.3f} s; set it with --clock-offset, "
-            "or use --clock-offset auto."
-        )
+        return 0.0, f"{said} where the data ask for {low:.3f} to {high:.3f} s: --clock-offset auto."
 
 
 # ------------------------------------------------------------------ a loop
@@ -420,37 +311,35 @@ def contradictions(evidence: Evidence) -> Iterator[str]:
     results = evidence.results
     if not isinstance(results, LoopResults):
         return
-    request, loop = results.request, results.loop
-    landed, at = _landed_m(evidence), request.landed_at
-    if landed is not None and at is not None:
-        said = math.hypot(at.forward_m, at.right_m)
-        if abs(said - landed) > TAPE_M:
-            yield (
-                f"--landed-at says {length_words(said)} from the place of take-off; it landed "
-                f"{length_words(landed)} from it."
-            )
+    request, landed = results.request, _landed_m(evidence)
+    at = request.landed_at
+    said = math.hypot(at.forward_m, at.right_m) if at else 0.0
+    if at and landed is not None and abs(said - landed) > TAPE_M:
+        yield (
+            f"--landed-at says {length_words(said)} from the place of take-off; it landed "
+            f"{length_words(landed)} from it."
+        )
     if landed is not None and landed <= TAPE_M and not request.came_back:
         yield "--open says that it did not come back, but it landed where it took off."
-    drift_m, drift_deg = request.position_drift_m, request.heading_drift_deg
-    stated = f"--drift {drift_m:g} and --heading-drift {drift_deg:g} are"
-    factor = _stated_drift(request)
+    stated = _stated_drift(results)
     true = 0.0 if evidence.answer is None else evidence.answer.scenario.get("vio_drift") or 0.0
-    if isinstance(true, float) and true > 0.0:
-        off = drift_m / (100.0 * true)
-        if max(off, 1.0 / off, drift_deg / USUAL_HEADING_DEG) > FAR_OFF:
-            yield f"{stated} far from how the odometry of this log drifts."
-    elif factor > FAR_OFF:
-        yield f"{stated} up to {factor:.2g} times what odometry indoors drifts."
-    chosen = at is not None or factor != 1.0
-    if chosen and any(one.accepted and 1.0 - one.p < TOO_GOOD for one in loop.closures):
+    off = stated
+    if isinstance(true, float) and true > 0.0:  # stated too small, too, makes a closure false
+        off = request.position_drift_m / (100.0 * true)
+        off = max(off, 1.0 / off, request.heading_drift_deg / USUAL_HEADING_DEG)
+    if off > FAR_OFF:
+        yield "--drift and --heading-drift are far from how the odometry drifts."
+    chosen = at is not None or stated != 1.0
+    if chosen and any(one.accepted and 1.0 - one.p < TOO_GOOD for one in results.loop.closures):
         yield (
             "The loop closes far better than the stated drift lets any loop close: "
             "--landed-at, --drift or --heading-drift may have been chosen for that."
         )
 
 
-def _stated_drift(request: LoopRequest) -> float:
+def _stated_drift(results: LoopResults) -> float:
     """How many times the usual drift was stated, at most."""
+    request = results.request
     position = request.position_drift_m / USUAL_DRIFT_M
     return max(position, request.heading_drift_deg / USUAL_HEADING_DEG)
 
@@ -487,46 +376,40 @@ class LoopItem(RubricItem, frozen=True, kw_only=True, tag="loop"):
             why = absence(loop.known_end if isinstance(loop, LoopPart) else loop)
             return 0.0, f"Your report measures no loop{why}."
         if loop.absolute:
-            return 0.0, (
-                "Your loop is on a track that follows a positioning system and does not drift; "
-                "measure it on odometry."
-            )
-        share, why = _open_end(evidence)
-        if opened and not loop.closures:
-            worth = (1.0 + 2.0 * share) / 3.0 if share else 0.0
-            return worth, f"You left the end open (--open), {why}."
-        measured = f"You measured a closure error of {loop.closure_error_m or 0.0:.3g} m"
-        if opened:
-            measured = f"You left the end open (--open) and gave {len(loop.closures)} closures"
+            return 0.0, "Your loop is on a track that does not drift; measure it on odometry."
         wrong = [*contradictions(evidence)]
-        if not wrong and loop.closures and not any(one.accepted for one in loop.closures):
-            return (1.0 + 2.0 * share) / 3.0, (
-                f"{measured}; the closure was rejected as false, which leaves the path as it is, "
-                f"{why}."
-            )
-        landed = _landed_m(evidence)
-        assumed = request is not None and request.landed_at is None and not opened
-        if landed is not None and landed > TAPE_M and assumed:
+        left_open = opened and not loop.closures
+        accepted = any(one.accepted for one in loop.closures)
+        rejected = bool(loop.closures) and not wrong and not accepted
+        said = f"You measured a closure error of {loop.closure_error_m or 0.0:.3g} m"
+        if opened:
+            said = "You left the end open (--open)"
+        if left_open or rejected:
+            share, why = _open_end(evidence)
+            worth = (1.0 + 2.0 * share) / 3.0 if share or rejected else 0.0
+            false = "; the closure was rejected as false" if rejected else ""
+            return worth, f"{said}{false}, {why}."
+        landed = _landed_m(evidence) or 0.0
+        if landed > TAPE_M and request and request.landed_at is None and not opened:
             wrong.append(
                 "It did not land at the place of take-off: say where it did (--landed-at) or leave "
                 "the end open (--open)."
             )
         if wrong:
-            return 1 / 3, f"{measured}, but {_begun_small(wrong[0])}"
+            return 1 / 3, f"{said}. {wrong[0]}"
         share, comment = self._corrected(loop.corrections)
-        return (1.0 + share) / 3.0, f"{measured}{comment}"
+        return (1.0 + share) / 3.0, f"{said}{comment}"
 
     def _corrected(self, corrections: Mapping[Way, Maybe[Correction]]) -> Scored:
         """One for a corrected path and one for an ATE below the uncorrected one."""
         ways: tuple[Way, ...] = ("by_distance_plain", "by_distance", "pose_graph_gated")
-        tried = [corrections.get(way) for way in ways]
-        done = [one for one in tried if isinstance(one, Correction)]
+        done = [one for one in map(corrections.get, ways) if isinstance(one, Correction)]
         if not done:
             return 0.0, ", but the path is not corrected."
         before = _ates(corrections.get("uncorrected"))
         pairs = [
-            (was, now) for one in done for name, now in _ates(one).items()
-            if (was := before.get(name))
+            (before[name], now) for one in done for name, now in _ates(one).items()
+            if before.get(name)
         ]  # fmt: skip
         if not pairs:
             return 1.0 + self.without_reference, (
@@ -534,14 +417,10 @@ class LoopItem(RubricItem, frozen=True, kw_only=True, tag="loop"):
                 "would show."
             )
         was, now = min(pairs, key=lambda pair: pair[1] / pair[0])
+        changed = f" and corrected the path, whose ATE went from {was:.3g} m to {now:.3g} m"
         if now < was:
-            return 2.0, (
-                f", and correcting the path brought its ATE from {was:.3g} m to {now:.3g} m."
-            )
-        return 1.0, (
-            f" and corrected the path, but its ATE is {now:.3g} m against {was:.3g} m "
-            "uncorrected: explain why the correction makes it worse."
-        )
+            return 2.0, f"{changed}."
+        return 1.0, f"{changed}: explain why the correction makes it worse."
 
 
 def _ates(correction: object) -> dict[str, float]:
@@ -572,18 +451,15 @@ class ClosureItem(RubricItem, frozen=True, kw_only=True, tag="closure"):
         if not isinstance(loop, LoopPart) or not isinstance(results, LoopResults):
             return 0.0, f"Your report measures no loop{absence(loop)}."
         for wrong in contradictions(evidence):
-            return 0.0, f"No points, since {_begun_small(wrong)}"
+            return 0.0, wrong
         accepted = [one for one in loop.closures if one.accepted]
         if not results.request.came_back or not accepted:
             share, why = _open_end(evidence)
             if _landed_m(evidence) is None and not loop.closures:
                 share = min(share, self.open_unknown)
-            return share if evidence.claims(OPEN) else 0.0, (
-                f"Your loop is not closed, {why}. A closure error that drift cannot explain is no "
-                "error of the odometry."
-            )
+            return share if evidence.claims(OPEN) else 0.0, f"Your loop is not closed, {why}."
         # a larger drift that was stated explains any error
-        scale = max(_stated_drift(results.request), 1.0) ** 2
+        scale = max(_stated_drift(results), 1.0) ** 2
         p = min(float(chi2.sf(one.d2 * scale, one.degrees_of_freedom)) for one in accepted)
         off, path = length_words(loop.closure_error_m or 0.0), length_words(loop.path_length_m)
         said = f"Your closure error is {off} in {path}"
@@ -594,7 +470,3 @@ class ClosureItem(RubricItem, frozen=True, kw_only=True, tag="closure"):
             f"{said}, more than the odometry's usual drift explains ({p_words(p)}); look for what "
             "made it drift, or whether it landed elsewhere."
         )
-
-
-def _begun_small(sentence: str) -> str:
-    return sentence[:1].lower() + sentence[1:]

@@ -7,38 +7,21 @@ and PDFs stand in folders beside the page and are loaded as they are unfolded.
 from __future__ import annotations
 
 import base64
-import math
-import posixpath
 import statistics
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from px4fuse.answers import form_rows
 from px4fuse.grading.anonymous import Veil
 from px4fuse.grading.class_table import number
-from px4fuse.grading.flags import copied_notes
 from px4fuse.grading.model import Entry, Graded, Item, Override, columns
 from px4fuse.grading.overrides import TOTAL
 from px4fuse.plain import number_words
+from px4fuse.webpage import frame
 from px4fuse.webpage.charts import tenths
-from px4fuse.webpage.frame import (
-    Cell,
-    Column,
-    Part,
-    Row,
-    boxes,
-    figure,
-    links,
-    listed,
-    page,
-    pairs,
-    pictures,
-    prose,
-    tabled,
-    words,
-)
-from px4fuse.webpage.safe import local_link, template
+from px4fuse.webpage.frame import Cell, Column, Part, Row
+from px4fuse.webpage.safe import PICTURE, local_link, template
 
 MISSING = "nothing handed in"
 # How each status looks, and its sign, from the best to what says nothing
@@ -53,7 +36,6 @@ LOOKS: dict[str, tuple[str, str]] = {
 STATUSES = tuple(LOOKS)
 # Of one submission, on the page; all of it stands in the report
 MAX_DIFFERENCES = 50
-MAX_COPIES = 3
 PNG = b"\x89PNG\r\n\x1a\n"
 SHOWN = (*STATUSES, "pending", "to read", "flagged", "late", "said by you")
 
@@ -64,7 +46,8 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
     Parameters
     ----------
     entries : sequence of Entry
-        One per student. Where they have pseudonyms, no name, id or file's name is on the page.
+        One per student. Where they have pseudonyms, no name, id or file's name is on the page, and
+        their order is that of the pseudonyms, which says nothing of the names.
     made_with : str
         Name and version of the program.
 
@@ -73,71 +56,64 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
     str
         Write it as UTF-8. The same for the same input: no dates of today.
     """
-    if entries and all(entry.pseudonym for entry in entries):
-        entries = sorted(entries, key=lambda entry: entry.pseudonym)
-    made = _Page(entries)
-    veil = made.veil
-    return page(
+    entries = sorted(entries, key=lambda entry: entry.pseudonym)
+    veil = Veil(entries)
+    items, numbers = columns(entries)
+    counts = Counter(tag for entry in entries for tag in _tags(entry))
+    tags = (*SHOWN, *sorted(tag for tag in counts if tag not in SHOWN))
+    options = [(tag, f"{tag} ({counts[tag]})") for tag in tags if counts[tag]]
+    return frame.page(
         title=title,
         subtitle=f"{len(entries)} {'student' if len(entries) == 1 else 'students'}, graded with "
         f"{made_with}",
-        above=_above(entries, veil),
+        above=_above(entries, counts, veil),
         noun=("student", "students"),
         columns=(
             Column("Student"),
-            *[Column("Id", "line", narrow="tablet")] * made.named,
+            Column("Id", "line", narrow="tablet"),
             Column("Status", "rank"),
             Column("Points", "number"),
-            *[Column("Handed in", "line", narrow="desk")] * made.timed,
+            Column("Handed in", "line", narrow="desk"),
             Column("Flags", "rank", narrow="desk"),
-            *(Column(veil.hide(name), "number", "items") for name in made.items),
-            *(Column(veil.hide(name), "number", "numbers") for name in made.numbers),
+            *(Column(veil.hide(name), "number", "items") for name in items),
+            *(Column(veil.hide(name), "number", "numbers") for name in numbers),
         ),
-        rows=[made.row(at, entry) for at, entry in enumerate(entries)],
-        filters=_filters(entries),
+        rows=[_row(entry, items, numbers, veil) for entry in entries],
+        filters=[("Status", [("", f"Everyone ({len(entries)})"), *options])],
         groups=(("items", "Points of each item"), ("numbers", "Numbers")),
         placeholder="name, id, file, flag",
         otherwise="All rows are in class.csv.",
     )
 
 
-def _above(entries: Sequence[Entry], veil: Veil) -> str:
+def _above(entries: Sequence[Entry], counts: Mapping[str, int], veil: Veil) -> str:
     """What stands above the table: counts, the points of all, and those of each item."""
     totals = [entry.total for entry in entries if entry.total is not None]
+    most = max((entry.of for entry in entries if entry.of > 0.0), default=1.0)
+    named = (("Missing", MISSING), ("Flagged", "flagged"), ("Late", "late"))
+    cells = [("Students", f"{len(entries)}"), ("Verified", f"{counts['verified']}")]
+    cells += [(name, f"{counts[tag]}") for name, tag in named if counts[tag]]
+    for name, of_all in (("Mean points", statistics.fmean), ("Median", statistics.median)):
+        of = f" <small>of {number(most)}</small>"
+        cells.append((name, f"{of_all(totals):.1f}{of}" if totals else "–"))
     graded = [one for entry in entries if (one := entry.counting)]
-    most = {entry.of for entry in entries if entry.of > 0.0}
-    of = f" <small>of {number(max(most))}</small>" if len(most) == 1 else ""
-    counts = {
-        "Students": len(entries),
-        "Missing": len(entries) - len(graded),
-        "Verified": sum(one.status == "verified" for one in graded),
-        "Flagged": sum(bool(one.flags) for one in graded),
-        "Late": sum(bool(entry.late_s) for entry in entries),
-    }
-    cells = [(name, f"{count}") for name, count in counts.items() if count or name == "Verified"]
-    cells += [
-        ("Mean points", f"{statistics.fmean(totals):.1f}{of}" if totals else "–"),
-        ("Median", f"{statistics.median(totals):.1f}{of}" if totals else "–"),
-    ]
     if pending := [one.points for one in graded if one.pending]:
         said = f"{number(sum(pending))} points, not counted"
         cells.append(("Pending", f"{len(pending)} <small>{said}</small>"))
-    largest = max(most, default=1.0)
     return template("grading/above.html").render(
         entries=cells,
-        totals=tenths(totals, largest) if totals else (),
-        most=number_words(largest),
-        items=list(_items(entries, veil)),
+        totals=tenths(totals, most) if totals else (),
+        most=number_words(most),
+        items=list(_items(graded, veil)),
     )
 
 
-def _items(entries: Sequence[Entry], veil: Veil) -> Iterator[tuple[Any, ...]]:
+def _items(graded: Sequence[Graded], veil: Veil) -> Iterator[tuple[Any, ...]]:
     """Distribution of points per item, as they count: a row of the table each."""
     found: dict[str, list[Item]] = defaultdict(list)
-    for entry in entries:
-        one = entry.counting
-        for title, item in one.by_title.items() if one and not one.pending else ():
-            found[title].append(item)
+    for one in graded:
+        for item in () if one.pending else one.items:
+            found[item.title].append(item)
     for title, items in found.items():
         shares = [item.points / item.of if item.of else 0.0 for item in items]
         mean, most = statistics.fmean(i.points for i in items), max(i.of for i in items)
@@ -145,139 +121,82 @@ def _items(entries: Sequence[Entry], veil: Veil) -> Iterator[tuple[Any, ...]]:
         yield veil.hide(title), tenths(shares, 1.0), mean, number(most), none, full
 
 
-def status_of(entry: Entry) -> str:
-    """That of the counting report."""
+def _status(entry: Entry) -> str:
     return entry.counting.status if entry.counting else MISSING
 
 
 def _tags(entry: Entry) -> list[str]:
     one = entry.counting
-    tags = [status_of(entry)]
+    tags = [_status(entry), *["flagged"] * bool(entry.flags), *["late"] * bool(entry.late_s)]
     if one:
         tags += ["pending"] * bool(one.pending) + ["to read"] * one.waits
-        tags += ["flagged"] * bool(entry.flags)
-        tags += [f"missed:{mistake}" for mistake, named in one.mistakes.items() if not named]
-    tags += ["late"] * bool(entry.late_s)
+        tags += [f"missed: {mistake}" for mistake, named in one.mistakes.items() if not named]
     return tags + ["said by you"] * bool(entry.overrides or entry.comment)
 
 
-def _filters(entries: Sequence[Entry]) -> list[tuple[str, list[tuple[str, str]]]]:
-    counts = Counter(tag for entry in entries for tag in _tags(entry))
-    shown = [(name, f"{name} ({counts[name]})") for name in SHOWN if counts[name]]
-    filters = [("Status", [("", f"Everyone ({len(entries)})"), *shown])]
-    missed = sorted(tag for tag in counts if tag.startswith("missed:"))
-    if missed:
-        options = [(tag, f"{tag.removeprefix('missed:')} ({counts[tag]})") for tag in missed]
-        filters.append(("Missed", [("", "Whatever was missed"), *options]))
-    return filters
+def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str], veil: Veil) -> Row:
+    """One student."""
+    one = entry.counting
+    status = _status(entry)
+    look, sign = LOOKS[status]
+    count = len(entry.flags)
+    few = f"{count} flag{'s' if count > 1 else ''}" if count else ""
+    file = one.submission if one and not entry.pseudonym else ""
+    late = f"{entry.late_s / 3600.0:.1f} h late" if entry.late_s else ""
+    points = {item.title: item.points for item in one.items} if one else {}
+    held = one.numbers if one else {}
+    cells = (
+        Cell(entry.called, entry.pseudonym or entry.student or None, file),
+        frame.words("" if entry.pseudonym else entry.student_id),
+        Cell(f"{sign} {status}", float(STATUSES.index(status)), few, look),
+        _points(entry),
+        frame.words(entry.handed_in, late),
+        Cell(veil.hide("\n".join(entry.flags)), float(count), "", "flags"),
+        *(frame.figure(points.get(name)) for name in items),
+        *(frame.figure(held.get(name)) for name in numbers),
+    )
+    if one is None:
+        nothing = (frame.listed("Missing", ["Nothing was handed in."]), _comment(entry))
+        return Row(cells, tuple(_tags(entry)), tuple(map(veil.of_part, nothing)))
+    details = map(veil.of_part, _details(entry, one))
+    boxes = () if entry.pseudonym else (_boxes(entry, one),)
+    return Row(cells, tuple(_tags(entry)), (*details, *boxes), _beside(entry, one))
 
 
-class _Page:
-    """A class, and what its rows share: columns, names to hide, texts that are alike."""
+def _comment(entry: Entry) -> Part:
+    return frame.listed("Your comment", [entry.comment] if entry.comment else [])
 
-    def __init__(self, entries: Sequence[Entry]) -> None:
-        self.entries = entries
-        self.veil = Veil(entries)
-        self.named = not entries or not all(entry.pseudonym for entry in entries)
-        self.timed = any(entry.handed_in or entry.late_s for entry in entries)
-        places = [at for at, entry in enumerate(entries) if entry.counting]
-        graded = [one for entry in entries if (one := entry.counting)]
-        self.items, self.numbers = columns(entries)
-        self.copied = {
-            places[at]: [(share, places[to]) for share, to in others]
-            for at, others in copied_notes(graded).items()
-        }
-        # the folder or zip file that all are in says nothing in a row
-        common = posixpath.commonprefix([one.submission for one in graded])
-        self.shared = common.rfind("/") + 1
 
-    def hidden(self, texts: Sequence[str]) -> list[str]:
-        """Texts without names, and without those that are empty."""
-        return [self.veil.hide(text) for text in texts if text]
-
-    def row(self, at: int, entry: Entry) -> Row:
-        """One student."""
-        one = entry.counting
-        status = status_of(entry)
-        look, sign = LOOKS[status]
-        flags = self.hidden(entry.flags)
-        few = f"{len(flags)} flag{'s' if len(flags) > 1 else ''}" if flags else ""
-        known = entry.pseudonym or entry.student
-        file = one.submission[self.shared :] if one and not entry.pseudonym else ""
-        items = one.by_title if one else {}
-        numbers = one.numbers if one else {}
-        cells = (
-            Cell(entry.called, known or None, file),
-            *[words("" if entry.pseudonym else entry.student_id)] * self.named,
-            Cell(f"{sign} {status}", float(STATUSES.index(status)), few, look),
-            _points(entry),
-            *[words(entry.handed_in, late_words(entry))] * self.timed,
-            Cell("\n".join(flags), float(len(flags)), "", "flags"),
-            *(figure(items[name].points if name in items else None) for name in self.items),
-            *(figure(numbers.get(title)) for title in self.numbers),
-        )
-        beside = _beside(entry, one) if one else ()
-        return Row(cells, tuple(_tags(entry)), self._details(at, entry), beside)
-
-    def _details(self, at: int, entry: Entry) -> tuple[Part, ...]:
-        one, hide = entry.counting, self.veil.hide
-        comment = listed("Your comment", self.hidden([entry.comment]))
-        if one is None:
-            return listed("Missing", ["Nothing was handed in."]), comment
-        verdict = one.verdict
-        more = len(verdict.differences) - MAX_DIFFERENCES
-        items = [
-            [hide(title), number(item.points), number(item.of), hide(item.comment)]
-            for title, item in one.by_title.items()
-        ]
-        attempts = [
-            f"{f'attempt {place}' if entry.pseudonym else other.submission}: {other.status}"
-            for place, other in enumerate(entry.others, start=1)
-        ]
-        return (
-            listed("Flags", self.hidden(entry.flags), warn=True),
-            listed("Pending: what you can do", self.hidden([one.pending]), warn=True),
-            listed("Verification", self.hidden(verdict.reasons)),
-            tabled(
-                "Numbers that differ",
-                ("Where", "Report", "New run") if verdict.differences else (),
-                [
-                    [hide(text) for text in (each.path, each.recorded, each.recomputed)]
-                    for each in verdict.differences[:MAX_DIFFERENCES]
-                ],
-                after=f"and {more} more" if more > 0 else "",
-            ),
-            tabled(
-                "Points (proposed)" if one.pending else "Points",
-                ("Item", "Points", "Of", "Comment") if items else (),
-                items,
-                (1, 2),
-            ),
-            comment,
-            listed(
-                "Mistakes of this flight",
-                [f"{name}: {'' if n else 'not '}named" for name, n in one.mistakes.items()],
-            ),
-            pairs(
-                "The form",
-                [(hide(a), hide(b)) for a, b in (form_rows(one.form) if one.form else ())],
-            ),
-            *([] if entry.pseudonym else [_boxes(entry, one)]),
-            prose("The student's own words", hide(one.notes, own_words=True)),
-            *self._alike(at),
-            listed("Other attempts", attempts),
-        )
-
-    def _alike(self, at: int) -> list[Part]:
-        """The texts that share passages with a student's own, to be read beside it."""
-        found = [(share, self.entries[to]) for share, to in self.copied.get(at, ())[:MAX_COPIES]]
-        return [
-            prose(
-                f"Text of {other.called}, which shares {share:.0%}",
-                self.veil.hide(other.counting.notes if other.counting else "", own_words=True),
-            )
-            for share, other in found
-        ]
+def _details(entry: Entry, one: Graded) -> Iterator[Part]:
+    """What a row unfolds to, as long as nobody is to be hidden."""
+    verdict = one.verdict
+    differ = [
+        (each.path, each.recorded, each.recomputed)
+        for each in verdict.differences[:MAX_DIFFERENCES]
+    ]
+    more = len(verdict.differences) - MAX_DIFFERENCES
+    items = [(item.title, number(item.points), number(item.of), item.comment) for item in one.items]
+    named = [f"{name}: {'' if found else 'not '}named" for name, found in one.mistakes.items()]
+    attempts = [
+        f"{f'attempt {place}' if entry.pseudonym else other.submission}: {other.status}"
+        for place, other in enumerate(entry.others, start=1)
+    ]
+    yield frame.listed("Flags", entry.flags, warn=True)
+    yield frame.listed("Pending: what you can do", [one.pending] if one.pending else [], warn=True)
+    yield frame.listed("Verification", verdict.reasons)
+    yield frame.tabled(
+        "Numbers that differ",
+        ("Where", "Report", "New run") if differ else (),
+        differ,
+        after=f"and {more} more" if more > 0 else "",
+    )
+    title = "Points (proposed)" if one.pending else "Points"
+    yield frame.tabled(title, ("Item", "Points", "Of", "Comment") if items else (), items, (1, 2))
+    yield _comment(entry)
+    yield frame.listed("Mistakes of this flight", named)
+    yield frame.pairs("The form", [*form_rows(one.form)] if one.form else [])
+    yield frame.prose("The student's own words", one.notes)
+    yield frame.listed("Other attempts", attempts)
 
 
 def _points(entry: Entry) -> Cell:
@@ -292,33 +211,18 @@ def _points(entry: Entry) -> Cell:
     return Cell(text, entry.total, ", ".join(said), "", share)
 
 
-def late_words(entry: Entry) -> str:
-    """How late it came.
-
-    >>> late_words(Entry("", "", None, late_s=3 * 3600.0 + 1.0))
-    '3 h late'
-    """
-    if not entry.late_s:
-        return ""
-    for unit, size, least in (("days", 86400.0, 2.0), ("h", 3600.0, 1.0)):
-        if entry.late_s >= least * size:
-            return f"{entry.late_s / size:.0f} {unit} late"
-    return f"{math.ceil(entry.late_s / 60.0)} min late"
-
-
 def _boxes(entry: Entry, one: Graded) -> Part:
     """Points and a comment for what only the instructor scores, and for the whole."""
-    by_hand = {title: item.of for title, item in one.by_title.items() if item.by_hand}
-    by_hand[TOTAL] = entry.of
-    said = [(title, of, entry.overrides.get(title, Override())) for title, of in by_hand.items()]
-    rows = [(title, of, own.points, own.comment) for title, of, own in said]
+    by_hand = {item.title: item.of for item in one.items if item.by_hand} | {TOTAL: entry.of}
+    said = {title: entry.overrides.get(title, Override()) for title in by_hand}
+    rows = [(title, by_hand[title], own.points, own.comment) for title, own in said.items()]
     kept = [
         (title, own.points, own.comment)
         for title, own in entry.overrides.items()
         if title not in by_hand
     ]
     kept += [("", None, entry.comment)] if entry.comment else []
-    return boxes("Your points and words", entry.student_id or one.submission, rows, kept)
+    return frame.boxes("Your points and words", entry.student_id or one.submission, rows, kept)
 
 
 def _beside(entry: Entry, one: Graded) -> tuple[Part, ...]:
@@ -329,19 +233,16 @@ def _beside(entry: Entry, one: Graded) -> tuple[Part, ...]:
         for at, name in enumerate(one.sheets, start=1)
         if (link := local_link(name))
     ]
-    every = pictures("Every page, drawn again from the log", drawn)
+    every = frame.pictures("Every page, drawn again from the log", drawn)
     if entry.pseudonym:
         return (every,)
     handed_in = []
     if one.handed_in.startswith(PNG):
         said = f"Page {one.page}, as handed in: not verified"
-        source = f"data:image/png;base64,{base64.b64encode(one.handed_in).decode()}"
+        source = f"{PICTURE}{base64.b64encode(one.handed_in).decode()}"
         # the redrawn one stands beside it
         handed_in = drawn[one.page - 1 : one.page]
         handed_in += [(said, f"Page {one.page} {whose}, as handed in", source)]
-    report = (
-        ("Drawn again from the log (PDF): read this one", local_link(one.redrawn_name)),
-        ("As it was handed in (PDF): the student's own file", local_link(one.handed_in_name)),
-    )
+    report = [("Drawn again from the log (PDF)", local_link(one.redrawn_name))]
     title = "The page that differs" if drawn else "As handed in"
-    return links("The report", report), pictures(title, handed_in), every
+    return frame.links("The report", report), frame.pictures(title, handed_in), every

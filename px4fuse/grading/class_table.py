@@ -12,7 +12,7 @@ from px4fuse.spreadsheet import neutral, neutral_id
 
 FIRST = ("file", "student", "id", "status", "points", "pending points", "of", "deducted", "total")
 LAST = (
-    "handed in", "hours late", "pending", "comment", "remarks", "flags", "other files", "reasons",
+    "handed in", "hours late", "pending", "comment", "flags", "other files", "reasons",
     "log SHA-256",
 )  # fmt: skip
 BETWEEN = " | "
@@ -35,7 +35,7 @@ def csv_text(entries: Sequence[Entry]) -> str:
     writer.writerow(neutral(title) for title in (*FIRST, *items, *numbers, *LAST))
     for entry in entries:
         one = entry.counting
-        points = {title: item.points for title, item in one.by_title.items()} if one else {}
+        points = {item.title: item.points for item in one.items} if one else {}
         row: list[str | float | None] = [
             one.submission if one else "", entry.student, None, one.status if one else "missing",
             one.counted if one else None, one.points if one and one.counted is None else None,
@@ -43,8 +43,7 @@ def csv_text(entries: Sequence[Entry]) -> str:
             *map(points.get, items),
             *(one.numbers.get(title) if one else None for title in numbers),
             entry.handed_in, None if entry.late_s is None else entry.late_s / 3600.0,
-            one.pending if one else "", entry.comment, BETWEEN.join(entry.remarks),
-            BETWEEN.join(one.flags) if one else "",
+            one.pending if one else "", entry.comment, BETWEEN.join(entry.flags),
             BETWEEN.join(other.submission for other in entry.others),
             BETWEEN.join(one.verdict.reasons) if one else "", one.log_sha256 if one else "",
         ]  # fmt: skip
@@ -61,3 +60,11 @@ def number(value: float | None) -> str:
     ('7', '0.3', '')
     """
     return "" if value is None or not math.isfinite(value) else f"{value:.10g}"
+
+
+def decimal(text: str) -> float | None:
+    """A number as people type it in tables, also with a comma; None for anything else."""
+    try:
+        return float(text.replace(",", "."))
+    except ValueError:
+        return None

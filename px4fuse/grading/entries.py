@@ -11,6 +11,7 @@ from typing import Literal
 from px4fuse.assignment.roster import Person
 from px4fuse.assignment.sheet import Sheet
 from px4fuse.grading.class_table import number
+from px4fuse.grading.flags import class_flags
 from px4fuse.grading.lateness import LateRule, in_zone_of
 from px4fuse.grading.model import Entry, Graded, Item, Override, Submission
 from px4fuse.grading.overrides import TOTAL, Overrides, matched
@@ -60,9 +61,8 @@ Attempt = tuple[tuple[float, float], Graded, Entry]
 def class_entries(
     graded: Sequence[Graded],
     submissions: Sequence[Submission],
-    register: Register | None,
+    register: Register,
     course: Course,
-    times: Mapping[int, datetime],
     overrides: Overrides,
 ) -> tuple[tuple[Entry, ...], tuple[str, ...]]:
     """Lay out a class: everyone in the register, then what belongs to nobody in it.
@@ -75,8 +75,8 @@ def class_entries(
     ----------
     graded, submissions : sequences
         Of every file, in one order.
-    times : mapping
-        Index of a person in the register to when Moodle says that the work was handed in.
+    register : Register
+        Without people where nobody knows who is in the class.
 
     Returns
     -------
@@ -84,20 +84,21 @@ def class_entries(
     notes : tuple of str
         On overrides that fit nobody.
     """
-    everyone = register or Register(_named(graded, submissions))
+    everyone = register if register.people else _named(graded, submissions)
     attempts: dict[int, list[Attempt]] = defaultdict(list)
     strangers = []
-    note = "Not in the roster." if register else "Neither the report nor the platform names anyone."
+    note = "Neither the report nor the platform names anyone."
+    if register.people:
+        note = "Not in the roster."
     for one, submission in zip(graded, submissions, strict=True):
         place = everyone.by_platform(submission.origin)
         if place is None:
             place = everyone.place(Person(one.student_id, one.student))
-        said = submission.origin.time or times.get(-1 if place is None else place)
-        attempt = _attempt(one, submission, said, course, place, everyone)
+        attempt = _attempt(one, submission, course, place, everyone)
         if place is not None:
             attempts[place].append(attempt)
         else:
-            strangers.append(replace(attempt[2], remarks=(note, *attempt[2].remarks)))
+            strangers.append(replace(attempt[2], flags=(note, *attempt[2].flags)))
     made = [
         _chosen(attempts[at], course) if attempts[at]
         else Entry(person.name, person.student_id, None, email=person.email)
@@ -106,70 +107,68 @@ def class_entries(
     made += strangers
     told, notes = matched(overrides, made)
     most = max((one.of for one in graded), default=0.0)
+    alike = class_flags([entry.counting for entry in made if entry.counting])
     settled = (
-        _settled(one, words, most, course.include_pending)
+        _settled(one, words, alike, most, course.include_pending)
         for one, words in zip(made, told, strict=True)
     )
     return tuple(settled), notes
 
 
-def _named(graded: Sequence[Graded], submissions: Sequence[Submission]) -> list[Person]:
+def _named(graded: Sequence[Graded], submissions: Sequence[Submission]) -> Register:
     """Without a roster: everyone whom a platform, else a report, names; each once."""
-    register = Register([])
+    register = Register()
     for one, submission in zip(graded, submissions, strict=True):
-        origin = submission.origin
+        person = submission.origin.person
         claimed = register.place(Person(one.student_id)) if one.student_id else None
-        if origin.platform and (origin.number or origin.login):
-            if register.by_platform(origin) is not None:
+        if person.numbers or person.login:
+            if register.place(person) is not None:
                 continue
             # two students may not hand in under one id: the second is known by the platform alone
-            student_id = origin.student_id or ("" if claimed is not None else one.student_id)
-            name = one_line(one.student if student_id else origin.name, 200) or origin.name
-            known_by = student_id or origin.login or origin.number
-            register.people.append(replace(origin.person, student_id=known_by, name=name))
+            student_id = person.student_id or ("" if claimed is not None else one.student_id)
+            name = one_line(one.student if student_id else person.name, 200) or person.name
+            known_by = (student_id, person.login, *person.numbers.values())
+            student_id = next(filter(None, known_by))
+            register.people.append(replace(person, student_id=student_id, name=name))
         elif one.student_id and claimed is None:
             register.people.append(Person(one.student_id, one_line(one.student, 200)))
-    return register.people
+    return register
 
 
 def _attempt(
     graded: Graded,
     submission: Submission,
-    said: datetime | None,
     course: Course,
     place: int | None,
     register: Register,
 ) -> Attempt:
-    """One file as if it were the only one of its student, ``said`` when it came."""
+    """One file as if it were the only one of its student."""
     origin, due = submission.origin, course.due
-    time, packed = (
-        None if one is None else in_zone_of(one, due) for one in (said, submission.time)
-    )
+    platform = origin.platform.capitalize()
+    said = origin.time or (None if place is None else register.times.get(place))
+    time, packed = (one and in_zone_of(one, due) for one in (said, submission.time))
     late_s = None
-    remarks = []
+    flags = []
     if due is not None and time is not None:
         # not their difference: in one zone Python takes the clock's, also over a change of it
         late_s = max(time.timestamp() - due.timestamp(), 0.0)
     elif origin.late:
-        remarks.append(
-            f"{origin.platform.capitalize()} marks it as late and does not say by how much: nothing"
-            " was taken off; say in overrides.csv what is."
-        )
+        flags.append(f"{platform} marks it as late and not by how much: nothing was taken off.")
     elif course.late and due and packed and packed.timestamp() > due.timestamp():
-        remarks.append(
+        flags.append(
             f"The zip file dates it {packed.strftime(SHOWN)}, after the due time; that may be when "
             "it was downloaded, so nothing was taken off."
         )
     claimed = register.place(Person(graded.student_id)) if origin.platform else None
     if claimed is not None and place is not None and claimed != place:
         other = register.people[claimed]
-        remarks.append(
+        flags.append(
             f"The report gives the id of {other.student_id} ({other.name or 'no name'}), but "
-            f"{origin.platform.capitalize()} says who handed it in."
+            f"{platform} says who handed it in."
         )
     person = Person(graded.student_id) if place is None else register.people[place]
     entry = Entry(
-        person.name or one_line(graded.student or origin.name, 200),
+        person.name or one_line(graded.student or origin.person.name, 200),
         person.student_id,
         graded,
         (),
@@ -177,10 +176,10 @@ def _attempt(
         late_s,
         course.late.deduction(late_s, graded.of) if course.late and late_s else 0.0,
         email=person.email,
-        remarks=tuple(remarks),
+        flags=tuple(flags),
     )
-    times = (time.timestamp() if time else 0.0, packed.timestamp() if packed else 0.0)
-    return times, graded, entry
+    stamps = (time.timestamp() if time else 0.0, packed.timestamp() if packed else 0.0)
+    return stamps, graded, entry
 
 
 def _worth(attempt: Attempt) -> float:
@@ -205,38 +204,43 @@ def _chosen(attempts: Sequence[Attempt], course: Course) -> Entry:
         "first": [one for one in able if one[0] == able[0][0]][-1],
         "best": max(able, key=lambda one: (_worth(one), _order(one))),
     }[course.attempt]
-    times, graded, entry = found
-    remarks = list(entry.remarks)
-    beside = sum(one[0] == times for one in able) if any(times) else 1
+    stamps, graded, entry = found
+    flags = list(entry.flags)
+    beside = sum(one[0] == stamps for one in able) if any(stamps) else 1
     if beside > 1:
-        remarks.append(f"{beside} reports came at the same time; the best of them counts.")
+        flags.append(f"{beside} reports came at the same time; the best of them counts.")
     last = ordered[-1][1]
     if not last.version and last is not graded:
         name = one_line(last.submission, 80)
-        remarks.append(f"{name} cannot be read as a report, so that another file counts.")
+        flags.append(f"{name} cannot be read as a report, so that another file counts.")
     others = tuple(one for _, one, _ in ordered if one is not graded)
-    return replace(entry, others=others, remarks=tuple(remarks))
+    return replace(entry, others=others, flags=tuple(flags))
 
 
 def _settled(
-    entry: Entry, said: Mapping[str, Override], most: float, include_pending: bool
+    entry: Entry,
+    said: Mapping[str, Override],
+    alike: Mapping[str, Sequence[str]],
+    most: float,
+    include_pending: bool,
 ) -> Entry:
-    """With the instructor's word on items and on all of it, and the total that follows."""
-    words = [said[name].comment for name in ("", TOTAL) if name in said]
-    one, total = entry.counting, None
+    """With the instructor's word on items and on all of it, the total that follows, and flags."""
+    one, total, flags = entry.counting, None, entry.flags
     if one is not None:
-        items = (_overruled(item, said.get(title)) for title, item in one.by_title.items())
+        items = (_overruled(item, said.get(item.title)) for item in one.items)
         one = replace(one, items=tuple(items))
+        flags = (*flags, *one.flags, *alike.get(one.submission, ()))
         if one.counted is not None or include_pending:
             total = round(max(one.points - entry.deduction, 0.0), 2)
-    final = said[TOTAL].points if TOTAL in said else None
+    final = said.get(TOTAL, Override())
     return replace(
         entry,
         counting=one,
         overrides={title: each for title, each in said.items() if title},
-        comment="\n".join(filter(None, words)),
-        total=total if final is None else final,
+        comment="\n".join(filter(None, (said.get("", Override()).comment, final.comment))),
+        total=total if final.points is None else final.points,
         of=one.of if one else most,
+        flags=flags,
     )
 
 

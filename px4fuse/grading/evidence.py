@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -25,9 +25,7 @@ from px4fuse.verification.rerun import log_sha256
 MAX_QUOTE = 160
 # Lists are cut where a comment would become longer than a sentence
 NAMED = 4
-NOT_BOTH = " (it needs the axes north and east, which were not both analysed: leave --axis out)"
-# A step of a path: in quotes where it has dots
-STEP = re.compile(r'"([^"]*)"|([^."]+)')
+NOT_BOTH = " (it needs the axes north and east: leave --axis out)"
 
 # What stands on one line
 _PLAIN = r"[^\x00-\x1f\x7f]"
@@ -93,9 +91,9 @@ class Evidence:
         return "loop" if isinstance(self.results, LoopResults) else "compare"
 
     @cached_property
-    def plain(self) -> dict[str, Any]:
-        """The results, for paths that a rubric names."""
-        return to_plain(self.results)
+    def values(self) -> dict[str, Any]:
+        """What the results hold, for paths that a rubric names."""
+        return dict(flattened(to_plain(self.results)))
 
     @cached_property
     def answer(self) -> Answer | None:
@@ -113,24 +111,32 @@ class Evidence:
 
     @cached_property
     def form(self) -> Answers | str:
-        """The form about this log, or why there is none: the end of "your form ..."."""
+        """The form about this log, or why there is none."""
         answers = self.results.student.answers
         if not isinstance(answers, Answers):
-            return "is not in your report: make it with --answers answers.toml"
+            return "your form is not in your report: make it with --answers answers.toml"
         try:
             check(answers)
         except ValueError as error:
-            return f"cannot be read ({text_of(str(error))})"
+            return f"your form cannot be read ({text_of(str(error))})"
         if answers.log_sha256 != log_sha256(self.results):
-            return "was made for another log"
+            return "your form was made for another log"
         return answers
 
     @cached_property
-    def form_points(self) -> FormPoints | None:
-        """What the form is worth; None without an answer key for this log, or without a form."""
-        truth = None if self.answer is None else self.answer.form
-        known = truth is not None and isinstance(self.form, Answers)
-        return form_points(self.form, truth) if known else None  # type: ignore[arg-type]
+    def form_points(self) -> FormPoints | str:
+        """What the form is worth, or why nothing."""
+        theirs = self.key and self.key.of_student(self.results.student.id)
+        if self.answer is None or (theirs and theirs.sha256 != self.answer.sha256):
+            given = f" ({text_of(theirs.file)})" if theirs else ""
+            return (
+                f"this report is not about the log that you were given{given}: make it of that "
+                "log, with your --id"
+            )
+        if isinstance(self.form, str):
+            return self.form
+        truth = self.answer.form
+        return "the answer key has no answers" if truth is None else form_points(self.form, truth)
 
     def claims(self, *kinds: str) -> bool:
         """Whether the form names one of these mistakes."""
@@ -143,39 +149,36 @@ class Evidence:
 
     def why_absent(self, path: str) -> str:
         """Why there is nothing at a path, in brackets, as far as the results say it."""
-        steps = [match[0] for match in STEP.finditer(path)]
+        steps = path.split(".")
         for end in range(len(steps), 0, -1):
-            for _, reason in values_at(self.plain, ".".join((*steps[:end], "reason"))):
+            for _, reason in values_at(self.values, ".".join((*steps[:end], "reason"))):
                 return f" ({text_of(reason).rstrip('.')})"
-        axes = self.comparison and self.comparison.axes
-        if HORIZONTAL in path and axes and not {"north", "east"} <= set(axes):
-            return NOT_BOTH
-        return ""
+        return NOT_BOTH if HORIZONTAL in path else ""
 
 
-def values_at(results: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
-    """Paths and values where a path leads; ``*`` is every key, quotes hold names with dots.
+def flattened(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Paths and values of what is no mapping and no list, keys joined by dots.
 
-    >>> values_at({"a": {"b.c": [1, 2]}}, 'a."b.c".1')
-    [('a.b.c.1', 2)]
+    >>> [*flattened({"a": {"b.c": [1, 2]}})]
+    [('a.b.c.0', 1), ('a.b.c.1', 2)]
     """
-    found: list[tuple[str, Any]] = [("", results)]
-    for match in STEP.finditer(path):
-        step = match[1] if match[1] is not None else match[2]
-        found = [
-            (f"{name}.{key}", part)
-            for name, value in found
-            for key, part in _parts(value)
-            if step in ("*", key)
-        ]
-    return [(name.removeprefix("."), value) for name, value in found]
+    if isinstance(value, list | tuple):
+        value = dict(enumerate(value))
+    if not isinstance(value, Mapping):
+        yield path, value
+        return
+    for key, part in value.items():
+        yield from flattened(part, f"{path}.{key}" if path else f"{key}")
 
 
-def _parts(value: Any) -> Iterator[tuple[str, Any]]:
-    if isinstance(value, Mapping):
-        yield from value.items()
-    elif isinstance(value, list | tuple):
-        yield from ((str(place), part) for place, part in enumerate(value))
+def values_at(values: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
+    """Paths and values where a path leads; ``*`` is every key, quotes may enclose names with dots.
+
+    >>> values_at({"a.b.c.0": 1, "a.d.0": 2}, 'a."b.c".*')
+    [('a.b.c.0', 1)]
+    """
+    pattern = path.replace('"', "")
+    return [(name, value) for name, value in values.items() if fnmatchcase(name, pattern)]
 
 
 def falling(off: float, factor: float) -> float:

@@ -9,8 +9,6 @@ for one to delete, and zero for a grade.
   ``mod/assign/feedback/offline/importgradeslib.php``, which finds "Identifier" ("Participant 12"),
   "Grade" and "Last modified (grade)" by their titles, takes "Feedback comments" as HTML, passes
   over grades above "Maximum Grade", and numbers in the language of the site.
-- Moodle, files: "Upload multiple feedback files in a zip"; read back by
-  ``mod/assign/feedback/file/importziplib.php``: ``{name}_{participant}_assignfeedback_file_/``.
 - Canvas: "How do I import grades in the Gradebook?", Instructor Guide: the exported gradebook, with
   Student, ID, SIS User ID, SIS Login ID, Section, and ``Title (12345)`` for an assignment; columns
   marked "(read only)" in the row "Points Possible" are ignored.
@@ -22,7 +20,7 @@ from __future__ import annotations
 
 import html
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -30,10 +28,9 @@ from px4fuse.assignment.key import folded
 from px4fuse.assignment.roster import person_of_row
 from px4fuse.assignment.sheet import Sheet
 from px4fuse.errors import SettingsError
-from px4fuse.grading.class_table import number
-from px4fuse.grading.model import Entry, Submission
+from px4fuse.grading.class_table import decimal, number
+from px4fuse.grading.model import Entry
 from px4fuse.grading.roster import Register
-from px4fuse.grading.zipping import zipped
 from px4fuse.plain import few_words
 from px4fuse.results.reading import one_line
 from px4fuse.spreadsheet import neutral
@@ -74,21 +71,18 @@ def grade_column(sheet: Sheet, wanted: str) -> int:
         if (kind != "canvas" or CANVAS.match(title))
         and not any(READ_ONLY in row[at] for row in sheet.rows[:3])
     }
+    usual = [*titles]
+    if kind != "canvas":
+        usual = [at for at in [sheet.column(GRADE)] if at is not None]
     named = [at for at, title in titles.items()
              if folded(wanted) in (folded(title), folded(sheet.head[at]))]  # fmt: skip
-    usual = sheet.column(GRADE)
-    if kind == "canvas":
-        found = named if wanted else [*titles]
-    else:
-        may_be_usual = usual is not None and (not wanted or kind == "moodle")
-        found = named or [usual] * may_be_usual  # type: ignore[list-item]
+    # the title may be meant for another table than Moodle's
+    found = named if wanted and (named or kind != "moodle") else usual
     if len(found) == 1:
         return found[0]
     several = "several columns for the grade" if found else "no column for the grade"
-    others = ", ".join(one_line(title, 40) for title in titles.values())
-    raise SettingsError(
-        f"{sheet.path}: {several}", f"Name one with --column: {one_line(others, 300)}."
-    )
+    others = one_line(", ".join(one_line(title, 40) for title in titles.values()), 300)
+    raise SettingsError(f"{sheet.path}: {several}", f"Name one with --column: {others}.")
 
 
 def filled(
@@ -148,11 +142,7 @@ def filled(
 def _most(sheet: Sheet, row: Sequence[str], place: int) -> float | None:
     """The most points that the platform takes, where the table says it."""
     possible = (one[place] for one in sheet.rows[:3] if "points possible" in one[0].casefold())
-    said = next(possible, sheet.cell(row, MAX_GRADE))
-    try:
-        return float(said.replace(",", "."))
-    except ValueError:
-        return None
+    return decimal(next(possible, sheet.cell(row, MAX_GRADE)))
 
 
 def _who(entry: Entry) -> str:
@@ -167,29 +157,3 @@ def as_html(text: str) -> str:
     """
     lines = html.escape(text, quote=False).rstrip("\n").split("\n")
     return "<br>".join(re.sub(r"^ +", lambda m: "&nbsp;" * len(m[0]), line) for line in lines)
-
-
-def moodle_feedback(
-    entries: Sequence[Entry], files: Mapping[str, Submission], feedback: Sequence[str]
-) -> bytes | None:
-    """Feedback files as Moodle's "Upload multiple feedback files in a zip" takes them.
-
-    Parameters
-    ----------
-    files : mapping
-        Name of a submission to the submission.
-
-    Returns
-    -------
-    bytes or None
-        None where nothing came from Moodle.
-    """
-    made = {}
-    for entry, text in zip(entries, feedback, strict=True):
-        origin = files[entry.counting.submission].origin if entry.counting else None
-        if origin is not None and origin.platform == "moodle":
-            # Moodle splits at _ and looks for the number in the second part
-            name = re.sub(r'[_/\\:*?"<>|\x00-\x1f]+', " ", origin.name).strip() or "student"
-            folder = f"{name}_{origin.number}_assignfeedback_file_"
-            made[f"{folder}/feedback.txt"] = text.encode("utf-8-sig")
-    return zipped(made) if made else None

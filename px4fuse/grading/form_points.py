@@ -102,9 +102,8 @@ def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
     elif truth.mistakes and all(wrong.size is None for wrong in truth.mistakes):
         parts["kinds"] += weights["sizes"] * shares["kinds"]  # there is nothing to size
     parts["kinds"] = max(parts["kinds"] - FALSE_CLAIM * len(false), 0.0)
-    named = {
-        wrong.kind: claim is not None and claim.kind == wrong.kind for wrong, claim, _ in matched
-    }
+    claimed = [claim.kind for claim in answers.mistakes]
+    named = {wrong.kind: wrong.kind in claimed for wrong in truth.mistakes}
     return FormPoints(parts, weights, tuple(_said(matched, false, called_clean)), named)
 
 
@@ -115,15 +114,14 @@ def _said(matched: list[Match], false: list[Claim], called_clean: bool) -> Itera
     """What of the mistakes was found, in words."""
     if not matched:
         yield f"your flight has no mistake{', as you say' * called_clean}"
-    found = [wrong.kind for wrong, claim, _ in matched if claim and claim.kind == wrong.kind]
-    if found:
-        yield f"you found {' and '.join(found)}"
     for wrong, claim, _ in matched:
         what = f"{wrong.kind} ({MISTAKES[wrong.kind][0]})"
         if claim is None:
             yield f"you missed {what}"
         elif claim.kind != wrong.kind:
             yield f"you named {claim.kind} where it is {what}"
+        else:
+            yield f"you found {wrong.kind}"
     if false:
         yield f"not in your flight: {', '.join(claim.kind for claim in false)}"
 

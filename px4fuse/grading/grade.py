@@ -6,7 +6,6 @@ import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 
@@ -14,14 +13,14 @@ from px4fuse.assignment.key import AnswerKey
 from px4fuse.assignment.roster import people_of_sheet, person_of_row
 from px4fuse.grading import submissions
 from px4fuse.grading.entries import Course, class_entries
-from px4fuse.grading.evidence import values_at
+from px4fuse.grading.evidence import flattened
 from px4fuse.grading.exports import grade_column, kind_of
-from px4fuse.grading.flags import chosen_settings, class_flags, own_flags
+from px4fuse.grading.flags import own_flags
 from px4fuse.grading.lateness import moodle_time
 from px4fuse.grading.model import Entry, Graded, Submission
 from px4fuse.grading.outputs import write_class
 from px4fuse.grading.overrides import NAME, read_overrides
-from px4fuse.grading.records import verified
+from px4fuse.grading.records import RECORDS, verified
 from px4fuse.grading.roster import Register, people_of_key
 from px4fuse.grading.rubric import Rubric
 from px4fuse.grading.scoring import assess, refused
@@ -30,7 +29,6 @@ from px4fuse.results.contract import to_plain
 from px4fuse.verification.model import Refused, Verdict
 from px4fuse.verification.workers import Failed, run_bounded
 
-RECORDS = "records"
 FAILED = "Do not open it: ask for the report as px4fuse wrote it."
 # For the class table: column title, and where in the results
 NUMBERS = (
@@ -113,37 +111,20 @@ def grade(
     for sheet in course.worksheets:
         grade_column(sheet, course.column)
     found, notes = submissions.collect(paths)
-    register, times = register_of(course, key)
+    register = register_of(course, key)
     records = output / RECORDS
     graded, reused = grade_all(found, logs, rubric, records, key, register, processes, progress)
-    entries, unknown = class_entries(graded, found, register, course, times, overrides)
-    entries = _flagged(entries, key)
-    written, more = write_class(
-        entries,
-        {one.name: one for one in found},
-        register or Register([]),
-        course,
-        title or rubric.title or "Class",
-        output,
-        records,
-        processes,
-    )
+    entries, unknown = class_entries(graded, found, register, course, overrides)
+    name = title or rubric.title or "Class"
+    written, more = write_class(entries, register, course, name, output, processes)
     return GradeOutcome(entries, (*notes, *unknown, *more), reused, written)
 
 
-def register_of(
-    course: Course, key: AnswerKey | None
-) -> tuple[Register | None, dict[int, datetime]]:
-    """Who is in the class, and when Moodle's worksheets say that each of them handed in.
-
-    With what all worksheets know of them; None where nothing says who is in it.
-    """
+def register_of(course: Course, key: AnswerKey | None) -> Register:
+    """Who is in the class, with what all worksheets know of them."""
     listed = [people_of_sheet(sheet) for sheet in course.worksheets]
-    people = course.roster or (people_of_key(key) if key else next(iter(listed), None))
-    if people is None:
-        return None, {}
+    people = course.roster or (people_of_key(key) if key else next(iter(listed), ()))
     register = Register(people)
-    times = {}
     for others in listed:
         register.add(others)
     for sheet in course.worksheets:
@@ -152,20 +133,8 @@ def register_of(
             person = person_of_row(sheet, row)
             place = register.place(person) if person else None
             if time is not None and place is not None:
-                times[place] = time
-    return register, times
-
-
-def _flagged(entries: Sequence[Entry], key: AnswerKey | None) -> tuple[Entry, ...]:
-    """With what stands out between the reports that count."""
-    places = [place for place, entry in enumerate(entries) if entry.counting]
-    flags = class_flags([one for entry in entries if (one := entry.counting)], key)
-    made = list(entries)
-    for index, said in flags.items():
-        entry = made[places[index]]
-        one = entry.counting
-        made[places[index]] = replace(entry, counting=one and replace(one, flags=one.flags + said))
-    return tuple(made)
+                register.times[place] = time
+    return register
 
 
 def grade_all(
@@ -174,47 +143,41 @@ def grade_all(
     rubric: Rubric,
     records: Path,
     key: AnswerKey | None,
-    register: Register | None,
+    register: Register,
     processes: int | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> tuple[tuple[Graded, ...], int]:
     """Verify, or recall, and score every file, each within bounds; and how many were recalled."""
     jobs = []
     for submission in found:
-        place = register.by_platform(submission.origin) if register else None
-        owner = register.people[place].student_id if register and place is not None else ""
+        place = register.by_platform(submission.origin)
+        owner = "" if place is None else register.people[place].student_id
         jobs.append((submission, owner))
-    graded: dict[int, Graded] = {}
+    scored = partial(
+        grade_one,
+        logs=files_by_sha256(logs),
+        rubric=rubric,
+        key=key,
+        records=records,
+        largest_log_bytes=max_log_bytes.get(),
+    )
+    made: dict[int, Graded] = {}
     reused = 0
     progress(0, len(found))
-    work = run_bounded(
-        partial(
-            grade_one,
-            logs=files_by_sha256(logs),
-            rubric=rubric,
-            key=key,
-            records=records,
-            largest_log_bytes=max_log_bytes.get(),
-        ),
-        jobs,
-        processes=processes,
-    )
-    with closing(work):
+    with closing(run_bounded(scored, jobs, processes=processes)) as work:
         for index, result in work:
             if isinstance(result, Failed):
                 why = Refused(f"Grading it failed: {result.reason}", FAILED)
-                result = refused(rubric, key, why), False  # noqa: PLW2901
-            one, recalled = result
+                one, recalled = refused(rubric, key, why), False
+            else:
+                one, recalled = result
             submission = found[index]
-            nameless = not one.student and not one.student_id
-            graded[index] = replace(
-                one,
-                submission=submission.name,
-                student=submission.origin.name if nameless else one.student,
-            )
+            known = one.student or one.student_id
+            student = one.student if known else submission.origin.person.name
+            made[index] = replace(one, submission=submission.name, student=student)
             reused += recalled
-            progress(len(graded), len(found))
-    return tuple(graded[index] for index in range(len(found))), reused
+            progress(len(made), len(found))
+    return tuple(made[index] for index in range(len(found))), reused
 
 
 def grade_one(
@@ -237,14 +200,13 @@ def grade_one(
     if isinstance(found, Refused):
         return replace(refused(rubric, key, found), sha256=sha256), recalled
     results, verdict, page = found
-    plain = to_plain(results)
+    values = dict(flattened(to_plain(results)))
     made = assess(results, verdict, rubric, key, owner_id)
     whole = replace(
         made,
         flags=(*_page_flags(verdict), *own_flags(results, key is not None), *made.flags),
-        numbers={title: float(n) for title, path in NUMBERS for _, n in values_at(plain, path)},
+        numbers={title: float(values[path]) for title, path in NUMBERS if path in values},
         sha256=sha256,
-        settings=chosen_settings(results),
         page=page,
     )
     return whole, recalled

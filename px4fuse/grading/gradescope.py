@@ -9,35 +9,33 @@ to build the container, ``run_autograder`` for every submission; the zip file's 
 
 from __future__ import annotations
 
+import io
 import json
 import platform
 import re
 import tempfile
-import time
+import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
 from importlib import metadata
-from importlib.resources import files
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from px4fuse.assignment.key import key_text, read_key
+from px4fuse.assignment.roster import Person
 from px4fuse.errors import SettingsError
 from px4fuse.grading.entries import Course, class_entries
 from px4fuse.grading.feedback import returned_text
-from px4fuse.grading.grade import grade_all
+from px4fuse.grading.grade import grade_all, register_of
 from px4fuse.grading.lateness import LateRule
 from px4fuse.grading.model import Entry
 from px4fuse.grading.platforms import NOBODY, ExportOrigin
-from px4fuse.grading.roster import Register, people_of_key
 from px4fuse.grading.rubric import read_rubric, rubric_text
 from px4fuse.grading.submissions import collect
-from px4fuse.grading.zipping import zipped
 from px4fuse.reading import files_by_sha256, read_log_bytes, read_text
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.writing import write_all
@@ -64,62 +62,27 @@ VISIBLE = "after_due_date"
 MAX_METADATA = 5_000_000
 
 
-def results(entry: Entry, text: str, seconds: float) -> dict[str, Any]:
-    """``results.json`` of one student.
-
-    Parameters
-    ----------
-    text : str
-        What the student reads about all of it.
-    seconds : float
-        That grading took.
-    """
+def results(entry: Entry, text: str) -> dict[str, Any]:
+    """``results.json`` of one student, who reads ``text``; flags are the instructor's alone."""
     graded = entry.counting
-    tests: list[dict[str, Any]] = [
-        {
-            "name": one_line(item.title, 200),
-            "output": item.comment,
-            "visibility": VISIBLE,
-            "score": item.points,
-            "max_score": item.of,
-            "status": "passed" if item.points >= item.of else "failed",
-            "tags": ["px4fuse", graded.status if graded else "missing"],
-        }
-        for item in (graded.items if graded else ())
-    ]
-    said = [f"Pending: {graded.pending}"] if graded and graded.pending else []
-    if said := [*said, *entry.flags]:
-        tests.append(
-            {
-                "name": "For the instructor",
-                "output": "\n".join(map(cleaned, said)),
-                "visibility": "hidden",
-                "score": 0.0,
-                "max_score": 0.0,
-                "tags": ["px4fuse", "instructor"],
-            }
-        )
-    for number, test in enumerate(tests, start=1):
-        test.update(number=str(number), name_format="text", output_format="text")
+    pending = [f"Pending: {graded.pending}"] if graded and graded.pending else []
+    said = "\n".join(map(cleaned, (*pending, *entry.flags)))
+    hidden = {"name": "For the instructor", "output": said, "visibility": "hidden"}
     return {
         "score": entry.total or 0.0,
         "output": text,
-        "output_format": "text",
-        "test_output_format": "text",
-        "test_name_format": "text",
         "visibility": VISIBLE,
         "stdout_visibility": "hidden",
-        "tests": tests,
-        "execution_time": round(seconds, 2),
+        "tests": [hidden] if said else [],
     }
 
 
-class _User(msgspec.Struct):
+class _User(msgspec.Struct, frozen=True):
     name: str | None = None
     email: str | None = None
 
 
-class _Assignment(msgspec.Struct):
+class _Assignment(msgspec.Struct, frozen=True):
     due_date: datetime | None = None
 
 
@@ -127,7 +90,7 @@ class _Metadata(msgspec.Struct):
     """What is read of ``submission_metadata.json``."""
 
     users: list[_User] = []
-    assignment: _Assignment | None = None
+    assignment: _Assignment = _Assignment()
     created_at: datetime | None = None
 
 
@@ -151,8 +114,8 @@ def submission_metadata(folder: Path) -> tuple[ExportOrigin, datetime | None]:
         raise SettingsError(f"{path.name}: not what Gradescope writes.") from error
     user = said.users[0] if said.users else _User()
     name, email = (one_line(one or "", 200) for one in (user.name, user.email))
-    origin = ExportOrigin("gradescope", name=name, email=email, time=said.created_at)
-    return origin if name else NOBODY, getattr(said.assignment, "due_date", None)
+    origin = ExportOrigin("gradescope", Person("", name, email), said.created_at)
+    return origin if name else NOBODY, said.assignment.due_date
 
 
 def autograder_zip(
@@ -179,18 +142,31 @@ def autograder_zip(
     options = f' --late "{late.text}"' if late else ""
     about = metadata.distribution("px4fuse")
     described = about.read_text("METADATA") or about.read_text("PKG-INFO") or ""
+    package = Path(__file__).parents[1]
+    modules = [path for path in sorted(package.rglob("*")) if "__pycache__" not in path.parts]
     contents = {
         "setup.sh": SETUP.format(python=python).encode(),
         "run_autograder": RUN.format(options=options).encode(),
         "requirements.txt": "".join(f"{one}\n" for one in sorted(set(_requirements()))).encode(),
         f"px4fuse-{about.version}.dist-info/METADATA": described.encode(),
-        **dict(_package("px4fuse", files("px4fuse"))),
+        **{
+            f"px4fuse/{path.relative_to(package).as_posix()}": path.read_bytes()
+            for path in modules
+            if path.is_file()
+        },
         "rubric.toml": text.encode(),
         **({} if key is None else {"key.json": key_text(read_key(key)).encode()}),
     }
     for number, path in enumerate(paths):
         contents[f"logs/{number}{path.suffix}"] = read_log_bytes(path)
-    return zipped(contents, EXECUTABLE)
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in contents.items():
+            entry = zipfile.ZipInfo(name)  # without the time of today
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            entry.external_attr = (0o100755 if name in EXECUTABLE else 0o100644) << 16
+            archive.writestr(entry, content)
+    return out.getvalue()
 
 
 def _requirements() -> Iterator[str]:
@@ -200,15 +176,6 @@ def _requirements() -> Iterator[str]:
         if name is not None and "extra == 'test'" not in text:
             with suppress(metadata.PackageNotFoundError):  # an extra that is not installed here
                 yield f"{name[0]}=={metadata.version(name[0])}"
-
-
-def _package(name: str, folder: Traversable) -> Iterator[tuple[str, bytes]]:
-    """The files of a package, without what Python compiled."""
-    for one in sorted(folder.iterdir(), key=lambda each: each.name):
-        if one.is_dir() and one.name != "__pycache__":
-            yield from _package(f"{name}/{one.name}", one)
-        elif one.is_file():
-            yield f"{name}/{one.name}", one.read_bytes()
 
 
 def run_autograder(folder: Path, late: LateRule | None) -> None:
@@ -224,33 +191,30 @@ def run_autograder(folder: Path, late: LateRule | None) -> None:
     SettingsError
         Rubric, key or metadata are not what they should be: Gradescope shows it to the instructor.
     """
-    start = time.perf_counter()
     source = folder / "source"
     rubric = read_rubric(source / "rubric.toml")
     key_path = source / "key.json"
     key = read_key(key_path) if key_path.exists() else None
     origin, due = submission_metadata(folder)
-    register = Register(people_of_key(key)) if key else None
+    course = Course(due=due, late=late)
+    register = register_of(course, key)
     try:
         found, _ = collect([folder / "submission"])
     except SettingsError as error:  # an empty folder, or other files than PDFs
-        of = sum(item.points for item in rubric.items)
-        entry = Entry(origin.name, "", None, email=origin.email, of=of)
-        text = str(error)
+        entry, text = Entry(origin.person.name, "", None), str(error)
     else:
         found = tuple(replace(one, origin=origin) for one in found)
         with tempfile.TemporaryDirectory(prefix="px4fuse-") as records:
             graded, _ = grade_all(found, [source / "logs"], rubric, Path(records), key, register, 1)
-        entries, _ = class_entries(graded, found, register, Course(due=due, late=late), {}, {})
+        entries, _ = class_entries(graded, found, register, course, {})
         entry = max(
             (one for one in entries if one.counting),
             key=lambda one: -1.0 if one.total is None else one.total,
         )
         text = returned_text(entry)
-        if register and register.by_platform(origin) is None:
-            name = origin.name or "(none)"
+        if register.people and register.by_platform(origin) is None:
+            name = origin.person.name or "(none)"
             unknown = f"The answer key has nobody of the name {name}: compare the report's."
-            entry = replace(entry, remarks=(unknown, *entry.remarks))
-    made = results(entry, text, time.perf_counter() - start)
-    content = json.dumps(made, ensure_ascii=False, indent=2)
+            entry = replace(entry, flags=(unknown, *entry.flags))
+    content = json.dumps(results(entry, text), ensure_ascii=False, indent=2)
     write_all({folder / "results" / "results.json": content.encode()})

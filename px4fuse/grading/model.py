@@ -8,7 +8,6 @@ from datetime import datetime
 from pathlib import Path
 
 from px4fuse.answers import Answers
-from px4fuse.grading.names import distinct
 from px4fuse.grading.platforms import NOBODY, ExportOrigin
 from px4fuse.verification.model import Verdict
 
@@ -70,7 +69,7 @@ class Graded:
     items : tuple of Item
         In the rubric's order.
     flags : tuple of str
-        What an instructor should look at: sentences.
+        What an instructor should look at in this report: sentences.
     pending : str
         One sentence: what the instructor can do so that the points count.
     form : Answers or None
@@ -79,8 +78,6 @@ class Graded:
         A few for the class table, by column title.
     sha256, log_sha256, version : str
         Of the PDF, of the log it is about, and of px4fuse.
-    settings : str
-        Those chosen, to the last digit, for comparison between students; "" for usual ones.
     notes : str
         The student's own words.
     mistakes : mapping
@@ -90,9 +87,8 @@ class Graded:
         that differs most.
     page : int
         Which page that is, counted from 1.
-    sheets, handed_in_name, redrawn_name : tuple of str, str, str
-        Where pictures of the redrawn pages, the PDF that was handed in and the redrawn one stand,
-        relative to the class page.
+    sheets, redrawn_name : tuple of str, str
+        Where pictures of the redrawn pages, and the redrawn PDF, stand, relative to the class page.
     """
 
     submission: str
@@ -107,14 +103,12 @@ class Graded:
     sha256: str = ""
     log_sha256: str = ""
     version: str = ""
-    settings: str = ""
     notes: str = field(default="", repr=False)
     mistakes: Mapping[str, bool] = field(default_factory=dict)
     handed_in: bytes = field(default=b"", repr=False)
     page: int = 1
     redrawn_name: str = ""
     sheets: tuple[str, ...] = ()
-    handed_in_name: str = ""
 
     @property
     def status(self) -> str:
@@ -141,11 +135,6 @@ class Graded:
     def of(self) -> float:
         """The most that there is to have."""
         return sum(item.of for item in self.items)
-
-    @property
-    def by_title(self) -> dict[str, Item]:
-        """The items by their titles; titles that come twice are numbered."""
-        return dict(zip(distinct(item.title for item in self.items), self.items, strict=True))
 
 
 @dataclass(frozen=True)
@@ -176,8 +165,7 @@ class Entry:
     deduction : float
         Points taken off for being late, from the sum over the items.
     overrides : mapping
-        What the instructor says, by the title of an item (numbered like the table's columns) or
-        "total".
+        What the instructor says, by the title of an item or "total".
     comment : str
         The instructor's own words on all of it.
     total : float or None
@@ -186,8 +174,9 @@ class Entry:
         The most that there is to have.
     email : str
         As the roster says.
-    remarks : tuple of str
-        On who this is and what counts: sentences for the instructor.
+    flags : tuple of str
+        All that an instructor should look at: on who this is and what counts, on the counting
+        report, and on what it has in common with others.
     pseudonym : str
         What the class page shows instead of name, id and names of files; "" to show them.
     """
@@ -204,7 +193,7 @@ class Entry:
     total: float | None = None
     of: float = 0.0
     email: str = ""
-    remarks: tuple[str, ...] = ()
+    flags: tuple[str, ...] = ()
     pseudonym: str = ""
 
     @property
@@ -217,14 +206,9 @@ class Entry:
         """What the class page calls the student."""
         return self.pseudonym or self.student or self.student_id or "no name"
 
-    @property
-    def flags(self) -> tuple[str, ...]:
-        """All that an instructor should look at."""
-        return (*self.remarks, *(self.counting.flags if self.counting else ()))
-
 
 def columns(entries: Sequence[Entry]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Titles of the items and of the numbers that the class has, each once."""
     graded = [one for entry in entries if (one := entry.counting)]
-    items = dict.fromkeys(title for one in graded for title in one.by_title)
+    items = dict.fromkeys(item.title for one in graded for item in one.items)
     return tuple(items), tuple(dict.fromkeys(title for one in graded for title in one.numbers))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 
-from px4fuse.assignment.roster import RESERVED
+from px4fuse.assignment.roster import file_stem
 
 
 def distinct(names: Iterable[str], form: str = "{} ({})") -> list[str]:
@@ -26,10 +26,5 @@ def distinct(names: Iterable[str], form: str = "{} ({})") -> list[str]:
 
 
 def file_names(stems: Iterable[str]) -> list[str]:
-    """A name for each one's files, unique ignoring case: letters, digits, - and _ only."""
-    safe = (
-        "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in stem)[:60]
-        for stem in stems
-    )
-    usable = (f"report_{s}" if not s or s.casefold() in RESERVED else s for s in safe)
-    return distinct(usable, "{}-{}")
+    """A name for each one's files on any system, unique ignoring case."""
+    return distinct((file_stem(stem) or "report" for stem in stems), "{}-{}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 from px4fuse.assignment.key import folded
 from px4fuse.assignment.sheet import read_sheet
 from px4fuse.errors import SettingsError
+from px4fuse.grading.class_table import decimal
 from px4fuse.grading.model import Entry, Override
 from px4fuse.grading.roster import only_place, same_id
 from px4fuse.results.reading import cleaned, one_line
@@ -46,32 +46,20 @@ def read_overrides(path: Path) -> Overrides:
         )
     found: dict[str, dict[str, Override]] = defaultdict(dict)
     for number, row in zip(sheet.numbers, sheet.rows, strict=True):
-        student, item, points = (sheet.cell(row, (title,)) for title in TITLES[:3])
-        student, item = (cell.removeprefix("'") for cell in (student, item))
-        comment = cleaned(sheet.cell(row, ("comment",))[:MAX_COMMENT])
+        student, item, points, comment = (
+            sheet.cell(row, (title,)).removeprefix("'") for title in TITLES
+        )
+        value = decimal(points)
+        wrong = ""
         if item in found[student]:
-            raise SettingsError(
-                f"{path}: row {number}: {one_line(student, 40)}, {one_line(item, 40) or 'all'} "
-                "stands there twice",
-                "Keep one of them.",
-            )
-        value = _points(points)
-        if (points and value is None) or (value is not None and not item):
-            raise SettingsError(
-                f"{path}: row {number}: points {one_line(points, 20)!r} "
-                + ("are not a number from 0 up." if item else "without an item. Name it, or total.")
-            )
-        found[student][item] = Override(value, comment)
+            wrong = f"{one_line(student, 40)}, {one_line(item, 40) or 'all'} stands there twice"
+        elif points and (value is None or not 0.0 <= value <= MOST or not item):
+            given = one_line(points, 20)
+            wrong = f"points {given!r}: give a number from 0 up, and an item or total"
+        if wrong:
+            raise SettingsError(f"{path}: row {number}: {wrong}.")
+        found[student][item] = Override(value, cleaned(comment[:MAX_COMMENT]))
     return found
-
-
-def _points(text: str) -> float | None:
-    try:
-        # 7,5 in a table that is separated by semicolons
-        value = float(text.replace(",", "."))
-    except ValueError:
-        return None
-    return value if math.isfinite(value) and 0.0 <= value <= MOST else None
 
 
 def matched(
@@ -93,7 +81,8 @@ def matched(
             notes.append(f"{NAME}: nobody has the id {one_line(student, 40) or '(empty)'}.")
             continue
         one = entries[place].counting
-        titles = {folded(title): title for title in (*(one.by_title if one else ()), TOTAL, "")}
+        known = [item.title for item in one.items] if one else []
+        titles = {folded(title): title for title in (*known, TOTAL, "")}
         for item, override in rows.items():
             if folded(item) in titles:
                 said[place][titles[folded(item)]] = override

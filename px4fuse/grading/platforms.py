@@ -54,6 +54,9 @@ _SUBMITTERS = re.compile(r"^  :submitters:\s*\n((?:  - .*\n?|    .*\n?)*)", re.M
 _MAX_METADATA = 20_000_000
 
 
+UNKNOWN = Person("")
+
+
 @dataclass(frozen=True)
 class ExportOrigin:
     """What a platform says of a file that was handed in.
@@ -62,11 +65,9 @@ class ExportOrigin:
     ----------
     platform : str
         One of :data:`PLATFORMS`; "" where the name is of no platform.
-    number : str
-        The platform's own: Moodle's participant, Canvas's and ILIAS's user, Gradescope's
-        submission. Never the university's.
-    name, login, student_id, email : str
-        Of the student; "" where the platform does not say.
+    person : Person
+        The student, as far as the platform says; its number is the platform's own (Moodle's
+        participant, Canvas's and ILIAS's user, Gradescope's submission), never the university's.
     time : datetime or None
         Without a time zone where the platform leaves it out.
     late : bool
@@ -74,19 +75,9 @@ class ExportOrigin:
     """
 
     platform: str = ""
-    number: str = ""
-    name: str = ""
-    login: str = ""
-    student_id: str = ""
-    email: str = ""
+    person: Person = UNKNOWN
     time: datetime | None = None
     late: bool = False
-
-    @property
-    def person(self) -> Person:
-        """Who it is, for a look at a class list."""
-        numbers = {self.platform: self.number} if self.number else {}
-        return Person(self.student_id, self.name, self.email, self.login, numbers)
 
 
 NOBODY = ExportOrigin()
@@ -95,14 +86,12 @@ NOBODY = ExportOrigin()
 def origin_of(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> ExportOrigin:
     """Who handed a file in, by its path in the export.
 
-    >>> origin_of("Doe Jane_4711_assignsubmission_file_/report.pdf").name
+    >>> origin_of("Doe Jane_4711_assignsubmission_file_/report.pdf").person.name
     'Doe Jane'
-    >>> origin_of("doejane_LATE_12345_67890_report-1.pdf").number
-    '12345'
+    >>> origin_of("doejane_LATE_12345_67890_report-1.pdf").person.numbers
+    {'canvas': '12345'}
     >>> origin_of("Lab 3_jdoe_attempt_2026-11-20-12-34-56_report.pdf").time
     datetime.datetime(2026, 11, 20, 12, 34, 56)
-    >>> origin_of("Lab_jdoe_attempt_2026-11-20-12-34-56_x_attempt_2026-11-19-01-02-03.pdf").login
-    'jdoe'
     >>> origin_of("report.pdf") == ExportOrigin()
     True
     """
@@ -119,11 +108,10 @@ def origin_of(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> ExportO
                 time = datetime.strptime(stamp, TIME_IN_NAMES) if stamp else None
             except ValueError:  # a 99th month: a student's own name
                 continue
-            whole = f"{said.get('first', '')} {said.get('last', '')}".strip()
-            return ExportOrigin(
-                platform, said.get("number", ""), said.get("name") or whole, said.get("login", ""),
-                time=time, late=bool(said.get("late")),
-            )  # fmt: skip
+            whole = said.get("name") or f"{said.get('first', '')} {said.get('last', '')}".strip()
+            numbers = {platform: said["number"]} if "number" in said else {}
+            person = Person("", whole, "", said.get("login", ""), numbers)
+            return ExportOrigin(platform, person, time, bool(said.get("late")))
     return NOBODY
 
 
@@ -152,7 +140,7 @@ def origins_of(
         if origin.platform in ("gradescope", ""):
             # PDF assignments are exported as 123456.pdf
             stem = name.rpartition("/")[2].casefold().removesuffix(".pdf")
-            origin = people.get(origin.number or stem, origin)
+            origin = people.get(origin.person.numbers.get("gradescope", stem), origin)
         made.append(origin)
     return made
 
@@ -164,7 +152,7 @@ def gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
     Of a group the first member is named.
 
     >>> text = "submission_7:\n  :submitters:\n  - :name: Ada\n    :sid: '12'\n"
-    >>> gradescope_metadata(text)["7"].student_id
+    >>> gradescope_metadata(text)["7"].person.student_id
     '12'
     """
     found = {}
@@ -174,8 +162,8 @@ def gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
             _value(people[1] if people else "", rf"  (?:- |  ):{key}")
             for key in ("name", "sid", "email")
         )
-        time = _time(_value(block, "  :created_at"))
-        found[number] = ExportOrigin("gradescope", number, name, "", student_id, email, time)
+        person = Person(student_id, name, email, "", {"gradescope": number})
+        found[number] = ExportOrigin("gradescope", person, _time(_value(block, "  :created_at")))
     return found
 
 

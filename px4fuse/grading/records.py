@@ -29,6 +29,8 @@ from px4fuse.verification.verification import verify
 from px4fuse.verification.workers import bounded
 from px4fuse.writing import write_all
 
+# In the folder of a class
+RECORDS = "records"
 HANDED_IN, REDRAWN = ".handed-in.png", ".pdf"
 MADE_WITH = ("px4fuse", "numpy", "scipy", "matplotlib", "pypdfium2", "pillow")
 _SHA256 = re.compile(r'"([0-9a-f]{64})"')
@@ -45,9 +47,8 @@ class VerificationRecord:
     results : str
         As they were attached.
     files : dict
-        SHA-256 of every file that the report rests on, and whether it was at hand.
-    gap : bool
-        Whether the log is of the answer key and was not at hand: the instructor's gap.
+        SHA-256 of every file that the report rests on, and whether it was "here", "handed out" by
+        the answer key and not at hand, which is the instructor's gap, or "away".
     page : int
         Which page the picture of what was handed in shows, counted from 1.
     """
@@ -55,8 +56,7 @@ class VerificationRecord:
     made_with: dict[str, str]
     refused: Refused | None = None
     results: str = ""
-    files: dict[str, bool] = field(default_factory=dict)
-    gap: bool = False
+    files: dict[str, str] = field(default_factory=dict)
     verdict: Verdict | None = None
     page: int = 1
 
@@ -94,28 +94,27 @@ def verified(
     if isinstance(report, Refused):
         _keep(records, sha256, VerificationRecord(_versions(), report), {})
         return report, False
-    gap = _is_gap(report.results, logs, handed_out)
+    results = to_json(report.results)
+    rests_on = _files(results, logs, handed_out)
+    gap = rests_on.get(log_sha256(report.results)) == "handed out"
     verdict = verify(report, {} if gap else logs)
     page = max(verdict.pages, key=lambda one: (one.picture, one.words)).page if verdict.pages else 1
     handed_in: object = b""
     if verdict.pages or not verdict.redrawn:
         handed_in = bounded(partial(picture, page=page - 1), pdf, TIMEOUT_S, MEMORY_BYTES)
-    results = to_json(report.results)
     unread = replace(verdict, redrawn=b"")
-    kept = VerificationRecord(_versions(), None, results, _files(results, logs), gap, unread, page)
+    kept = VerificationRecord(_versions(), None, results, rests_on, unread, page)
     shown = handed_in if isinstance(handed_in, bytes) else b""
     _keep(records, sha256, kept, {HANDED_IN: shown, REDRAWN: verdict.redrawn})
     return (report.results, unread, page), False
 
 
-def _is_gap(results: Reported, logs: Mapping[str, Path], handed_out: frozenset[str]) -> bool:
-    log = log_sha256(results)
-    return log in handed_out and log not in logs
-
-
-def _files(results: str, logs: Mapping[str, Path]) -> dict[str, bool]:
-    """Of every file that a report rests on, whether it is at hand."""
-    return {name: name in logs for name in sorted(set(_SHA256.findall(results)))}
+def _files(results: str, logs: Mapping[str, Path], handed_out: frozenset[str]) -> dict[str, str]:
+    """Where every file is that a report rests on."""
+    return {
+        name: "here" if name in logs else "handed out" if name in handed_out else "away"
+        for name in sorted(set(_SHA256.findall(results)))
+    }
 
 
 @cache
@@ -144,9 +143,7 @@ def _recalled(
     # none, or not one of ours: done again
     except (OSError, msgspec.MsgspecError, ResultsError):
         return None
-    if not isinstance(results, ComparisonResults | LoopResults):
+    same = kept.files == _files(kept.results, logs, handed_out)
+    if not same or not isinstance(results, ComparisonResults | LoopResults):
         return None
-    same = kept.files == _files(kept.results, logs) and kept.gap == _is_gap(
-        results, logs, handed_out
-    )
-    return (results, kept.verdict, kept.page) if same else None
+    return results, kept.verdict, kept.page

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from datetime import datetime
 from typing import TypeVar
 
 from px4fuse.assignment.key import AnswerKey, folded
@@ -20,10 +21,14 @@ def people_of_key(key: AnswerKey) -> tuple[Person, ...]:
 
 
 class Register:
-    """The class, to be asked who somebody is."""
+    """The class, to be asked who somebody is; without people where nothing says who is in it.
 
-    def __init__(self, people: Sequence[Person]) -> None:
+    ``times`` is when Moodle says that the person at a place handed in.
+    """
+
+    def __init__(self, people: Iterable[Person] = ()) -> None:
         self.people = list(people)
+        self.times: dict[int, datetime] = {}
 
     def add(self, others: Iterable[Person]) -> None:
         """What another list knows of the same people; who is not among them is left out."""

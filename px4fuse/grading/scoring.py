@@ -13,7 +13,6 @@ from px4fuse.grading.evidence import Evidence, reason_of, text_of
 from px4fuse.grading.flags import text_flags
 from px4fuse.grading.model import Graded, Item
 from px4fuse.grading.rubric import Doubtful, Rubric
-from px4fuse.plain import capital
 from px4fuse.results.contract import Reported
 from px4fuse.verification.model import Refused, Verdict
 from px4fuse.verification.rerun import log_sha256
@@ -40,7 +39,7 @@ def assess(
             share, comment = item.score(evidence)
         waits = item.by_hand and bool(student.notes.strip()) and fate != "zero"
         points = round(item.points * min(max(share, 0.0), 1.0), 2)
-        made.append(Item(item.title, points, item.points, capital(comment), item.by_hand, waits))
+        made.append(Item(item.title, points, item.points, comment, item.by_hand, waits))
     found = evidence.form_points
     return Graded(
         "",
@@ -54,7 +53,7 @@ def assess(
             *([] if evidence.own else [_whose(evidence)]),
         ),
         pending=why if fate == "pending" else "",
-        mistakes={} if found is None or not evidence.own else found.named,
+        mistakes={} if isinstance(found, str) or not evidence.own else found.named,
         form=evidence.form if isinstance(evidence.form, Answers) else None,
         log_sha256=log_sha256(results),
         version=results.provenance.px4fuse,
@@ -68,39 +67,25 @@ def _fate(evidence: Evidence, rubric: Rubric) -> tuple[Doubtful, str]:
     reason = reason_of(verdict)
     if verdict.status == "numbers differ":
         return "zero", f"your report's numbers are not those that its log gives{reason}"
-    todo: list[str] = []
-    # whether it is so, what the rubric says of it, why there are no points, and what can be done
-    for holds, rule, zero, remedy in (
-        (
-            verdict.status != "verified",
-            rubric.unverified,
-            f"your report could not be verified{reason}",
-            verdict.what_to_do or f"Look at it yourself: it could not be verified{reason}.",
-        ),
-        (
-            verdict.status == "verified" and verdict.page_status == "differ",
-            rubric.pages,
-            "pages of your PDF are not those that px4fuse draws from the log",
-            "Compare the pages that differ with the redrawn report.",
-        ),
-        (
-            not evidence.own,
-            rubric.others_log,
-            "your report is not about the log that you were given",
-            "" if evidence.own else _whose(evidence),
-        ),
-        (
-            evidence.key is not None and bool(getattr(evidence.results.request, "position", None)),
-            "pending",
-            "",
-            "Ask where its position file comes from: none was handed out.",
-        ),
-    ):
-        if holds and rule == "zero":
-            return "zero", zero
-        if holds and rule == "pending":
-            todo.append(remedy)
-    return ("pending", " ".join(todo)) if todo else ("count", "")
+    # of each doubt what the rubric says, why there are no points, and what can be done
+    doubts: list[tuple[Doubtful, str, str]] = []
+    if verdict.status != "verified":
+        todo = verdict.what_to_do or f"Look at it yourself: it could not be verified{reason}."
+        doubts.append((rubric.unverified, f"your report could not be verified{reason}", todo))
+    elif verdict.page_status == "differ":
+        why = "pages of your PDF are not those that px4fuse draws from the log"
+        doubts.append((rubric.pages, why, "Compare the pages with the redrawn report."))
+    if not evidence.own:
+        why = "your report is not about the log that you were given"
+        doubts.append((rubric.others_log, why, _whose(evidence)))
+    if evidence.key is not None and getattr(evidence.results.request, "position", None):
+        todo = "Ask where its position file comes from: none was handed out."
+        doubts.append(("pending", "", todo))
+    for rule, why, _ in doubts:
+        if rule == "zero":
+            return "zero", why
+    todo = " ".join(todo for rule, _, todo in doubts if rule == "pending")
+    return ("pending", todo) if todo else ("count", "")
 
 
 def _whose(evidence: Evidence) -> str:

@@ -12,6 +12,7 @@ import re
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 from px4fuse.flight import Unavailable
 from px4fuse.verification.pages import page_pictures
@@ -24,13 +25,14 @@ DRAWN_AS = "700 px, 16 colours"
 NAMED = re.compile(r"([0-9a-f]{16})-\d{3}-of-\d{3}\.png")
 
 
+Key = TypeVar("Key")
 # A redrawn report, and the words that its pictures must not show
 Redrawn = tuple[Path, Sequence[str]]
 
 
 def draw_sheets(
-    reports: Mapping[str, Redrawn], folder: Path, processes: int | None = None
-) -> dict[str, tuple[str, ...]]:
+    reports: Mapping[Key, Redrawn], folder: Path, processes: int | None = None
+) -> dict[Key, tuple[str, ...]]:
     """Draw the pages of reports that are not drawn yet, in processes of their own.
 
     Pictures that it drew before of reports that are no longer among these are deleted.

@@ -6,17 +6,16 @@ Nothing is unpacked to disk. Names from a zip file are shown and never used as p
 from __future__ import annotations
 
 import io
-import os
 import re
 import stat
 import struct
 import zipfile
 import zlib
-from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import IO
 
@@ -31,42 +30,108 @@ from px4fuse.verification.model import Refused
 MAX_ENTRIES = 10_000
 # Of the table of contents, which zipfile reads in one piece before it can be counted
 MAX_DIRECTORY_BYTES = 4_000_000
-# Of the PDFs of one zip file, unpacked one at a time, and of the zip files in it
-MAX_TOTAL_BYTES = 4_000_000_000
+# Of the zip files in one zip file, unpacked one at a time
 MAX_INNER_BYTES = 500_000_000
 # PDFs are compressed inside; what still shrinks a hundred times is empty
 MAX_RATIO = 100
 MAX_NAME = 200
 # The year that stands where a program knew no time
 ZIP_EPOCH = 1980
+# Zip files may hold zip files, which may not hold more
+MAX_DEPTH = 2
 
 _TOO_LARGE = f"larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB."
 # Between a zip file's entry and the entry of the zip file in it; no name can hold it
 _INSIDE = "\0"
 _ENCRYPTED = 1
 _UTF8 = 0x800
-_DAMAGED = (
-    zipfile.BadZipFile,
-    zlib.error,
-    struct.error,
-    OSError,
-    EOFError,
-    ValueError,
-    RuntimeError,  # also NotImplementedError: what zipfile does not know
-    LookupError,
-    OverflowError,
-    MemoryError,
-)
+
+
+class _EntryError(Exception):
+    """Why an entry of a zip file is not read."""
+
+
+# RuntimeError: also NotImplementedError, for what zipfile does not know
+_UNREADABLE = (
+    _EntryError, zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, ValueError,
+    RuntimeError, LookupError, OverflowError, MemoryError,
+)  # fmt: skip
+
+
+def _why(error: Exception) -> str:
+    """Why something could not be read: the end of a sentence."""
+    if isinstance(error, _EntryError):
+        return str(error)
+    why = error.strerror if isinstance(error, OSError) and error.strerror else "damaged"
+    return f"it cannot be read ({why})."
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where a file lies: itself, or an entry of a zip file; and what is known of it.
+
+    ``inside`` is what names of files in it begin with, ``depth`` in how many zip files it lies.
+    """
+
+    file: Path
+    entry: str
+    name: str
+    inside: str
+    time: datetime | None = None
+    depth: int = 0
 
 
 @dataclass
 class _Search:
     """What a search has met: PDFs by where they are, people of Gradescope, and what it says."""
 
-    found: dict[tuple[Path, str], tuple[str, datetime | None]] = field(default_factory=dict)
+    found: dict[tuple[Path, str], _Place] = field(default_factory=dict)
     people: dict[str, ExportOrigin] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    others: Counter[str] = field(default_factory=Counter)
+    others: int = 0
+
+    def take(self, place: _Place, opened: Callable[[], IO[bytes]]) -> None:
+        """Look at a file by what its name says it is.
+
+        Whatever is wrong with a zip file is a note and ends no search.
+        """
+        end = place.name.lower()[-4:]
+        if end == ".pdf":
+            self.found.setdefault((place.file, place.entry), place)
+        elif place.depth >= MAX_DEPTH or (end != ".zip" and not _is_metadata(place.name)):
+            self.others += 1
+        else:
+            try:
+                with opened() as stream:
+                    if end == ".zip":
+                        self._take_zip(place, stream)
+                    else:
+                        text = stream.read(MAX_BYTES).decode("utf-8", errors="replace")
+                        self.people |= gradescope_metadata(text)
+            except _UNREADABLE as error:
+                self.notes.append(f"{_shown(place.name)}: passed over: {_why(error)}")
+
+    def _take_zip(self, place: _Place, stream: IO[bytes]) -> None:
+        with _archive(stream) as archive:
+            entries = [one for one in archive.infolist() if not one.is_dir()]
+            last = {one.filename: one for one in entries}
+            if len(last) < len(entries):
+                self.notes.append(
+                    f"{_shown(place.name)}: {len(entries) - len(last)} entries have the name of "
+                    "another one; only the last of each name was read."
+                )
+            left = MAX_INNER_BYTES
+            for name, one in last.items():
+                label = _label(one)
+                if any(map(_hidden, label.split("/"))):
+                    continue
+                if label.lower().endswith(".zip") and (left := left - one.file_size) < 0:
+                    raise _EntryError("it holds too many zip files.")
+                whole = place.inside + label
+                inner = _Place(place.file, name, whole, f"{whole}/", _time(one), place.depth + 1)
+                if place.depth:  # a student set the clock of what is in a zip file in another one
+                    inner = replace(inner, entry=f"{place.entry}{_INSIDE}{name}", time=place.time)
+                self.take(inner, partial(_unpacked, archive, name))
 
 
 def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, ...]]:
@@ -75,9 +140,9 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
     Parameters
     ----------
     paths : sequence of Path
-        PDFs, zip files, and folders, which are searched with their subfolders. Zip files may hold
-        zip files, which may not hold more. Gradescope's ``submission_metadata.yml`` is read where
-        it stands beside the submissions, never inside one.
+        PDFs, zip files, and folders, which are searched with their subfolders. Gradescope's
+        ``submission_metadata.yml`` is read where it stands beside the submissions, never inside
+        one.
 
     Returns
     -------
@@ -94,74 +159,52 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
     search = _Search()
     for path in paths:
         for file, name in _files(path, search.notes):
-            if name.lower().endswith(".pdf"):
-                search.found.setdefault((file, ""), (name, None))
-            elif name.lower().endswith(".zip"):
-                with file.open("rb") as stream:
-                    prefix = f"{name}/" if path.is_dir() else ""
-                    _search_zip(stream, name, prefix, file, search)
-            elif _is_metadata(name):
-                with file.open("rb") as stream:
-                    search.people |= _people(stream.read(MAX_BYTES))
-            else:
-                search.others[_kind(name)] += 1
+            inside = f"{name}/" if path.is_dir() else ""
+            search.take(_Place(file, "", name, inside), partial(_opened, file))
     notes = search.notes
     if search.others:
-        kinds = ", ".join(f"{count} {kind}" for kind, count in search.others.most_common(5))
-        more = ", ..." if len(search.others) > 5 else ""
-        notes.append(f"Passed over, since they are not PDFs: {kinds}{more}.")
+        notes.append(f"Files passed over that are not PDFs: {search.others}.")
     if not search.found:
         raise SettingsError(
             one_line(" ".join(["No PDF was found in what was given.", *notes]), 500)
         )
     order = sorted(
-        search.found.items(), key=lambda item: (item[1][0].casefold(), item[1][0], item[0])
+        search.found.values(), key=lambda one: (one.name.casefold(), one.name, one.file, one.entry)
     )
-    names = distinct(_shown(name) for _, (name, _) in order)
-    exports = [(file if entry else None, name)
-               for ((file, entry), _), name in zip(order, names, strict=True)]  # fmt: skip
+    names = distinct(_shown(one.name) for one in order)
+    exports = [
+        (one.file if one.entry else None, name) for one, name in zip(order, names, strict=True)
+    ]
     made = (
-        Submission(*where, name, time, origin)
-        for (where, (_, time)), name, origin in zip(
-            order, names, origins_of(exports, search.people), strict=True
-        )
+        Submission(one.file, one.entry, name, one.time, origin)
+        for one, name, origin in zip(order, names, origins_of(exports, search.people), strict=True)
     )
     return tuple(made), tuple(notes)
 
 
 def read(submission: Submission) -> bytes | Refused:
     """Bytes of a submission, at most :data:`~px4fuse.verification.intake.MAX_BYTES` of them."""
-    reason = "no file any more."
     try:
-        if submission.file.is_file():
-            with submission.file.open("rb") as file:
-                stream: IO[bytes] = file
-                for entry in filter(None, submission.entry.split(_INSIDE)):
-                    with _archive(stream) as archive:
-                        stream = io.BytesIO(_unpacked(archive, entry))
-                content = stream.read(MAX_BYTES + 1)
-            if len(content) > MAX_BYTES:
-                raise _EntryError(_TOO_LARGE)
-            return content
-    except _EntryError as error:
-        reason = str(error)
-    except _DAMAGED as error:
-        why = error.strerror if isinstance(error, OSError) and error.strerror else "damaged"
-        reason = f"it cannot be read ({why})."
-    return Refused(f"{one_line(submission.name, MAX_NAME)}: {reason}")
+        with submission.file.open("rb") as file:
+            stream: IO[bytes] = file
+            for entry in filter(None, submission.entry.split(_INSIDE)):
+                with _archive(stream) as archive:
+                    stream = _unpacked(archive, entry)
+            content = stream.read(MAX_BYTES + 1)
+        if len(content) > MAX_BYTES:
+            raise _EntryError(_TOO_LARGE)
+    except _UNREADABLE as error:
+        return Refused(f"{one_line(submission.name, MAX_NAME)}: {_why(error)}")
+    return content
+
+
+def _opened(file: Path) -> IO[bytes]:
+    return file.open("rb")
 
 
 def _is_metadata(name: str) -> bool:
     *folders, last = name.split("/")
     return last == METADATA and not any(one.startswith("submission_") for one in folders)
-
-
-def _people(content: bytes) -> dict[str, ExportOrigin]:
-    return gradescope_metadata(content.decode("utf-8", errors="replace"))
-
-
-class _EntryError(Exception):
-    """Why an entry of a zip file is not read."""
 
 
 class _Limited:
@@ -193,23 +236,22 @@ def _files(path: Path, notes: list[str]) -> Iterator[tuple[Path, str]]:
         yield path.resolve(), path.name
         return
     if not path.is_dir():
-        raise SettingsError(f"{one_line(str(path), MAX_NAME)}: no such file or folder.")
+        raise SettingsError(f"{one_line(str(path), MAX_NAME)}: no regular file, and no folder.")
     root = path.resolve()
     outside = 0
-    for folder, folders, files in os.walk(root):  # symbolic links to folders are not entered
-        folders[:] = sorted(each for each in folders if not _hidden(each))
-        outside += sum((Path(folder) / each).is_symlink() for each in folders)
-        for file in sorted(each for each in files if not _hidden(each)):
-            whole = Path(folder) / file
-            try:
-                resolved = whole.resolve(strict=True)
-                # a named pipe would keep us waiting forever
-                inside = resolved.is_relative_to(root) and resolved.is_file()
-            except (OSError, RuntimeError):  # it leads nowhere, or in a circle
-                inside = False
-            if inside:
-                yield resolved, whole.relative_to(root).as_posix()
-            outside += not inside
+    for whole in root.rglob("*"):  # symbolic links to folders are not entered
+        name = whole.relative_to(root)
+        if any(map(_hidden, name.parts)) or (whole.is_dir() and not whole.is_symlink()):
+            continue
+        try:
+            resolved = whole.resolve(strict=True)
+            # a named pipe would keep us waiting forever
+            inside = resolved.is_relative_to(root) and resolved.is_file()
+        except (OSError, RuntimeError):  # it leads nowhere, or in a circle
+            inside = False
+        if inside:
+            yield resolved, name.as_posix()
+        outside += not inside
     if outside:
         notes.append(
             f"{one_line(path.name, MAX_NAME)}: {outside} links out of the folder or special files "
@@ -219,85 +261,6 @@ def _files(path: Path, notes: list[str]) -> Iterator[tuple[Path, str]]:
 
 def _hidden(name: str) -> bool:
     return name.startswith(".") or name == "__MACOSX"
-
-
-def _kind(name: str) -> str:
-    """What to call a file that is not a PDF."""
-    suffix = Path(name).suffix.lower()
-    return suffix if re.fullmatch(r"\.[a-z0-9]{1,8}", suffix) else "without a known suffix"
-
-
-def _search_zip(
-    stream: IO[bytes],
-    name: str,
-    prefix: str,
-    file: Path,
-    search: _Search,
-    outer: tuple[str, datetime | None] | None = None,
-) -> None:
-    """Look for PDFs in a zip file, and in the zip files in it.
-
-    Parameters
-    ----------
-    prefix : str
-        What names of its files begin with.
-    outer : (str, datetime or None), optional
-        Of a zip file in another one: its entry there, and its time. The student set the clock of
-        what is in it.
-    """
-    shown, left = _shown(name), MAX_INNER_BYTES
-    with _damage_noted(shown, search), _archive(stream) as archive:
-        for entry, label in _listed(archive, shown, search.notes):
-            where = entry.filename if outer is None else f"{outer[0]}{_INSIDE}{entry.filename}"
-            time = _time(entry) if outer is None else outer[1]
-            end, whole = label.lower()[-4:], prefix + label
-            about = outer is None and _is_metadata(label)
-            if end == ".pdf":
-                search.found.setdefault((file, where), (whole, time))
-            elif not about and end != ".zip":
-                search.others[_kind(label)] += 1
-            elif outer is not None:
-                search.notes.append(f"{shown}: a zip file in it was passed over: too deep.")
-            elif (left := left - entry.file_size) < 0:
-                raise _EntryError("it holds too many zip files.")
-            else:
-                with _damage_noted(_shown(whole), search):
-                    content = _unpacked(archive, entry.filename)
-                    if about:
-                        search.people |= _people(content)
-                        continue
-                    inside = io.BytesIO(content)
-                    _search_zip(inside, whole, f"{whole}/", file, search, (where, time))
-
-
-@contextmanager
-def _damage_noted(shown: str, search: _Search) -> Iterator[None]:
-    """Whatever is wrong with a zip file, or with an entry of it, is a note and ends no search."""
-    try:
-        yield
-    except (_EntryError, *_DAMAGED) as error:
-        why = str(error) if isinstance(error, _EntryError) else "not a zip file, or damaged."
-        search.notes.append(f"{shown}: passed over: {why}")
-
-
-def _listed(
-    archive: zipfile.ZipFile, shown: str, notes: list[str]
-) -> Iterator[tuple[zipfile.ZipInfo, str]]:
-    """Entries of a zip file that are files and not hidden, with their names for people."""
-    entries = [entry for entry in archive.infolist() if not entry.is_dir()]
-    # the declared size is the most that zipfile unpacks of an entry, so a lie makes it smaller
-    if sum(entry.file_size for entry in entries) > MAX_TOTAL_BYTES:
-        raise _EntryError(f"it unpacks to more than {MAX_TOTAL_BYTES // 10**9} GB.")
-    last = {entry.filename: entry for entry in entries}
-    if len(last) < len(entries):
-        notes.append(
-            f"{shown}: {len(entries) - len(last)} entries have the name of another one; only the "
-            "last of each name was read."
-        )
-    for entry in last.values():
-        label = _label(entry)
-        if not any(map(_hidden, label.split("/"))):
-            yield entry, label
 
 
 def _time(entry: zipfile.ZipInfo) -> datetime | None:
@@ -322,7 +285,7 @@ def _label(entry: zipfile.ZipInfo) -> str:
     return "/".join(part for part in parts if part not in ("", ".", "..") and part[1:] != ":")
 
 
-def _unpacked(archive: zipfile.ZipFile, name: str) -> bytes:
+def _unpacked(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
     """Content of an entry, if it is one that a learning platform would write."""
     entry = archive.getinfo(name)
     small = entry.file_size <= max(1_000_000, MAX_RATIO * entry.compress_size)
@@ -338,15 +301,12 @@ def _unpacked(archive: zipfile.ZipFile, name: str) -> bytes:
         if wrong:
             raise _EntryError(why)
     # zipfile gives no more than the declared size
-    return archive.read(entry)
+    return io.BytesIO(archive.read(entry))
 
 
 def _shown(name: str) -> str:
-    """A name that does nothing wherever it is shown, with its end, where the file's name is."""
+    """A name on one line, with its end, where the file's name is."""
     line = " ".join(cleaned(name[-10 * MAX_NAME :]).split())
-    line = re.sub(r'[<>"`|]', "_", line)
-    if line[:1] in set("=+-@"):  # a formula to a spreadsheet
-        line = f"_{line[1:]}"
     if len(line) > MAX_NAME:
         line = f"{line[: MAX_NAME // 2]}…{line[-(MAX_NAME - MAX_NAME // 2 - 1) :]}"
     return line or "nameless"
