@@ -16,7 +16,15 @@ from px4fuse.cli.quantity import TypedQuantity
 from px4fuse.errors import OutputError, SettingsError, on_one_line
 from px4fuse.reading import read_text
 from px4fuse.simulation.mistakes import MISTAKES, as_typed, made, parse
-from px4fuse.simulation.scenario import KINDS, OF_KIND, YAWS, Kind, Scenario, scenario_of
+from px4fuse.simulation.scenario import (
+    KINDS,
+    OF_KIND,
+    YAWS,
+    Kind,
+    Scenario,
+    quantities,
+    scenario_of,
+)
 
 if TYPE_CHECKING:
     from px4fuse.assignment.drawing import Kinds
@@ -34,30 +42,16 @@ MAX_SECRET_BYTES = 10_000
 Command = TypeVar("Command", bound=Callable[..., None])
 
 
-# Option, field of the scenario, whose own value is the default, unit and help
-_SCENARIO = (
-    ("--length", "length_m", "m", "Of the aisle, or of a side of the square."),
-    ("--speed", "speed_m_s", "m/s", "On the straight."),
-    ("--heading", "heading_deg", "°", "Of the aisle or of the first side, clockwise from north."),
-    ("--sigma-uwb", "sigma_uwb_m", "m", "White noise of the UWB, per axis: the true SIGMA_Z."),
-    ("--uwb-rate", "uwb_rate_hz", "Hz", None),
-    ("--sigma-gnss", "sigma_gnss_m", "m", "White noise of GNSS, north and east."),
-    ("--sigma-a", "sigma_a_m_s2", "m/s²",
-     "White noise of the accelerometer's mean over 0.1 s: the true SIGMA_A."),
-    ("--accel-bias-sigma", "accel_bias_sigma_m_s2", "m/s²",
-     "Width from which the accelerometer's constant bias is drawn."),
-)  # fmt: skip
-
-
 def _scenario_options(command: Command) -> Command:
-    """The real numbers of the scenario."""
-    for name, field, unit, meaning in reversed(_SCENARIO):
-        usual = getattr(_DEFAULT, field)
-        kind = TypedQuantity(unit, usual, between=(0.0, 360.0) if unit == "°" else None)
-        outdoors = OF_KIND[OUTDOOR].get(field)
+    """The options that set a real number of the scenario; its field has the default and help."""
+    for field, taken in reversed(quantities(Scenario).items()):
+        if not taken.meaning:
+            continue
+        usual, outdoors = getattr(_DEFAULT, field), OF_KIND[OUTDOOR].get(field)
         shown = f"{usual:g}" + (f"; outdoors {outdoors:g}" if outdoors else "")
-        told = f"{meaning}  [default: {shown}]"
-        command = click.option(name, field, type=kind, help=told)(command)
+        told = f"{taken.meaning}  [default: {shown}]"
+        kind = TypedQuantity(taken.unit, usual)
+        command = click.option(taken.typed, field, type=kind, help=told)(command)
     return command
 
 
@@ -72,7 +66,7 @@ class WithMistakes(click.Command):
                 [
                     (
                         f"{name}{mistake.usage}",
-                        mistake.help + (f" [{mistake.default:g}]" if mistake.arguments else ""),
+                        mistake.help + (f" [{mistake.usual:g}]" if mistake.sizes else ""),
                     )
                     for name, mistake in MISTAKES.items()
                 ]
@@ -159,12 +153,6 @@ class WithMistakes(click.Command):
     help="Whether the nose stays or follows the flight.  [default: fixed; follow around a square]",
 )
 @_scenario_options
-@click.option(
-    "--vio-drift",
-    type=float,
-    metavar="SHARE",
-    help=f"Drift of the VIO, as a share of the distance.  [default: {_DEFAULT.vio_drift:g}]",
-)
 def simulate(
     output: Path,
     assignment: Path | None,

@@ -9,8 +9,8 @@ import click
 
 from px4fuse.cli.inputs import Named, flight_options, json_option, open_option, path_option
 from px4fuse.cli.outputs import finish, progress, report_paths, result_files
-from px4fuse.cli.quantity import NAMES, in_unit
 from px4fuse.errors import SettingsError
+from px4fuse.units import NAMES, in_unit
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
