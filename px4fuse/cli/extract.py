@@ -57,7 +57,7 @@ def extract(log: Path, folder: Path, kind: str, **given: Any) -> None:
     from px4fuse.inspect import tables as extraction
     from px4fuse.results.contract import to_json
 
-    flight = read_flight(comparison_request(log, given))
+    flight = extraction.of_best_source(read_flight(comparison_request(log, given)))
     _refuse_mixture(folder, flight.log.sha256)
     tables = extraction.tables(flight)
     encode = _parquet if kind == "parquet" else _csv

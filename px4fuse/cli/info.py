@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from px4fuse.report.page import Cell
     from px4fuse.request import ComparisonRequest
 
-# No clock drifts by more: the recording was replayed at another speed
-REPLAY_PPM = 10_000.0
 SOURCES_HEAD = ("", "source", "samples", "Hz", "gaps", "span (s)")
 
 
@@ -193,24 +191,12 @@ def _span(source: Source) -> str:
 
 
 def _clocks(inventory: Inventory) -> list[str]:
+    from px4fuse.report.words import clock_words
+
     on: dict[str, dict[str, None]] = {}
     for source in inventory.sources:
         if source.clock:
             name = source.name if source.part == "position" else source.part
             on.setdefault(source.clock, {})[name] = None
     lines = [f"{clock}: {', '.join(parts)}" for clock, parts in on.items()]
-    for clock in inventory.clocks:
-        note = f"; {clock.note}" if clock.note else ""
-        lines.append(
-            f"{clock.clock}, mapped by {clock.method} ({clock.pairs} pairs): offset "
-            f"{clock.offset_s:.4f} s, {_speed(clock.drift_ppm)}, jitter "
-            f"{clock.jitter_s * 1e3:.1f} ms{note}"
-        )
-    return lines
-
-
-def _speed(drift_ppm: float) -> str:
-    """A drift, or how much faster a replay ran."""
-    if abs(drift_ppm) < REPLAY_PPM:
-        return f"drift {drift_ppm:+.1f} ppm"
-    return f"{1.0 + drift_ppm * 1e-6:.3g} times its speed"
+    return lines + [clock_words(clock) for clock in inventory.clocks]
