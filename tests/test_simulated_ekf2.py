@@ -96,11 +96,10 @@ def test_a_clean_flight_agrees_with_its_replay_from_the_log(clean: Flight) -> No
     ("texts", "scenario"),
     [
         (("nlos=5%",), AISLE),
-        (("dropout=8s",), AISLE),
         (("ekf2-delay=175ms",), AISLE),
         ((), Scenario(kind="loop", passes=1, seed=5)),
     ],
-    ids=["outliers", "dropout", "delay", "loop"],
+    ids=["outliers", "delay", "loop"],
 )
 def test_flights_with_mistakes_agree_too(texts: tuple[str, ...], scenario: Scenario) -> None:
     found = agreement(flown(*texts, scenario=scenario))

@@ -27,10 +27,6 @@ if TYPE_CHECKING:
     from px4fuse.request import ComparisonRequest
     from px4fuse.results.contract import AidsResults, ComparisonResults
 
-STEPS = (
-    "reading", "filtering", "tuning", "clock offset", "changes of the clock", "replaying EKF2",
-    "heading", "looking for a loop", "drawing",
-)  # fmt: skip
 SEVERITIES = ("error", "warning", "info")
 
 
@@ -74,7 +70,7 @@ def compare(
     request = comparison_request(log, given)
     alone = json_path == STANDARD_OUTPUT
     report_paths(output or Path("reports/LOG.pdf"), json_path)  # before the work, not after it
-    with progress(alone, STEPS) as step:
+    with progress(alone) as step:
         analysis, typed = run_or_judge_aids(request, step), command_line(request)
         document: AidsDocument | Document
         found: AidsResults | ComparisonResults

@@ -15,11 +15,6 @@ from px4fuse.writing import STANDARD_OUTPUT
 if TYPE_CHECKING:
     from px4fuse.results.contract import ChangeResults
 
-STEPS = (
-    "reading", "filtering", "tuning", "clock offset", "replaying EKF2", "heading",
-    "looking for a loop", "comparing", "drawing",
-)  # fmt: skip
-
 
 @click.command()
 @click.argument("a", type=Named())
@@ -51,7 +46,7 @@ def diff(
 
     alone = json_path == STANDARD_OUTPUT
     report_paths(output or Path("reports/LOG.pdf"), json_path)  # before the work, not after it
-    with progress(alone, STEPS) as step:
+    with progress(alone) as step:
         found = compared(a, b, progress=step)
         results = found.results
         if output is None and not alone:

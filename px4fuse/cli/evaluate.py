@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from px4fuse.results.contract import EvaluationResults
     from px4fuse.trajectory.scores import Delta
 
-STEPS = ("reading", "scoring", "drawing the report", "drawing the picture")
 MAX_DELTA = 1e6
 _DELTA = re.compile(r"(\d+\.?\d*|\.\d+) ?(m|s|frames|f)")
 
@@ -104,7 +103,7 @@ def evaluate(
     if request.max_gap_s is not None and request.max_gap_s <= 0.0:
         raise SettingsError(f"--max-gap {request.max_gap_s:g}: give more than 0 seconds.")
     _picture(output, picture, json_path)  # before the work, not after it
-    with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
+    with progress(json_path == STANDARD_OUTPUT) as step:
         step("reading")
         first = read_source(request.estimate, system=request.system)
         second = read_source(request.reference, default="truth", system=request.system)

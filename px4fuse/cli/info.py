@@ -10,6 +10,7 @@ import click
 
 from px4fuse.cli.inputs import Named, comparison_request, json_option, recording_options
 from px4fuse.cli.outputs import finish, progress, result_files
+from px4fuse.plain import few_words
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ def info(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.inspect.inventory import take_inventory, to_plain
 
     request = comparison_request(log, given)
-    with progress(json_path == STANDARD_OUTPUT, ("reading", "looking")) as step:
+    with progress(json_path == STANDARD_OUTPUT) as step:
         flight = read_flight(request, step)
         step("looking at what is in it")
         inventory = take_inventory(flight)
@@ -131,9 +132,7 @@ def _flying(inventory: Inventory) -> str:
     if not inventory.airborne:
         return "never, by the land detector"
     spans = [f"{start:.1f} s to {end:.1f} s" for start, end in inventory.airborne]
-    most = 3
-    more = f" and {len(spans) - most} more" if len(spans) > most else ""
-    return ", ".join(spans[:most]) + more
+    return few_words(spans, 3)
 
 
 def _senders(inventory: Inventory) -> list[tuple[str, ...]]:

@@ -35,10 +35,6 @@ if TYPE_CHECKING:
     from px4fuse.loop.loop import Loop
     from px4fuse.results.contract import LoopResults
 
-STEPS = (
-    "reading", *(f"solving: pose graph, {name}" for name in ("all", "gated", "DCS", "GNC")),
-    "drawing",
-)  # fmt: skip
 # Nobody's tape is longer
 MAX_LANDED_AT = 10_000.0
 # What may be given with a pose graph
@@ -123,7 +119,7 @@ def loop(
     alone = output is None and json_path is not None
     results = (json_path,) if alone else report_paths(output or Path("reports/A.pdf"), json_path)
     check_targets([tum, g2o, *results])
-    with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
+    with progress(json_path == STANDARD_OUTPUT) as step:
         found = run_loop(request, step)
         findings = find_loop(found)
         document = LoopDocument(found, findings, person, command_line(request))

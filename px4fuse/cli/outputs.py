@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Protocol
@@ -72,16 +72,10 @@ def silent(what: str, done: int = 0, of: int | None = None) -> None:
 
 
 @contextmanager
-def progress(quiet: bool = False, steps: Sequence[str] = ()) -> Iterator[ShowStep]:
-    """A bar on a terminal about what is being done and what remains; nothing in a pipe.
+def progress(quiet: bool = False) -> Iterator[ShowStep]:
+    """A bar on a terminal about what is being done, and what remains where that can be counted.
 
-    Parameters
-    ----------
-    quiet : bool
-        Show nothing on a terminal either.
-    steps : sequence of str
-        With what each step of the work begins, in their order; what is said besides is a part of
-        the step before.
+    Nothing in a pipe, nor where it is to be ``quiet``.
     """
     from rich.console import Console
 
@@ -94,20 +88,13 @@ def progress(quiet: bool = False, steps: Sequence[str] = ()) -> Iterator[ShowSte
     columns = (
         bars.SpinnerColumn(), bars.TextColumn("{task.description}", markup=False), bars.BarColumn(),
         bars.TextColumn("{task.fields[count]}"), bars.TimeElapsedColumn(),
-        # of work that is counted; steps are not equally long
-        *(() if steps else (bars.TextColumn("of which left"), bars.TimeRemainingColumn())),
+        bars.TimeRemainingColumn(),
     )  # fmt: skip
     with bars.Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("starting", total=len(steps) or None, count="")
-        at = 0
+        task = bar.add_task("starting", total=None, count="")
 
         def show(what: str, done: int = 0, of: int | None = None) -> None:
-            nonlocal at
-            if steps:
-                begun = (number for number, step in enumerate(steps) if what.startswith(step))
-                at = max(at, next(begun, at))
-                done, of = at, len(steps)
-            count = f"step {at + 1} of {of}" if steps else "" if of is None else f"{done} of {of}"
+            count = "" if of is None else f"{done} of {of}"
             bar.update(task, description=what, completed=done, total=of, count=count)
 
         yield show

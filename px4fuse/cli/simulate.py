@@ -35,9 +35,8 @@ MIXED = "mixed"
 OUTDOOR: Kind = "outdoor"
 SOURCES = {"aisle": "UWB", "loop": "VIO", OUTDOOR: "GNSS"}
 # What goes with --assignment, and what goes with nothing else
-OF_ASSIGNMENTS = ("output", "assignment", "secret", "secret_file", "count", "kind", "answer_path",
-                  "no_truth", "preview")  # fmt: skip
-ONLY_ASSIGNMENTS = ("secret", "secret_file", "count", "preview")
+ONLY_ASSIGNMENTS = ("secret_file", "count", "preview")
+OF_ASSIGNMENTS = ("output", "assignment", "kind", "answer_path", "no_truth", *ONLY_ASSIGNMENTS)
 MAX_SECRET_BYTES = 10_000
 Command = TypeVar("Command", bound=Callable[..., None])
 
@@ -92,11 +91,6 @@ class WithMistakes(click.Command):
     metavar="FILE",
     help="Holds the secret from which assignments are drawn: the same secret and id give the same "
     "flight.  [default: made up, and kept in the answer key]",
-)
-@click.option(
-    "--secret",
-    metavar="TEXT",
-    help="The secret itself; others on this computer may see what you type.",
 )
 @click.option(
     "--mistakes",
@@ -157,7 +151,6 @@ def simulate(
     output: Path,
     assignment: Path | None,
     secret_file: Path | None,
-    secret: str | None,
     count: int | None,
     mistakes: tuple[str, ...],
     answer_path: Path | None,
@@ -180,7 +173,7 @@ def simulate(
     """
     _check_options(assignment)
     if assignment is not None:
-        drawn_from = _read_secret(secret, secret_file), cast("Kinds", kind), count
+        drawn_from = _read_secret(secret_file), cast("Kinds", kind), count
         _assign(assignment, output, answer_path, *drawn_from, truth=not no_truth, preview=preview)
         return
     if kind == MIXED:
@@ -198,7 +191,7 @@ def simulate(
     from px4fuse.results.contract import to_json
     from px4fuse.simulation import flights
 
-    with progress(steps=("flying", "writing")) as step:
+    with progress() as step:
         step("flying")
         simulation = flights.simulate(scenario, parsed)
         step("writing the log")
@@ -231,13 +224,9 @@ def _check_options(assignment: Path | None) -> None:
             raise SettingsError(f"{parameter.opts[0]} requires --assignment ROSTER.csv.")
 
 
-def _read_secret(secret: str | None, file: Path | None) -> bytes | None:
+def _read_secret(file: Path | None) -> bytes | None:
     from px4fuse.assignment.drawing import secret_of
 
-    if secret is not None and file is not None:
-        raise SettingsError("--secret and --secret-file: give one of them.")
-    if secret is not None:
-        return secret_of(secret, "--secret")
     if file is None:
         return None
     name = f"--secret-file {file}"

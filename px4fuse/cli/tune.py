@@ -19,10 +19,6 @@ if TYPE_CHECKING:
     from px4fuse.flight import Unavailable
     from px4fuse.request import ComparisonRequest
 
-STEPS = (
-    "reading",
-    *(f"tuning {name}" for name in ("north", "east", "down", "aisle", "horizontal")),
-)  # fmt: skip
 HEAD = (
     "axis", "SIGMA_A (m/s²)\nvalue, 95 %", "SIGMA_Z (m)\nvalue, 95 %", "\ngain", "held\nout",
     "lag 1\nbefore after",
@@ -51,7 +47,7 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.results.build import tuning_results
 
     request = comparison_request(log, given)
-    with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
+    with progress(json_path == STANDARD_OUTPUT) as step:
         compared = run_preparation(request, step)
         tuned = tuned_noises(compared, progress=step)
     results = tuning_results(request, compared, tuned, command_line(request, "tune"))
