@@ -19,8 +19,7 @@ from rich.console import Console
 
 from px4fuse.analysis import run as analyse
 from px4fuse.cli import cli
-from px4fuse.cli.compare import default_report
-from px4fuse.cli.outputs import progress, terminal
+from px4fuse.cli.outputs import free_report, progress, terminal
 from px4fuse.cli.quantity import NAMES, in_unit
 from px4fuse.findings import find
 from px4fuse.report import screen
@@ -306,7 +305,7 @@ def reported(made: ComparisonResults, **changes: object) -> str:
     student = Student(name=str(changes.pop("student", "")))
     request = replace(made.request, **changes)
     changed = replace(made, request=request.recorded(), student=student)
-    path = default_report(request, changed)
+    path = free_report(Path(request.log).stem, settings_name(request), changed)
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(page_of(None, to_json(changed)))
     path.with_suffix(".json").write_text(to_json(changed), encoding="utf-8")

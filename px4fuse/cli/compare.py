@@ -24,7 +24,6 @@ from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
     from px4fuse.report.document import AidsDocument, Document
-    from px4fuse.request import ComparisonRequest
     from px4fuse.results.contract import AidsResults, ComparisonResults
 
 SEVERITIES = ("error", "warning", "info")
@@ -81,7 +80,7 @@ def compare(
             document = Document(analysis, find(analysis), person, typed)
             found = results(request, analysis, document.findings, person, typed)
         if output is None and not alone:
-            output = default_report(request, found)
+            output = free_report(log.stem, settings_name(request), found)
         contents = result_files(found, json_path, output, document, step)
     if isinstance(document, AidsDocument):
         finish(contents, partial(print_aids, document=document))
@@ -96,17 +95,3 @@ def compare(
         worst = SEVERITIES[: SEVERITIES.index(fail_on) + 1]
         if any(one.severity in worst and one.caused_by is None for one in document.findings):
             sys.exit(1)
-
-
-def default_report(request: ComparisonRequest, results: AidsResults | ComparisonResults) -> Path:
-    """Where a report goes that was given no name: that of the same flight, settings and student."""
-    return free_report(Path(request.log).stem, settings_name(request), results, _same)
-
-
-def _same(old: AidsResults | ComparisonResults, mine: AidsResults | ComparisonResults) -> bool:
-    first, second = (
-        (one.request, one.log.sha256, [file.sha256 for file in one.log.joined])
-        for one in (old, mine)
-    )
-    names = [(one.student.name, one.student.id) for one in (old, mine)]
-    return first == second and names[0] in (("", ""), names[1])

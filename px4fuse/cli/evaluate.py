@@ -10,11 +10,11 @@ import click
 
 from px4fuse.cli.inputs import (
     Named,
+    json_option,
     max_size_option,
     open_option,
     path_option,
     request_options,
-    results_option,
 )
 from px4fuse.cli.outputs import (
     check_targets,
@@ -29,7 +29,6 @@ from px4fuse.request import EVALUATION_OPTIONS, EvaluationRequest, command_line,
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
-    from px4fuse.results.contract import EvaluationResults
     from px4fuse.trajectory.scores import Delta
 
 MAX_DELTA = 1e6
@@ -73,7 +72,7 @@ def delta(text: str) -> Delta:
     metavar="FILE.png",
     help="The picture: the path by its error, APE, RPE.  [default: beside the PDF]",
 )
-@results_option
+@json_option
 @open_option
 def evaluate(
     estimate: Path,
@@ -121,21 +120,13 @@ def evaluate(
         results = evaluation_results(found, command_line(request))
         if output is None and picture is None and json_path is None:
             name = f"{file_name(estimate)}_against_{file_name(reference)}"
-            output = free_report(name, settings_name(request), results, _same)
+            output = free_report(name, settings_name(request), results)
         contents = result_files(results, json_path, output, found, step)
         picture = _picture(output, picture, json_path)
         if picture is not None:
             step("drawing the picture")
             contents[picture] = draw(found)
     finish(contents, lambda console: print_evaluation(console, found))
-
-
-def _same(old: EvaluationResults, mine: EvaluationResults) -> bool:
-    """Whether an earlier page is of the same: the settings are in the command."""
-    first, second = (
-        (one.provenance.command, one.estimate.sha256, one.reference.sha256) for one in (old, mine)
-    )
-    return first == second
 
 
 def _picture(output: Path | None, picture: Path | None, json_path: Path | None) -> Path | None:

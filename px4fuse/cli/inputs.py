@@ -122,11 +122,13 @@ max_size_option = click.option(
     metavar="MB",
     help=f"Largest log that is read.  [default: {max_log_bytes.get() // 1_000_000}]",
 )
+#: The results, which stand beside a report where there is one
 json_option = path_option(
     "--json",
     "json_path",
     metavar="FILE",
-    help="Write it as JSON; - prints that alone on standard output.",
+    help="The results as JSON; - prints them alone on standard output, and without -o writes no "
+    "report.  [default: beside the PDF]",
 )
 
 
@@ -158,14 +160,6 @@ person_options = _together(
         help="The form about the flight, filled in (see px4fuse answers), printed in the report.",
     ),
 )
-#: Of commands whose results stand beside a report
-results_option = path_option(
-    "--json",
-    "json_path",
-    metavar="FILE",
-    help="The results; - prints them alone on standard output, and without -o writes no report.  "
-    "[default: beside the PDF]",
-)
 #: Of every command that makes a report: the PDF and its results
 report_options = _together(
     path_option(
@@ -175,7 +169,7 @@ report_options = _together(
         help="The report.  [default: reports/LOG.pdf, settings that are not at their defaults in "
         "its name]",
     ),
-    results_option,
+    json_option,
 )
 
 

@@ -9,12 +9,12 @@ import click
 
 from px4fuse.cli.inputs import (
     Named,
+    json_option,
     max_size_option,
     path_option,
     person_options,
     read_person,
     request_options,
-    results_option,
     show_option,
     typed_parameters,
 )
@@ -33,7 +33,6 @@ from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
     from px4fuse.loop.loop import Loop
-    from px4fuse.results.contract import LoopResults
 
 # Nobody's tape is longer
 MAX_LANDED_AT = 10_000.0
@@ -81,7 +80,7 @@ def landing(text: str) -> Landing:
     metavar="FILE.pdf",
     help="The report.  [default: reports/SOURCE_loop.pdf]",
 )
-@results_option
+@json_option
 @path_option(
     "--tum", metavar="FILE", help="Write the corrected path as a TUM file, in the axes of SOURCE."
 )
@@ -125,16 +124,10 @@ def loop(
         document = LoopDocument(found, findings, person, command_line(request))
         made = loop_results(request, found, findings, person, document.command)
         if output is None and not alone:
-            output = free_report(f"{file_name(source)}_loop", settings_name(request), made, _same)
+            output = free_report(f"{file_name(source)}_loop", settings_name(request), made)
         contents = _files(found, tum, g2o)
         contents |= result_files(made, json_path, output, document, step)
     finish(contents, lambda console: print_loop(console, found, findings, request))
-
-
-def _same(old: LoopResults, mine: LoopResults) -> bool:
-    """Whether an earlier report is of the same."""
-    first, second = ((one.request, one.track.sha256, one.student) for one in (old, mine))
-    return first == second
 
 
 def loop_request(source: Path, given: dict[str, Any]) -> LoopRequest:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -100,27 +101,23 @@ def progress(quiet: bool = False) -> Iterator[ShowStep]:
         yield show
 
 
-def free_report(stem: str, settings: str, mine: Results, same: Callable[[Any, Any], bool]) -> Path:
+def free_report(stem: str, settings: str, mine: Results) -> Path:
     """Where a report goes that was given no name: what is not at its default is in its name.
 
-    What an earlier run of the ``same`` wrote is written over: results of this kind of which that is
-    true. Where another file has the name, a number is added.
+    What an earlier run wrote of the same files, settings and student is written over. Where another
+    file has the name, a number is added.
     """
-
-    def is_same(old: Results) -> bool:
-        return type(old) is type(mine) and same(old, mine)
-
     name = f"{stem}{settings}"
     if len(os.fsencode(name)) > LONGEST_NAME:
         name = os.fsencode(stem)[:LONGEST_STEM].decode(errors="ignore")
     number, path = 1, Path("reports", f"{name}.pdf")
-    while not all(_is_ours(file, is_same) for file in (path, path.with_suffix(".json"))):
+    while not all(_is_ours(file, mine) for file in (path, path.with_suffix(".json"))):
         number += 1
         path = Path("reports", f"{name}_{number}.pdf")
     return path
 
 
-def _is_ours(file: Path, is_same: Callable[[Results], bool]) -> bool:
+def _is_ours(file: Path, mine: Results) -> bool:
     """Whether a report or its results are of the same, or not there yet."""
     from pypdf import PdfReader
     from pypdf.errors import PyPdfError
@@ -133,9 +130,21 @@ def _is_ours(file: Path, is_same: Callable[[Results], bool]) -> bool:
     try:
         results = file.suffix == ".json"
         text = file.read_bytes() if results else PdfReader(file).attachments[RESULTS_NAME][0]
-        return is_same(read_results(text))
+        (asked, names), (ours, our_names) = map(_of_what, (read_results(text), mine))
     except (OSError, PyPdfError, KeyError, ValueError, ResultsError):
         return False  # not a report, or not one that this version reads
+    return asked == ours and names in ((), our_names)  # a name is added to what had none
+
+
+def _of_what(results: Results) -> tuple[object, tuple[str, ...]]:
+    """What was asked of which files, and whose report it is."""
+    from px4fuse.results.contract import to_json
+
+    student = getattr(results, "student", None)
+    names = (student.name, student.id) if student is not None else ()
+    asked = getattr(results, "request", results.provenance.command)
+    files = re.findall(r'sha256": *"(\w+)"', to_json(results))
+    return (type(results), asked, files), names if any(names) else ()
 
 
 def web_page(output: Path | None, default: Path) -> Path:

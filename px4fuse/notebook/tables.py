@@ -42,6 +42,8 @@ from px4fuse.trajectory.scores import PairwiseError
 EKF2 = "EKF2"
 OURS = "our filter"
 WIDTH = 100
+# Standard deviations, by the columns of their squares
+SIGMAS = {"position_variance_m2": "sigma_p_m", "velocity_variance_m2_s2": "sigma_v_m_s"}
 
 
 def row(record: Any) -> dict[str, Any]:
@@ -185,26 +187,21 @@ def _(comparison: Comparison) -> pd.DataFrame:
 def _(result: AxisComparison) -> pd.DataFrame:
     """Over time, at the filter's steps; EKF2 and truth interpolated, innovations at updates."""
     steps, updates = result.replay.steps, result.replay.updates
-    table = pd.DataFrame(
-        {
-            "kf_position_m": steps["position_m"],
-            "kf_velocity_m_s": steps["velocity_m_s"],
-            "kf_sigma_p_m": np.sqrt(steps["position_variance_m2"]),
-            "kf_sigma_v_m_s": np.sqrt(steps["velocity_variance_m2_s2"]),
-            "measurement_m": updates["measurement_m"],
-            "kf_innovation_m": updates["innovation_m"],
-            "kf_sqrt_s_m": np.sqrt(updates["innovation_variance_m2"]),
-        },
-        index=steps.index,
-    )
-    for owner, series in (("ekf2", result.ekf2_state), ("truth", result.truth)):
-        if isinstance(series, pd.DataFrame):
+    table = pd.DataFrame(index=steps.index)
+    for owner, state, variance in (
+        ("kf", steps, steps),
+        ("ekf2", result.ekf2_state, result.ekf2_variance),
+        ("truth", result.truth, None),
+    ):
+        if isinstance(state, pd.DataFrame):
             for column in ("position_m", "velocity_m_s"):
-                table[f"{owner}_{column}"] = _at(series[column], steps.index)
-    if isinstance(result.ekf2_variance, pd.DataFrame):
-        variance = result.ekf2_variance
-        table["ekf2_sigma_p_m"] = np.sqrt(_at(variance["position_variance_m2"], steps.index))
-        table["ekf2_sigma_v_m_s"] = np.sqrt(_at(variance["velocity_variance_m2_s2"], steps.index))
+                table[f"{owner}_{column}"] = _at(state[column], steps.index)
+        if isinstance(variance, pd.DataFrame):
+            for column, name in SIGMAS.items():
+                table[f"{owner}_{name}"] = np.sqrt(_at(variance[column], steps.index))
+    table["measurement_m"] = updates["measurement_m"]
+    table["kf_innovation_m"] = updates["innovation_m"]
+    table["kf_sqrt_s_m"] = np.sqrt(updates["innovation_variance_m2"])
     return table
 
 
