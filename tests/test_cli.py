@@ -127,12 +127,6 @@ def test_bad_logs_give_one_line_and_write_nothing(tmp_path, monkeypatch, capsys,
     assert {path.name for path in Path().rglob("*")} - {"bad.ulg"} == {"reports", "bad.pdf"}
 
 
-def test_no_command_shows_help(monkeypatch, capsys):
-    code, out, err = run_main(monkeypatch, capsys)
-    assert code == 2
-    assert "Usage:" in out + err
-
-
 def test_a_pipe_that_closes_early_is_no_traceback(tmp_path, sample_log):
     """As in px4fuse compare ... | head: the reader is gone before the summary is printed."""
     command = [sys.executable, "-m", "px4fuse", "compare", str(sample_log), "--axis", "down",

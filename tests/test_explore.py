@@ -431,19 +431,6 @@ def explore(*words: str | Path) -> Result:
     return CliRunner().invoke(cli, ["explore", *map(str, words)])
 
 
-def test_the_command_writes_one_file(
-    sample_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    done = explore(sample_log, "--start", "20", "--end", "40", "--sigma-z", "0.2")
-    assert done.exit_code == 0, done.output
-    written = [file for file in tmp_path.rglob("*") if file.is_file()]
-    name = "aisle_uwb_sigma-z-0.2_start-20_end-40.html"
-    assert written == [tmp_path / "reports" / name]
-    assert f"reports/{name}" in done.output
-    assert written[0].read_bytes().startswith(b"<!DOCTYPE html>")
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [

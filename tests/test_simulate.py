@@ -131,13 +131,6 @@ def test_aisle_is_as_long_as_asked_ends_where_it_began_and_the_nose_follows_or_s
 # --- sensors
 
 
-def test_position_noise_is_white_and_as_stated():
-    error, _ = position_error(Scenario(seed=2, sigma_uwb_m=0.07, uwb_rate_hz=20.0))
-    assert np.std(error, axis=0) == pytest.approx(np.full(3, 0.07), rel=0.05)
-    for axis in error.T:
-        assert abs(np.corrcoef(axis[1:], axis[:-1])[0, 1]) < 0.06
-
-
 @pytest.mark.parametrize("texts", [[], ["vibration=0.5"]])
 def test_acceleration_noise_per_step_is_sigma_a(texts):
     scenario = Scenario(seed=3, passes=4, wander_m=0.0, **IDEAL)

@@ -243,7 +243,7 @@ def test_a_shell_runs_what_is_printed(desk) -> None:
         (["compare", "l.ulg", "--heading", "-30"], "not between 0 and 360"),
         (["compare", "l.ulg", "--heading", "361"], "not between 0 and 360"),
         (["compare", "l.ulg", "--heading", "north"], "give degrees, as 30"),
-        (["simulate", "-o", "s.ulg", "--heading", "-1"], "not between 0 and 360"),
+        (["simulate", "-o", "s.ulg", "--heading", "361"], "--heading 361 is out of range"),
         (["simulate", "-o", "s.ulg", "--speed", "3.6km/h"], "give metres per second, as 1"),
         (["loop", "l.ulg", "--drift", "1 m"], "give metres, as 1"),
         (["whatif", "l.ulg", "--set", "EKF2_EV_DELAY=0.1s"], "give milliseconds, as 100"),

@@ -5,8 +5,6 @@ from __future__ import annotations
 import io
 import json
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -374,15 +372,3 @@ def test_bad_input_gives_one_line_and_writes_nothing(
     assert said in err
     assert "1.79525e+09" not in err  # times can be told apart
     assert contents(desk) == before
-
-
-@pytest.mark.parametrize("command", ["loop s.tum", "evaluate s.tum s.tum"])
-def test_a_reader_that_leaves_is_no_error(desk, command) -> None:
-    """As in px4fuse loop s.tum | head -1, when head has gone before anything is printed."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "px4fuse", *command.split()],
-        cwd=desk, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
-    process.stdout.close()
-    _, complaint = process.communicate()
-    assert (process.returncode, complaint) == (0, b"")

@@ -35,10 +35,7 @@ SEVERITIES = ("error", "warning", "info")
 @person_options
 @report_options
 @click.option(
-    "--fail-on",
-    type=click.Choice(SEVERITIES),
-    default=None,
-    help="Exit with 1 if there is a finding of at least this severity.",
+    "--fail-on", type=click.Choice(SEVERITIES), help="Exit with 1 on a finding at least so severe."
 )
 @click.option(
     "--checks",

@@ -62,15 +62,10 @@ def delta(text: str) -> Delta:
 @request_options(EvaluationRequest, EVALUATION_OPTIONS)
 @max_size_option
 @path_option(
-    "-o",
-    "--output",
-    metavar="FILE.pdf",
-    help="The page.  [default: reports/ESTIMATE_against_REFERENCE.pdf]",
+    "-o", "--output", metavar="FILE.pdf", help="The page.  [default: reports/A_against_B.pdf]"
 )
 @path_option(
-    "--picture",
-    metavar="FILE.png",
-    help="The picture: the path by its error, APE, RPE.  [default: beside the PDF]",
+    "--picture", metavar="FILE.png", help="The path by its error, APE, RPE.  [default: as the PDF]"
 )
 @json_option
 @open_option

@@ -26,12 +26,7 @@ MAX_DESCRIPTION_BYTES = 50_000_000
 @click.command()
 @click.argument("log", type=Named())
 @path_option(
-    "-o",
-    "--output",
-    "folder",
-    required=True,
-    metavar="DIR",
-    help="Folder for the tables; made where it is missing.",
+    "-o", "--output", "folder", required=True, metavar="DIR", help="Folder for the tables."
 )
 @click.option(
     "--format",

@@ -154,11 +154,7 @@ person_options = _together(
     click.option("--student", metavar="NAME", help="Name on the report."),
     click.option("--id", "student_id", metavar="ID", help="Student number on the report."),
     path_option("--notes", metavar="FILE.md", help="Your own words, printed in the report."),
-    path_option(
-        "--answers",
-        metavar="FILE.toml",
-        help="The form about the flight, filled in (see px4fuse answers), printed in the report.",
-    ),
+    path_option("--answers", metavar="FILE.toml", help="The form of px4fuse answers, filled in."),
 )
 #: Of every command that makes a report: the PDF and its results
 report_options = _together(

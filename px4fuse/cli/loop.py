@@ -75,10 +75,7 @@ def landing(text: str) -> Landing:
 @max_size_option
 @person_options
 @path_option(
-    "-o",
-    "--output",
-    metavar="FILE.pdf",
-    help="The report.  [default: reports/SOURCE_loop.pdf]",
+    "-o", "--output", metavar="FILE.pdf", help="The report.  [default: reports/SOURCE_loop.pdf]"
 )
 @json_option
 @path_option(

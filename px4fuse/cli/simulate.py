@@ -74,11 +74,7 @@ class WithMistakes(click.Command):
 
 @click.command(cls=WithMistakes)
 @path_option(
-    "-o",
-    "--output",
-    required=True,
-    metavar="FLIGHT.ulg|DIR",
-    help="The log to write; with --assignment the folder for everyone's.",
+    "-o", "--output", required=True, metavar="FLIGHT.ulg|DIR", help="The log, or a class's folder."
 )
 @path_option(
     "--assignment",
@@ -99,11 +95,7 @@ class WithMistakes(click.Command):
     metavar="N",
     help="How many mistakes each assigned flight has.  [default: drawn: none, one or two]",
 )
-@click.option(
-    "--preview",
-    is_flag=True,
-    help="Print what --assignment draws for whom, for you alone, and write nothing.",
-)
+@click.option("--preview", is_flag=True, help="Print what --assignment draws; write nothing.")
 @click.option(
     "--kind",
     type=click.Choice((*KINDS, MIXED)),
@@ -113,18 +105,14 @@ class WithMistakes(click.Command):
     "others.",
 )
 @click.option(
-    "--seed",
-    type=int,
-    default=_DEFAULT.seed,
-    metavar="N",
-    help="A number per student gives everyone a flight of their own; the same number the same.",
+    "--seed", type=int, default=_DEFAULT.seed, metavar="N", help="The same number: the same flight."
 )
 @click.option(
     "--mistake",
     "mistakes",
     multiple=True,
     metavar="NAME[=VALUE]",
-    help="What goes wrong, from the table below; may be repeated.",
+    help="See below. Repeatable.",
 )
 @path_option(
     "--answer",
@@ -136,15 +124,10 @@ class WithMistakes(click.Command):
 @click.option("--no-truth", is_flag=True, help="Leave the ground truth out of the log.")
 @click.option("--no-ekf2", is_flag=True, help="Fly without EKF2, which is faster.")
 @click.option(
-    "--passes",
-    type=int,
-    metavar="N",
-    help="Passes of the aisle [6], or laps of the square [1; outdoors 3].",
+    "--passes", type=int, metavar="N", help="Passes [6], or laps of a square [1; outdoors 3]."
 )
 @click.option(
-    "--yaw",
-    type=click.Choice(YAWS),
-    help="Whether the nose stays or follows the flight.  [default: fixed; follow around a square]",
+    "--yaw", type=click.Choice(YAWS), help="Of the nose.  [default: fixed; follow around a square]"
 )
 @_scenario_options
 def simulate(
