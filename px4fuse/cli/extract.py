@@ -66,10 +66,6 @@ def extract(log: Path, folder: Path, kind: str, **given: Any) -> None:
     click.echo("  data_dictionary.csv, flight.json")
     for part in extraction.absent(flight):
         click.echo(f"Not in this log: {part.what} ({part.reason})")
-    others = {path for path in folder.glob(f"*.{kind}") if path not in contents}
-    if others:
-        names = ", ".join(sorted(path.name for path in others))
-        click.echo(on_one_line(f"Already there and not of this run: {names}"))
 
 
 def _refuse_mixture(folder: Path, sha256: str) -> None:

@@ -8,7 +8,7 @@ import signal
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import click
 
@@ -39,7 +39,7 @@ OPENED = "px4fuse.opened"
 TO_LOOK_AT = (".html", ".htm", ".pdf", ".png")
 
 
-class Interrupted(click.ClickException):
+class Interrupted(Exception):  # noqa: N818 - no error of anybody
     """The run was ended from outside.
 
     Parameters
@@ -52,12 +52,7 @@ class Interrupted(click.ClickException):
 
     def __init__(self, stopped: KeyboardInterrupt, left: str) -> None:
         super().__init__(f"interrupted, {left}")
-        number = stopped.args[0] if stopped.args else signal.SIGINT
-        self.exit_code = 128 + number  # type: ignore[misc]  # read from the instance by click
-
-    def show(self, file: IO[Any] | None = None) -> None:
-        """Say so on one line."""
-        click.echo(f"px4fuse: {self.message}", file=file, err=True)
+        self.exit_code = 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
 
 
 class ShowStep(Protocol):
