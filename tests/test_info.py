@@ -242,14 +242,14 @@ def test_gaps_are_counted_and_the_longest_is_given(tmp_path):
                                    ("vehicle_visual_odometry", 5, 0.1)):  # fmt: skip
         at = next(i for i, t in enumerate(log.topics) if t.name == name)
         seconds = first_s + np.arange(len(log.topics[at].fields["timestamp"])) / rate_hz
-        lost = ((seconds > 10.0) & (seconds < 12.0)) | ((seconds > 20.0) & (seconds < 20.5))
+        lost = ((seconds > 10.0) & (seconds < 12.0)) | ((seconds > 20.0) & (seconds < 20.15))
         log.topics[at] = take(log.topics[at], np.flatnonzero(~lost))
     inventory = inventory_of(log, tmp_path)
     imu, position = source(inventory, "IMU").gaps, source(inventory, "position").gaps
     assert (imu.count, imu.limit_s) == (2, pytest.approx(0.1))
     assert imu.longest_s == pytest.approx(2.0)
-    assert imu.total_s == pytest.approx(2.5)
-    assert (position.count, position.limit_s) == (1, pytest.approx(1.0))
+    assert imu.total_s == pytest.approx(2.15)
+    assert (position.count, position.limit_s) == (1, pytest.approx(1.0, abs=0.01))
     assert position.longest_s == pytest.approx(2.0, abs=0.21)
     assert source(inventory, "attitude").gaps.count == 0
 
