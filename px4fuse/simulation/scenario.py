@@ -29,7 +29,7 @@ OF_KIND: Mapping[Kind, Mapping[str, float]] = {
 
 
 @dataclass(frozen=True)
-class Quantity:
+class Bounds:
     """What a number of a simulation may be; beyond it, it is a slip of the keyboard.
 
     Attributes
@@ -52,10 +52,10 @@ class Quantity:
 
 def number(usual: Any, *about: Any) -> Any:
     """A field of a record that is a number, its default, and what it may be."""
-    return field(default=usual, metadata={"quantity": Quantity(*about)})
+    return field(default=usual, metadata={"quantity": Bounds(*about)})
 
 
-def quantities(record: type) -> dict[str, Quantity]:
+def quantities(record: type) -> dict[str, Bounds]:
     """The fields of a record that :func:`number` made."""
     return {one.name: one.metadata["quantity"] for one in fields(record) if one.metadata}
 
