@@ -85,10 +85,9 @@ def __dir__() -> list[str]:
 def __getattr__(name: str) -> _typing.Any:
     """Import a public name when it is first used, so that ``px4fuse --help`` is instant."""
     if name not in _HOMES:
-        from px4fuse.errors import did_you_mean as _did_you_mean  # noqa: PLC0415
-
-        near = _did_you_mean(name, _HOMES).strip()
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}. {near}".rstrip(". "))
+        raise AttributeError(
+            f"module {__name__!r} has no attribute {name!r}", name=name, obj=_sys.modules[__name__]
+        )
     _importlib.import_module(f"{__name__}.notebook")  # by which results show themselves
     value = getattr(_importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
     globals()[name] = value

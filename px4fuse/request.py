@@ -251,7 +251,7 @@ class Option(NamedTuple):
     meaning : str
         Its help; empty where the command declares the option itself.
     unit : str
-        Of a number, as :data:`px4fuse.cli.quantity.NAMES` has it.
+        Of a number, as :data:`px4fuse.units.NAMES` has it.
     example : float
         Shown where what was typed cannot be understood.
     metavar : str or None

@@ -21,6 +21,7 @@ from pathlib import Path
 import pytest
 from browser import browser  # noqa: F401 - a fixture
 from exchange import replace
+from explore_tools import explored, page  # noqa: F401 - fixtures
 from hypothesis import HealthCheck, settings
 from pypdf import PdfWriter
 

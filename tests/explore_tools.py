@@ -4,27 +4,36 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import pytest
 from browser import Browser
 
-from px4fuse.analysis import Analysis
-from px4fuse.explore.page import html_text
+from px4fuse.analysis import Analysis, run
 from px4fuse.findings import find
-from px4fuse.findings.model import Finding
 from px4fuse.request import ComparisonRequest
 
 
-def open_page(
-    browser: Browser, file: Path, flights: list[tuple[Analysis, ComparisonRequest]], at: str = ""
-) -> Browser:
-    told: list[tuple[Analysis, tuple[Finding, ...], ComparisonRequest]] = [
-        (analysis, find(analysis), request) for analysis, request in flights
-    ]
-    file.write_bytes(html_text(told).encode())
-    return show(browser, file, at)
+@pytest.fixture(scope="session")
+def explored(sample_log: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Analysis]:
+    """The page of the sample flight."""
+    from px4fuse.explore.page import html_text  # Bokeh takes long, and few tests need it
+
+    request = ComparisonRequest(log=str(sample_log))
+    analysis = run(request)
+    file = tmp_path_factory.mktemp("explore") / "sample.html"
+    file.write_bytes(html_text([(analysis, find(analysis), request)]).encode())
+    return file, analysis
+
+
+@pytest.fixture
+def page(browser: Browser, explored: tuple[Path, Analysis]) -> Iterator[Browser]:
+    yield show(browser, explored[0])
+    assert browser.complaints() == []
+    assert browser.requests() <= {"file", "data", "blob"}
 
 
 def show(browser: Browser, file: Path, at: str = "", width: int = 1400) -> Browser:
@@ -70,8 +79,25 @@ def settle(browser: Browser) -> None:
 
 def ask(browser: Browser, script: str) -> Any:
     """What a script with ``await`` gives."""
-    answer = browser.call(
-        "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
+    return browser.ask_later(script)
+
+
+def mouse(page: Browser, places: list[tuple[float, float]]) -> None:
+    """Drag from the first place to the last."""
+    kinds = ["mousePressed", *["mouseMoved"] * (len(places) - 1), "mouseReleased"]
+    for kind, (x, y) in zip(kinds, [*places, places[-1]], strict=True):
+        page.call(
+            "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1,
+            clickCount=1,
+        )  # fmt: skip
+    settle(page)
+
+
+def box(page: Browser, name: str) -> tuple[float, float, float, float]:
+    """Where an element is once it is scrolled to: x, y, width and height."""
+    x, y, width, height = page.ask(
+        f"(() => {{ const node = document.getElementById({json.dumps(name)});"
+        "node.scrollIntoView({block: 'center'}); const box = node.getBoundingClientRect();"
+        "return [box.x, box.y, box.width, box.height]; })()"
     )
-    assert "exceptionDetails" not in answer, answer
-    return answer["result"].get("value")
+    return x, y, width, height

@@ -356,11 +356,7 @@ class TestKey:
 
 
 BAD_COMMANDS = {
-    "short secret": ("--assignment roster.csv -o f --secret abc", "can be guessed"),
-    "two secrets": (
-        "--assignment roster.csv -o f --secret abcdefgh1 --secret-file x",
-        "one of",
-    ),
+    "short secret": ("--assignment roster.csv -o f --secret-file abc.txt", "can be guessed"),
     "no secret file": ("--assignment roster.csv -o f --secret-file none", "cannot be read"),
     "seed": ("--assignment roster.csv -o f --seed 3", "--seed is for a single flight"),
     "too many for a loop": ("--assignment roster.csv -o f --kind mixed --mistakes 2", "0 to 1"),
@@ -380,6 +376,7 @@ class TestCommand:
     def at(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         roster(tmp_path, "id,name\ns01,=cmd|x\ns02,<b>\n")
+        (tmp_path / "abc.txt").write_text("abc")
         (tmp_path / "secret.txt").write_text("\ufeffour secret 2026\r\n", encoding="utf-8")
         return tmp_path
 
@@ -388,14 +385,14 @@ class TestCommand:
 
     def test_preview_prints_what_is_then_drawn_and_writes_nothing(self, at):
         given = ("--assignment", "roster.csv", "-o", "f", "--kind", "mixed", "--mistakes", "1",
-                 "--secret", "our secret 2026")  # fmt: skip
+                 "--secret-file", "secret.txt")  # fmt: skip
         before = files(at)
         shown = self.run(*given, "--preview")
         assert shown.exit_code == 0, shown.output
         assert files(at) == before
         assert "Nothing was written" in shown.output
         assert self.run(*given).exit_code == 0
-        by_file = self.run(*given[:-2], "--secret-file", "secret.txt")
+        by_file = self.run(*given)
         assert "0 written, 2 were there already" in by_file.output
         assert "our secret" not in (at / "f_answers.json").read_text(encoding="utf-8")
         key = read_key(at / "f_answers.json")

@@ -2,11 +2,9 @@
 
 import json
 import os
-import platform
 import shutil
 import subprocess
 import sys
-from importlib import metadata
 from pathlib import Path
 
 import jsonschema
@@ -16,7 +14,6 @@ from cli_tools import contents, run, run_main
 from click.testing import Result
 from conftest import REPOSITORY as ROOT
 
-from px4fuse.cli import COMMANDS, _flushed
 from px4fuse.results.contract import schema
 
 pytestmark = pytest.mark.usefixtures("analysed_once")
@@ -86,23 +83,15 @@ def test_same_input_gives_the_same_bytes_and_fail_on_another_exit_code(tmp_path,
     "options",
     [
         ["--sigma-a", "0"],
-        ["--sigma-a", "-1"],
-        ["--sigma-z", "0"],
-        ["--sigma-z", "1e9"],
         ["--sigma-z", "nan"],
-        ["--dt", "0"],
-        ["--dt", "100"],
         ["--clock-offset", "inf"],
         ["--heading", "nan"],
         ["--start", "500"],
         ["--start", "50", "--end", "40"],
-        ["--start", "50", "--end", "50.1"],
-        ["--position-source", "vehicle_mocap_odometry"],
         ["--position-source", "nonsense"],
         ["--notes", "absent.md"],
         ["-o", "report.txt"],
-        ["-o", "same.pdf", "--json", "same.pdf"],
-        ["--sigma-a", "abc"],
+        ["-o", __file__ + "/r.pdf"],
         ["--axis", "up"],
         ["--no-such-option"],
     ],
@@ -119,7 +108,7 @@ def test_bad_settings_give_one_line_and_leave_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("content", [None, b"", b"no log at all", b"ULog\x01\x12\x35" * 2])
+@pytest.mark.parametrize("content", [None, b"", b"no log at all"])
 @pytest.mark.parametrize("command", ["compare", "info", "extract -o tables", "tune", "sync"])
 def test_bad_logs_give_one_line_and_write_nothing(tmp_path, monkeypatch, capsys, command, content):
     monkeypatch.chdir(tmp_path)
@@ -138,19 +127,6 @@ def test_bad_logs_give_one_line_and_write_nothing(tmp_path, monkeypatch, capsys,
     assert {path.name for path in Path().rglob("*")} - {"bad.ulg"} == {"reports", "bad.pdf"}
 
 
-def test_no_command_shows_help(monkeypatch, capsys):
-    code, out, err = run_main(monkeypatch, capsys)
-    assert code == 2
-    assert "Usage:" in out + err
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_help(command):
-    result = run(command, "--help")
-    assert result.exit_code == 0
-    assert "Usage:" in result.output
-
-
 def test_a_pipe_that_closes_early_is_no_traceback(tmp_path, sample_log):
     """As in px4fuse compare ... | head: the reader is gone before the summary is printed."""
     command = [sys.executable, "-m", "px4fuse", "compare", str(sample_log), "--axis", "down",
@@ -160,18 +136,6 @@ def test_a_pipe_that_closes_early_is_no_traceback(tmp_path, sample_log):
     assert process.stderr.read() == b""
     process.stderr.close()
     assert process.wait() in (0, 1)
-
-
-@pytest.mark.usefixtures("no_drawing")
-def test_output_that_cannot_be_written_gives_one_line(tmp_path, monkeypatch, capsys, sample_log):
-    blocker = tmp_path / "file"
-    blocker.write_text("in the way")
-    code, _, err = run_main(
-        monkeypatch, capsys, "compare", sample_log, "--axis", "down", "-o", blocker / "r.pdf"
-    )
-    assert code == 2
-    assert len(err.strip().splitlines()) == 1
-    assert blocker.read_text() == "in the way"
 
 
 def test_help_imports_nothing_heavy():
@@ -188,17 +152,6 @@ def test_help_imports_nothing_heavy():
     assert "compare" in done.stdout
 
 
-def test_lesson_kalman_prints_the_lesson_digit_for_digit():
-    assert run("lesson", "kalman").output == (
-        "t 0.5 s: p 0.57 (true 0.50), v 0.57, sigma_p 0.099 m, sigma_v 0.719 m/s\n"
-        "t 1.0 s: p 0.88 (true 1.00), v 0.61, sigma_p 0.097 m, sigma_v 0.262 m/s\n"
-        "t 1.5 s: p 1.48 (true 1.50), v 0.98, sigma_p 0.090 m, sigma_v 0.164 m/s\n"
-        "t 2.0 s: p 2.06 (true 2.00), v 1.07, sigma_p 0.085 m, sigma_v 0.141 m/s\n"
-        "t 2.5 s: p 2.49 (true 2.50), v 0.97, sigma_p 0.082 m, sigma_v 0.137 m/s\n"
-        "t 3.0 s: p 2.93 (true 3.00), v 0.92, sigma_p 0.081 m, sigma_v 0.136 m/s\n"
-    )
-
-
 def test_a_name_with_stray_bytes_or_ten_thousand_characters_is_drawn(tmp_path, sample_log):
     result = run(
         "compare", sample_log, "--axis", "north", "--start", "20", "--end", "40",
@@ -207,16 +160,6 @@ def test_a_name_with_stray_bytes_or_ten_thousand_characters_is_drawn(tmp_path, s
     assert result.exit_code == 0, result.output
     student = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))["student"]
     assert student == {"name": "bad?", "id": "9" * 10_000, "notes": ""}
-
-
-@pytest.mark.usefixtures("no_drawing")
-def test_a_segment_beyond_the_data_is_cut_and_said_to_be(tmp_path, sample_log):
-    out = tmp_path / "r.pdf"
-    run("compare", sample_log, "--axis", "down", "--start", "-50", "--end", "500", "-o", out)
-    settings = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))["settings"]
-    assert settings["start_s"] == 0.0
-    assert 129.0 < settings["end_s"] < 130.0
-    assert "cut at the ends of the data" in settings["segment_reason"]
 
 
 # --------------------------------------------------------------------------- sample and versions
@@ -264,16 +207,6 @@ def test_without_the_samples_it_says_what_to_install(monkeypatch, capsys) -> Non
     )
 
 
-def test_versions_are_for_a_bug_report() -> None:
-    made = run("info", "--versions")
-    assert made.exit_code == 0
-    first, libraries = made.output.splitlines()
-    assert first.startswith(
-        f"px4fuse {metadata.version('px4fuse')}, Python {platform.python_version()}"
-    )
-    assert f"numpy {metadata.version('numpy')}" in libraries
-
-
 @pytest.mark.parametrize(
     ("words", "loaded"),
     [(("info", "{log}"), False), (("extract", "{log}", "-o", "{out}"), True), ((), False)],
@@ -315,16 +248,3 @@ def test_no_file_is_opened_in_the_encoding_of_the_machine(
     command = [sys.executable, "-X", "warn_default_encoding", "-c", script]
     done = subprocess.run(command, capture_output=True, cwd=tmp_path, env=environment, check=False)
     assert done.returncode == 0, done.stderr.decode("cp1252")[-300:]
-
-
-@pytest.mark.parametrize(("code", "ends_with", "said"), [(0, 2, True), (1, 1, False)])
-def test_a_last_flush_that_fails_is_said_once(monkeypatch, capsys, code, ends_with, said):
-    class Full:
-        def flush(self):
-            raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("px4fuse.cli._abandon_output", lambda: None)
-    monkeypatch.setattr("px4fuse.cli.sys.stdout", Full())
-    assert _flushed(code) == ends_with
-    err = capsys.readouterr().err
-    assert ("standard output: cannot be written (No space left on device)." in err) is said

@@ -50,6 +50,20 @@ SCRIPT = """(async () => {
 })()"""
 
 
+# What the page calls the columns of a replay
+COLUMNS = {
+    "steps": {
+        "time": "time", "p": "position_m", "v": "velocity_m_s", "p00": "position_variance_m2",
+        "p01": "covariance_m2_s", "p11": "velocity_variance_m2_s2",
+    },
+    "updates": {
+        "time": "time", "z": "measurement_m", "nu": "innovation_m", "s": "innovation_variance_m2",
+        "k0": "gain_position", "k1": "gain_velocity", "p": "prior_position_m",
+        "p00": "prior_position_variance_m2", "p11": "prior_velocity_variance_m2_s2",
+    },
+}  # fmt: skip
+
+
 @pytest.fixture(scope="module")
 def engine(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Browser:
     file = tmp_path_factory.mktemp("engine") / "engine.html"
@@ -119,29 +133,10 @@ def test_the_page_replays_as_python_does(engine: Browser, sample_log: Path, name
     for (at, settings), made in zip(tries, in_browser(engine, comparison, tries), strict=True):
         run = in_python(comparison, at, settings)
         gaps += run.input_gap_s > 0.0
-        theirs: dict[str, Any] = {
-            "time": run.steps.index,
-            "p": run.steps["position_m"],
-            "v": run.steps["velocity_m_s"],
-            "p00": run.steps["position_variance_m2"],
-            "p01": run.steps["covariance_m2_s"],
-            "p11": run.steps["velocity_variance_m2_s2"],
-        }
-        for column, values in theirs.items():
-            close(made["steps"][column], values, column, settings)
-        theirs = {
-            "time": run.updates.index,
-            "z": run.updates["measurement_m"],
-            "nu": run.updates["innovation_m"],
-            "s": run.updates["innovation_variance_m2"],
-            "k0": run.updates["gain_position"],
-            "k1": run.updates["gain_velocity"],
-            "p": run.updates["prior_position_m"],
-            "p00": run.updates["prior_position_variance_m2"],
-            "p11": run.updates["prior_velocity_variance_m2_s2"],
-        }
-        for column, values in theirs.items():
-            close(made["updates"][column], values, column, settings)
+        for part, columns in COLUMNS.items():
+            frame = getattr(run, part).rename_axis("time").reset_index()
+            for column, ours in columns.items():
+                close(made[part][column], frame[ours], column, settings)
         times = np.array(made["between"]["time"])
         for column, values in zip(("p", "v"), state_at(run, times), strict=True):
             # JSON has null where there is no state

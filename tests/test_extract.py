@@ -15,20 +15,26 @@ from conftest import REPOSITORY
 from exchange import replace
 from flights import Estimator, aisle_flight
 from msgspec import structs
-from ulog_tools import Log, make_log, stamps, topic
+from ulog_tools import make_log
 
 from px4fuse.comparison.comparison import compare
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import ned_acceleration
-from px4fuse.flight import QUATERNION_COLUMNS, Flight, Reset, Unavailable
+from px4fuse.flight import Flight, Reset
 from px4fuse.inspect import tables as extraction
 from px4fuse.readers import read_log
 from px4fuse.recording import ClockMap, Dropout, InputFile
+from px4fuse.simulation.flights import simulate, to_ulog
+from px4fuse.simulation.scenario import scenario_of
 
 # As it stands in the documentation: the lesson's Example 1 on one's own flight
 PAGE = (REPOSITORY / "docs" / "python.md").read_text(encoding="utf-8")
 (LESSON,) = re.findall(r"```python\n(import numpy.*?)```", PAGE, re.DOTALL)
+
+
+UNITS = {"_m": "m", "_m2": "m^2", "_s": "s", "_m_s": "m/s", "_m_s2": "m/s^2",
+         "_m2_s2": "m^2/s^2", "_rad_s": "rad/s"}  # fmt: skip
 
 
 def extract(*arguments: str | Path) -> Result:
@@ -80,7 +86,9 @@ def test_csv_reads_back_as_exactly_the_same_floats(written, sample_flight):
         "truth": sample_flight.truth.samples,
     } | {f"position_{track.name}": track.samples for track in sample_flight.positions}
     for name, frame in expected.items():
-        table = read(folder / f"{name}.csv")
+        table, content = read(folder / f"{name}.csv"), (folder / f"{name}.csv").read_bytes()
+        assert content.isascii()  # UTF-8 whatever the spreadsheet guesses
+        assert not re.search(rb"\r|nan|inf", content)
         assert table.columns[0] == "time_s"
         np.testing.assert_array_equal(table["time_s"], frame.index, strict=False)
         np.testing.assert_array_equal(table.iloc[:, 1:], frame, err_msg=name)
@@ -94,6 +102,15 @@ def test_innovations_are_one_tidy_table(written, sample_flight):
         frame = sample_flight.ekf2.innovations[axis]
         np.testing.assert_array_equal(rows["time_s"], frame.index)
         np.testing.assert_array_equal(rows[frame.columns], frame)
+
+
+def test_those_of_a_flight_on_gnss_are_of_gnss(tmp_path):
+    log = tmp_path / "o.ulg"
+    log.write_bytes(to_ulog(simulate(scenario_of("outdoor", passes=1, length_m=10.0))))
+    assert "external vision" not in extract(log, "-o", tmp_path / "o").output
+    flight = json.loads((tmp_path / "o" / "flight.json").read_text())
+    assert flight["streams"]["ekf2_innovations"]["topics"] == ["estimator_aid_src_gnss_pos"]
+    assert {*read(tmp_path / "o" / "ekf2_innovations.csv")["axis"]} == {"north", "east"}
 
 
 def test_the_lists_of_a_flight_are_tables():
@@ -129,24 +146,10 @@ def test_all_that_an_analysis_reads_is_extracted(sample_flight):
     assert not any(name.startswith("orientation") for name in extraction.tables(sample_flight))
 
 
-def test_files_are_what_a_spreadsheet_reads_and_all_are_said(written):
-    """Comma, ASCII (so UTF-8 whatever the spreadsheet guesses), line feed, a header, no NaN."""
-    for path in written[0].glob("*.csv"):
-        content = path.read_bytes()
-        assert content.isascii(), path.name
-        assert b"\r" not in content
-        assert content.endswith(b"\n")
-        assert b"nan" not in content.lower().replace(b"resonan", b"")
-        assert b"inf," not in content
-    names = {path.name for path in written[0].iterdir()}
-    listed = set(re.findall(r"^  (\S+\.csv)\s+\d+ rows$", written[1], re.MULTILINE))
-    assert names == listed | {"data_dictionary.csv", "flight.json"}
-
-
 # ---- the dictionary ---------------------------------------------------------------------------
 
 
-def test_the_dictionary_and_the_files_agree_both_ways(written):
+def test_the_dictionary_and_the_files_agree_both_ways(written, sample_flight):
     folder, _ = written
     dictionary = pd.read_csv(folder / "data_dictionary.csv", keep_default_na=False)
     described = list(zip(dictionary["table"], dictionary["column"], strict=True))
@@ -162,37 +165,23 @@ def test_the_dictionary_and_the_files_agree_both_ways(written):
         "table", "column", "unit", "frame", "meaning", "source_topic", "clock",
     ]  # fmt: skip
     assert dictionary["meaning"].ne("").all()
+    for part, stream in sample_flight.streams.items():
+        rows = dictionary[dictionary["table"] == part]
+        assert set(rows["source_topic"]) == {" ".join(stream.topics)}, part
+        assert set(rows["clock"]) == {stream.clock}
 
 
 @pytest.mark.parametrize("flight", [rich_flight(), aisle_flight(duration_s=5.0, imu=None)])
-def test_every_column_of_every_flight_is_described(flight):
+def test_every_column_of_every_flight_is_described_in_the_unit_of_its_name(flight):
     dictionary = extraction.data_dictionary(flight)
     tables = extraction.tables(flight)
     assert list(dict.fromkeys(dictionary["table"])) == list(tables)
     for name, table in tables.items():
         columns = dictionary[dictionary["table"] == name]["column"]
         assert columns.tolist() == table.columns.tolist()
-
-
-UNITS = {"_m": "m", "_m2": "m^2", "_s": "s", "_m_s": "m/s", "_m_s2": "m/s^2",
-         "_m2_s2": "m^2/s^2", "_rad_s": "rad/s"}  # fmt: skip
-
-
-def test_units_are_those_in_the_names():
-    for row in extraction.data_dictionary(rich_flight()).itertuples():
+    for row in dictionary.itertuples():
         suffix = re.search(r"(_(rad|m2?))?(_s2?)?$", row.column)[0]
-        if suffix:
-            assert row.unit == UNITS[suffix], row
-
-
-def test_the_dictionary_names_topics_and_clocks(written, sample_flight):
-    dictionary = pd.read_csv(written[0] / "data_dictionary.csv", keep_default_na=False)
-    for part, stream in sample_flight.streams.items():
-        rows = dictionary[dictionary["table"] == part]
-        assert set(rows["source_topic"]) == {" ".join(stream.topics)}, part
-        assert set(rows["clock"]) == {stream.clock}
-    acceleration = dictionary[dictionary["table"] == "acceleration_ned"]
-    assert set(acceleration["source_topic"]) == {"sensor_combined vehicle_attitude"}
+        assert not suffix or row.unit == UNITS[suffix], row
 
 
 def test_flight_json_says_what_the_log_is_and_lacks(written, sample_flight):
@@ -215,9 +204,7 @@ def test_flight_json_says_what_the_log_is_and_lacks(written, sample_flight):
     ("dropped", "lost"),
     [
         ("sensor_combined", {"imu", "acceleration_ned"}),
-        ("vehicle_attitude", {"attitude", "acceleration_ned"}),
         ("estimator_states", {"ekf2_variance"}),
-        ("vehicle_land_detected", {"airborne"}),
         ("vehicle_visual_odometry", {"position_vehicle_visual_odometry"}),
     ],
 )
@@ -231,15 +218,6 @@ def test_what_is_unavailable_has_no_table_and_is_said(tmp_path, dropped, lost):
     )
     if dropped != "vehicle_visual_odometry":  # others stand in for that one
         assert "Not in this log: " in result.output
-
-
-def test_a_log_of_other_topics_has_no_tables(tmp_path):
-    at = stamps(2.0, 10.0)
-    log = Log([topic("battery_status", at, {"voltage_v": np.full(len(at), 16.0)})])
-    flight = read_log(log.write(tmp_path / "battery.ulg"))
-    assert extraction.tables(flight) == {}
-    assert extraction.data_dictionary(flight).empty
-    assert "IMU" in [part.what for part in extraction.absent(flight)]
 
 
 # ---- names and folders ------------------------------------------------------------------------
@@ -273,21 +251,6 @@ def test_what_cannot_be_written_is_one_line(
     assert (code, out, len(err.splitlines())) == (2, "", 1)
     assert said in err
     assert folder.exists() == (not options)
-
-
-def test_a_failed_run_overwrites_nothing(tmp_path, monkeypatch, capsys, sample_log):
-    folder = tmp_path / "tables"
-    (folder / "truth.csv").mkdir(parents=True)  # a table cannot be written there
-    (folder / "imu.csv").write_text("mine")
-    code, _, err = run_main(monkeypatch, capsys, "extract", sample_log, "-o", folder)
-    assert (code, len(err.splitlines())) == (2, 1)
-    assert sorted(path.name for path in folder.iterdir()) == ["imu.csv", "truth.csv"]
-    assert (folder / "imu.csv").read_text() == "mine"
-
-
-def test_tables_of_an_earlier_run_are_pointed_out(tmp_path, sample_log):
-    (tmp_path / "position_old.csv").write_text("time_s\n")
-    assert "position_old.csv" in extract(sample_log, "-o", tmp_path).output.splitlines()[-1]
 
 
 # ---- Parquet ----------------------------------------------------------------------------------
@@ -330,17 +293,10 @@ def test_the_lesson_by_hand_is_what_compare_does(
     assert np.median(gain[inside]) == pytest.approx(settled, rel=0.1)
 
 
-def test_acceleration_of_a_level_vehicle_at_rest_is_zero(tmp_path):
-    table = extraction.tables(read_log(make_log().write(tmp_path / "made.ulg")))["acceleration_ned"]
-    np.testing.assert_allclose(table.iloc[:, 1:], 0.0, atol=1e-6)
-    attitude = extraction.tables(read_log(tmp_path / "made.ulg"))["attitude"]
-    assert attitude.columns.tolist() == ["time_s", *QUATERNION_COLUMNS]
-
-
 @pytest.mark.reallogs
 def test_every_log_is_extracted(shared_logs):
     for path in sorted(shared_logs.glob("real/*.ulg")):
-        flight = read_log(path)
+        flight = extraction.of_best_source(read_log(path))
         tables = extraction.tables(flight)
         dictionary = extraction.data_dictionary(flight)
         assert len(dictionary) == sum(len(table.columns) for table in tables.values()), path.name
@@ -348,5 +304,3 @@ def test_every_log_is_extracted(shared_logs):
             if "time_s" in table:
                 assert table.columns[0] == "time_s"
                 assert np.isfinite(table["time_s"]).all(), (path.name, name)
-        for part in extraction.absent(flight):
-            assert isinstance(part, Unavailable)

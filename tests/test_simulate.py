@@ -22,7 +22,7 @@ from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, make_axes, project_acceleration, step_means
 from px4fuse.findings import find
-from px4fuse.flight import POSITION_COLUMNS, Truth, Unavailable
+from px4fuse.flight import POSITION_COLUMNS, Truth
 from px4fuse.simulation import sensors
 from px4fuse.simulation.flights import answer, simulate, simulate_flight, to_flight, to_ulog
 from px4fuse.simulation.mistakes import MISTAKES, Mistakes, as_typed, made, parse
@@ -77,13 +77,6 @@ class TestMotion:
         turned = cumulative_simpson(state.yaw_rate_rad_s, x=time, initial=0)
         assert np.allclose(state.yaw_rad, state.yaw_rad[0] + turned, atol=1e-6)
 
-    def test_acceleration_is_continuous(self, scenario):
-        time = np.linspace(0.0, motion_of(scenario).duration_s, 200_001)
-        state = motion_of(scenario).at(time)
-        steps = np.abs(np.diff(state.acceleration_m_s2, axis=0)) / (time[1] - time[0])
-        assert steps.max() < 1.05 * np.abs(state.jerk_m_s3).max()
-        assert np.abs(state.jerk_m_s3).max() < 10.0
-
     def test_stands_on_the_ground_before_and_after(self, scenario):
         motion = motion_of(scenario)
         time = np.array([0.0, motion.take_off_s, motion.touch_down_s + 1e-6, motion.duration_s])
@@ -108,55 +101,34 @@ class TestMotion:
         assert np.quantile(error, 0.999) < 1e-5
         assert error.max() < 0.01
 
-    def test_is_gentle(self, scenario):
-        motion = motion_of(scenario)
-        state = motion.at(np.linspace(0.0, motion.duration_s, 20_001))
-        tilt = np.degrees(np.arccos(attitude(state).body_to_ned[:, 2, 2]))
-        assert 2.0 < tilt.max() < 15.0
-        assert np.hypot(*state.velocity_m_s[:, :2].T).max() < 1.3 * scenario.speed_m_s
-
-
-def test_aisle_is_as_long_as_asked_and_ends_where_it_began():
-    motion = motion_of(replace(AISLE, wander_m=0.0))
-    position = motion.at(np.linspace(0.0, motion.duration_s, 5001)).position_m
-    along = position @ direction(30.0)
-    assert along.max() == pytest.approx(12.0, abs=1e-9)
-    assert np.abs(position @ direction(120.0)).max() < 1e-9
-    assert position[:, 2].min() == pytest.approx(-1.5, abs=1e-9)
-    assert np.allclose(position[-1], 0.0, atol=1e-9)
-
 
 @pytest.mark.parametrize(("left_out", "texts"), [(0.0, []), (2.5, ["open-end=2.5m"])])
 def test_loop_closes_but_for_what_is_left_out(left_out, texts):
     scenario = replace(LOOP, passes=2)
-    motion = motion_of(scenario, parse(texts))
-    first, last = motion.at(np.array([0.0, motion.duration_s])).position_m
+    flown = simulate(scenario, parse(texts))
+    first, last = flown.motion.at(np.array([0.0, flown.motion.duration_s])).position_m
     # its last side points back along heading + 270 degrees
     assert np.allclose(last - first, -left_out * direction(30.0 + 270.0), atol=1e-9)
-    assert answer(simulate(scenario, parse(texts)))["truth"]["closure_error_m"] == pytest.approx(
-        left_out, abs=1e-9
-    )
+    told = answer(flown)["truth"]["closure_error_m"]
+    assert told == pytest.approx(left_out, abs=1e-9)
 
 
-def test_nose_follows_the_flight_or_stays():
-    fixed, following = motion_of(AISLE), motion_of(FOLLOWING)
-    time = np.linspace(0.0, fixed.duration_s, 5001)
-    assert np.allclose(fixed.at(time).yaw_rad, np.radians(30.0))
-    state = following.at(np.linspace(0.0, following.duration_s, 5001))
+@pytest.mark.parametrize("yaw", ["fixed", "follow"])
+def test_aisle_is_as_long_as_asked_ends_where_it_began_and_the_nose_follows_or_stays(yaw):
+    motion = motion_of(replace(AISLE, wander_m=0.0, yaw=yaw))
+    state = motion.at(np.linspace(0.0, motion.duration_s, 5001))
+    assert (state.position_m @ direction(30.0)).max() == pytest.approx(12.0, abs=1e-9)
+    assert np.abs(state.position_m @ direction(120.0)).max() < 1e-9
+    assert state.position_m[:, 2].min() == pytest.approx(-1.5, abs=1e-9)
+    assert np.allclose(state.position_m[-1], 0.0, atol=1e-9)
     moving = np.hypot(*state.velocity_m_s[:, :2].T) > 0.8
     course = np.arctan2(state.velocity_m_s[:, 1], state.velocity_m_s[:, 0])
-    off = np.angle(np.exp(1j * (course - state.yaw_rad)))[moving]
-    assert np.abs(off).max() < 0.2  # the wander's part
+    expected = np.radians(30.0) if yaw == "fixed" else course
+    off = np.angle(np.exp(1j * (expected - state.yaw_rad)))[moving]
+    assert np.abs(off).max() < 1e-6
 
 
 # --- sensors
-
-
-def test_position_noise_is_white_and_as_stated():
-    error, _ = position_error(Scenario(seed=2, sigma_uwb_m=0.07, uwb_rate_hz=20.0))
-    assert np.std(error, axis=0) == pytest.approx(np.full(3, 0.07), rel=0.05)
-    for axis in error.T:
-        assert abs(np.corrcoef(axis[1:], axis[:-1])[0, 1]) < 0.06
 
 
 @pytest.mark.parametrize("texts", [[], ["vibration=0.5"]])
@@ -191,23 +163,6 @@ def test_biases_are_constant_and_drawn_as_stated():
     assert np.std([b[1] for b in drawn]) == pytest.approx(0.002, rel=0.1)
 
 
-def test_logged_attitude_has_a_small_slow_error():
-    scenario = Scenario(seed=5)
-    simulation = simulate(scenario)
-    logged = to_flight(simulation).attitude
-    time = logged.index.to_numpy()
-    truth = Rotation.from_matrix(attitude(simulation.motion.at(time)).body_to_ned)
-    error = Rotation.from_quat(logged.to_numpy(copy=True), scalar_first=True) * truth.inv()
-    expected = sensors.attitude_error(scenario, NO_MISTAKES, time).as_rotvec()
-    assert np.allclose(error.as_rotvec(), expected, atol=2e-6)
-    spread = [
-        sensors.attitude_error(Scenario(seed=s), NO_MISTAKES, np.linspace(0, 240, 200)).as_rotvec()
-        for s in range(60)
-    ]
-    rms = np.degrees(np.sqrt(np.mean(np.concatenate(spread) ** 2, axis=0)))
-    assert rms == pytest.approx([0.1, 0.1, 1.0], rel=0.15)
-
-
 def test_vio_drifts_as_stated():
     ends = []
     for seed in range(40):
@@ -223,52 +178,37 @@ def test_vio_drifts_as_stated():
     assert source.distance_m == pytest.approx(32.0, rel=0.1)
 
 
-def test_arrival_is_30_ms_after_measurement():
-    fields = simulate(Scenario(seed=3)).positions.topic.fields
-    lag = (fields["timestamp"].astype(float) - fields["timestamp_sample"].astype(float)) * 1e-6
-    assert np.mean(lag) == pytest.approx(0.030, abs=5e-4)
-    assert np.std(lag) == pytest.approx(0.003, rel=0.15)
-    assert np.all(np.diff(fields["timestamp"].astype(np.int64)) >= 0)
-
-
 # --- mistakes
 
 
 class TestMistakes:
     CLEAN = simulate(AISLE)
 
-    def test_clock_offset_shifts_the_stamps(self):
-        late = simulate(AISLE, parse(["clock-offset=80ms"]))
-        assert np.allclose(stamps_s(late) - late.positions.measured_s, 0.08, atol=1e-6)
-        assert np.allclose(stamps_s(late) - stamps_s(self.CLEAN), 0.08, atol=1.1e-6)
+    @pytest.mark.parametrize(
+        ("text", "offset_s", "share"),
+        [("clock-offset=80ms", 0.08, 0), ("clock-drift=500ppm", 0, 5e-4)],
+    )
+    def test_a_wrong_clock_shifts_the_stamps_and_nothing_else(self, text, offset_s, share):
+        late = simulate(AISLE, parse([text]))
+        time = late.positions.measured_s
+        assert np.allclose(stamps_s(late) - time, offset_s + share * time, atol=1e-6)
         arrivals = (s.positions.topic.fields["timestamp"] for s in (late, self.CLEAN))
         assert np.array_equal(*arrivals)
-        assert answer(late)["truth"]["clock_offset_to_add_s"] == -0.08
-
-    def test_clock_drift_grows(self):
-        drifting = simulate(AISLE, parse(["clock-drift=500ppm"]))
-        time = drifting.positions.measured_s
-        assert np.allclose(stamps_s(drifting) - time, 500e-6 * time, atol=1e-6)
+        assert answer(late)["truth"]["clock_offset_to_add_s"] == -offset_s
 
     def test_clock_jump_ends_when_timesync_converges(self):
-        scenario = Scenario(seed=4)
-        jumping = simulate(scenario, parse(["clock-jump=0.25"]))
-        fields = jumping.positions.topic.fields
-        time = jumping.positions.measured_s
+        jumping = simulate(Scenario(seed=4), parse(["clock-jump=0.25"]))
+        fields, time = jumping.positions.topic.fields, jumping.positions.measured_s
         before = time < 50.0
-        assert np.any(before)
-        assert np.any(~before)
-        same = fields["timestamp"] == fields["timestamp_sample"]
-        assert np.array_equal(same, before)
+        assert 0.0 < before.mean() < 1.0
+        assert np.array_equal(fields["timestamp"] == fields["timestamp_sample"], before)
         late = stamps_s(jumping) - time
         assert np.mean(late[before]) == pytest.approx(0.25, abs=1e-3)
         assert np.allclose(late[~before], 0.0, atol=1e-6)
 
     def test_nlos_is_an_exact_share_in_bursts(self):
-        scenario = Scenario(seed=6, sigma_uwb_m=0.0)
-        simulation = simulate(scenario, parse(["nlos=5%,3m"]))
-        outlier = simulation.positions.outlier
-        motion = simulation.motion
+        simulation = simulate(Scenario(seed=6, sigma_uwb_m=0.0), parse(["nlos=5%,3m"]))
+        outlier, motion = simulation.positions.outlier, simulation.motion
         time = simulation.positions.measured_s
         flying = (time > motion.take_off_s) & (time < motion.touch_down_s)
         assert np.count_nonzero(outlier) == round(0.05 * np.count_nonzero(flying))
@@ -291,36 +231,32 @@ class TestMistakes:
         gone = simulate(AISLE, parse([text]))
         middle = gone.motion.duration_s / 2.0
         start, end = start or middle - 3.0, end or middle + 3.0
-        time = gone.positions.measured_s
-        assert not np.any((time > start) & (time < end))
         clean = self.CLEAN.positions.measured_s
-        assert len(time) == np.count_nonzero((clean <= start) | (clean >= end))
+        kept = clean[(clean <= start) | (clean >= end)]
+        assert np.array_equal(gone.positions.measured_s, kept)
 
-    def test_imu_dropout_takes_the_imu_alone(self):
-        gone = to_flight(simulate(AISLE, parse(["imu-dropout=2s,10s"])))
-        time = gone.imu.index.to_numpy()
-        assert np.diff(time).max() == pytest.approx(2.0, abs=1e-6)
-        assert len(time) == len(to_flight(self.CLEAN).imu) - 499
-        assert len(gone.attitude) == len(to_flight(self.CLEAN).attitude)
-
-    @pytest.mark.parametrize("rate", [1.0, 2.0, 4.0])
-    def test_decimate_thins_the_source(self, rate):
-        thin = to_flight(simulate(AISLE, parse([f"decimate={rate}Hz"])))
+    @pytest.mark.parametrize("rate", [2.0, 4.0])
+    def test_thinning_keeps_samples_as_they_are(self, rate):
+        mistakes = parse([f"decimate={rate}Hz", f"imu-rate={10 * rate}", "imu-dropout=2s,10s"])
+        thin, clean = (to_flight(s) for s in (simulate(AISLE, mistakes), self.CLEAN))
         samples = thin.positions[0].samples
         assert len(samples) / thin.log.duration_s == pytest.approx(rate, rel=0.1)
-        assert samples.index.isin(to_flight(self.CLEAN).positions[0].samples.index).all()
+        assert samples.index.isin(clean.positions[0].samples.index).all()
+        pd.testing.assert_frame_equal(thin.imu, clean.imu.loc[thin.imu.index])
+        intervals = np.diff(thin.imu.index)
+        assert np.median(intervals) == pytest.approx(0.1 / rate, rel=0.05)
+        assert intervals.max() == pytest.approx(2.0, abs=0.1 / rate)
+        assert len(thin.attitude) == len(clean.attitude)
 
     @pytest.mark.parametrize("factor", [0.1, 9.0])
     def test_r_scale_changes_what_is_reported_alone(self, factor):
-        scaled = to_flight(simulate(AISLE, parse([f"r-scale={factor}"])))
-        clean = to_flight(self.CLEAN)
-        reported = scaled.positions[0].samples["north_m2"]
-        assert np.allclose(reported, 0.01 * factor)
-        assert scaled.log.parameters["EKF2_EVP_NOISE"] == pytest.approx(0.1 * np.sqrt(factor))
-        pd.testing.assert_frame_equal(
-            scaled.positions[0].samples[POSITION_COLUMNS],
-            clean.positions[0].samples[POSITION_COLUMNS],
+        scaled, clean = (
+            to_flight(s) for s in (simulate(AISLE, parse([f"r-scale={factor}"])), self.CLEAN)
         )
+        one, other = (flight.positions[0].samples for flight in (scaled, clean))
+        assert np.allclose(one["north_m2"], 0.01 * factor)
+        assert scaled.log.parameters["EKF2_EVP_NOISE"] == pytest.approx(0.1 * np.sqrt(factor))
+        pd.testing.assert_frame_equal(one[POSITION_COLUMNS], other[POSITION_COLUMNS])
 
     @pytest.mark.parametrize(
         ("text", "turned"),
@@ -362,30 +298,11 @@ class TestMistakes:
         assert np.allclose(difference[:, 0], 0.3, atol=1e-5)
         assert np.allclose(difference[:, 1:], 0.0, atol=1e-5)
 
-    @pytest.mark.parametrize("rate", [20.0, 125.0])
-    def test_imu_rate_thins_the_imu(self, rate):
-        thin = to_flight(simulate(AISLE, parse([f"imu-rate={rate}"]))).imu
-        clean = to_flight(self.CLEAN).imu
-        assert np.mean(np.diff(thin.index)) == pytest.approx(1 / rate, rel=1e-2)
-        pd.testing.assert_frame_equal(thin, clean.loc[thin.index])
-
-    @pytest.mark.parametrize("scenario", [AISLE, LOOP])
-    def test_no_motion_hovers_for_as_long(self, scenario):
-        hovering = simulate(scenario, parse(["no-motion"]))
-        assert hovering.motion.duration_s == motion_of(scenario).duration_s
-        time = np.linspace(0.0, hovering.motion.duration_s, 1001)
-        assert np.abs(hovering.motion.at(time).position_m[:, :2]).max() < 0.2
-
     def test_no_vvo_leaves_no_source(self):
         kept = to_flight(simulate(AISLE, parse(["no-vvo"]))).positions
-        assert {track.name for track in kept} <= {
-            "estimator_aid_src_ev_pos",
-            "ekf2_state_plus_innovation",
-        }
-        assert {round(track.rate_hz) for track in kept} == {2}
+        assert [round(track.rate_hz) for track in kept] == [2, 2]
         flight = to_flight(simulate(replace(AISLE, ekf2=False), parse(["no-vvo"])))
         assert flight.positions == ()
-        assert flight.log.parameters["SDLOG_PROFILE"] == 1.0
         with pytest.raises(px4fuse.Px4FuseError, match="SDLOG_PROFILE"):
             compare(flight)
 
@@ -406,63 +323,48 @@ class TestMistakes:
                 )
                 assert same == (name not in changed_by), (name, topic)
 
-    def test_combine(self):
-        both = simulate(AISLE, parse(["clock-offset=0.1", "yaw=10", "nlos=4%", "decimate=2.5Hz"]))
-        assert made(both.mistakes) == ("clock-offset", "nlos", "decimate", "yaw")
-        late = stamps_s(both) - both.positions.measured_s
-        assert np.allclose(late, 0.1, atol=1e-6)
-        assert len(both.positions.outlier) == len(late)
+
+@pytest.mark.parametrize(
+    ("text", "field", "value"),
+    [
+        ("clock-offset=-80ms", "clock_offset_s", -0.08),
+        ("nlos=5%,50cm", "nlos_size_m", 0.5),
+        ("dropout=8,0", "dropout_at_s", 0.0),  # a gap may begin with the flight
+        ("r-scale=1e-1", "r_scale", 0.1),
+        ("accel-bias=.5m/s²", "accel_bias_m_s2", 0.5),
+        ("no-motion", "no_motion", True),
+    ],
+)
+def test_values_have_units(text, field, value):
+    assert getattr(parse([text]), field) == pytest.approx(value)
 
 
-class TestParsing:
-    @pytest.mark.parametrize(
-        ("text", "field", "value"),
-        [
-            ("clock-offset=0.08", "clock_offset_s", 0.08),
-            ("clock-offset=-80ms", "clock_offset_s", -0.08),
-            ("nlos=5%", "nlos_percent", 5.0),
-            ("nlos=5%,50cm", "nlos_size_m", 0.5),
-            ("dropout=8s", "dropout_s", 8.0),
-            ("dropout = 8 s, 40s", "dropout_at_s", None),
-            ("r-scale=1e-1", "r_scale", 0.1),
-            ("accel-bias=.5m/s²", "accel_bias_m_s2", 0.5),
-            ("no-motion", "no_motion", True),
-        ],
-    )
-    def test_values_have_units(self, text, field, value):
-        if value is None:
-            with pytest.raises(SettingsError, match="not a known mistake"):
-                parse([text])
-        else:
-            assert getattr(parse([text]), field) == pytest.approx(value)
+@pytest.mark.parametrize("name", MISTAKES)
+def test_every_default_is_a_mistake_and_can_be_typed_again(name):
+    parsed = parse([name])
+    assert made(parsed) == (name,)
+    assert parse([as_typed(name, parsed)]) == parsed
+    assert made(parse(["clock-offset=0", "nlos=0"])) == ()
 
-    @pytest.mark.parametrize("name", MISTAKES)
-    def test_every_default_is_a_mistake_and_can_be_typed_again(self, name):
-        parsed = parse([name])
-        assert made(parsed) == (name,)
-        assert parse([as_typed(name, parsed)]) == parsed
 
-    @pytest.mark.parametrize(
-        ("text", "said"),
-        [
-            ("fog", "Choose from clock-offset, clock-drift"),
-            ("nlos=much", "not a number in %"),
-            ("nlos=5s", "not a number in %"),
-            ("nlos=80%", "give 0 to 50 %"),
-            ("nlos=5%,1m,2", r"give nlos=PERCENT\[,SIZE\]"),
-            ("clock-offset=nan", "not a number"),
-            ("clock-offset=1e999", "out of range"),
-            ("clock-offset=", "not a number"),
-            ("no-motion=1", "give no-motion"),
-        ],
-    )
-    def test_bad_ones_are_one_line(self, text, said):
-        with pytest.raises(SettingsError, match=said) as error:
-            parse([text])
-        assert "\n" not in str(error.value)
-
-    def test_zero_is_no_mistake(self):
-        assert made(parse(["clock-offset=0", "nlos=0"])) == ()
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("fog", "Choose from clock-offset, clock-drift"),
+        ("dropout = 8s", "not a known mistake"),
+        ("nlos=5s", "give percent"),
+        ("nlos=80%", "give 0 to 50 %"),
+        ("nlos=5%,1m,2", r"give nlos=PERCENT\[,SIZE\]"),
+        ("clock-offset=nan", "give seconds"),
+        ("clock-offset=1e999", "out of range"),
+        ("clock-offset=", "give seconds"),
+        ("no-motion=1", "give no-motion"),
+    ],
+)
+def test_bad_mistakes_are_one_line(text, said):
+    with pytest.raises(SettingsError, match=said) as error:
+        parse([text])
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -522,8 +424,9 @@ def test_reader_gives_the_flight_that_is_made_in_memory(scenario, texts, tmp_pat
             assert a.name == b.name
             pd.testing.assert_frame_equal(a.samples, b.samples, check_exact=True)
         elif part.name == "ekf2":
-            pd.testing.assert_frame_equal(a.state, b.state, check_exact=True)
-            pd.testing.assert_frame_equal(a.variance, b.variance, check_exact=True)
+            for one, other in ((a.state, b.state), (a.variance, b.variance)):
+                pd.testing.assert_frame_equal(one, other, check_exact=True)
+            pd.testing.assert_frame_equal(a.record.delayed, b.record.delayed, check_exact=True)
             assert (a.resets, a.horizon_s, a.gate) == (b.resets, b.horizon_s, b.gate)
         elif part.name == "positions":
             for one, other in zip(a, b, strict=True):
@@ -534,31 +437,12 @@ def test_reader_gives_the_flight_that_is_made_in_memory(scenario, texts, tmp_pat
             assert a == b, part.name
 
 
-def test_same_seed_same_bytes_and_another_seed_others():
-    first, again, other = (to_ulog(simulate(Scenario(passes=1, seed=seed))) for seed in (1, 1, 2))
-    assert first == again
-    assert first != other
-
-
 def test_pyulog_reads_it(tmp_path):
     path = tmp_path / "flight.ulg"
     path.write_bytes(to_ulog(simulate(LOOP)))
     ulog = ULog(str(path))
     assert not ulog.file_corruption
-    assert {data.name for data in ulog.data_list} == {
-        "estimator_aid_src_ev_pos",
-        "estimator_states",
-        "estimator_status_flags",
-        "sensor_combined",
-        "vehicle_attitude",
-        "vehicle_attitude_groundtruth",
-        "vehicle_land_detected",
-        "vehicle_local_position",
-        "vehicle_local_position_groundtruth",
-        "vehicle_visual_odometry",
-    }
     assert ulog.msg_info_dict["ver_hw"] == "px4fuse simulation"
-    assert ulog.msg_info_dict["sys_name"] == "PX4"
     assert ulog.initial_parameters["EKF2_EN"] == 1
     odometry = ulog.get_dataset("vehicle_visual_odometry").data
     norm = np.linalg.norm([odometry[f"q[{i}]"] for i in range(4)], axis=0)
@@ -570,7 +454,7 @@ def test_pyulog_reads_it(tmp_path):
 def test_log_does_not_give_the_mistakes_away():
     texts = [name for name, one in MISTAKES.items() if "aisle" in one.kinds and name != "no-vvo"]
     content = to_ulog(simulate(AISLE, parse(texts)))
-    for name in (*MISTAKES, *(a.field for m in MISTAKES.values() for a in m.arguments)):
+    for name in (*MISTAKES, *(field for mistake in MISTAKES.values() for field in mistake.fields)):
         if name not in ("yaw", "scale", "jump", "heading"):  # of the log's own words
             assert name.encode() not in content
     assert b"mistake" not in content.lower()
@@ -628,9 +512,7 @@ def test_clean_flight_has_no_mistake(scenario):
         ("dropout=8s", "source_gap"),
         ("imu-dropout=2s", "imu_gap"),
         ("imu-rate=20", "logging_rate_low"),
-        ("no-motion", "no_motion"),
         ("accel-bias=0.5", "kf_variance_understated"),
-        ("vibration=1.5", "kf_variance_understated"),
         ("smoothed=1s", "kf_variance_overstated"),
     ],
 )
@@ -647,42 +529,20 @@ def run(*arguments):
     return CliRunner().invoke(cli, ["simulate", *map(str, arguments)])
 
 
-def test_command_writes_log_and_answer(tmp_path):
-    log, told = tmp_path / "s07.ulg", tmp_path / "s07.json"
+def test_command_writes_log_and_answer_the_same_again(tmp_path):
+    log, told, again = (tmp_path / name for name in ("s07.ulg", "s07.json", "again.ulg"))
     options = ("--seed", 7, "--passes", 1, "--mistake", "nlos=5%", "--mistake", "clock-offset=80ms")
     result = run("-o", log, *options, "--answer", told)
     assert result.exit_code == 0, result.output
     assert "nlos=5%,2m" in result.output
-    assert "EKF2      px4fuse's model of it" in result.output
-    first = log.read_bytes()
     content = json.loads(told.read_text(encoding="utf-8"))
     assert set(content["mistakes"]) == {"nlos", "clock-offset"}
-    assert content["truth"]["clock_offset_to_add_s"] == -0.08
     assert content["scenario"]["seed"] == 7
-    assert content["truth"]["outlier_index"]
-    again = tmp_path / "again.ulg"
     assert run("-o", again, *options).exit_code == 0
-    assert again.read_bytes() == first
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["again.ulg", "s07.json", "s07.ulg"]
-
-
-def test_command_flies_loops(tmp_path):
-    result = run("-o", tmp_path / "loop.ulg", "--kind", "loop", "--no-truth", "--vio-drift", 0.02)
-    assert result.exit_code == 0, result.output
-    assert "1 lap of a square of 12 m" in result.output
-    assert "drift 2.0% of the path" in result.output
-    flight = px4fuse.read_log(tmp_path / "loop.ulg")
-    assert flight.positions[0].rate_hz == pytest.approx(30.0, rel=0.01)
-    assert isinstance(flight.truth, Unavailable)
-    assert b"groundtruth" not in (tmp_path / "loop.ulg").read_bytes()
-
-
-def test_help_lists_every_mistake():
-    result = run("--help")
-    assert result.exit_code == 0
-    for name, mistake in MISTAKES.items():
-        assert name + mistake.usage in result.output
-        assert mistake.finding.endswith(".")
+    assert again.read_bytes() == log.read_bytes()
+    assert run("-o", again, "--seed", 8, *options[2:], "--no-truth").exit_code == 0
+    assert again.read_bytes() != log.read_bytes()
+    assert b"groundtruth" not in again.read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -704,7 +564,3 @@ def test_bad_options_are_one_line_and_write_nothing(arguments, said, tmp_path, m
     assert said in error
     assert error.count("\n") == 1
     assert not list(tmp_path.iterdir())
-
-
-def test_a_gap_may_begin_with_the_flight():
-    assert parse(["dropout=8,0"]).dropout_at_s == 0.0

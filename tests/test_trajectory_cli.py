@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
-import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +16,6 @@ from cli_tools import contents, run, run_main
 from click.testing import Result
 from conftest import REPOSITORY
 
-from px4fuse.loop.corrections import BY_DISTANCE, PLAIN
 from px4fuse.results.contract import schema
 
 pytestmark = pytest.mark.usefixtures("analysed_once")
@@ -42,13 +39,6 @@ def write(path: Path, rows: list[str], newline: str = "\n", encoding: str = "utf
     path.write_bytes("".join(row + newline for row in rows).encode(encoding))
 
 
-def with_field(row: int, field: int, text: str) -> list[str]:
-    """The trajectory with another text in one field, or in this one and all after it."""
-    fields = ROWS[row].split()
-    fields[field:] = [text] * (len(fields) - field) if field > 3 else [text, *fields[field + 1 :]]
-    return [*ROWS[:row], " ".join(fields), *ROWS[row + 1 :]]
-
-
 def with_times(change: Any) -> list[str]:
     return [" ".join([change(row.split()[0]), *row.split()[1:]]) for row in ROWS]
 
@@ -65,24 +55,16 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     binary = np.random.default_rng(0).bytes(5000)
     for name, content in {
         "l.ulg": log,
-        "cut.ulg": log[:200],
         "empty.tum": b"",
-        "empty.ulg": b"",
         "junk.bin": binary,
         "f.pdf": b"%PDF-1.7\n\x00\x01\x02" + binary,
-        "df.BIN": b"\xa3\x95\x80\x80\x59FMT\x00BBnNZ\x00Type,Length,Name\x00" + binary,
     }.items():
         (folder / name).write_bytes(content)
-    (folder / "folder").mkdir()
     for name, rows in {
         "s.tum": ROWS,
         "junk.txt": ["hello world", "this is no data"],
-        "uwb.csv": ["time,x,y,z", "1,2,3,4", "2,3,4,5"],
-        "two.tum": ROWS[:2],
         "nonmono.tum": [*ROWS[:100], ROWS[101], ROWS[100], *ROWS[102:]],
-        "nan.tum": with_field(50, 2, "nan"),
-        "zero.tum": with_field(50, 4, "0"),
-        "comma.tum": [row.replace(" ", ",") for row in ROWS],
+        "nan.tum": [*ROWS[:50], ROWS[50].replace(ROWS[50].split()[2], "nan"), *ROWS[51:]],
         "still.tum": straight(0.0),
         "line.tum": straight(0.1),
         "g.g2o": [
@@ -94,7 +76,6 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "n.md": ["my own words"],
     }.items():
         write(folder / name, rows)
-    (folder / "hard.json").hardlink_to(folder / "s.tum")
     (folder / "soft.json").symlink_to(folder / "l.ulg")
     (folder / "s.pdf").write_bytes((folder / "s.tum").read_bytes())
     return folder
@@ -129,11 +110,8 @@ def test_loop_writes_report_results_path_and_graph(made, found) -> None:
     assert result.exit_code == 0, result.output
     names = ["r.g2o", "r.json", "r.pdf", "r.tum"]
     assert sorted(path.name for path in folder.iterdir()) == names
-    for said in ("1.42 m", "REJECTED", "Example 2", *(f"Wrote    {folder / n}" for n in names)):
+    for said in ("REJECTED", "Example 2", *(f"Wrote    {folder / n}" for n in names)):
         assert said in result.output
-    for name in (PLAIN, BY_DISTANCE):  # with the score of each against the truth and against SLAM
-        row = rf"^{name} +\d\S* / \S+ +0\.[23]\d+ .* 0\.[23]\d+"
-        assert len(re.findall(row, result.output, re.MULTILINE)) == 1
     reader = pypdf.PdfReader(folder / "r.pdf")
     assert reader.attachments["results.json"] == [(folder / "r.json").read_bytes()]
     jsonschema.validate(found, schema())
@@ -184,14 +162,6 @@ def test_the_written_graph_is_solved_already(made, found, tmp_path) -> None:
     )
 
 
-def test_loop_of_a_graph_writes_both_files(desk, tmp_path) -> None:
-    result = run("loop", desk / "g.g2o", "--g2o", tmp_path / "s.g2o", "--json", tmp_path / "s.json")
-    assert result.exit_code == 0, result.output
-    assert set(contents(tmp_path)) == {"s.g2o", "s.json"}
-    assert json.loads((tmp_path / "s.json").read_text(encoding="utf-8"))["graph"]["poses"] == 3
-    assert run("loop", tmp_path / "s.g2o").exit_code == 0
-
-
 def test_the_results_keep_the_command_that_makes_them_again(desk, tmp_path) -> None:
     given = ["--landed-at", "0.1,-0.2,5", "--drift", "2"]
     given += ["--closure", "10,50", "--closure", " 20, 60,0.2"]
@@ -201,10 +171,7 @@ def test_the_results_keep_the_command_that_makes_them_again(desk, tmp_path) -> N
         "--drift 2"
     )
     assert len(found["loop"]["closures"]) == 3
-    opened = results("loop", desk / "s.tum", "--open")
-    assert opened["provenance"]["command"] == "px4fuse loop s.tum --open"
     beside = results("loop", desk / "s.tum", "--tum", tmp_path / "o.tum")
-    assert beside["schema"]["name"] == "px4fuse-loop"
     assert beside["provenance"]["command"] == "px4fuse loop s.tum"
     assert set(contents(tmp_path)) == {"o.tum"}
 
@@ -214,24 +181,18 @@ def test_evaluate_writes_page_and_results(desk, tmp_path, monkeypatch) -> None:
     command = ["evaluate", desk / "s.tum", desk / "l.ulg:truth"]
     result = run(*command)
     assert result.exit_code == 0, result.output
-    assert "ATE (m)" in result.output
-    name = "s_against_l_truth"
-    assert set(contents(tmp_path)) == {f"{name}.pdf", f"{name}.json"}
-    for end in ("pdf", "json"):
-        assert f"Wrote    {Path('reports', name)}.{end}" in result.output
-    folder = tmp_path / "reports"
-    reader = pypdf.PdfReader(folder / f"{name}.pdf")
-    text = (folder / f"{name}.json").read_bytes()
+    before = contents(tmp_path)
+    pdf, text = (before[f"s_against_l_truth.{end}"] for end in ("pdf", "json"))
+    assert len(before) == 2
+    reader = pypdf.PdfReader(io.BytesIO(pdf))
     assert reader.attachments["results.json"] == [text]
+    assert str(tmp_path) not in "".join(page.extract_text() for page in reader.pages)
     found = json.loads(text)
     jsonschema.validate(found, schema())
     assert found == results(*command)
-    assert found["schema"]["name"] == "px4fuse-evaluation"
     assert found["alignment"] == "se3"
     assert found["ate"]["translation_m"]["rmse"] == pytest.approx(0.060, abs=0.01)
     assert found["time_offset"]["determinable"]
-    assert str(tmp_path) not in "".join(page.extract_text() for page in reader.pages)
-    before = contents(tmp_path)
     assert run(*command).exit_code == 0
     assert contents(tmp_path) == before
     deltas = results(*command, "--rpe", "5m", "--rpe", "10s", "--rpe", "1f")["rpe"]
@@ -275,20 +236,6 @@ def test_evaluate_writes_what_is_named(desk, tmp_path, monkeypatch, options, wri
     alone = "--json -" in options
     assert alone == result.output.startswith("{")
     assert alone == ("ATE (m)" not in result.output)
-
-
-@pytest.mark.parametrize("name", ["s.tum", "l.ulg:vio", "l.ulg:truth"])
-def test_a_trajectory_has_no_error_against_itself(desk, name) -> None:
-    found = results("evaluate", desk / name, desk / name)
-    assert found["ate"]["translation_m"]["max"] == pytest.approx(0.0, abs=1e-6)
-
-
-def test_the_clocks_of_another_day_are_matched(desk, tmp_path) -> None:
-    later = tmp_path / "later.tum"
-    write(later, with_times(lambda time: f"{float(time) + 86_400.0:.6f}"))
-    found = results("evaluate", desk / "s.tum", later)
-    assert found["time_offset"]["offset_s"] == pytest.approx(86_400.0, abs=0.01)
-    assert found["ate"]["translation_m"]["rmse"] < 0.01
 
 
 def test_a_loop_is_scored_against_what_is_given(desk) -> None:
@@ -350,29 +297,16 @@ def test_a_track_with_z_up_scores_in_the_loop_as_evaluate_does(tmp_path) -> None
     assert score["rpe"][0]["translation_m"]["max"] < 0.01
 
 
-def test_a_part_beyond_the_data_is_cut(desk) -> None:
-    found = results("loop", desk / "s.tum", "--from", "5", "--to", "5000")["loop"]
-    assert found["end_s"] - found["start_s"] < 90.0
-
-
 # ------------------------------------------------------------------ what is refused
 
 # Command and a part of what it must say
 REFUSED = {
     "missing": ("loop absent.ulg", "absent.ulg: cannot be read (No such file or directory)"),
-    "no name": ("loop ''", "the name is empty"),
-    "folder": ("loop folder", "folder: is a folder"),
     "empty trajectory": ("loop empty.tum", "empty.tum: the file is empty"),
     "text junk": ("loop junk.txt", "junk.txt: not a trajectory file"),
-    "another table": ("loop uwb.csv", "uwb.csv: poses: 2"),
     "PDF": ("loop f.pdf", "f.pdf: a PDF, not a flight log"),
-    "DataFlash": ("loop df.BIN", "df.BIN: not a PX4 ULog but an ArduPilot DataFlash"),
-    "cut log": ("loop cut.ulg", "cut.ulg: a ULog without any data"),
-    "two poses": ("loop two.tum", "two.tum: poses: 2"),
     "times that go back": ("loop nonmono.tum", "nonmono.tum, line 102"),
     "not a number": ("loop nan.tum -o f.pdf", "nan.tum, line 51"),
-    "zero quaternion": ("loop zero.tum", "zero.tum, line 51: columns 5 to 8 are not a quaternion"),
-    "commas": ("loop comma.tum", "comma.tum, line 1: the place"),
     "no motion": ("loop still.tum", "still.tum: the path is 0.00 m long"),
     "closure outside": ("loop s.tum --closure 10,5000", "within the path"),
     "closure of one time": ("loop s.tum --closure 10", "'10' is not T1,T2"),
@@ -383,41 +317,23 @@ REFUSED = {
     "closure of words": ("loop s.tum --closure a,b", "is not T1,T2"),
     "closure without end": ("loop s.tum --closure 2,inf", "is not T1,T2"),
     "landing of words": ("loop s.tum --landed-at junk", "'junk' is not FORWARD,RIGHT"),
-    "landing of four": ("loop s.tum --landed-at 1,2,3,4", "is not FORWARD,RIGHT"),
     "landing on the moon": ("loop s.tum --landed-at 1e300,1", "is not FORWARD,RIGHT"),
     "landing, and open": ("loop s.tum --landed-at 1,2 --open", "exclude each other"),
     "open, and nothing to correct": ("loop s.tum --open --tum o.tum", "no corrected path"),
-    "no drift": ("loop s.tum --drift 0", "--drift 0 is outside"),
-    "no heading drift": ("loop s.tum --heading-drift 0", "--heading-drift 0 is outside"),
     "from after to": ("loop s.tum --from 50 --to 40", "Change --from or --to"),
-    "from NaN": ("loop s.tum --from nan", "nan is not a finite number"),
-    "no key frames": ("loop s.tum --key-frames 0", "--key-frames 0 is outside"),
     "no such part": ("loop l.ulg:slam", "'slam' is not a part of a flight"),
     "part of a trajectory": ("loop s.tum:vio", "s.tum: a trajectory file has no part 'vio'"),
     "frame of a flight": ("loop l.ulg --frame enu", "--frame enu is for trajectory files"),
-    "no such frame": ("loop s.tum --frame up", "'up' is not one of"),
     "no PDF": ("loop s.tum -o r.txt", "r.txt: the report is a PDF"),
-    "results and path": ("loop s.tum --json x --tum ./x", "two outputs name the same file"),
     "path and graph": ("loop s.tum --tum x --g2o x", "two outputs name the same file"),
     "path to standard output": ("loop s.tum --tum -", "only --json can print"),
-    "path into a file": ("loop s.tum --tum n.md/r.tum", "cannot be written"),
-    "path over a folder": ("loop s.tum --json j.json --tum folder", "folder: is a folder"),
     "reference a graph": ("loop s.tum --reference g.g2o", "g.g2o: a pose graph, not a trajectory"),
     "graph with a bad edge": ("loop bad.g2o", "bad.g2o, line 2"),
-    "graph of words": ("loop text.g2o", "text.g2o: no edges"),
     "part of a graph": ("loop g.g2o:vio", "a pose graph has no part 'vio'"),
     "report of a graph": ("loop g.g2o -o r.pdf", "not for a pose graph"),
-    "graph's outputs the same": ("loop g.g2o --json x --g2o ./x", "two outputs name the same file"),
-    "nothing": ("loop", "Missing argument 'SOURCE'"),
-    "evaluate nothing": ("evaluate s.tum", "Missing argument 'REFERENCE'"),
-    "evaluate missing": ("evaluate s.tum absent.tum", "absent.tum: cannot be read"),
     "evaluate junk": ("evaluate s.tum junk.bin", "junk.bin: not a PX4 ULog"),
-    "evaluate a graph": ("evaluate s.tum g.g2o", "g.g2o: a pose graph, not a trajectory"),
-    "evaluate another flight": ("evaluate s.tum still.tum", "no poses match in time"),
     "evaluate apart": ("evaluate s.tum l.ulg --time-offset 0", "no poses match in time"),
     "evaluate a line": ("evaluate line.tum line.tum", "--alignment yaw"),
-    "gap of NaN": ("evaluate s.tum s.tum --max-gap nan", "nan is not a finite number"),
-    "offset of NaN": ("evaluate s.tum s.tum --time-offset nan", "nan is not a finite number"),
     "offset of words": ("evaluate s.tum s.tum --time-offset abc", "give seconds, as 0.1, or auto"),
     "RPE over nothing": ("evaluate s.tum s.tum --rpe 0m", "'0m' is not a distance"),
     "RPE over half a frame": ("evaluate s.tum s.tum --rpe 1.5f", "frames come whole"),
@@ -427,17 +343,10 @@ REFUSED = {
 
 # What a command reads, it does not write over
 SPARED = {
-    "report": "loop s.pdf -o s.pdf",
     "path": "loop s.tum --tum s.tum",
-    "path of a part": "loop l.ulg:vio --tum l.ulg",
-    "graph": "loop s.tum --g2o s.tum",
-    "results": "loop s.tum --json s.tum",
     "results by soft link of a part": "loop l.ulg:vio --json soft.json",
-    "results of the report": "loop l.ulg -o r.pdf --json l.ulg",
     "reference": "loop l.ulg --reference s.tum --tum s.tum",
-    "notes": "loop s.tum --notes n.md --json n.md",
     "pose graph": "loop g.g2o --g2o g.g2o",
-    "estimate": "evaluate s.tum s.tum --json s.tum",
     "reference of evaluate": "evaluate s.tum l.ulg:truth --json l.ulg",
     "estimate by its page": "evaluate s.pdf s.tum -o s.pdf",
 }
@@ -460,24 +369,3 @@ def test_bad_input_gives_one_line_and_writes_nothing(
     assert said in err
     assert "1.79525e+09" not in err  # times can be told apart
     assert contents(desk) == before
-
-
-@pytest.mark.parametrize("command", ["loop s.tum", "evaluate s.tum s.tum", "loop g.g2o"])
-def test_a_reader_that_leaves_is_no_error(desk, command) -> None:
-    """As in px4fuse loop s.tum | head -1, when head has gone before anything is printed."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "px4fuse", *command.split()],
-        cwd=desk, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
-    process.stdout.close()
-    _, complaint = process.communicate()
-    assert (process.returncode, complaint) == (0, b"")
-
-
-@pytest.mark.usefixtures("no_drawing")
-def test_compare_reports_the_loop_of_the_sample_flight(tmp_path) -> None:
-    result = run("compare", LOG, "--axis", "down", "-o", tmp_path / "r.pdf")
-    assert result.exit_code == 0, result.output
-    found = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))
-    jsonschema.validate(found, schema())
-    assert found["loop"]["closure_error_m"] == pytest.approx(1.42, abs=0.05)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import json
-from importlib import import_module
 from pathlib import Path
 
 import jsonschema
@@ -19,12 +17,9 @@ from px4fuse.ekf2.whatif import Summary
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.errors import MissingDataError, Px4FuseError, SettingsError
 from px4fuse.flight import Flight
-from px4fuse.report.document import WhatIfDocument
-from px4fuse.report.pdf import render
 from px4fuse.report.whatif import heads, reading, rows, sweep_heads, sweep_rows
 from px4fuse.request import Sweep, WhatIfRequest, command_line
-from px4fuse.results.build import whatif_results
-from px4fuse.results.contract import WhatIfResults, schema, to_json
+from px4fuse.results.contract import WhatIfResults, schema
 from px4fuse.results.reading import read_results
 
 
@@ -46,24 +41,18 @@ def run(*words: str | Path) -> Result:
     return CliRunner().invoke(cli, ["whatif", *map(str, words)])
 
 
-def test_results_and_table_have_the_three_side_by_side(sample_log: Path) -> None:
-    done = run(sample_log, "--set", "EKF2_EVP_NOISE=0.3", "--json", "-")
+def test_results_have_the_three_side_by_side(sample_log: Path, tmp_path: Path) -> None:
+    done = run(sample_log, "--set", "EKF2_EVP_NOISE=0.3", "-o", tmp_path / "w.pdf", "--json", "-")
     assert done.exit_code == 0, done.output
     said = json.loads(done.output)
     jsonschema.validate(said, schema())
     assert isinstance(read_results(done.output.encode()), WhatIfResults)
-    assert said["agreement"]["north"]["innovation_correlation"] > 0.995
-    assert said["whatif"]["changed"] == {"EKF2_EVP_NOISE": 0.3}
+    attached = PdfReader(tmp_path / "w.pdf").attachments["results.json"][0]
+    assert attached == (tmp_path / "w.json").read_bytes()
     for key in ("logged", "replayed", "whatif"):
         for axis in ("north", "east"):
             assert 0.04 < said[key][axis]["position_rmse_to_truth_m"] < 0.09
-            assert said[key][axis]["nis_mean"] > 0.05
-        assert said[key]["rejected_share"] == said[key]["resets"] == 0
     assert said["whatif"]["north"]["nis_mean"] < 0.3 * said["replayed"]["north"]["nis_mean"]
-    assert "236 of about 592" in said["logged"]["longest_without_fusion_s"]["reason"]
-    assert said["asked"] is False
-    assert said["request"]["log"] == "aisle_uwb.ulg"
-    assert "sweep" not in said
 
 
 def test_without_set_it_is_what_the_data_ask_for(asked: Counterfactual) -> None:
@@ -72,19 +61,11 @@ def test_without_set_it_is_what_the_data_ask_for(asked: Counterfactual) -> None:
     assert set(asked.changes) == {"EKF2_EVP_NOISE"}
     assert asked.changes["EKF2_EVP_NOISE"] == pytest.approx(0.1, abs=0.01)
     assert "what the data ask for" in heads(asked)[-1]
-
-
-def test_the_table_says_what_the_summaries_hold(asked: Counterfactual) -> None:
-    table = {label.strip(): cells for label, *cells in rows(asked)}
-    found = asked.whatif
+    table, found = {label.strip(): cells for label, *cells in rows(asked)}, asked.whatif
     every = (found.logged, found.replayed, found.whatif[0])
-    assert len(heads(asked)) == len(every)
     assert table["north: mean NIS"] == [f"{s.axes['north'].nis_mean:.3g}" for s in every]
     assert table["samples"] == [str(s.samples) for s in every]
-    assert table["rejected"] == ["0.0%"] * 3
-    assert table["longest without fusion (s)"][0] == "n/a"
-    assert table["position resets"] == ["0"] * 3
-    assert all(len(cells) == 3 for cells in table.values())
+    assert all(len(cells) == len(heads(asked)) == 3 for cells in table.values())
 
 
 def test_a_sweep_changes_the_rest_as_set(swept: Counterfactual) -> None:
@@ -100,41 +81,12 @@ def test_a_sweep_changes_the_rest_as_set(swept: Counterfactual) -> None:
     assert "nearest to 1 at EKF2_EVP_NOISE 0.1" in best
     least = min(values, key=lambda value: value.position_rmse_to_truth_m)
     assert f"least at EKF2_EVP_NOISE {least.changed['EKF2_EVP_NOISE']:.3g}" in error
-    made = whatif_results(WhatIfRequest(log="x"), swept, "")
-    assert made.whatif is not None
-    assert made.whatif.changed == {"EKF2_EVP_GATE": 3.0}
-    assert len(made.sweep) == 3
-
-
-def test_the_page_holds_table_panels_and_results(swept: Counterfactual) -> None:
-    text = to_json(whatif_results(WhatIfRequest(log="x.ulg"), swept, "px4fuse whatif x.ulg"))
-    pdf = render(WhatIfDocument(swept, "px4fuse whatif x.ulg"), text)
-    assert pdf == render(WhatIfDocument(swept, "px4fuse whatif x.ulg"), text)
-    reader = PdfReader(io.BytesIO(pdf))
-    said = " ".join(" ".join(page.extract_text() for page in reader.pages).split())
-    for words in ("as logged", "replayed", "not PX4's own code", "EKF2_EVP_GATE 3", "mean NIS",
-                  "RMSE to truth (m)", "EKF2_EVP_NOISE (m)", "0.9997 (north)"):  # fmt: skip
-        assert words in said, words
-    assert reader.attachments["results.json"][0].decode() == text
-
-
-def test_terminal_and_files(tmp_path: Path, sample_log: Path) -> None:
-    page, results = tmp_path / "page.pdf", tmp_path / "w.json"
-    done = run(sample_log, "--set", "EKF2_EVP_NOISE=0.2", "--sweep", "EKF2_EV_DELAY=0:100:2",
-               "-o", page, "--json", results)  # fmt: skip
-    assert done.exit_code == 0, done.output
-    for words in ("as logged", "what if EKF2_EVP_NOISE", "EKF2_EV_DELAY ", "(ms) ", "It agrees",
-                  "n/a", "not of PX4's own code"):  # fmt: skip
-        assert words in done.output, words
-    assert page.read_bytes()[:5] == b"%PDF-"
-    assert json.loads(results.read_text())["request"]["sweep"]["count"] == 2
 
 
 def test_the_request_is_written_as_it_was_typed() -> None:
-    request = WhatIfRequest(
-        log="/a/log.ulg", mavlink="/b/x.tlog", changes={"EKF2_EVP_NOISE": 0.1},
-        sweep=Sweep("EKF2_EV_DELAY", 0.0, 200.0, 5),
-    )  # fmt: skip
+    swept = Sweep("EKF2_EV_DELAY", 0.0, 200.0, 5)
+    changes = {"EKF2_EVP_NOISE": 0.1}
+    request = WhatIfRequest(log="/a/log.ulg", mavlink="/b/x.tlog", changes=changes, sweep=swept)
     assert command_line(request) == (
         "px4fuse whatif log.ulg --mavlink x.tlog --set EKF2_EVP_NOISE=0.1 "
         "--sweep EKF2_EV_DELAY=0:200:5"
@@ -145,16 +97,13 @@ def test_the_request_is_written_as_it_was_typed() -> None:
     ("words", "said"),
     [
         (["--set", "EKF2_BARO_NOISE=1"], ", ".join(PARAMETERS)),
-        (["--set", "EKF2_EVP_NOISE=0"], "outside PX4's range, 0.01 to 1000 m"),
         (["--set", "EKF2_EVP_NOISE"], "give NAME=VALUE"),
         (["--set", "EKF2_EVP_NOISE=much"], "'much' is not a number"),
         (["--set", "EKF2_EVP_NOISE=nan"], "outside PX4's range"),
         (["--set", "EKF2_EVP_GATE=3", "--set", "EKF2_EVP_GATE=4"], "given twice"),
         (["--sweep", "EKF2_EVP_NOISE=0.1"], "give NAME=LOW:HIGH"),
-        (["--sweep", "EKF2_EVP_NOISE=0.1:0.2:many"], "give NAME=LOW:HIGH"),
         (["--sweep", "EKF2_EVP_NOISE=0.2:0.1"], "the first value must be the smaller one"),
         (["--sweep", "EKF2_EVP_NOISE=0.1:0.2:1"], "not between 2 and 200"),
-        (["--sweep", "NOISE=0.1:0.2"], "does not have this parameter"),
         (
             ["--set", "EKF2_EVP_NOISE=0.1", "--sweep", "EKF2_EVP_NOISE=0.1:0.2"],
             "set and swept",
@@ -232,22 +181,6 @@ def error(summary: Summary) -> float:
     assert all(isinstance(part, float) for part in parts)
     assert summary.position_rmse_to_truth_m == pytest.approx(np.hypot(*parts))
     return float(np.hypot(*parts))
-
-
-def test_results_alone_are_not_mixed_with_how_far_it_is(
-    sample_log: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    command = import_module("px4fuse.cli.whatif")
-    shown, alone = command.progress, []
-
-    def recorded(is_alone: bool, steps: tuple[str, ...]) -> object:
-        alone.append(is_alone)
-        return shown(is_alone, steps)
-
-    monkeypatch.setattr(command, "progress", recorded)
-    assert run(sample_log, "--json", "-").exit_code == 0
-    assert run(sample_log).exit_code == 0
-    assert alone == [True, False]
 
 
 def test_what_is_chaotic_has_no_numbers(sample_flight: Flight) -> None:

@@ -125,10 +125,10 @@ def truth_of(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
 def _wrong(
     name: str, given: Mapping[str, Any], truth: Mapping[str, Any], comparison: Comparison
 ) -> Wrong:
-    arguments = SIMULATED[name].arguments
-    if not arguments:
+    sizes = SIMULATED[name].sizes
+    if not sizes:
         return Wrong(name)
-    size = given[arguments[0].field]
+    size = given[sizes[0]]
     off = LANDED_WITHIN_M if name == "open-end" else TOLERANCE * abs(size)
     low, high = size - off, size + off
     if name == "clock-offset":  # what an ideal analysis of the log can tell
@@ -149,7 +149,7 @@ def _wrong(
             from_s = given["heading_at_s"]
         case "dropout" | "imu-dropout" | "jump":
             share = 2.0 / 3.0 if name == "jump" else 0.5
-            from_s = given[arguments[1].field]
+            from_s = given[sizes[1]]
             from_s = start_s + share * (end_s - start_s) if from_s is None else from_s
             until_s = None if name == "jump" else from_s + abs(size)
     return Wrong(name, size, low, high, from_s, until_s)

@@ -142,7 +142,7 @@ def main() -> None:
         _say(str(error))
         code = 2
     except Interrupted as stopped:
-        stopped.show()
+        _say(str(stopped))
         code = stopped.exit_code
     except BrokenPipeError:  # the reader of a pipe has gone, as with | head; the files are written
         _abandon_output()

@@ -24,13 +24,8 @@ from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
     from px4fuse.report.document import AidsDocument, Document
-    from px4fuse.request import ComparisonRequest
     from px4fuse.results.contract import AidsResults, ComparisonResults
 
-STEPS = (
-    "reading", "filtering", "tuning", "clock offset", "changes of the clock", "replaying EKF2",
-    "heading", "looking for a loop", "drawing",
-)  # fmt: skip
 SEVERITIES = ("error", "warning", "info")
 
 
@@ -40,10 +35,7 @@ SEVERITIES = ("error", "warning", "info")
 @person_options
 @report_options
 @click.option(
-    "--fail-on",
-    type=click.Choice(SEVERITIES),
-    default=None,
-    help="Exit with 1 if there is a finding of at least this severity.",
+    "--fail-on", type=click.Choice(SEVERITIES), help="Exit with 1 on a finding at least so severe."
 )
 @click.option(
     "--checks",
@@ -74,7 +66,7 @@ def compare(
     request = comparison_request(log, given)
     alone = json_path == STANDARD_OUTPUT
     report_paths(output or Path("reports/LOG.pdf"), json_path)  # before the work, not after it
-    with progress(alone, STEPS) as step:
+    with progress(alone) as step:
         analysis, typed = run_or_judge_aids(request, step), command_line(request)
         document: AidsDocument | Document
         found: AidsResults | ComparisonResults
@@ -85,7 +77,7 @@ def compare(
             document = Document(analysis, find(analysis), person, typed)
             found = results(request, analysis, document.findings, person, typed)
         if output is None and not alone:
-            output = default_report(request, found)
+            output = free_report(log.stem, settings_name(request), found)
         contents = result_files(found, json_path, output, document, step)
     if isinstance(document, AidsDocument):
         finish(contents, partial(print_aids, document=document))
@@ -100,17 +92,3 @@ def compare(
         worst = SEVERITIES[: SEVERITIES.index(fail_on) + 1]
         if any(one.severity in worst and one.caused_by is None for one in document.findings):
             sys.exit(1)
-
-
-def default_report(request: ComparisonRequest, results: AidsResults | ComparisonResults) -> Path:
-    """Where a report goes that was given no name: that of the same flight, settings and student."""
-    return free_report(Path(request.log).stem, settings_name(request), results, _same)
-
-
-def _same(old: AidsResults | ComparisonResults, mine: AidsResults | ComparisonResults) -> bool:
-    first, second = (
-        (one.request, one.log.sha256, [file.sha256 for file in one.log.joined])
-        for one in (old, mine)
-    )
-    names = [(one.student.name, one.student.id) for one in (old, mine)]
-    return first == second and names[0] in (("", ""), names[1])

@@ -8,17 +8,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from px4fuse.cli.inputs import Named, max_size_option, open_option, path_option, results_option
+from px4fuse.cli.inputs import Named, json_option, max_size_option, open_option, path_option
 from px4fuse.cli.outputs import finish, free_report, progress, report_paths, result_files
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
-    from px4fuse.results.contract import ChangeResults
-
-STEPS = (
-    "reading", "filtering", "tuning", "clock offset", "replaying EKF2", "heading",
-    "looking for a loop", "comparing", "drawing",
-)  # fmt: skip
+    pass
 
 
 @click.command()
@@ -28,7 +23,7 @@ STEPS = (
 @path_option(
     "-o", "--output", metavar="FILE.pdf", help="The report.  [default: reports/A_to_B.pdf]"
 )
-@results_option
+@json_option
 @click.option(
     "--fail-on",
     type=click.Choice(["worse"]),
@@ -51,21 +46,13 @@ def diff(
 
     alone = json_path == STANDARD_OUTPUT
     report_paths(output or Path("reports/LOG.pdf"), json_path)  # before the work, not after it
-    with progress(alone, STEPS) as step:
+    with progress(alone) as step:
         found = compared(a, b, progress=step)
         results = found.results
         if output is None and not alone:
-            output = free_report(f"{a.stem}_to_{b.stem}", "", results, _same)
+            output = free_report(f"{a.stem}_to_{b.stem}", "", results)
         document = ChangesDocument(results, found.a.analysis, found.b.analysis)
         contents = result_files(results, json_path, output, document, step)
     finish(contents, lambda console: print_changes(console, results))
     if fail_on is not None and found.is_worse:
         sys.exit(1)
-
-
-def _same(old: ChangeResults, mine: ChangeResults) -> bool:
-    """Whether an earlier report is of the same two."""
-    first, second = (
-        [(side.given, side.log_sha256) for side in (one.a, one.b)] for one in (old, mine)
-    )
-    return first == second

@@ -10,11 +10,11 @@ import click
 
 from px4fuse.cli.inputs import (
     Named,
+    json_option,
     max_size_option,
     open_option,
     path_option,
     request_options,
-    results_option,
 )
 from px4fuse.cli.outputs import (
     check_targets,
@@ -29,10 +29,8 @@ from px4fuse.request import EVALUATION_OPTIONS, EvaluationRequest, command_line,
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
-    from px4fuse.results.contract import EvaluationResults
     from px4fuse.trajectory.scores import Delta
 
-STEPS = ("reading", "scoring", "drawing the report")
 MAX_DELTA = 1e6
 _DELTA = re.compile(r"(\d+\.?\d*|\.\d+) ?(m|s|frames|f)")
 
@@ -64,12 +62,9 @@ def delta(text: str) -> Delta:
 @request_options(EvaluationRequest, EVALUATION_OPTIONS)
 @max_size_option
 @path_option(
-    "-o",
-    "--output",
-    metavar="FILE.pdf",
-    help="The page.  [default: reports/ESTIMATE_against_REFERENCE.pdf]",
+    "-o", "--output", metavar="FILE.pdf", help="The page.  [default: reports/A_against_B.pdf]"
 )
-@results_option
+@json_option
 @open_option
 def evaluate(
     estimate: Path,
@@ -97,7 +92,7 @@ def evaluate(
         raise SettingsError(f"--max-gap {request.max_gap_s:g}: give more than 0 seconds.")
     alone = output is None and json_path is not None
     check_targets((json_path,) if alone else report_paths(output or Path("A.pdf"), json_path))
-    with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
+    with progress(json_path == STANDARD_OUTPUT) as step:
         step("reading")
         first = read_source(request.estimate, system=request.system)
         second = read_source(request.reference, default="truth", system=request.system)
@@ -115,14 +110,6 @@ def evaluate(
         results = evaluation_results(found, command_line(request))
         if output is None and not alone:
             name = f"{file_name(estimate)}_against_{file_name(reference)}"
-            output = free_report(name, settings_name(request), results, _same)
+            output = free_report(name, settings_name(request), results)
         contents = result_files(results, json_path, output, found, step)
     finish(contents, lambda console: print_evaluation(console, found))
-
-
-def _same(old: EvaluationResults, mine: EvaluationResults) -> bool:
-    """Whether an earlier page is of the same: the settings are in the command."""
-    first, second = (
-        (one.provenance.command, one.estimate.sha256, one.reference.sha256) for one in (old, mine)
-    )
-    return first == second

@@ -20,11 +20,6 @@ from px4fuse.errors import SettingsError
 from px4fuse.request import settings_name
 from px4fuse.writing import STANDARD_OUTPUT
 
-STEPS = (
-    "reading", "filtering", "tuning", "clock offset", "changes of the clock", "replaying EKF2",
-    "heading", "looking for a loop", "writing the page",
-)  # fmt: skip
-
 
 @click.command()
 @click.argument("logs", nargs=-1, type=Named())
@@ -51,7 +46,7 @@ def explore(logs: tuple[Path, ...], output: Path | None, **given: Any) -> None:
     stems = "_".join(log.stem for log in logs)
     target = web_page(output, Path("reports", f"{stems}{settings_name(requests[0])}.html"))
     check_targets([target])  # before the work, not after it
-    with progress(target == STANDARD_OUTPUT, STEPS) as step:
+    with progress(target == STANDARD_OUTPUT) as step:
         found = []
         for request in requests:
             analysis = run(request, step)

@@ -26,12 +26,7 @@ MAX_DESCRIPTION_BYTES = 50_000_000
 @click.command()
 @click.argument("log", type=Named())
 @path_option(
-    "-o",
-    "--output",
-    "folder",
-    required=True,
-    metavar="DIR",
-    help="Folder for the tables; made where it is missing.",
+    "-o", "--output", "folder", required=True, metavar="DIR", help="Folder for the tables."
 )
 @click.option(
     "--format",
@@ -57,7 +52,7 @@ def extract(log: Path, folder: Path, kind: str, **given: Any) -> None:
     from px4fuse.inspect import tables as extraction
     from px4fuse.results.contract import to_json
 
-    flight = read_flight(comparison_request(log, given))
+    flight = extraction.of_best_source(read_flight(comparison_request(log, given)))
     _refuse_mixture(folder, flight.log.sha256)
     tables = extraction.tables(flight)
     encode = _parquet if kind == "parquet" else _csv
@@ -71,10 +66,6 @@ def extract(log: Path, folder: Path, kind: str, **given: Any) -> None:
     click.echo("  data_dictionary.csv, flight.json")
     for part in extraction.absent(flight):
         click.echo(f"Not in this log: {part.what} ({part.reason})")
-    others = {path for path in folder.glob(f"*.{kind}") if path not in contents}
-    if others:
-        names = ", ".join(sorted(path.name for path in others))
-        click.echo(on_one_line(f"Already there and not of this run: {names}"))
 
 
 def _refuse_mixture(folder: Path, sha256: str) -> None:

@@ -10,6 +10,7 @@ import click
 
 from px4fuse.cli.inputs import Named, comparison_request, json_option, recording_options
 from px4fuse.cli.outputs import finish, progress, result_files
+from px4fuse.plain import few_words
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
     from px4fuse.report.page import Cell
     from px4fuse.request import ComparisonRequest
 
-# No clock drifts by more: the recording was replayed at another speed
-REPLAY_PPM = 10_000.0
 SOURCES_HEAD = ("", "source", "samples", "Hz", "gaps", "span (s)")
 
 
@@ -52,7 +51,7 @@ def info(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.inspect.inventory import take_inventory, to_plain
 
     request = comparison_request(log, given)
-    with progress(json_path == STANDARD_OUTPUT, ("reading", "looking")) as step:
+    with progress(json_path == STANDARD_OUTPUT) as step:
         flight = read_flight(request, step)
         step("looking at what is in it")
         inventory = take_inventory(flight)
@@ -133,9 +132,7 @@ def _flying(inventory: Inventory) -> str:
     if not inventory.airborne:
         return "never, by the land detector"
     spans = [f"{start:.1f} s to {end:.1f} s" for start, end in inventory.airborne]
-    most = 3
-    more = f" and {len(spans) - most} more" if len(spans) > most else ""
-    return ", ".join(spans[:most]) + more
+    return few_words(spans, 3)
 
 
 def _senders(inventory: Inventory) -> list[tuple[str, ...]]:
@@ -193,24 +190,12 @@ def _span(source: Source) -> str:
 
 
 def _clocks(inventory: Inventory) -> list[str]:
+    from px4fuse.report.words import clock_words
+
     on: dict[str, dict[str, None]] = {}
     for source in inventory.sources:
         if source.clock:
             name = source.name if source.part == "position" else source.part
             on.setdefault(source.clock, {})[name] = None
     lines = [f"{clock}: {', '.join(parts)}" for clock, parts in on.items()]
-    for clock in inventory.clocks:
-        note = f"; {clock.note}" if clock.note else ""
-        lines.append(
-            f"{clock.clock}, mapped by {clock.method} ({clock.pairs} pairs): offset "
-            f"{clock.offset_s:.4f} s, {_speed(clock.drift_ppm)}, jitter "
-            f"{clock.jitter_s * 1e3:.1f} ms{note}"
-        )
-    return lines
-
-
-def _speed(drift_ppm: float) -> str:
-    """A drift, or how much faster a replay ran."""
-    if abs(drift_ppm) < REPLAY_PPM:
-        return f"drift {drift_ppm:+.1f} ppm"
-    return f"{1.0 + drift_ppm * 1e-6:.3g} times its speed"
+    return lines + [clock_words(clock) for clock in inventory.clocks]

@@ -122,11 +122,13 @@ max_size_option = click.option(
     metavar="MB",
     help=f"Largest log that is read.  [default: {max_log_bytes.get() // 1_000_000}]",
 )
+#: The results, which stand beside a report where there is one
 json_option = path_option(
     "--json",
     "json_path",
     metavar="FILE",
-    help="Write it as JSON; - prints that alone on standard output.",
+    help="The results as JSON; - prints them alone on standard output, and without -o writes no "
+    "report.  [default: beside the PDF]",
 )
 
 
@@ -152,19 +154,7 @@ person_options = _together(
     click.option("--student", metavar="NAME", help="Name on the report."),
     click.option("--id", "student_id", metavar="ID", help="Student number on the report."),
     path_option("--notes", metavar="FILE.md", help="Your own words, printed in the report."),
-    path_option(
-        "--answers",
-        metavar="FILE.toml",
-        help="The form about the flight, filled in (see px4fuse answers), printed in the report.",
-    ),
-)
-#: Of commands whose results stand beside a report
-results_option = path_option(
-    "--json",
-    "json_path",
-    metavar="FILE",
-    help="The results; - prints them alone on standard output, and without -o writes no report.  "
-    "[default: beside the PDF]",
+    path_option("--answers", metavar="FILE.toml", help="The form of px4fuse answers, filled in."),
 )
 #: Of every command that makes a report: the PDF and its results
 report_options = _together(
@@ -175,7 +165,7 @@ report_options = _together(
         help="The report.  [default: reports/LOG.pdf, settings that are not at their defaults in "
         "its name]",
     ),
-    results_option,
+    json_option,
 )
 
 

@@ -10,12 +10,12 @@ import click
 
 from px4fuse.cli.inputs import (
     Named,
+    json_option,
     max_size_option,
     path_option,
     person_options,
     read_person,
     request_options,
-    results_option,
     show_option,
     typed_parameters,
 )
@@ -41,12 +41,7 @@ from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
     from px4fuse.loop.loop import Loop
-    from px4fuse.results.contract import LoopResults
 
-STEPS = (
-    "reading", *(f"solving: pose graph, {name}" for name in ("all", "gated", "DCS", "GNC")),
-    "drawing",
-)  # fmt: skip
 # Nobody's tape is longer
 MAX_LANDED_AT = 10_000.0
 # What may be given with a pose graph
@@ -99,12 +94,9 @@ def closure(text: str) -> GivenClosure:
 @max_size_option
 @person_options
 @path_option(
-    "-o",
-    "--output",
-    metavar="FILE.pdf",
-    help="The report.  [default: reports/SOURCE_loop.pdf]",
+    "-o", "--output", metavar="FILE.pdf", help="The report.  [default: reports/SOURCE_loop.pdf]"
 )
-@results_option
+@json_option
 @path_option(
     "--tum", metavar="FILE", help="Write the corrected path as a TUM file, in the axes of SOURCE."
 )
@@ -142,22 +134,16 @@ def loop(
     alone = output is None and json_path is not None
     results = (json_path,) if alone else report_paths(output or Path("reports/A.pdf"), json_path)
     check_targets([tum, g2o, *results])
-    with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
+    with progress(json_path == STANDARD_OUTPUT) as step:
         found = run_loop(request, step)
         findings = find_loop(found)
         document = LoopDocument(found, findings, person, command_line(request))
         made = loop_results(request, found, findings, person, document.command)
         if output is None and not alone:
-            output = free_report(f"{file_name(source)}_loop", settings_name(request), made, _same)
+            output = free_report(f"{file_name(source)}_loop", settings_name(request), made)
         contents = _files(found, tum, g2o)
         contents |= result_files(made, json_path, output, document, step)
     finish(contents, lambda console: print_loop(console, found, findings, request))
-
-
-def _same(old: LoopResults, mine: LoopResults) -> bool:
-    """Whether an earlier report is of the same."""
-    first, second = ((one.request, one.track.sha256, one.student) for one in (old, mine))
-    return first == second
 
 
 def loop_request(source: Path, given: dict[str, Any]) -> LoopRequest:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import click
 
@@ -38,7 +39,7 @@ OPENED = "px4fuse.opened"
 TO_LOOK_AT = (".html", ".htm", ".pdf", ".png")
 
 
-class Interrupted(click.ClickException):
+class Interrupted(Exception):  # noqa: N818 - no error of anybody
     """The run was ended from outside.
 
     Parameters
@@ -51,12 +52,7 @@ class Interrupted(click.ClickException):
 
     def __init__(self, stopped: KeyboardInterrupt, left: str) -> None:
         super().__init__(f"interrupted, {left}")
-        number = stopped.args[0] if stopped.args else signal.SIGINT
-        self.exit_code = 128 + number  # type: ignore[misc]  # read from the instance by click
-
-    def show(self, file: IO[Any] | None = None) -> None:
-        """Say so on one line."""
-        click.echo(f"px4fuse: {self.message}", file=file, err=True)
+        self.exit_code = 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
 
 
 class ShowStep(Protocol):
@@ -72,16 +68,10 @@ def silent(what: str, done: int = 0, of: int | None = None) -> None:
 
 
 @contextmanager
-def progress(quiet: bool = False, steps: Sequence[str] = ()) -> Iterator[ShowStep]:
-    """A bar on a terminal about what is being done and what remains; nothing in a pipe.
+def progress(quiet: bool = False) -> Iterator[ShowStep]:
+    """A bar on a terminal about what is being done, and what remains where that can be counted.
 
-    Parameters
-    ----------
-    quiet : bool
-        Show nothing on a terminal either.
-    steps : sequence of str
-        With what each step of the work begins, in their order; what is said besides is a part of
-        the step before.
+    Nothing in a pipe, nor where it is to be ``quiet``.
     """
     from rich.console import Console
 
@@ -94,46 +84,35 @@ def progress(quiet: bool = False, steps: Sequence[str] = ()) -> Iterator[ShowSte
     columns = (
         bars.SpinnerColumn(), bars.TextColumn("{task.description}", markup=False), bars.BarColumn(),
         bars.TextColumn("{task.fields[count]}"), bars.TimeElapsedColumn(),
-        # of work that is counted; steps are not equally long
-        *(() if steps else (bars.TextColumn("of which left"), bars.TimeRemainingColumn())),
+        bars.TimeRemainingColumn(),
     )  # fmt: skip
     with bars.Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("starting", total=len(steps) or None, count="")
-        at = 0
+        task = bar.add_task("starting", total=None, count="")
 
         def show(what: str, done: int = 0, of: int | None = None) -> None:
-            nonlocal at
-            if steps:
-                begun = (number for number, step in enumerate(steps) if what.startswith(step))
-                at = max(at, next(begun, at))
-                done, of = at, len(steps)
-            count = f"step {at + 1} of {of}" if steps else "" if of is None else f"{done} of {of}"
+            count = "" if of is None else f"{done} of {of}"
             bar.update(task, description=what, completed=done, total=of, count=count)
 
         yield show
 
 
-def free_report(stem: str, settings: str, mine: Results, same: Callable[[Any, Any], bool]) -> Path:
+def free_report(stem: str, settings: str, mine: Results) -> Path:
     """Where a report goes that was given no name: what is not at its default is in its name.
 
-    What an earlier run of the ``same`` wrote is written over: results of this kind of which that is
-    true. Where another file has the name, a number is added.
+    What an earlier run wrote of the same files, settings and student is written over. Where another
+    file has the name, a number is added.
     """
-
-    def is_same(old: Results) -> bool:
-        return type(old) is type(mine) and same(old, mine)
-
     name = f"{stem}{settings}"
     if len(os.fsencode(name)) > LONGEST_NAME:
         name = os.fsencode(stem)[:LONGEST_STEM].decode(errors="ignore")
     number, path = 1, Path("reports", f"{name}.pdf")
-    while not all(_is_ours(file, is_same) for file in (path, path.with_suffix(".json"))):
+    while not all(_is_ours(file, mine) for file in (path, path.with_suffix(".json"))):
         number += 1
         path = Path("reports", f"{name}_{number}.pdf")
     return path
 
 
-def _is_ours(file: Path, is_same: Callable[[Results], bool]) -> bool:
+def _is_ours(file: Path, mine: Results) -> bool:
     """Whether a report or its results are of the same, or not there yet."""
     from pypdf import PdfReader
     from pypdf.errors import PyPdfError
@@ -146,9 +125,21 @@ def _is_ours(file: Path, is_same: Callable[[Results], bool]) -> bool:
     try:
         results = file.suffix == ".json"
         text = file.read_bytes() if results else PdfReader(file).attachments[RESULTS_NAME][0]
-        return is_same(read_results(text))
+        (asked, names), (ours, our_names) = map(_of_what, (read_results(text), mine))
     except (OSError, PyPdfError, KeyError, ValueError, ResultsError):
         return False  # not a report, or not one that this version reads
+    return asked == ours and names in ((), our_names)  # a name is added to what had none
+
+
+def _of_what(results: Results) -> tuple[object, tuple[str, ...]]:
+    """What was asked of which files, and whose report it is."""
+    from px4fuse.results.contract import to_json
+
+    student = getattr(results, "student", None)
+    names = (student.name, student.id) if student is not None else ()
+    asked = getattr(results, "request", results.provenance.command)
+    files = re.findall(r'sha256": *"(\w+)"', to_json(results))
+    return (type(results), asked, files), names if any(names) else ()
 
 
 def web_page(output: Path | None, default: Path) -> Path:

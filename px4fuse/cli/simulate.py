@@ -16,7 +16,15 @@ from px4fuse.cli.quantity import TypedQuantity
 from px4fuse.errors import OutputError, SettingsError, on_one_line
 from px4fuse.reading import read_text
 from px4fuse.simulation.mistakes import MISTAKES, as_typed, made, parse
-from px4fuse.simulation.scenario import KINDS, OF_KIND, YAWS, Kind, Scenario, scenario_of
+from px4fuse.simulation.scenario import (
+    KINDS,
+    OF_KIND,
+    YAWS,
+    Kind,
+    Scenario,
+    quantities,
+    scenario_of,
+)
 
 if TYPE_CHECKING:
     from px4fuse.assignment.drawing import Kinds
@@ -27,37 +35,22 @@ MIXED = "mixed"
 OUTDOOR: Kind = "outdoor"
 SOURCES = {"aisle": "UWB", "loop": "VIO", OUTDOOR: "GNSS"}
 # What goes with --assignment, and what goes with nothing else
-OF_ASSIGNMENTS = ("output", "assignment", "secret", "secret_file", "count", "kind", "answer_path",
-                  "no_truth", "preview")  # fmt: skip
-ONLY_ASSIGNMENTS = ("secret", "secret_file", "count", "preview")
+ONLY_ASSIGNMENTS = ("secret_file", "count", "preview")
+OF_ASSIGNMENTS = ("output", "assignment", "kind", "answer_path", "no_truth", *ONLY_ASSIGNMENTS)
 MAX_SECRET_BYTES = 10_000
 Command = TypeVar("Command", bound=Callable[..., None])
 
 
-# Option, field of the scenario, whose own value is the default, unit and help
-_SCENARIO = (
-    ("--length", "length_m", "m", "Of the aisle, or of a side of the square."),
-    ("--speed", "speed_m_s", "m/s", "On the straight."),
-    ("--heading", "heading_deg", "°", "Of the aisle or of the first side, clockwise from north."),
-    ("--sigma-uwb", "sigma_uwb_m", "m", "White noise of the UWB, per axis: the true SIGMA_Z."),
-    ("--uwb-rate", "uwb_rate_hz", "Hz", None),
-    ("--sigma-gnss", "sigma_gnss_m", "m", "White noise of GNSS, north and east."),
-    ("--sigma-a", "sigma_a_m_s2", "m/s²",
-     "White noise of the accelerometer's mean over 0.1 s: the true SIGMA_A."),
-    ("--accel-bias-sigma", "accel_bias_sigma_m_s2", "m/s²",
-     "Width from which the accelerometer's constant bias is drawn."),
-)  # fmt: skip
-
-
 def _scenario_options(command: Command) -> Command:
-    """The real numbers of the scenario."""
-    for name, field, unit, meaning in reversed(_SCENARIO):
-        usual = getattr(_DEFAULT, field)
-        kind = TypedQuantity(unit, usual, between=(0.0, 360.0) if unit == "°" else None)
-        outdoors = OF_KIND[OUTDOOR].get(field)
+    """The options that set a real number of the scenario; its field has the default and help."""
+    for field, taken in reversed(quantities(Scenario).items()):
+        if not taken.meaning:
+            continue
+        usual, outdoors = getattr(_DEFAULT, field), OF_KIND[OUTDOOR].get(field)
         shown = f"{usual:g}" + (f"; outdoors {outdoors:g}" if outdoors else "")
-        told = f"{meaning}  [default: {shown}]"
-        command = click.option(name, field, type=kind, help=told)(command)
+        told = f"{taken.meaning}  [default: {shown}]"
+        kind = TypedQuantity(taken.unit, usual)
+        command = click.option(taken.typed, field, type=kind, help=told)(command)
     return command
 
 
@@ -72,7 +65,7 @@ class WithMistakes(click.Command):
                 [
                     (
                         f"{name}{mistake.usage}",
-                        mistake.help + (f" [{mistake.default:g}]" if mistake.arguments else ""),
+                        mistake.help + (f" [{mistake.usual:g}]" if mistake.sizes else ""),
                     )
                     for name, mistake in MISTAKES.items()
                 ]
@@ -81,11 +74,7 @@ class WithMistakes(click.Command):
 
 @click.command(cls=WithMistakes)
 @path_option(
-    "-o",
-    "--output",
-    required=True,
-    metavar="FLIGHT.ulg|DIR",
-    help="The log to write; with --assignment the folder for everyone's.",
+    "-o", "--output", required=True, metavar="FLIGHT.ulg|DIR", help="The log, or a class's folder."
 )
 @path_option(
     "--assignment",
@@ -100,22 +89,13 @@ class WithMistakes(click.Command):
     "flight.  [default: made up, and kept in the answer key]",
 )
 @click.option(
-    "--secret",
-    metavar="TEXT",
-    help="The secret itself; others on this computer may see what you type.",
-)
-@click.option(
     "--mistakes",
     "count",
     type=int,
     metavar="N",
     help="How many mistakes each assigned flight has.  [default: drawn: none, one or two]",
 )
-@click.option(
-    "--preview",
-    is_flag=True,
-    help="Print what --assignment draws for whom, for you alone, and write nothing.",
-)
+@click.option("--preview", is_flag=True, help="Print what --assignment draws; write nothing.")
 @click.option(
     "--kind",
     type=click.Choice((*KINDS, MIXED)),
@@ -125,18 +105,14 @@ class WithMistakes(click.Command):
     "others.",
 )
 @click.option(
-    "--seed",
-    type=int,
-    default=_DEFAULT.seed,
-    metavar="N",
-    help="A number per student gives everyone a flight of their own; the same number the same.",
+    "--seed", type=int, default=_DEFAULT.seed, metavar="N", help="The same number: the same flight."
 )
 @click.option(
     "--mistake",
     "mistakes",
     multiple=True,
     metavar="NAME[=VALUE]",
-    help="What goes wrong, from the table below; may be repeated.",
+    help="See below. Repeatable.",
 )
 @path_option(
     "--answer",
@@ -148,28 +124,16 @@ class WithMistakes(click.Command):
 @click.option("--no-truth", is_flag=True, help="Leave the ground truth out of the log.")
 @click.option("--no-ekf2", is_flag=True, help="Fly without EKF2, which is faster.")
 @click.option(
-    "--passes",
-    type=int,
-    metavar="N",
-    help="Passes of the aisle [6], or laps of the square [1; outdoors 3].",
+    "--passes", type=int, metavar="N", help="Passes [6], or laps of a square [1; outdoors 3]."
 )
 @click.option(
-    "--yaw",
-    type=click.Choice(YAWS),
-    help="Whether the nose stays or follows the flight.  [default: fixed; follow around a square]",
+    "--yaw", type=click.Choice(YAWS), help="Of the nose.  [default: fixed; follow around a square]"
 )
 @_scenario_options
-@click.option(
-    "--vio-drift",
-    type=float,
-    metavar="SHARE",
-    help=f"Drift of the VIO, as a share of the distance.  [default: {_DEFAULT.vio_drift:g}]",
-)
 def simulate(
     output: Path,
     assignment: Path | None,
     secret_file: Path | None,
-    secret: str | None,
     count: int | None,
     mistakes: tuple[str, ...],
     answer_path: Path | None,
@@ -192,7 +156,7 @@ def simulate(
     """
     _check_options(assignment)
     if assignment is not None:
-        drawn_from = _read_secret(secret, secret_file), cast("Kinds", kind), count
+        drawn_from = _read_secret(secret_file), cast("Kinds", kind), count
         _assign(assignment, output, answer_path, *drawn_from, truth=not no_truth, preview=preview)
         return
     if kind == MIXED:
@@ -210,7 +174,7 @@ def simulate(
     from px4fuse.results.contract import to_json
     from px4fuse.simulation import flights
 
-    with progress(steps=("flying", "writing")) as step:
+    with progress() as step:
         step("flying")
         simulation = flights.simulate(scenario, parsed)
         step("writing the log")
@@ -243,13 +207,9 @@ def _check_options(assignment: Path | None) -> None:
             raise SettingsError(f"{parameter.opts[0]} requires --assignment ROSTER.csv.")
 
 
-def _read_secret(secret: str | None, file: Path | None) -> bytes | None:
+def _read_secret(file: Path | None) -> bytes | None:
     from px4fuse.assignment.drawing import secret_of
 
-    if secret is not None and file is not None:
-        raise SettingsError("--secret and --secret-file: give one of them.")
-    if secret is not None:
-        return secret_of(secret, "--secret")
     if file is None:
         return None
     name = f"--secret-file {file}"

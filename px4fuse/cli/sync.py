@@ -11,8 +11,6 @@ from px4fuse.cli.inputs import Named, analysis_options, comparison_request, json
 from px4fuse.cli.outputs import finish, progress, result_files
 from px4fuse.writing import STANDARD_OUTPUT
 
-STEPS = ("reading", "tuning", "clock offset", "changes of the clock")
-
 
 @click.command()
 @click.argument("log", type=Named())
@@ -34,7 +32,7 @@ def sync(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.results.build import sync_results
 
     request = comparison_request(log, given)
-    with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
+    with progress(json_path == STANDARD_OUTPUT) as step:
         compared = run_preparation(request, step)
         _, found = noises_and_clock(compared, step)
     results = sync_results(request, compared, found, command_line(request, "sync"))

@@ -15,14 +15,10 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from px4fuse.comparison.model import Comparison
-    from px4fuse.filter.tuning import AxisTuning, Noise
+    from px4fuse.filter.tuning import AxisTuning
     from px4fuse.flight import Unavailable
     from px4fuse.request import ComparisonRequest
 
-STEPS = (
-    "reading",
-    *(f"tuning {name}" for name in ("north", "east", "down", "aisle", "horizontal")),
-)  # fmt: skip
 HEAD = (
     "axis", "SIGMA_A (m/s²)\nvalue, 95 %", "SIGMA_Z (m)\nvalue, 95 %", "\ngain", "held\nout",
     "lag 1\nbefore after",
@@ -51,7 +47,7 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.results.build import tuning_results
 
     request = comparison_request(log, given)
-    with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
+    with progress(json_path == STANDARD_OUTPUT) as step:
         compared = run_preparation(request, step)
         tuned = tuned_noises(compared, progress=step)
     results = tuning_results(request, compared, tuned, command_line(request, "tune"))
@@ -67,6 +63,7 @@ def _print(
     request: ComparisonRequest,
 ) -> None:
     from px4fuse.flight import Unavailable
+    from px4fuse.notebook.tables import noise_words
     from px4fuse.report.page import Page
     from px4fuse.report.screen import show
     from px4fuse.report.style import MUTED
@@ -83,8 +80,8 @@ def _print(
         rows.append(
             (
                 name,
-                _noise(found.filter_sigma_a),
-                _noise(found.sigma_z),
+                noise_words(found.filter_sigma_a),
+                noise_words(found.sigma_z),
                 f"{found.gain_nats:.3f}",
                 "" if isinstance(held, Unavailable) else f"{held.gain_nats:+.3f}",
                 _whiteness(found),
@@ -95,14 +92,6 @@ def _print(
         page_below.write(NOTE, colour=MUTED)
     show(console, page.blocks + page_below.blocks)
     print_advice(console, tuning_advice(compared, tuned), request)
-
-
-def _noise(noise: Noise) -> str:
-    if noise.value is None:
-        return "not determinable" if noise.high is None else f"at most {noise.high:.2g}"
-    low = "0" if noise.low is None else f"{noise.low:.2g}"
-    high = "?" if noise.high is None else f"{noise.high:.2g}"
-    return f"{noise.value:.3g} ({low}-{high})"
 
 
 def _whiteness(found: AxisTuning) -> str:

@@ -61,7 +61,7 @@ def verify(
     if isinstance(read, Refused):
         raise LogError(read.reason)
     check_targets([json_path, output])
-    with progress(json_path == STANDARD_OUTPUT, ("hashing", "running")) as step:
+    with progress(json_path == STANDARD_OUTPUT) as step:
         step("hashing the logs")
         files = files_by_sha256(logs)
         if logs and not files:

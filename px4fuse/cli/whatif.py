@@ -9,17 +9,12 @@ import click
 
 from px4fuse.cli.inputs import Named, flight_options, json_option, open_option, path_option
 from px4fuse.cli.outputs import finish, progress, report_paths, result_files
-from px4fuse.cli.quantity import NAMES, in_unit
 from px4fuse.errors import SettingsError
+from px4fuse.units import NAMES, in_unit
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
     from px4fuse.request import Sweep
-
-STEPS = (
-    "reading", "replaying EKF2", "clock offset", "changes of the clock", "replaying with",
-    "drawing",
-)  # fmt: skip
 
 
 @click.command()
@@ -66,7 +61,7 @@ def whatif(
         sweep=None if sweep is None else _sweep(sweep),
         **given,
     )
-    with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
+    with progress(json_path == STANDARD_OUTPUT) as step:
         found = run_what_if(request, step)
         document = WhatIfDocument(found, command_line(request))
         results = whatif_results(request, found, document.command)

@@ -101,13 +101,8 @@ def prepare(
     if kind := choices.get("source_kind"):
         track = replace(track, origin=structs.replace(track.origin, kind=kind))
     track = _of_vehicle(shift_clock(track, settings.clock_offset_s), flight)
+    flight = of_source(flight, track)
     missing = flight.missing
-    if track.origin.by_gnss and isinstance(flight.ekf2, Ekf2):
-        # what the log lacks of another source is no lack here
-        of_vision = _lacking(flight.ekf2)
-        ekf2 = with_gnss(flight.ekf2)
-        missing = tuple(part for part in missing if not part.source and part not in of_vision)
-        flight, missing = replace(flight, ekf2=ekf2), missing + _lacking(ekf2)
     segment = choose_segment(flight, track, choices.get("start_s"), choices.get("end_s"))
     names, heading_deg = choices.get("axes"), choices.get("heading_deg")
     if names is None and track.origin.by_gnss:
@@ -129,6 +124,18 @@ def prepare(
         notes += (f"no acceleration input ({acceleration.reason}): constant velocity was used",)
         missing += () if acceleration in missing else (acceleration,)
     return Comparison(flight, track, reason, segment, settings, lines, notes, missing)
+
+
+def of_source(flight: Flight, track: PositionTrack) -> Flight:
+    """The flight with EKF2's innovations of GNSS where that is the source, else as it is."""
+    if isinstance(flight.ekf2, Unavailable) or not track.origin.by_gnss:
+        return flight
+    # what the log lacks of another source is no lack here
+    of_vision, ekf2, streams = _lacking(flight.ekf2), with_gnss(flight.ekf2), dict(flight.streams)
+    missing = tuple(part for part in flight.missing if not part.source and part not in of_vision)
+    if "ekf2_state" in streams and ekf2.aids:
+        streams["ekf2_innovations"] = replace(streams["ekf2_state"], topics=ekf2.innovation_topics)
+    return replace(flight, ekf2=ekf2, streams=streams, missing=missing + _lacking(ekf2))
 
 
 def _lacking(ekf2: Ekf2) -> tuple[Unavailable, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
@@ -12,6 +12,7 @@ import pandas as pd
 
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.preparation import of_source
 from px4fuse.ekf2.aids import judge_aids
 from px4fuse.ekf2.inputs import prepare
 from px4fuse.errors import MissingDataError, Px4FuseError
@@ -198,8 +199,8 @@ def take_inventory(flight: Flight) -> Inventory:
         remedy = with_options(error.remedy)
         if not isinstance(error, MissingDataError):
             remedy = "Record more of the flight: the logger from arming on (SDLOG_MODE 0)."
-    if compared is not None and compared.source.origin.is_gnss:
-        flight = _on_gnss(flight, compared)
+    if compared is not None:
+        flight = of_source(flight, compared.source)
     log = flight.log
     cut = log.ends_in_flight and not log.damage
     return Inventory(
@@ -223,14 +224,6 @@ def take_inventory(flight: Flight) -> Inventory:
             *(flight.ekf2.notes if isinstance(flight.ekf2, Ekf2) else ()),
         ),
     )
-
-
-def _on_gnss(flight: Flight, compared: Comparison) -> Flight:
-    """The flight with EKF2's innovations of GNSS in place of those of external vision."""
-    ekf2, streams = compared.flight.ekf2, dict(flight.streams)
-    if isinstance(ekf2, Ekf2) and (of_state := streams.get("ekf2_state")) and ekf2.aids:
-        streams["ekf2_innovations"] = replace(of_state, topics=ekf2.innovation_topics)
-    return replace(flight, ekf2=ekf2, missing=compared.missing, streams=streams)
 
 
 def to_plain(inventory: Inventory) -> dict[str, Any]:
@@ -317,47 +310,46 @@ def _gaps(frame: pd.DataFrame, *, of_imu: bool) -> Gaps:
 
 def _abilities(flight: Flight, compared: Comparison | None, reason: str) -> Iterator[Ability]:
     """What compare does, with what, or why not."""
-    given: object
+    acceleration: object = ned_acceleration(flight)
+    done: dict[str, tuple[object, str]] = {}
     if compared is None:
         yield Ability("compare", False, reason)
-        given = ned_acceleration(flight)
     else:
         source, segment = compared.source, compared.segment
         count, span = len(within(source.samples, segment)), (segment.start_s, segment.end_s)
         said = "our filter on {}, {} samples, {:.1f} s to {:.1f} s"
         yield Ability("compare", True, said.format(source.name, count, *span))
-        given = compared.lines[0].acceleration
+        acceleration, done = compared.lines[0].acceleration, _done(compared)
     slow = " ".join(found.message for found in imu.rates(flight))
-    if isinstance(given, Unavailable):
-        slow = f"{given.reason}; velocity is held constant"
+    if isinstance(acceleration, Unavailable):
+        slow = f"{acceleration.reason}; velocity is held constant"
     turned = "IMU turned into NED by the attitude, gravity removed"
     yield Ability("acceleration", not slow, slow or turned)
     parts = _parts(flight)
-    done: dict[str, str | Unavailable] = {} if compared is None else _done(compared)
     for name, key in OF_PARTS.items():
-        part = parts.get(key, flight.ekf2)
-        found = part if isinstance(part, Unavailable) else done.get(name, NO_AXIS)
-        if isinstance(found, Unavailable):
-            yield Ability(name, False, found.reason)
-        else:
-            yield Ability(name, True, found)
+        logged, (used, said) = parts.get(key, flight.ekf2), done.get(name, (NO_AXIS, ""))
+        yield _ability(name, logged if isinstance(logged, Unavailable) else used, said)
     aids, ekf2 = judge_aids(flight), flight.ekf2
-    if isinstance(aids, Unavailable):
-        yield Ability("aids", False, aids.reason)
-    elif isinstance(ekf2, Ekf2):
-        rates = [f"{a.label} {sample_rate(ekf2.aids[n].samples):.2g} Hz" for n, a in aids.items()]
-        yield Ability("aids", True, f"each judged by its own innovations: {', '.join(rates)}")
+    if isinstance(aids, dict) and isinstance(ekf2, Ekf2):
+        rates = (f"{a.label} {sample_rate(ekf2.aids[n].samples):.2g} Hz" for n, a in aids.items())
+        said = f"each judged by its own innovations: {', '.join(rates)}"
+    yield _ability("aids", aids, said)
     inputs = prepare(flight)
-    if isinstance(inputs, Unavailable):
-        yield Ability("what if", False, inputs.reason)
-    else:
+    if not isinstance(inputs, Unavailable):
         replayed_s = sum(float(np.ptp(stretch.time_s)) for stretch in inputs.stretches)
         said = f"EKF2 replayed on {inputs.aid.label} for {replayed_s:.0f} s, also otherwise set"
-        yield Ability("what if", True, said)
+    yield _ability("what if", inputs, said)
 
 
-def _done(compared: Comparison) -> dict[str, str | Unavailable]:
-    """What compare did with EKF2 and the truth along its first axis, or why it did not."""
+def _ability(name: str, part: object, said: str) -> Ability:
+    """What is said of what is done with a part, or why it is not done."""
+    if isinstance(part, Unavailable):
+        return Ability(name, False, part.reason)
+    return Ability(name, True, said)
+
+
+def _done(compared: Comparison) -> dict[str, tuple[object, str]]:
+    """What compare did with EKF2 and the truth along its first axis, and what is said of it."""
     first, truth = next(iter(compared.axes.values())), compared.flight.truth
     innovations = {name: axis.ekf2_innovations for name, axis in compared.axes.items()}
     counts = [f"{n} {len(f)}" for n, f in innovations.items() if isinstance(f, pd.DataFrame)]
@@ -365,7 +357,7 @@ def _done(compared: Comparison) -> dict[str, str | Unavailable]:
     what = "position only"
     if isinstance(truth, Truth) and truth.samples[VELOCITY_COLUMNS].notna().any(axis=None):
         what = "position and velocity"
-    rows = {
+    return {
         "EKF2 states": (first.difference, f"{_count(first.ekf2_state)} of position and velocity"),
         "EKF2 variances": (first.ekf2_variance, _count(first.ekf2_variance)),
         "EKF2 innovations": (
@@ -373,9 +365,6 @@ def _done(compared: Comparison) -> dict[str, str | Unavailable]:
             f"two-sided consistency: {', '.join(counts)}",
         ),
         "truth": (first.truth, f"RMSE and NEES of {what} against {getattr(truth, 'name', '')}"),
-    }
-    return {
-        name: part if isinstance(part, Unavailable) else said for name, (part, said) in rows.items()
     }
 
 

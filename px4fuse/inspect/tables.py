@@ -13,6 +13,8 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
+from px4fuse.comparison.preparation import choose_source, of_source
+from px4fuse.errors import MissingDataError
 from px4fuse.filter.signals import ned_acceleration
 from px4fuse.flight import Ekf2, Flight, PositionTrack, Truth, Unavailable
 from px4fuse.plain import plain
@@ -35,6 +37,14 @@ class DescribedTable:
     name: str
     data: pd.DataFrame
     columns: pd.DataFrame
+
+
+def of_best_source(flight: Flight) -> Flight:
+    """The flight with EKF2's innovations of the position that compare would take."""
+    try:
+        return of_source(flight, choose_source(flight)[0])
+    except MissingDataError:
+        return flight
 
 
 def tables(flight: Flight) -> Mapping[str, pd.DataFrame]:

@@ -16,9 +16,6 @@ __all__ = ["tables"]
 
 @draw.register
 def _(result: Shown, **options: Any) -> Any:
-    from px4fuse.notebook.pictures import PICTURES  # noqa: PLC0415 - matplotlib takes its time
+    from px4fuse.notebook.pictures import picture  # noqa: PLC0415 - matplotlib takes its time
 
-    drawn: Any = PICTURES.get(type(result))
-    if drawn is None:
-        raise TypeError(f"{type(result).__name__} has no picture; its table: .to_frame()")
-    return drawn(result, **options)
+    return picture(result, **options)

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import wraps
-from inspect import signature
 from pathlib import Path
-from typing import Any, Literal, ParamSpec, TypeVar, get_args
+from typing import Any, Literal, get_args
 
 from px4fuse.analysis import Analysis, run, run_what_if
 from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.whatif import WhatIf
-from px4fuse.errors import MissingDataError, OutputError, SettingsError, did_you_mean
-from px4fuse.filter.settings import Settings
+from px4fuse.errors import MissingDataError, OutputError, SettingsError
 from px4fuse.findings import find
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.analysis import analyse
@@ -40,36 +37,17 @@ from px4fuse.writing import write_all
 
 Pathlike = str | Path
 Progress = Callable[[str], None]
-Given = ParamSpec("Given")
-Made = TypeVar("Made")
 
 
-def _with_names(function: Callable[Given, Made]) -> Callable[Given, Made]:
-    """The function, which says what a mistyped argument was meant to be."""
-    known = signature(function).parameters
-
-    @wraps(function)
-    def call(*args: Given.args, **named: Given.kwargs) -> Made:
-        for name in named:
-            near = "" if name in known else did_you_mean(name, known)
-            if near:
-                raise TypeError(f"{function.__name__}() has no argument `{name}`. {near.strip()}")
-        return function(*args, **named)
-
-    return call
-
-
-@_with_names
 def compare(
     log: Pathlike | Flight,
-    settings: Settings | None = None,
     *,
-    sigma_a_m_s2: float | None = None,
+    sigma_a_m_s2: float = 0.5,
     sigma_z_m: float | None = None,
-    dt_s: float | None = None,
+    dt_s: float = 0.1,
     input: InputName | None = None,  # noqa: A002 - the name of the setting
     clock_offset_s: float | Literal["auto"] | None = None,
-    axes: str | Sequence[str] = (),
+    axes: AxisName | Sequence[AxisName] = (),
     heading_deg: float | None = None,
     start_s: float | None = None,
     end_s: float | None = None,
@@ -86,10 +64,8 @@ def compare(
     ----------
     log : str, Path or Flight
         A ULog or a MAVLink recording, or a flight that was read.
-    settings : Settings, optional
-        The filter's; what is given besides goes before it.
     sigma_a_m_s2, sigma_z_m, dt_s, input
-        See :class:`Settings`.
+        See :class:`Settings`; by default SIGMA_Z is 0.1 m, of GNSS what EKF2 takes.
     clock_offset_s : float or "auto", optional
         Added to the source's stamps; "auto" finds it.
     axes : str or sequence of str
@@ -121,10 +97,9 @@ def compare(
     LogError, MissingDataError, SettingsError
         A file cannot be read, the flight lacks what was asked for, or a setting is out of range.
     """
-    known: tuple[AxisName, ...] = get_args(AxisName)
-    asked = (axes,) if isinstance(axes, str) else tuple(axes)
-    if unknown := [name for name in asked if name not in known]:
-        raise SettingsError(f"`axes` {unknown[0]!r}: choose from {', '.join(known)}.")
+    known, asked = get_args(AxisName), (axes,) if isinstance(axes, str) else tuple(axes)
+    if unknown := set(asked).difference(known):
+        raise SettingsError(f"`axes` {unknown.pop()!r}: choose from {', '.join(known)}.")
     if isinstance(log, Flight) and (position, mavlink, system) != (None, None, None):
         raise SettingsError(
             "`position`, `mavlink` and `system` say what is read beside a log, and this flight has "
@@ -133,9 +108,6 @@ def compare(
         )
     if isinstance(clock_offset_s, str) and clock_offset_s != AUTO:
         raise SettingsError(f"`clock_offset_s` {clock_offset_s!r}: give seconds, or 'auto'.")
-    chosen = settings or Settings()
-    if clock_offset_s is None:
-        clock_offset_s = chosen.clock_offset_s or None
     request = ComparisonRequest(
         log=log.log.name if isinstance(log, Flight) else str(log),
         mavlink=None if mavlink is None else str(mavlink),
@@ -143,12 +115,11 @@ def compare(
         position=PositionFile(path=str(position)) if isinstance(position, str | Path) else position,
         position_source=position_source,
         source_kind=source_kind,
-        sigma_a_m_s2=chosen.sigma_a_m_s2 if sigma_a_m_s2 is None else sigma_a_m_s2,
-        sigma_z_m=settings.sigma_z_m if settings and sigma_z_m is None else sigma_z_m,
-        dt_s=chosen.dt_s if dt_s is None else dt_s,
-        # "imu", the default of settings, asks for the IMU where it is logged
-        input=input or ("zero" if chosen.input == "zero" else None),
-        axes=tuple(name for one in asked for name in known if name == one),
+        sigma_a_m_s2=sigma_a_m_s2,
+        sigma_z_m=sigma_z_m,
+        dt_s=dt_s,
+        input=input,
+        axes=asked,
         heading_deg=heading_deg,
         start_s=start_s,
         end_s=end_s,
@@ -188,7 +159,6 @@ def _reference(given: Pathlike | Trajectory) -> Trajectory:
     return read_source(str(given), default="truth").trajectory
 
 
-@_with_names
 def close_loop(
     source: Pathlike | Trajectory,
     *,
@@ -326,7 +296,6 @@ def _request(analysis: Analysis) -> ComparisonRequest:
     return analysis.request
 
 
-@_with_names
 def what_if(
     log: Pathlike | Flight | Model,
     changes: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,

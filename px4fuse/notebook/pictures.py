@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from textwrap import fill
 from typing import Any
 
@@ -38,10 +39,6 @@ LABEL_WIDTH = 26
 ACROSS = {"NED": (1, 0), "FRD": (1, 0), "ENU": (0, 1), "camera": (0, 2), "unknown": (0, 1)}
 
 
-def _one(ax: Axes | None) -> Axes:
-    return plt.subplots(layout="constrained")[1] if ax is None else ax
-
-
 def _map(ax: Axes, right: str, up: str) -> Axes:
     ax.set(xlabel=right, ylabel=up, aspect="equal")
     return _beside(ax)
@@ -53,9 +50,8 @@ def _beside(ax: Axes) -> Axes:
     return ax
 
 
-def flight(result: Flight, ax: Axes | None = None) -> Axes:
+def flight(result: Flight, ax: Axes) -> Axes:
     """Every position from above."""
-    ax = _one(ax)
     for name, samples in tracks(result):
         style: dict[str, Any] = EKF2_LINE if name == EKF2 else {"lw": 0.8}
         if name.startswith("truth"):
@@ -66,10 +62,8 @@ def flight(result: Flight, ax: Axes | None = None) -> Axes:
     return _map(ax, "east, m", "north, m")
 
 
-def axis_comparison(result: AxisComparison, ax: Any = None) -> Any:
+def axis_comparison(result: AxisComparison, ax: Any) -> Any:
     """Error, innovations and standard deviation over time, as in the report: three axes."""
-    if ax is None:
-        _, ax = plt.subplots(3, 1, sharex=True, figsize=(8, 7), layout="constrained")
     first = POSITION if isinstance(error_reference(result), Unavailable) else ERROR
     for axes, panel in zip(ax, (first, INNOVATIONS, SIGMA_P), strict=True):
         panel.draw(axes, result)
@@ -79,23 +73,21 @@ def axis_comparison(result: AxisComparison, ax: Any = None) -> Any:
     return ax
 
 
-def comparison(result: Comparison | Analysis, axis: str | None = None, ax: Any = None) -> Any:
+def comparison(result: Comparison | Analysis, ax: Any, axis: str | None = None) -> Any:
     """One axis, by default the aisle where there is one."""
     return axis_comparison(result.main if axis is None else result[axis], ax)
 
 
-def why(result: Why, ax: Axes | None = None) -> Axes:
+def why(result: Why, ax: Axes) -> Axes:
     """What each step brings our filter nearer to EKF2."""
-    ax = _one(ax)
     table = frame(result).iloc[::-1]
     ax.barh(table["step"], table["position_mean_square_m2"], color=OURS_COLOUR)
     ax.set_xlabel("nearer to EKF2, mean square, m²")
     return ax
 
 
-def tuning(result: AxisTuning, ax: Axes | None = None) -> Axes:
+def tuning(result: AxisTuning, ax: Axes) -> Axes:
     """Likelihood of both noises, the most likely ones and their 95 % region."""
-    ax = _one(ax)
     grid = result.map
     drop = np.minimum(grid.drop.T, SHOWN_DROP)
     ax.contourf(grid.sigma_a_m_s2, grid.sigma_z_m, drop, levels=12, cmap="Blues_r")
@@ -107,34 +99,29 @@ def tuning(result: AxisTuning, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def clock(result: ClockOffset, ax: Axes | None = None) -> Axes:
+def clock(result: ClockOffset, ax: Axes) -> Axes:
     """Likelihood of each offset, with the 95 % interval, as in the report."""
-    ax = _one(ax)
     draw_curve(ax, result)
     ax.set_ylabel("ln of how much less likely than the best")
     return ax
 
 
-def loop(result: Loop, ax: Axes | None = None) -> Axes:
+def loop(result: Loop, ax: Axes) -> Axes:
     """The path and its corrections in the odometry's frame, as in the report."""
-    ax = _one(ax)
     draw_map(ax, result)
     return _beside(ax)
 
 
-def trajectory(result: Trajectory, ax: Axes | None = None) -> Axes:
+def trajectory(result: Trajectory, ax: Axes) -> Axes:
     """The path from above."""
-    ax = _one(ax)
     right, up = ACROSS[result.frame]
     table = frame(result)
     ax.plot(table.iloc[:, right], table.iloc[:, up], lw=0.9, label=result.name)
     return _map(ax, table.columns[right], table.columns[up])
 
 
-def evaluation(result: Evaluation, ax: Any = None) -> Any:
+def evaluation(result: Evaluation, ax: Any) -> Any:
     """The path coloured by its error, and the error over time, as in the report: two axes."""
-    if ax is None:
-        _, ax = plt.subplots(2, 1, figsize=(7, 8), layout="constrained")
     path, over_time = ax
     draw_path(path, result, views(result)[0], path.inset_axes((1.02, 0.0, 0.03, 1.0)))
     draw_ape(over_time, result, result.time_s - zero_s(result), time_label(result))
@@ -144,18 +131,15 @@ def evaluation(result: Evaluation, ax: Any = None) -> Any:
     return ax
 
 
-def relative_error(result: PairwiseError, ax: Axes | None = None) -> Axes:
+def relative_error(result: PairwiseError, ax: Axes) -> Axes:
     """Error of every pair, by the pose that it starts from."""
-    ax = _one(ax)
     ax.plot(result.start, result.translation_error_m, **OURS_DOTS)
     ax.set(xlabel="pose that the pair starts from", ylabel=f"error over {result.delta_words}, m")
     return ax
 
 
-def what_if(result: WhatIf, ax: Any = None) -> Any:
+def what_if(result: WhatIf, ax: Any) -> Any:
     """Mean NIS, and error to the truth or share of rejections, of each EKF2: two axes."""
-    if ax is None:
-        _, ax = plt.subplots(1, 2, sharey=True, figsize=(10, 3.5), layout="constrained")
     labels = {"rejected_share": "share rejected", "nis_mean": "mean NIS (1 is consistent)"}
     known = not isinstance(result.logged.position_rmse_to_truth_m, Unavailable)
     second = "position_rmse_to_truth_m" if known else "rejected_share"
@@ -167,17 +151,36 @@ def what_if(result: WhatIf, ax: Any = None) -> Any:
     return ax
 
 
-PICTURES = {
-    Flight: flight,
-    AxisComparison: axis_comparison,
-    Comparison: comparison,
-    Analysis: comparison,
-    Why: why,
-    AxisTuning: tuning,
-    ClockOffset: clock,
-    Loop: loop,
-    Trajectory: trajectory,
-    Evaluation: evaluation,
-    PairwiseError: relative_error,
-    WhatIf: what_if,
+# Of each result how it is drawn, and in which figure where no axes are given
+ONE: dict[str, Any] = {}
+OVER_TIME: dict[str, Any] = {"nrows": 3, "sharex": True, "figsize": (8, 7)}
+PICTURES: dict[type, tuple[Callable[..., Any], dict[str, Any]]] = {
+    Flight: (flight, ONE),
+    AxisComparison: (axis_comparison, OVER_TIME),
+    Comparison: (comparison, OVER_TIME),
+    Analysis: (comparison, OVER_TIME),
+    Why: (why, ONE),
+    AxisTuning: (tuning, ONE),
+    ClockOffset: (clock, ONE),
+    Loop: (loop, ONE),
+    Trajectory: (trajectory, ONE),
+    Evaluation: (evaluation, {"nrows": 2, "figsize": (7, 8)}),
+    PairwiseError: (relative_error, ONE),
+    WhatIf: (what_if, {"ncols": 2, "sharey": True, "figsize": (10, 3.5)}),
 }
+
+
+def picture(result: Any, ax: Any = None, **options: Any) -> Any:
+    """Draw a result, by default in a figure of its own.
+
+    Raises
+    ------
+    TypeError
+        It has no picture.
+    """
+    if type(result) not in PICTURES:
+        raise TypeError(f"{type(result).__name__} has no picture; its table: .to_frame()")
+    drawn, size = PICTURES[type(result)]
+    if ax is None:
+        ax = plt.subplots(layout="constrained", **size)[1]
+    return drawn(result, ax, **options)

@@ -28,6 +28,7 @@ from px4fuse.flight import (
     Flight,
     Truth,
     Unavailable,
+    sample_rate,
 )
 from px4fuse.loop.loop import Loop
 from px4fuse.record import Record, written
@@ -41,6 +42,8 @@ from px4fuse.trajectory.scores import PairwiseError
 EKF2 = "EKF2"
 OURS = "our filter"
 WIDTH = 100
+# Standard deviations, by the columns of their squares
+SIGMAS = {"position_variance_m2": "sigma_p_m", "velocity_variance_m2_s2": "sigma_v_m_s"}
 
 
 def row(record: Any) -> dict[str, Any]:
@@ -80,17 +83,13 @@ def tracks(flight: Flight) -> Iterator[tuple[str, pd.DataFrame]]:
 
 @words.register
 def _(flight: Flight) -> str:
-    log = flight.log
-    airborne = flight.airborne
+    log, airborne = flight.log, flight.airborne
     flown = ""
     if not isinstance(airborne, Unavailable) and airborne:
         flown = f", in the air {airborne[0][0]:.1f} to {airborne[-1][1]:.1f} s"
-    has = [f"{track.name} at {track.rate_hz:.1f} Hz" for track in flight.positions]
-    has = has or ["no position source"]
-    has += [EKF2] if isinstance(flight.ekf2, Ekf2) else ["no EKF2"]
-    has += [f"truth {flight.truth.name}"] if isinstance(flight.truth, Truth) else []
     head = f"{log.name}: {log.format}, {log.firmware}, {log.duration_s:.1f} s{flown}"
-    return f"{head}\n{'; '.join(has)}"
+    has = [f"{name} at {sample_rate(samples):.1f} Hz" for name, samples in tracks(flight)]
+    return f"{head}\n{'; '.join(has) or 'no position'}"
 
 
 @frame.register
@@ -188,26 +187,21 @@ def _(comparison: Comparison) -> pd.DataFrame:
 def _(result: AxisComparison) -> pd.DataFrame:
     """Over time, at the filter's steps; EKF2 and truth interpolated, innovations at updates."""
     steps, updates = result.replay.steps, result.replay.updates
-    table = pd.DataFrame(
-        {
-            "kf_position_m": steps["position_m"],
-            "kf_velocity_m_s": steps["velocity_m_s"],
-            "kf_sigma_p_m": np.sqrt(steps["position_variance_m2"]),
-            "kf_sigma_v_m_s": np.sqrt(steps["velocity_variance_m2_s2"]),
-            "measurement_m": updates["measurement_m"],
-            "kf_innovation_m": updates["innovation_m"],
-            "kf_sqrt_s_m": np.sqrt(updates["innovation_variance_m2"]),
-        },
-        index=steps.index,
-    )
-    for owner, series in (("ekf2", result.ekf2_state), ("truth", result.truth)):
-        if isinstance(series, pd.DataFrame):
+    table = pd.DataFrame(index=steps.index)
+    for owner, state, variance in (
+        ("kf", steps, steps),
+        ("ekf2", result.ekf2_state, result.ekf2_variance),
+        ("truth", result.truth, None),
+    ):
+        if isinstance(state, pd.DataFrame):
             for column in ("position_m", "velocity_m_s"):
-                table[f"{owner}_{column}"] = _at(series[column], steps.index)
-    if isinstance(result.ekf2_variance, pd.DataFrame):
-        variance = result.ekf2_variance
-        table["ekf2_sigma_p_m"] = np.sqrt(_at(variance["position_variance_m2"], steps.index))
-        table["ekf2_sigma_v_m_s"] = np.sqrt(_at(variance["velocity_variance_m2_s2"], steps.index))
+                table[f"{owner}_{column}"] = _at(state[column], steps.index)
+        if isinstance(variance, pd.DataFrame):
+            for column, name in SIGMAS.items():
+                table[f"{owner}_{name}"] = np.sqrt(_at(variance[column], steps.index))
+    table["measurement_m"] = updates["measurement_m"]
+    table["kf_innovation_m"] = updates["innovation_m"]
+    table["kf_sqrt_s_m"] = np.sqrt(updates["innovation_variance_m2"])
     return table
 
 
@@ -247,17 +241,19 @@ def _(why: Why) -> pd.DataFrame:
 @words.register
 def _(tuning: AxisTuning) -> str:
     return (
-        f"{tuning.name}: SIGMA_A {_noise(tuning.filter_sigma_a, 'm/s²')}, SIGMA_Z "
-        f"{_noise(tuning.sigma_z, 'm')}; {len(tuning.outlier_time_s)} of {tuning.count} "
+        f"{tuning.name}: SIGMA_A {noise_words(tuning.filter_sigma_a)} m/s², SIGMA_Z "
+        f"{noise_words(tuning.sigma_z)} m (95 %); {len(tuning.outlier_time_s)} of {tuning.count} "
         "measurements are outliers"
     )
 
 
-def _noise(noise: Noise, unit: str) -> str:
+def noise_words(noise: Noise) -> str:
+    """A noise and its interval, without a unit."""
     if noise.value is None:
-        return "not determinable" if noise.high is None else f"at most {noise.high:.2g} {unit}"
-    low, high = (f"{end:.2g}" if end is not None else "?" for end in (noise.low or 0.0, noise.high))
-    return f"{noise.value:.3g} {unit} (95 %: {low} to {high})"
+        return "not determinable" if noise.high is None else f"at most {noise.high:.2g}"
+    low = "0" if noise.low is None else f"{noise.low:.2g}"
+    high = "?" if noise.high is None else f"{noise.high:.2g}"
+    return f"{noise.value:.3g} ({low}-{high})"
 
 
 @frame.register
@@ -286,12 +282,8 @@ def _(clock: ClockOffset) -> pd.DataFrame:
 
 @words.register
 def _(heading: HeadingError) -> str:
-    first, last = heading.ends
-    changes = (
-        f"from {first.heading_error_deg:+.1f}° to {last.heading_error_deg:+.1f}°"
-        if heading.drifts
-        else "the same all along"
-    )
+    ends = (f"{part.heading_error_deg:+.1f}°" for part in heading.ends)
+    changes = f"from {' to '.join(ends)}" if heading.drifts else "the same all along"
     return (
         f"the source's frame is turned by {heading.turn_deg:+.1f}° (± {heading.sigma_deg:.1f}) "
         f"against the vehicle's heading, {changes} (by the {heading.by})"
@@ -347,15 +339,14 @@ def _(loop: Loop) -> str:
 @frame.register
 def _(loop: Loop) -> pd.DataFrame:
     """A row per path and reference."""
-    rows = []
+    rows: list[dict[str, Any]] = []
     for path in loop.reported:
         moved = {"path": path.name, "moved_max_m": float(path.moved_m.max())}
         for name, score in path.scores.items():
-            ate = np.nan if isinstance(score, Unavailable) else score.ate.translation_m.rmse
+            ate = score.ate.translation_m.rmse if isinstance(score, Evaluation) else np.nan
             rows.append(moved | {"reference": name, "ate_rmse_m": ate})
-        if not path.scores:
-            rows.append(moved | {"reference": None, "ate_rmse_m": np.nan})
-    return pd.DataFrame(rows)
+        rows += [] if path.scores else [moved]
+    return pd.DataFrame(rows, columns=["path", "moved_max_m", "reference", "ate_rmse_m"])
 
 
 @words.register
@@ -385,14 +376,8 @@ def _(part: PairwiseError) -> str:
 @frame.register
 def _(part: PairwiseError) -> pd.DataFrame:
     """Every pair: its poses, as indices into the evaluation, and its errors."""
-    return pd.DataFrame(
-        {
-            "start": part.start,
-            "end": part.end,
-            "translation_error_m": part.translation_error_m,
-            "rotation_error_deg": part.rotation_error_deg,
-        }
-    )
+    columns = ("start", "end", "translation_error_m", "rotation_error_deg")
+    return pd.DataFrame({column: getattr(part, column) for column in columns})
 
 
 # -- what if ---------------------------------------------------------------------------------------

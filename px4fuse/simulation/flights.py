@@ -188,10 +188,7 @@ def answer(simulation: Simulation) -> dict[str, Any]:
                     "typed": as_typed(name, mistakes),
                     "help": MISTAKES[name].help,
                     "finding": MISTAKES[name].finding,
-                    **{
-                        argument.field: getattr(mistakes, argument.field)
-                        for argument in MISTAKES[name].arguments
-                    },
+                    **{field: getattr(mistakes, field) for field in MISTAKES[name].sizes},
                 }
                 for name in made(mistakes)
             },

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, Aid
@@ -26,35 +26,38 @@ OF_KIND: Mapping[Kind, Mapping[str, float]] = {
     "loop": {"passes": 1},
     "outdoor": {"passes": 3, "length_m": 30.0, "speed_m_s": 4.0, "altitude_m": 8.0},
 }
-# Range of each number beyond which it is a slip of the keyboard, with its option and unit
-_RANGES: dict[str, tuple[str, float, float, str]] = {
-    "passes": ("--passes", 1, 100, ""),
-    "length_m": ("--length", 2.0, 1000.0, "m"),
-    "speed_m_s": ("--speed", 0.1, 10.0, "m/s"),
-    "heading_deg": ("--heading", -360.0, 360.0, "degrees"),
-    "altitude_m": ("--altitude", 0.5, 50.0, "m"),
-    "uwb_rate_hz": ("--uwb-rate", 0.5, 100.0, "Hz"),
-    "sigma_uwb_m": ("--sigma-uwb", 0.0, 10.0, "m"),
-    "vio_rate_hz": ("vio_rate_hz", 1.0, 200.0, "Hz"),
-    "sigma_vio_m": ("sigma_vio_m", 0.0, 10.0, "m"),
-    "vio_drift": ("--vio-drift", 0.0, 0.5, "of the path"),
-    "vio_walk_m": ("vio_walk_m", 0.0, 1.0, "m/√m"),
-    "gnss_rate_hz": ("gnss_rate_hz", 1.0, 10.0, "Hz"),
-    "sigma_gnss_m": ("--sigma-gnss", 0.0, 10.0, "m"),
-    "sigma_gnss_m_s": ("sigma_gnss_m_s", 0.0, 5.0, "m/s"),
-    "sigma_a_m_s2": ("--sigma-a", 0.0, 20.0, "m/s²"),
-    "accel_bias_sigma_m_s2": ("--accel-bias-sigma", 0.0, 2.0, "m/s²"),
-    "gyro_bias_sigma_rad_s": ("gyro_bias_sigma_rad_s", 0.0, 0.5, "rad/s"),
-    "gyro_noise_rad_s": ("gyro_noise_rad_s", 0.0, 1.0, "rad/s"),
-    "tilt_error_deg": ("tilt_error_deg", 0.0, 10.0, "degrees"),
-    "yaw_error_deg": ("yaw_error_deg", 0.0, 45.0, "degrees"),
-    "pause_s": ("pause_s", 0.0, 600.0, "s"),
-    "wander_m": ("wander_m", 0.0, 1.0, "m"),
-    "imu_rate_hz": ("imu_rate_hz", 50.0, 1000.0, "Hz"),
-    "attitude_rate_hz": ("attitude_rate_hz", 5.0, 250.0, "Hz"),
-    "truth_rate_hz": ("truth_rate_hz", 1.0, 250.0, "Hz"),
-    "seed": ("--seed", 0, 2**32 - 1, ""),
-}
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What a number of a simulation may be; beyond it, it is a slip of the keyboard.
+
+    Attributes
+    ----------
+    low, high : float
+    unit : str
+        As :data:`px4fuse.units.NAMES` has it.
+    typed : str
+        The option that sets it, or what stands for it in the usage of a mistake.
+    meaning : str
+        The option's help; empty where no option sets it.
+    """
+
+    low: float
+    high: float
+    unit: str = ""
+    typed: str = ""
+    meaning: str = ""
+
+
+def number(usual: Any, *about: Any) -> Any:
+    """A field of a record that is a number, its default, and what it may be."""
+    return field(default=usual, metadata={"quantity": Bounds(*about)})
+
+
+def quantities(record: type) -> dict[str, Bounds]:
+    """The fields of a record that :func:`number` made."""
+    return {one.name: one.metadata["quantity"] for one in fields(record) if one.metadata}
 
 
 @dataclass(frozen=True)
@@ -118,46 +121,61 @@ class Scenario:
     """
 
     kind: Kind = "aisle"
-    passes: int = 6
-    length_m: float = 12.0
-    speed_m_s: float = 1.0
-    heading_deg: float = 30.0
-    altitude_m: float = 1.5
+    passes: int = number(6, 1, 100, "", "--passes")
+    length_m: float = number(
+        12.0, 2.0, 1000.0, "m", "--length", "Of the aisle, or of a side of the square."
+    )
+    speed_m_s: float = number(1.0, 0.1, 10.0, "m/s", "--speed", "On the straight.")
+    heading_deg: float = number(
+        30.0, -360.0, 360.0, "°", "--heading", "Of the aisle or of the first side, from north."
+    )
+    altitude_m: float = number(1.5, 0.5, 50.0, "m")
     yaw: Yaw | None = None
-    pause_s: float = 3.0
-    wander_m: float = 0.03
-    uwb_rate_hz: float = 5.0
-    sigma_uwb_m: float = 0.10
-    vio_rate_hz: float = 30.0
-    sigma_vio_m: float = 0.01
-    vio_drift: float = 0.015
-    vio_walk_m: float = 0.01
-    gnss_rate_hz: float = 5.0
-    sigma_gnss_m: float = 0.4
-    sigma_gnss_m_s: float = 0.3
-    sigma_a_m_s2: float = 0.2
-    accel_bias_sigma_m_s2: float = 0.03
-    gyro_bias_sigma_rad_s: float = 0.002
-    gyro_noise_rad_s: float = 0.01
-    tilt_error_deg: float = 0.1
-    yaw_error_deg: float = 1.0
-    imu_rate_hz: float = 250.0
-    attitude_rate_hz: float = 50.0
-    truth_rate_hz: float = 50.0
+    pause_s: float = number(3.0, 0.0, 600.0, "s")
+    wander_m: float = number(0.03, 0.0, 1.0, "m")
+    uwb_rate_hz: float = number(5.0, 0.5, 100.0, "Hz", "--uwb-rate", "Rate of the UWB.")
+    sigma_uwb_m: float = number(
+        0.10, 0.0, 10.0, "m", "--sigma-uwb", "White noise of the UWB: the true SIGMA_Z."
+    )
+    vio_rate_hz: float = number(30.0, 1.0, 200.0, "Hz")
+    sigma_vio_m: float = number(0.01, 0.0, 10.0, "m")
+    vio_drift: float = number(
+        0.015, 0.0, 0.5, "", "--vio-drift", "Drift of the VIO, as a share of the distance."
+    )
+    vio_walk_m: float = number(0.01, 0.0, 1.0)
+    gnss_rate_hz: float = number(5.0, 1.0, 10.0, "Hz")
+    sigma_gnss_m: float = number(
+        0.4, 0.0, 10.0, "m", "--sigma-gnss", "White noise of GNSS, north and east."
+    )
+    sigma_gnss_m_s: float = number(0.3, 0.0, 5.0, "m/s")
+    sigma_a_m_s2: float = number(
+        0.2, 0.0, 20.0, "m/s²", "--sigma-a", "White noise of the IMU over 0.1 s: the true SIGMA_A."
+    )
+    accel_bias_sigma_m_s2: float = number(
+        0.03, 0.0, 2.0, "m/s²", "--accel-bias-sigma", "Spread of the accelerometer's constant bias."
+    )
+    gyro_bias_sigma_rad_s: float = number(0.002, 0.0, 0.5)
+    gyro_noise_rad_s: float = number(0.01, 0.0, 1.0)
+    tilt_error_deg: float = number(0.1, 0.0, 10.0, "°")
+    yaw_error_deg: float = number(1.0, 0.0, 45.0, "°")
+    imu_rate_hz: float = number(250.0, 50.0, 1000.0, "Hz")
+    attitude_rate_hz: float = number(50.0, 5.0, 250.0, "Hz")
+    truth_rate_hz: float = number(50.0, 1.0, 250.0, "Hz")
     truth: bool = True
     ekf2: bool = True
-    seed: int = 1
+    seed: int = number(1, 0, 2**32 - 1, "", "--seed")
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise SettingsError(f"--kind {self.kind}: give {' or '.join(KINDS)}.")
         if self.yaw is not None and self.yaw not in YAWS:
             raise SettingsError(f"--yaw {self.yaw}: give {' or '.join(YAWS)}.")
-        for name, (option, low, high, unit) in _RANGES.items():
+        for name, taken in quantities(Scenario).items():
             value = getattr(self, name)
-            if not low <= value <= high:  # false for NaN too
+            if not taken.low <= value <= taken.high:  # false for NaN too
                 raise SettingsError(
-                    f"{option} {value:g} is out of range: give {low:g} to {high:g} {unit}".rstrip()
+                    f"{taken.typed or name} {value:g} is out of range: give {taken.low:g} to "
+                    f"{taken.high:g} {taken.unit}".rstrip()
                     + "."
                 )
         needed = self.speed_m_s * (START_STOP_S if self.kind == "aisle" else CORNER_S)

@@ -282,7 +282,7 @@ COMMANDS = (
     Target("verify", lambda: [(REPOSITORY / "reports/aisle_uwb.pdf").read_bytes()],
            _command("verify", "{path}", LOG), ".pdf", False, 2, 1.0, COMMAND_S),
     Target("assign", _text(_ROSTER, _MOODLE),
-           _command("simulate", "--assignment", "{path}", "--secret", "open sesame", "--preview",
+           _command("simulate", "--assignment", "{path}", "--secret-file", "{path}", "--preview",
                     "-o", "{out}"), ".csv", True, 20, 2.0, COMMAND_S),
     Target("batch", lambda: _ulogs() + _recordings(), _command("batch", "{path}", "-o", "{out}"),
            ".ulg", False, 0, 1.0, COMMAND_S),
