@@ -114,13 +114,6 @@ def test_a_variance_without_room_for_the_prior_leaves_it_unknown() -> None:
     assert got["posterior_variance_m2"].isna().tolist() == [False, True, True, False]
 
 
-def test_only_the_segment_is_taken() -> None:
-    made = with_innovations(flight(), north=NORTH, east=EAST)
-    part = Segment(1.3, 1.7, "")
-    for axis in ("north", "aisle"):
-        assert innovations(made, axis, part).index.tolist() == pytest.approx([1.4, 1.6])
-
-
 GONE = Unavailable("innovations", "none logged", "Log them.")
 
 
