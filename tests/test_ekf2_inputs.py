@@ -323,14 +323,6 @@ def test_a_stretch_of_a_vehicle_that_turns() -> None:
     np.testing.assert_allclose(_stretch(*flown, 5, 11.5).state[6:9], [3.0, 3.0, 10.5])
 
 
-def test_an_end_that_the_log_shows_sets_the_count_of_samples_again() -> None:
-    """States of 10.605 and 10.61 s, to half a microsecond; that of 10.705002 s is on no sample."""
-    shown = [10.5, 10.6050004, 10.6099996, 10.705002, 11.5]
-    found = _stretch(*turning(np.array(shown)), 0, 11.5)
-    steps = np.sort(np.append(10.5 + 0.01 * np.arange(101), 10.605))
-    np.testing.assert_allclose(found.time_s, steps, atol=1e-9)
-
-
 def stretches(monkeypatch: pytest.MonkeyPatch, **parts: Any) -> list[tuple[float, float]]:
     """Start and end of each, of a flight of 60 s with everything every 0.01 or 0.1 s."""
     found: list[tuple[float, float]] = []

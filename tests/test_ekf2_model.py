@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,12 +10,8 @@ import pandas as pd
 import pytest
 from ekf2_tools import plain_replay, step_matrix, step_noise, step_state
 from exchange import replace
-from findings_tools import made
 
 from px4fuse.alignment.joining import join
-from px4fuse.ekf2 import model as model_module
-from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.intervals import Timing
 from px4fuse.ekf2.model import (
     Model,
     delayed_states,
@@ -26,7 +21,6 @@ from px4fuse.ekf2.model import (
 )
 from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import HORIZONTAL
-from px4fuse.ekf2.stretches import Stretch
 from px4fuse.flight import (
     Ekf2,
     Flight,
@@ -252,37 +246,3 @@ def test_a_bias_that_ekf2_does_not_learn_is_no_trouble(sample_flight: Flight) ->
     )
     assert np.isfinite(made.flown.published.to_numpy()).all()
     assert np.isfinite(made.flown.updates.to_numpy()).all()
-
-
-@pytest.mark.parametrize(("horizon_s", "lag"), [(0.0, 1), (0.024, 2), (0.026, 3), (9.0, 100)])
-def test_what_is_published_has_the_bias_of_the_horizon(
-    monkeypatch: pytest.MonkeyPatch, horizon_s: float, lag: int
-) -> None:
-    """The newest IMU samples are corrected by the bias that the filter has ``lag`` steps before."""
-    count = 80
-    state = np.zeros((count + 1, 15))
-    state[:, 12:15] = np.random.default_rng(3).normal(0.0, 0.1, (count + 1, 3))
-    stretch = made(
-        Stretch, time_s=0.01 * np.arange(count + 1), step_s=np.full(count, 0.01),
-        rotation=np.tile(np.eye(3), (count + 1, 1, 1)), force_m_s2=np.ones((count, 3)),
-    )  # fmt: skip
-    variant = SimpleNamespace(
-        timing=lambda _: Timing(0.0, horizon_s), attitude=False,
-        settings={"EKF2_TAU_VEL": 0.25, "EKF2_TAU_POS": 0.4},
-    )  # fmt: skip
-    taken = {}
-
-    def keep(**given: Any) -> tuple[np.ndarray, np.ndarray]:
-        taken.update(given)
-        return state[:, 3:6], state[:, 6:9]
-
-    monkeypatch.setattr(model_module, "delayed_states", lambda *_: (state, state[:, :3]))
-    monkeypatch.setattr(model_module, "_track", lambda *_: pd.DataFrame())
-    monkeypatch.setattr(model_module, "publish", keep)
-    part = SimpleNamespace(stretch=stretch, variants=[variant])
-    model_module._tracks(made(Inputs, step_s=0.01), part, 0)  # type: ignore[arg-type]
-    assert taken["lag"] == lag
-    gravity = np.array([0.0, 0.0, 9.80665])
-    for step in range(count):
-        bias = state[max(step + 1 - lag, 0), 12:15]
-        np.testing.assert_allclose(taken["gain_m_s"][step], (1.0 - bias + gravity) * 0.01)

@@ -26,14 +26,13 @@ from px4fuse.ekf2.whatif import (
     WhatIf,
     _longest,
     _notes,
-    _of_replay,
     what_if,
 )
 from px4fuse.ekf2_parameters import GNSS_POS
 from px4fuse.filter.kalman import Replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
-from px4fuse.flight import STATE_COLUMNS, Ekf2, Flight, Truth, Unavailable
+from px4fuse.flight import STATE_COLUMNS, Flight, Truth, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate, to_ulog
 from px4fuse.simulation.mistakes import parse
@@ -186,38 +185,6 @@ def test_the_longest_time_without_fusion_counts_both_ends() -> None:
     assert _longest(np.array([16.0, 29.0, 41.0, 59.0]), judged) == 18.0
     assert _longest(np.array([40.0]), judged) == 25.0
     assert _longest(np.array([16.0]), judged) == 44.0
-
-
-@pytest.mark.parametrize("stated", [True, False])
-def test_the_stated_sigma_goes_from_after_one_sample_to_before_the_next(stated: bool) -> None:
-    """At the middle between them the variance is the mean of 0.01 after and 0.09 before."""
-    both = {
-        f"{part}_{axis}_{unit}": values
-        for axis in ("north", "east")
-        for part, unit, values in (
-            ("innovation", "m", [0.1, 0.3]), ("innovation_variance", "m2", [0.05, 0.13]),
-            ("observation_variance", "m2", [0.04, 0.04]),
-            ("position_variance", "m2", [0.01, 0.02]),
-        )
-    }  # fmt: skip
-    updates = pd.DataFrame(
-        {**both, "fused_at_s": [20.0, 22.0], "fused": 1.0, "rejected": [0.0, 1.0], "reset": 0.0},
-        index=[20.0, 22.0],
-    )
-    state = pd.DataFrame(0.0, index=[20.0, 21.0], columns=STATE_COLUMNS)
-    variance = pd.DataFrame({"north_m2": 9.0, "east_m2": 9.0}, index=[21.0]) if stated else NONE
-    flight = made(Flight, ekf2=made(Ekf2, state=state, variance=variance), truth=NONE)
-    replay = made(
-        Ekf2Replay, updates=updates, published=state, changed={}, late=1, lost=2, settings={},
-        delayed={"heading_rad": None},
-    )  # fmt: skip
-    found = _of_replay(flight, replay, ((10.0, 30.0),))
-    for axis in found.axes.values():
-        assert axis.nis_mean == pytest.approx((0.01 / 0.05 + 0.09 / 0.13) / 2.0)
-        assert axis.innovation_std_m == pytest.approx(0.1)
-        expected = pytest.approx(math.sqrt(0.05)) if stated else NONE
-        assert axis.sigma_p_median_m == expected
-    assert (found.samples, found.rejected_share, found.late, found.lost) == (2, 0.5, 1, 2)
 
 
 def test_a_summary_joins_north_and_east() -> None:

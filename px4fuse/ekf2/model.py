@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array
 from px4fuse.display import brief
-from px4fuse.ekf2.inputs import Inputs, prepare, same_sample
+from px4fuse.ekf2.inputs import WHAT, Inputs, prepare, same_sample
 from px4fuse.ekf2.intervals import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
@@ -88,7 +88,7 @@ def open_model(flight: Flight) -> Model | Unavailable:
     """
     inputs = prepare(flight)
     if isinstance(inputs, Unavailable):
-        return inputs
+        return structs.replace(inputs, what=WHAT)
     if inputs.aid == GNSS_POS and isinstance(flight.ekf2, Ekf2):
         flight = replace(flight, ekf2=with_gnss(flight.ekf2))
     flown = Variant(inputs.settings)
@@ -142,7 +142,7 @@ def replay_settings(
         idle["EKF2_DELAY_MAX"] = f"in {firmware} the longest delay makes the horizon"
     if inputs.received.own_times:
         idle[GNSS_POS.delay] = "EKF2 takes the receiver driver's own times"
-    for name in idle.keys() & {name for change in changes for name in change}:
+    for name in [name for change in changes for name in change if name in idle]:
         raise SettingsError(f"{name} changes nothing here: {idle[name]}.")
     if not changes:
         return ()
