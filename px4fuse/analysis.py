@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from px4fuse.comparison.estimates import (
 )
 from px4fuse.comparison.interventions import Intervention, interventions
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.preparation import Choices, no_source, prepare
+from px4fuse.comparison.preparation import no_source, prepare
 from px4fuse.comparison.remedy import asked_of_ekf2
 from px4fuse.comparison.why import why_ekf2_differs
 from px4fuse.display import brief
@@ -312,16 +312,13 @@ def run_preparation(
         # that of a position file is spent on placing it
         clock_offset_s=asked if isinstance(asked, float) and request.position is None else 0.0,
     )
-    choices = Choices(
-        input_required=request.input == "imu",
-        sigma_z_given=request.sigma_z_m is not None,
-        axes=request.axes or None,
-        heading_deg=request.heading_deg,
-        position_source=request.position_source,
-        source_kind=request.source_kind,
-        start_s=request.start_s,
-        end_s=request.end_s,
-    )
+    alike = ("heading_deg", "position_source", "source_kind", "start_s", "end_s")
+    choices: dict[str, Any] = {name: getattr(request, name) for name in alike}
+    choices |= {
+        "input_required": request.input == "imu",
+        "sigma_z_given": request.sigma_z_m is not None,
+        "axes": request.axes or None,
+    }
     prepared = prepare(flight, settings, **choices)
     if asked != AUTO or request.position is not None:
         return prepared
@@ -441,7 +438,7 @@ def run_what_if(
             raise
     if compared is not None:
         tuning, clock = noises_and_clock(compared, progress)
-        why = why_ekf2_differs(compared, model, tuning, clock)
+        why = why_ekf2_differs(compared, model, clock)
         if asked:
             changes = asked_of_ekf2(compared, model, tuning, clock)
             if not changes:
@@ -456,19 +453,14 @@ def run_what_if(
 
 
 def _nothing_asked(compared: Comparison, model: Model) -> str:
-    name, source = compared.flight.log.name, compared.source
-    why = "the data do not tell the noise and the delay of what EKF2 fused"
-    if source.origin.is_gnss:
+    source, why = compared.source, "the data do not tell the noise and the delay of what EKF2 fused"
+    if source.origin.is_gnss or source.origin.may_drift:
         why = (
-            "the data ask for no larger noise of GNSS, whose slow errors they do not tell, and the "
-            "delay fits or is not determinable"
+            f"innovations do not tell the slow errors of {source.name}, and its delay is as the "
+            "data ask for or not determinable"
         )
-    elif source.origin.may_drift:
-        why = (
-            f"{source.name} may drift, so that innovations do not tell its noise, and the delay is "
-            "as the data ask for or not determinable"
-        )
-    return f"{name}: {why}. Say what to change: `changes` {model.inputs.aid.noise}=0.1."
+    name, noise = compared.flight.log.name, model.inputs.aid.noise
+    return f"{name}: {why}. Say what to change: `changes` {noise}=0.1."
 
 
 def explain(comparison: Comparison, progress: Progress = silent) -> Analysis:
@@ -484,7 +476,7 @@ def explain(comparison: Comparison, progress: Progress = silent) -> Analysis:
     tuning, clock = noises_and_clock(comparison, progress, names)
     progress("replaying EKF2")
     model = open_model(comparison.flight)
-    why = why_ekf2_differs(comparison, model, tuning, clock)
+    why = why_ekf2_differs(comparison, model, clock)
     heading = turned_frame(comparison, tuning, clock, progress)
     progress("looking for a loop")
     from px4fuse.loop.analysis import loop_in  # noqa: PLC0415 (tune and sync have none)

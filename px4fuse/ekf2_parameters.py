@@ -232,12 +232,6 @@ def check(chosen: Mapping[str, float]) -> dict[str, float]:
                 f"{name}: the model of EKF2 does not have this parameter",
                 f"{did_you_mean(name, PARAMETERS)}It knows {', '.join(PARAMETERS)}.",
             )
-        if name in (EV_POS.delay, GNSS_POS.delay) and value < 0.0:
-            raise SettingsError(
-                f"{name} cannot be negative",
-                "Positions that are stamped later than they were measured need another clock: "
-                "correct the sender's.",
-            )
         if not known.minimum <= value <= known.maximum or not math.isfinite(value):
             unit = f" {known.unit}" if known.unit else ""
             raise SettingsError(

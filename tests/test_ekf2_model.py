@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,12 +10,8 @@ import pandas as pd
 import pytest
 from ekf2_tools import plain_replay, step_matrix, step_noise, step_state
 from exchange import replace
-from findings_tools import made
 
 from px4fuse.alignment.joining import join
-from px4fuse.ekf2 import model as model_module
-from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.intervals import Timing
 from px4fuse.ekf2.model import (
     Model,
     delayed_states,
@@ -26,7 +21,6 @@ from px4fuse.ekf2.model import (
 )
 from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import HORIZONTAL
-from px4fuse.ekf2.stretches import Stretch
 from px4fuse.flight import (
     Ekf2,
     Flight,
@@ -226,21 +220,6 @@ def test_a_mavlink_recording_gives_the_samples_that_the_log_lacks(sample_flight:
     assert made.agreement.ev_pos["north"].innovation_correlation > 0.999
 
 
-def test_the_published_attitude_follows_the_replayed_one(model: Model) -> None:
-    """Had EKF2's own attitude been 0.02 rad more about north, the replayed one would be so less."""
-    stretch = model.inputs.stretches[0]
-    tilted = replace(
-        stretch, attitude_error_rad=stretch.attitude_error_rad + np.array([0.02, 0, 0])
-    )
-    other = replace(model, inputs=replace(model.inputs, stretches=(tilted,)))
-    plain, changed = (replay_settings(m, [{"EKF2_TAU_POS": 0.25}])[0] for m in (model, other))
-    pd.testing.assert_frame_equal(plain.updates, changed.updates)
-    moved = (changed.published - plain.published).loc[40.0:120.0].mean()
-    # at the horizon the pull makes up for it; from there on it is dead reckoning
-    assert moved["east_m_s"] == pytest.approx(-0.02 * 9.8 * model.inputs.horizon_s, rel=0.15)
-    assert abs(moved["north_m_s"]) < 0.005
-
-
 def test_height_of_vision_counts_where_ekf2_fused_it(model: Model, sample_flight: Flight) -> None:
     ekf2, _ = of(sample_flight)
     assert isinstance(ekf2.fusing, pd.DataFrame)
@@ -267,37 +246,3 @@ def test_a_bias_that_ekf2_does_not_learn_is_no_trouble(sample_flight: Flight) ->
     )
     assert np.isfinite(made.flown.published.to_numpy()).all()
     assert np.isfinite(made.flown.updates.to_numpy()).all()
-
-
-@pytest.mark.parametrize(("horizon_s", "lag"), [(0.0, 1), (0.024, 2), (0.026, 3), (9.0, 100)])
-def test_what_is_published_has_the_bias_of_the_horizon(
-    monkeypatch: pytest.MonkeyPatch, horizon_s: float, lag: int
-) -> None:
-    """The newest IMU samples are corrected by the bias that the filter has ``lag`` steps before."""
-    count = 80
-    state = np.zeros((count + 1, 15))
-    state[:, 12:15] = np.random.default_rng(3).normal(0.0, 0.1, (count + 1, 3))
-    stretch = made(
-        Stretch, time_s=0.01 * np.arange(count + 1), step_s=np.full(count, 0.01),
-        rotation=np.tile(np.eye(3), (count + 1, 1, 1)), force_m_s2=np.ones((count, 3)),
-    )  # fmt: skip
-    variant = SimpleNamespace(
-        timing=lambda _: Timing(0.0, horizon_s), attitude=False,
-        settings={"EKF2_TAU_VEL": 0.25, "EKF2_TAU_POS": 0.4},
-    )  # fmt: skip
-    taken = {}
-
-    def keep(**given: Any) -> tuple[np.ndarray, np.ndarray]:
-        taken.update(given)
-        return state[:, 3:6], state[:, 6:9]
-
-    monkeypatch.setattr(model_module, "delayed_states", lambda *_: (state, state[:, :3]))
-    monkeypatch.setattr(model_module, "_track", lambda *_: pd.DataFrame())
-    monkeypatch.setattr(model_module, "publish", keep)
-    part = SimpleNamespace(stretch=stretch, variants=[variant])
-    model_module._tracks(made(Inputs, step_s=0.01), part, 0)  # type: ignore[arg-type]
-    assert taken["lag"] == lag
-    gravity = np.array([0.0, 0.0, 9.80665])
-    for step in range(count):
-        bias = state[max(step + 1 - lag, 0), 12:15]
-        np.testing.assert_allclose(taken["gain_m_s"][step], (1.0 - bias + gravity) * 0.01)

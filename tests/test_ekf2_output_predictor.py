@@ -59,22 +59,6 @@ def test_the_recursive_filters_are_the_buffer(lag: int) -> None:
         assert found == pytest.approx(known, abs=1e-9)
 
 
-def test_a_perfect_state_is_published_as_it_is() -> None:
-    n = 500
-    gain = np.tile([0.02, -0.01], (n, 1))
-    steps = np.arange(n + 1)[:, None]
-    velocity = 0.1 + steps * gain[0]
-    position = np.concatenate(
-        [np.zeros((1, 2)), np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * STEP_S, axis=0)]
-    )
-    out_v, out_p = publish(
-        gain_m_s=gain, step_s=np.full(n, STEP_S), velocity_m_s=velocity, position_m=position,
-        reset_m=np.zeros((n + 1, 2)), lag=19, tau_velocity_s=0.25, tau_position_s=0.25,
-    )  # fmt: skip
-    assert out_v == pytest.approx(velocity, abs=1e-12)
-    assert out_p == pytest.approx(position, abs=1e-12)
-
-
 def test_the_published_attitude_follows_by_half_a_step_per_horizon() -> None:
     lag, horizon_s = 19, 0.2
     error = np.zeros((600, 3))

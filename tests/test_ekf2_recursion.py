@@ -32,39 +32,16 @@ from px4fuse.ekf2.model import Model, replay_settings
 from px4fuse.ekf2.recursion import (
     Run,
     Variant,
-    _decide,
-    _down_to,
-    _drift,
     _Fusion,
     _in_turn,
     _limit_bias,
-    _Sample,
     run,
 )
 from px4fuse.ekf2.recursion import _measurements as measurements
 from px4fuse.ekf2.stretches import Stretch
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, Aid, settings_in_force
 from px4fuse.errors import SettingsError
-
-
-def test_a_variance_is_brought_down_to_its_target() -> None:
-    variance, target = np.array([0.5, 4.0, 0.1]), np.array([0.2, 3.5, 0.2])
-    noise = _down_to(variance, target)
-    np.testing.assert_allclose(variance[:2] * noise[:2] / (variance + noise)[:2], target[:2])
-    assert noise[2] == 1e9
-
-
-def test_biases_gain_variance_per_step_up_to_the_noise() -> None:
-    knob = {
-        f"EKF2_{name}_NOISE": np.array([value])
-        for name, value in (("GYR", 0.015), ("ACC", 0.35), ("GYR_B", 0.001), ("ACC_B", 0.003))
-    }
-    inputs, yes, no = made(Inputs, step_s=0.01), np.array([True]), np.array([False])
-    drift, limit = _drift(inputs, knob, yes, yes)
-    np.testing.assert_allclose(drift, [[1e-10] * 3 + [9e-10] * 3])
-    np.testing.assert_allclose(limit, [[0.015**2] * 3 + [0.35**2] * 3])
-    np.testing.assert_allclose(_drift(inputs, knob, no, yes)[0], [[1e-10] * 3 + [0.0] * 3])
-    np.testing.assert_allclose(_drift(inputs, knob, yes, no)[0], [[0.0] * 3 + [9e-10] * 3])
+from px4fuse.trajectory.rotation import skew
 
 
 def test_the_variance_of_a_bias_stays_within_px4s_limits() -> None:
@@ -97,11 +74,12 @@ def test_what_counts_as_measurement_and_noise() -> None:
     at = np.array([0]), np.array([[1]])
     position, noise = measurements(inputs, stretch, *at, knob, np.array([True, True]))
     # 0.3 m ahead of a body that faces east: the body is west of the sensor
-    np.testing.assert_allclose(position[0], [[1.0, 2.0, 3.0], [1.0, 1.7, 3.0]], atol=1e-12)
+    assert np.isnan(position[..., :3]).all()
+    np.testing.assert_allclose(position[0, :, 3:], [[1, 2, 3], [1, 1.7, 3]], atol=1e-12)
     # what is reported, EKF2_EVP_NOISE at least; or that alone, 1 cm at least
-    np.testing.assert_allclose(noise[0], [[0.04, 0.01, 0.01], [1e-4, 1e-4, 1e-4]])
+    np.testing.assert_allclose(noise[0, :, 3:], [[0.04, 0.01, 0.01], [1e-4, 1e-4, 1e-4]])
     _, noise = measurements(inputs, stretch, *at, knob, np.array([False, False]))
-    np.testing.assert_allclose(noise[0], [[0.01, 0.01, 0.01], [1e-4, 1e-4, 1e-4]])
+    np.testing.assert_allclose(noise[0, :, 3:], [[0.01, 0.01, 0.01], [1e-4, 1e-4, 1e-4]])
 
 
 def deciding(
@@ -110,17 +88,15 @@ def deciding(
     stopped: bool = False, left: int = 5, rules: Rules = RULES, velocity_silent_s: float = 0.0,
 ) -> tuple[bool, bool, bool, float, bool, int]:  # fmt: skip
     """What is rejected, taken and reset at 10 s; then last fusion, whether stopped, resets left."""
-    sample = _Sample(
-        action=np.array([action]), startable=np.array([startable]), time_s=np.array([10.0]),
-        gated=np.array([gated]), as_logged=np.array([obeys]), rejected=logged,
-        reset=logged_reset,
+    fusion = _Fusion(
+        rules, 10.0 - silent_s, action=np.array([[action]]), startable=np.array([[startable]]),
+        time_s=np.array([[10.0]]), gated=np.array([gated]), as_logged=np.array([obeys]),
+        rejected=np.array([logged]), reset=np.array([logged_reset]),
     )  # fmt: skip
-    before = _Fusion(
-        np.array([10.0 - silent_s]), np.array([10.0 - velocity_silent_s]), np.array([stopped]),
-        np.array([left]),
-    )  # fmt: skip
-    rejected, taken, reset, after = _decide(rules, sample, np.array([outside]), before)
-    last, stop, rest = after.last_s[0], after.stopped[0], after.left[0]
+    fusion.velocity_s = np.array([10.0 - velocity_silent_s])
+    fusion.stopped, fusion.left = np.array([stopped]), np.array([left])
+    rejected, taken, reset, _ = fusion.decide(0, np.array([outside]), np.array([False]))
+    last, stop, rest = fusion.last_s[0], fusion.stopped[0], fusion.left[0]
     return bool(rejected[0]), bool(taken[0]), bool(reset[0]), float(last), bool(stop), int(rest)
 
 
@@ -177,9 +153,11 @@ def test_the_horizon_is_the_length_of_the_buffer(
 
 def test_a_release_without_delay_max_has_none() -> None:
     rules = replace(RULES, horizon_by_delay=True)
-    inputs, flight = made(Inputs, rules=rules), SimpleNamespace(log=log(firmware="PX4 v1.14"))
+    received = made(Received, own_times=False)
+    inputs = made(Inputs, rules=rules, settings={}, aid=EV_POS, received=received)
+    flight = SimpleNamespace(log=log(firmware="PX4 v1.14"))
     model = made(Model, inputs=inputs, flight=flight)
-    with pytest.raises(SettingsError, match=r"PX4 v1\.14 has no such parameter"):
+    with pytest.raises(SettingsError, match=r"in PX4 v1\.14 the longest delay makes the horizon"):
         replay_settings(model, [{"EKF2_DELAY_MAX": 100.0}])
     assert replay_settings(model, []) == ()
 
@@ -205,35 +183,24 @@ def test_gnss_is_reset_to_without_both_for_7_s_or_position_for_14_s(
     assert (taken, reset) == (False, resets)
 
 
-def test_states_fused_in_turn_are_the_kalman_filters_where_they_do_not_share() -> None:
-    rng = np.random.default_rng(5)
-    root = rng.normal(size=(2, 15, 15))
-    P, x = root @ np.swapaxes(root, 1, 2), rng.normal(size=(2, 15))
-    nu, R = rng.normal(size=(2, 1)), np.array([[0.3], [0.7]])
-    S = P[:, 6, 6][:, None] + R
-    after, left = _in_turn(x, P, nu, S, R, 6, np.array([True, False]))
-    K = P[0, :, 6] / S[0]
-    np.testing.assert_allclose(after[0], x[0] + K * nu[0], rtol=1e-12)
-    np.testing.assert_allclose(left[0], P[0] - np.outer(K, P[0, 6]), atol=1e-9)
-    np.testing.assert_allclose(after[1], x[1])
-    np.testing.assert_allclose(left[1], P[1])
-
-
 def test_states_fused_in_turn_keep_the_innovations_of_before() -> None:
     """As EKF2 does: the second gain has the new covariance and the old S, so it is not optimal."""
     rng = np.random.default_rng(6)
-    root = rng.normal(size=(15, 15))
-    P, nu, R = root @ root.T, np.array([[0.4, -0.2]]), np.array([[0.5, 0.9]])
-    S = np.diagonal(P)[6:8] + R
-    x, left = _in_turn(np.zeros((1, 15)), P[None], nu, S, R, 6, np.array([True]))
-    expected, state = P, np.zeros(15)
-    for at, row in enumerate((6, 7)):
-        K = expected[:, row] / S[0, at]
+    root = rng.normal(size=(2, 15, 15))
+    P, nu, R = root @ np.swapaxes(root, 1, 2), rng.normal(size=(2, 6)), np.full((2, 6), 0.5)
+    S = np.diagonal(P, axis1=1, axis2=2)[:, 3:9] + R
+    taken = np.array([True, False])
+    x, left = _in_turn(np.zeros((2, 15)), P, nu, S, R, slice(3, 5), taken)
+    expected, state = P[0], np.zeros(15)
+    for told, row in ((3, 6), (4, 7)):
+        K = expected[:, row] / S[0, told]
         kept = np.eye(15) - np.outer(K, np.eye(15)[row])
-        expected = kept @ expected @ kept.T + R[0, at] * np.outer(K, K)
-        state = state + K * nu[0, at]
-    np.testing.assert_allclose(x[0], state, atol=1e-9)
-    np.testing.assert_allclose(left[0], expected, atol=1e-9)
+        expected = kept @ expected @ kept.T + R[0, told] * np.outer(K, K)
+        state = state + K * nu[0, told]
+        if row == 6:  # the first is the Kalman filter's
+            np.testing.assert_allclose(expected, P[0] - np.outer(K, P[0, 6]), atol=1e-9)
+    np.testing.assert_allclose(x, [state, np.zeros(15)], atol=1e-9)
+    np.testing.assert_allclose(left, [expected, P[1]], atol=1e-9)
     assert np.linalg.eigvalsh(left[0]).min() > -1e-9
 
 
@@ -248,13 +215,13 @@ def test_a_fix_at_rest_tells_the_velocity_too() -> None:
     done = on_gnss([0.0] * 20, [0.0] * 20)
     np.testing.assert_allclose(done.state, 0.0, atol=1e-9)
     # EKF2_GPS_V_NOISE², half as much again in σ for the vertical one
-    r = done.velocity_variance_m2_s2[0, 0] - np.array([1e-4, 1e-4, 1e-4])
+    r = done.innovation_variance[0, 0, :3] - np.array([1e-4, 1e-4, 1e-4])
     np.testing.assert_allclose(r, [0.09, 0.09, 0.2025], atol=3e-4)
     with_it, without = done.variance[-1, 0, 3:5], at_rest([0.0] * 20, aid=GNSS_POS).variance
     assert (with_it < 0.98 * without[-1, 0, 3:5]).all()
     off = on_gnss([0.0] * 20, [0.0] * 20, velocity=False)
     np.testing.assert_allclose(off.variance[-1, 0, 3:5], without[-1, 0, 3:5], rtol=1e-3)
-    assert not np.isfinite(at_rest([0.0] * 5, aid=GNSS_POS).velocity_innovation_m_s).any()
+    assert not np.isfinite(at_rest([0.0] * 5, aid=GNSS_POS).innovation[..., :3]).any()
 
 
 def test_what_else_tells_of_the_tilt_makes_it_surer_and_leaves_it() -> None:
@@ -275,7 +242,7 @@ def test_a_velocity_beyond_its_gate_moves_nothing(speed_m_s: float, moves: bool)
     done = on_gnss([0.0] * 20, [0.0] * 10 + [speed_m_s] + [0.0] * 9)
     assert done.fused.all()
     assert bool(abs(done.state[11, 0, 3]) > 1e-3) is moves
-    assert done.velocity_innovation_m_s[10, 0, 0] == pytest.approx(speed_m_s, abs=0.01)
+    assert done.innovation[10, 0, 0] == pytest.approx(speed_m_s, abs=0.01)
     wider = on_gnss([0.0] * 20, [0.0] * 10 + [3.0] + [0.0] * 9, EKF2_GPS_V_GATE=20.0)
     assert abs(wider.state[11, 0, 3]) > 1e-3
 
@@ -335,9 +302,9 @@ def test_a_vehicle_at_rest_stays_and_its_variance_is_the_kalman_filters() -> Non
     done = at_rest([0.0] * 20)
     np.testing.assert_allclose(done.state, 0.0, atol=1e-9)
     assert done.fused.all()
-    np.testing.assert_allclose(done.noise_m2, 0.01)
+    np.testing.assert_allclose(done.noise[..., 3:], 0.01)
     # P after = P R / (P + R), each of north and east alone
-    before, after = done.variance_m2[0, 0] - 0.01, done.variance[1, 0, 6:8]
+    before, after = done.innovation_variance[0, 0, 3:5] - 0.01, done.variance[1, 0, 6:8]
     np.testing.assert_allclose(after, before * 0.01 / (before + 0.01), rtol=1e-3)
     # the first 0.1 s: position 1e-4 and velocity 1e-4 over it, and what tilt and noise add
     assert before[0] == pytest.approx(1e-4 + 1e-4 * 0.1**2, rel=0.05)
@@ -352,7 +319,7 @@ def test_a_step_of_the_source_is_rejected_for_a_second_and_then_reset_to() -> No
     assert np.flatnonzero(rejected).tolist() == list(range(5, 16))
     assert np.flatnonzero(reset).tolist() == [15]
     assert np.flatnonzero(fused).tolist() == [*range(5), *range(16, 20)]
-    np.testing.assert_allclose(done.innovation_m[5, 0], [3.0, 0.0], atol=1e-3)
+    np.testing.assert_allclose(done.innovation[5, 0, 3:5], [3.0, 0.0], atol=1e-3)
     np.testing.assert_allclose(done.state[16, 0, 6:8], [3.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(done.state[15, 0, 6:8], [0.0, 0.0], atol=1e-3)
     np.testing.assert_allclose(done.variance[16, 0, 6:8], 0.01)
@@ -360,41 +327,21 @@ def test_a_step_of_the_source_is_rejected_for_a_second_and_then_reset_to() -> No
     np.testing.assert_allclose(done.variance[16, 0, 8], done.variance[15, 0, 8], rtol=0.01)
     assert (done.variance[16, 0, 3:6] > done.variance[15, 0, 3:6]).all()
     assert at_rest([0.0] * 5 + [3.0] * 15, EKF2_EVP_GATE=100.0).fused.all()
-    sigma = float(np.sqrt(done.variance_m2[5, 0, 0]))
+    sigma = float(np.sqrt(done.innovation_variance[5, 0, 3]))
     for times, beyond in ((4.99, False), (5.01, True)):
         assert at_rest([0.0] * 5 + [times * sigma]).rejected[5, 0] == beyond
-
-
-def test_what_the_log_tells_of_a_rejection_is_obeyed() -> None:
-    done = at_rest([0.0] * 6, logged=1.0)
-    assert done.rejected[:, 0].tolist() == [False, False, False, True, False, False]
-    assert done.fused[:, 0].tolist() == [True, True, True, False, True, True]
-    assert at_rest([0.0] * 6, logged=0.0).fused.all()
-
-
-def test_height_follows_ekf2s_own() -> None:
-    done = at_rest([0.0] * 20, down_m=0.05)
-    before, after = done.variance[0, 0, 8], done.variance[1:, 0, 8]
-    assert before == 1e-4  # already below EKF2's own, so that nothing is taken at first
-    assert abs(done.state[1, 0, 8]) < 1e-3
-    assert after[-1] == pytest.approx(4e-4, rel=0.01)
-    assert done.state[-1, 0, 8] == pytest.approx(0.05, abs=0.02)
 
 
 # ---------------------------------------------------------------- intervals
 
 
 @pytest.mark.parametrize("n", [4, 200])
-def test_unit_noise_at_the_end_of_a_leg_is_that_of_its_steps(n: int) -> None:
+def test_unit_noise_at_the_end_of_an_interval_is_that_of_its_steps(n: int) -> None:
     """Step by step: θ gains unit noise · dt, v turns with it, p follows v."""
     dt = 0.008
-    force = np.array([0.3, -0.2, -9.8])
-    tilt = -np.array(
-        [[0.0, -force[2], force[1]], [force[2], 0.0, -force[0]], [-force[1], force[0], 0.0]]
-    ) * dt  # fmt: skip
+    tilt = -skew(np.array([[0.3, -0.2, -9.8]]))[0] * dt
     F = np.eye(9)
-    F[3:6, 0:3] = tilt
-    F[6:9, 3:6] = dt * np.eye(3)
+    F[3:6, 0:3], F[6:9, 3:6] = tilt, dt * np.eye(3)
     sums = np.zeros((2, 9, 9))
     for _ in range(n):
         for at, rows in enumerate((slice(0, 3), slice(3, 6))):
@@ -408,9 +355,6 @@ def test_unit_noise_at_the_end_of_a_leg_is_that_of_its_steps(n: int) -> None:
         scale = np.sqrt(np.outer(np.diag(true), np.diag(true)))
         scale[scale == 0.0] = 1.0
         assert np.max(np.abs(found[0] - true) / scale) < (1e-9 if n == 4 else 0.03)
-    one_step = _noises(np.array([1.0]), np.array([dt]), tilt[None])
-    np.testing.assert_allclose(np.diag(one_step[1][0])[3:6], dt**2)
-    np.testing.assert_allclose(np.diag(one_step[1][0])[6:9], 0.0, atol=1e-18)
 
 
 def stretch_of(count: int, *, fusing: bool = True) -> Stretch:

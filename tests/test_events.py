@@ -16,7 +16,6 @@ from px4fuse.comparison.events import happened, source_gaps
 from px4fuse.flight import Flight, FlightMode, Reset, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.readers.parts import stretches_of_modes
-from px4fuse.readers.px4_topics import NAV_STATES
 from px4fuse.recording import Dropout
 
 MODES = (FlightMode(0.0, 40.0, "Offboard"), FlightMode(40.0, 90.0, "Land"))
@@ -48,11 +47,6 @@ def test_stretches_join_what_is_the_same_and_never_overlap() -> None:
     assert stretches_of_modes(names, 8.0) == (
         FlightMode(0.0, 2.0, "a"), FlightMode(2.0, 6.0, "c"), FlightMode(6.0, 8.0, "a"),
     )  # fmt: skip
-
-
-def test_the_modes_that_students_fly_have_the_names_of_qgroundcontrol() -> None:
-    told = {2: "Position", 4: "Hold", 14: "Offboard", 17: "Takeoff", 18: "Land", 23: "External 1"}
-    assert {number: NAV_STATES[number] for number in told} == told
 
 
 def test_a_gap_is_longer_than_a_second_and_five_intervals() -> None:

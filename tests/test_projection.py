@@ -13,16 +13,10 @@ from flights import Estimator, Uwb, aisle_flight, table
 from px4fuse.comparison.projection import (
     observation_variance,
     project_innovations,
-    project_state,
-    project_truth,
-    project_variance,
 )
 from px4fuse.filter.signals import Axis, Segment, make_axes
 from px4fuse.flight import (
-    POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
-    VELOCITY_COLUMNS,
-    VELOCITY_VARIANCE_COLUMNS,
     Alignment,
     Flight,
     Unavailable,
@@ -114,13 +108,6 @@ def test_a_variance_without_room_for_the_prior_leaves_it_unknown() -> None:
     assert got["posterior_variance_m2"].isna().tolist() == [False, True, True, False]
 
 
-def test_only_the_segment_is_taken() -> None:
-    made = with_innovations(flight(), north=NORTH, east=EAST)
-    part = Segment(1.3, 1.7, "")
-    for axis in ("north", "aisle"):
-        assert innovations(made, axis, part).index.tolist() == pytest.approx([1.4, 1.6])
-
-
 GONE = Unavailable("innovations", "none logged", "Log them.")
 
 
@@ -191,32 +178,3 @@ def test_the_observation_noise_is_ekf2s_own_rule(
     own_file = replace(track, alignment=placed)
     least = max(parameters["EKF2_EVP_NOISE"], 0.01) ** 2
     assert observation_variance(made, own_file, aisle, WHOLE) == pytest.approx(least)
-
-
-def test_state_truth_and_variance_are_projected() -> None:
-    made = flight()
-    rng = np.random.default_rng(2)
-    variances = POSITION_VARIANCE_COLUMNS + VELOCITY_VARIANCE_COLUMNS
-    second = np.arange(0.0, 40.5, 1.0)
-    variance = table(second, rng.uniform(0.1, 2.0, (len(second), 6)), variances)
-    ekf2 = replace(made.ekf2, variance=variance)
-    part, aisle = Segment(10.0, 20.0, ""), axes_of(made)["aisle"]
-    states = {"position_m": POSITION_COLUMNS, "velocity_m_s": VELOCITY_COLUMNS}
-    spreads = {
-        "position_variance_m2": POSITION_VARIANCE_COLUMNS,
-        "velocity_variance_m2_s2": VELOCITY_VARIANCE_COLUMNS,
-    }
-    for got, samples, columns, power in (
-        (project_state(ekf2.state, aisle, part), ekf2.state, states, 1),
-        (project_truth(made.truth, aisle, part), made.truth.samples, states, 1),
-        (project_variance(ekf2, aisle, part), variance, spreads, 2),
-    ):
-        assert isinstance(got, pd.DataFrame)
-        cut = samples[(samples.index >= 10.0) & (samples.index <= 20.0)]
-        assert got.index.tolist() == cut.index.tolist()
-        for column, (north, east, _) in columns.items():
-            expected = COSINE**power * cut[north] + SINE**power * cut[east]
-            np.testing.assert_allclose(got[column], expected, rtol=1e-12)
-    late = Segment(100.0, 110.0, "")
-    assert isinstance(project_variance(ekf2, aisle, late), Unavailable)
-    assert isinstance(project_truth(made.truth, aisle, late), Unavailable)

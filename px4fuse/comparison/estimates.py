@@ -139,19 +139,15 @@ def imu_too_slow_for_clocks(flight: Flight) -> Unavailable | None:
     if rate >= CLOCK_RATE_MARGIN * needed:
         return None
     hertz = f"{rate:.{1 if rate < 10 else 0}f} Hz"
-    if not telemetry:
-        return Unavailable(
-            "clock offset",
-            f"the IMU was logged at {hertz}, at least {needed:g} Hz are needed",
-            'Put the line "sensor_combined 0" into etc/logging/logger_topics.txt on the SD card.',
-        )
-    remedy = "Give the ULog of the same flight as LOG, and this recording with --mavlink."
-    return Unavailable(
-        "clock offset",
-        f"the IMU came by telemetry at {hertz}, each sample picked out of several; at least "
-        f"{needed:g} Hz are needed",
-        remedy if flight.log.has_ulog else f"Have the IMU sent at {needed:g} Hz.",
-    )
+    how = f"was logged at {hertz}"
+    remedy = 'Put the line "sensor_combined 0" into etc/logging/logger_topics.txt on the SD card.'
+    if telemetry:
+        how = f"came by telemetry at {hertz}, each sample picked out of several"
+        remedy = f"Have the IMU sent at {needed:g} Hz."
+        if flight.log.has_ulog:
+            remedy = "Give the ULog of the same flight as LOG, and this recording with --mavlink."
+    reason = f"the IMU {how}; at least {needed:g} Hz are needed"
+    return Unavailable("clock offset", reason, remedy)
 
 
 def with_drift(clock: ClockOffset) -> ClockOffset:

@@ -10,9 +10,10 @@ setting would only hide it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import pandas as pd
@@ -20,7 +21,7 @@ from msgspec import structs
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array
-from px4fuse.comparison.comparison import difference, kf_against_truth
+from px4fuse.comparison.comparison import against_truth, difference, kf_against_truth
 from px4fuse.comparison.estimates import Tuning
 from px4fuse.comparison.model import (
     AgainstTruth,
@@ -30,12 +31,11 @@ from px4fuse.comparison.model import (
     FilterSummary,
     UnjudgedFilter,
 )
-from px4fuse.comparison.projection import project_truth
+from px4fuse.comparison.projection import project_state, project_truth
 from px4fuse.comparison.remedy import delay_asked, noise_change, noise_used_m
-from px4fuse.ekf2.agreement import judged_from, settled
 from px4fuse.ekf2.model import Model, moved, replay_settings
 from px4fuse.ekf2.replay import HORIZONTAL as LEVEL
-from px4fuse.ekf2.replay import UPDATE_COLUMNS, Ekf2Replay
+from px4fuse.ekf2.replay import UPDATE_COLUMNS, Ekf2Replay, settled
 from px4fuse.ekf2_parameters import EV_POS, GNSS_VEL, PARAMETERS
 from px4fuse.filter.causes import Explained
 from px4fuse.filter.clock import ClockOffset
@@ -55,7 +55,6 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight import (
     POSITION_COLUMNS,
     SPECIFIC_FORCE_COLUMNS,
-    VELOCITY_COLUMNS,
     Unavailable,
 )
 from px4fuse.record import Positive, Record
@@ -197,26 +196,27 @@ def interventions(
     model : Model or Unavailable
         Of EKF2.
     """
-    filters: dict[FilterName, _Ours | _Ekf2 | None] = {
-        "kf": _Ours(comparison, tuning, clock, heading, explained),
-        "ekf2": _Ekf2.of(comparison, tuning, clock, heading, model),
-    }
+    known, source = (comparison, tuning, clock, heading), comparison.source
+    filters: list[_Changed] = [_Ours(*known, explained)]
+    if not isinstance(model, Unavailable):
+        fused = source.name == model.inputs.received.source and source.alignment is None
+        filters += [_Ekf2(*known, model)] if fused and model.agreement.good else []
     rows: list[Intervention] = []
-    for owner, changed in filters.items():
+    for changed in filters:
         for result in comparison.axes.values():
-            if changed is None or (owner == "ekf2" and result.axis.name == "down"):
+            if changed.owner == "ekf2" and result.axis.name == "down":
                 continue
-            for of in _discrepancies(result.filters[owner]):
-                tried = _tried(owner, result, of, changed.candidates(result, of), changed.number)
+            for of in _discrepancies(result.filters[changed.owner]):
+                tried = _tried(changed, result, of)
                 rows += tried
-                if cause := cause_of(tried, owner, result.axis.name, of):
-                    rows += _apart(cause, result, changed.number)
+                if cause := cause_of(tried, changed.owner, result.axis.name, of):
+                    rows += _apart(cause, result, changed)
     return tuple(rows)
 
 
-def _apart(cause: Intervention, result: AxisComparison, number: Number) -> list[Intervention]:
+def _apart(cause: Intervention, result: AxisComparison, changed: _Changed) -> list[Intervention]:
     """How far a cause keeps both filters apart."""
-    before, after = (number(result, "apart", change) for change in ({}, cause.change))
+    before, after = (changed.number(result, "apart", change) for change in ({}, cause.change))
     if before is None or after is None:
         return []
     share = 1.0 - (after[0] / before[0]) ** 2
@@ -234,36 +234,27 @@ def _discrepancies(statement: FilterSummary | UnjudgedFilter) -> list[Of]:
     return [*found, "nis"] if statement.times_off >= SIGMA_OFF else found
 
 
-def _stated(statement: FilterSummary | UnjudgedFilter, of: Of) -> float | None:
-    """The number as it is without a change: of EKF2 that of the log."""
-    if of == "nis":
-        return None if isinstance(statement, Unavailable) else statement.nis_mean
-    truth = statement.truth
-    return None if isinstance(truth, Unavailable) else truth.nees_position_mean
-
-
-Number = Callable[[AxisComparison, Of, Change], tuple[float, int] | None]
-
-
-def _tried(
-    owner: FilterName, result: AxisComparison, of: Of, candidates: Sequence[Change], number: Number
-) -> list[Intervention]:
+def _tried(changed: _Changed, result: AxisComparison, of: Of) -> list[Intervention]:
     """All candidates alone; where the best leaves the number outside its band, with the others."""
-    before = _stated(result.filters[owner], of)
-    if before is None or not candidates:
+    statement, candidates = result.filters[changed.owner], changed.candidates(result, of)
+    truth = statement.truth
+    before = None if isinstance(truth, Unavailable) else truth.nees_position_mean
+    if of == "nis" and isinstance(statement, FilterSummary):
+        before = statement.nis_mean
+    if before is None:
         return []
     deniable = of == "nis" and before < 1.0 and not isinstance(result.truth, Unavailable)
 
     def tried(change: Change) -> list[Intervention]:
-        found = number(result, of, change)
+        found = changed.number(result, of, change)
         if found is None or found[0] <= 0.0:
             return []
         after, count = found
         low, high = nis_band(count) if of == "nis" else (0.0, NEES_LARGE)
-        claimed = number(result, "nees", change) if deniable else None
+        claimed = changed.number(result, "nees", change) if deniable else None
         return [
             Intervention(
-                of=of, filter=owner, axis=result.axis.name, change=change, before=before,
+                of=of, filter=changed.owner, axis=result.axis.name, change=change, before=before,
                 after=after, explains=1.0 - float(np.log(after) / np.log(before)),
                 brings_into_band=low <= after <= high,
                 denied_by_truth=claimed is not None and claimed[0] >= NEES_LARGE,
@@ -286,6 +277,13 @@ def _rms_apart(run: Replay, state: pd.DataFrame) -> tuple[float, int] | None:
     return None if isinstance(found, Unavailable) else (found.position_rmse_m, found.count)
 
 
+def _nees(judged: AgainstTruth | Unavailable) -> tuple[float, int] | None:
+    """Mean NEES of position, and of how many."""
+    if isinstance(judged, Unavailable) or judged.nees_position_mean is None:
+        return None
+    return judged.nees_position_mean, judged.count
+
+
 def tuned_for(tuning: Tuning, axis: str) -> AxisTuning | None:
     """What was tuned for an axis: both horizontal ones together, where there are both."""
     names = (axis,) if axis == "down" else (HORIZONTAL, axis)
@@ -293,75 +291,91 @@ def tuned_for(tuning: Tuning, axis: str) -> AxisTuning | None:
     return next((tuned for tuned in found if isinstance(tuned, AxisTuning)), None)
 
 
-def _of_clock(
-    comparison: Comparison, clock: ClockOffset | Unavailable, taken_s: float
-) -> list[Change]:
-    """The offset of the stamps, where what a filter has not taken of it is beyond chance."""
-    if isinstance(clock, Unavailable) or not clock.determinable:
-        return []
-    offset_s = comparison.settings.clock_offset_s + clock.remaining_s
-    return [{CLOCK: round(offset_s, 3)}] if abs(offset_s - taken_s) > clock.chance_s else []
-
-
-def _of_frame(heading: HeadingError | Unavailable) -> list[Change]:
-    """How the positions are turned, where it is beyond chance."""
-    if isinstance(heading, Unavailable):
-        return []
-    if abs(heading.turn_deg) <= HEADING_SIGMAS * heading.sigma_deg:
-        return []
-    return [{TURN: -round(heading.turn_deg, 1)}]
-
-
 def _turned(direction: Array, turned_deg: float) -> Array:
     """A direction in the frame in which the positions are turned (clockwise from above)."""
     return np.asarray(Rotation.from_euler("z", -turned_deg, degrees=True).apply(direction))
 
 
-def _is_over(result: AxisComparison, owner: FilterName, of: Of) -> bool:
-    """Whether the variance is larger than what is shown."""
-    statement = result.filters[owner]
-    return of == "nis" and not isinstance(statement, Unavailable) and statement.nis_mean < 1.0
-
-
-def _hides_noise(comparison: Comparison) -> bool:
-    """Whether small innovations against the source say too little of its errors."""
-    return comparison.source.origin.may_drift or comparison.source.origin.is_gnss
-
-
 @dataclass(frozen=True)
-class _Ours:
-    """Our filter with changes; those of the settings only where the data's interval excludes it."""
+class _Changed:
+    """A filter that is run with changes, and what the data ask for."""
 
     comparison: Comparison
     tuning: Tuning
     clock: ClockOffset | Unavailable
     heading: HeadingError | Unavailable
-    explained: Explained | Unavailable
+
+    owner: ClassVar[FilterName]
+
+    @abstractmethod
+    def number(self, result: AxisComparison, of: Of, change: Change) -> tuple[float, int] | None:
+        """Mean NIS or NEES along an axis with a change, or how far apart; and of how many."""
+
+    @abstractmethod
+    def of_noise(self, result: AxisComparison, tuned: AxisTuning, over: bool) -> list[Change]:
+        """The noises that the data ask for, where their interval excludes those that were taken."""
+
+    @abstractmethod
+    def of_filter(self, tuned: AxisTuning | None) -> list[Change]:
+        """What else may be wrong; ``tuned`` where the variance is not larger than what is shown."""
 
     def candidates(self, result: AxisComparison, of: Of) -> list[Change]:
         """What to try along an axis."""
-        settings, tuned = self.comparison.settings, tuned_for(self.tuning, result.axis.name)
-        over, found = _is_over(result, "kf", of), list[Change]()
-        if tuned is not None and not (over and _hides_noise(self.comparison)):
-            for name, noise in ((SIGMA_A, tuned.filter_sigma_a), (SIGMA_Z, tuned.sigma_z)):
-                chosen = getattr(settings, name)
-                asked = noise.value or (noise.high if over else None) or 0.0
-                end = noise.high if over else noise.low
-                if noise.value is None and name == SIGMA_Z:
-                    asked = max(asked, SMALLEST_SIGMA_Z_M)
-                if asked and end is not None and (chosen > end if over else chosen < end):
-                    found.append({name: float(f"{asked:.3g}")})
+        statement, origin = result.filters[self.owner], self.comparison.source.origin
+        over = not isinstance(statement, Unavailable) and of == "nis" and statement.nis_mean < 1.0
+        tuned = tuned_for(self.tuning, result.axis.name)
+        found = list[Change]()
+        # small innovations against such a source say too little of its errors
+        hides_noise = origin.may_drift or origin.is_gnss
+        if tuned is not None and not (over and hides_noise):
+            found += self.of_noise(result, tuned, over)
         if tuned is not None and not over and len(tuned.outlier_time_s):
             found.append({OUTLIERS: float(len(tuned.outlier_time_s))})
-        found += _of_clock(self.comparison, self.clock, settings.clock_offset_s)
+        found += self.of_stamps()
         if result.axis.name == "down":
             return found
-        if isinstance(self.explained, Explained) and self.explained.biased:
-            found.append({
-                FORWARD: round(self.explained.forward_bias.value, 3),
-                RIGHT: round(self.explained.right_bias.value, 3),
-            })  # fmt: skip
-        return found + _of_frame(self.heading)
+        if isinstance(turn := self.heading, HeadingError):
+            beyond = abs(turn.turn_deg) > HEADING_SIGMAS * turn.sigma_deg
+            found += [{TURN: -round(turn.turn_deg, 1)}] if beyond else []
+        return found + self.of_filter(None if over else tuned)
+
+    def of_stamps(self) -> list[Change]:
+        """The offset of the stamps, where what was not taken of it is beyond chance."""
+        if isinstance(self.clock, Unavailable) or not self.clock.determinable:
+            return []
+        taken_s = self.comparison.settings.clock_offset_s
+        offset_s = taken_s + self.clock.remaining_s
+        missing_s = offset_s - (taken_s if self.owner == "kf" else 0.0)
+        return [{CLOCK: round(offset_s, 3)}] if abs(missing_s) > self.clock.chance_s else []
+
+
+@dataclass(frozen=True)
+class _Ours(_Changed):
+    """Our filter with changes."""
+
+    explained: Explained | Unavailable
+
+    owner = "kf"
+
+    def of_noise(self, result: AxisComparison, tuned: AxisTuning, over: bool) -> list[Change]:
+        """SIGMA_A and SIGMA_Z."""
+        found = list[Change]()
+        for name, noise in ((SIGMA_A, tuned.filter_sigma_a), (SIGMA_Z, tuned.sigma_z)):
+            chosen = getattr(self.comparison.settings, name)
+            asked = noise.value or (noise.high if over else None) or 0.0
+            end = noise.high if over else noise.low
+            if noise.value is None and name == SIGMA_Z:
+                asked = max(asked, SMALLEST_SIGMA_Z_M)
+            if asked and end is not None and (chosen > end if over else chosen < end):
+                found.append({name: float(f"{asked:.3g}")})
+        return found
+
+    def of_filter(self, tuned: AxisTuning | None) -> list[Change]:
+        """The accelerometer's bias."""
+        if isinstance(self.explained, Unavailable) or not self.explained.biased:
+            return []
+        forward, right = self.explained.forward_bias, self.explained.right_bias
+        return [{FORWARD: round(forward.value, 3), RIGHT: round(right.value, 3)}]
 
     def _unbiased(self, change: Change, direction: Array) -> Acceleration | Unavailable:
         """The acceleration along a direction, without the accelerometer's bias."""
@@ -376,7 +390,7 @@ class _Ours:
         return project_acceleration(made, direction, self.comparison.segment)
 
     def number(self, result: AxisComparison, of: Of, change: Change) -> tuple[float, int] | None:
-        """Mean NIS or NEES along an axis with a change, or how far apart; and of how many."""
+        """By our filter, run again."""
         source, segment, axis = self.comparison.source, self.comparison.segment, result.axis
         named: dict[str, Any] = {name: change[name] for name in change if name in vars(Settings())}
         settings = replace(self.comparison.settings, **named)
@@ -406,61 +420,36 @@ class _Ours:
         if of == "apart":
             state = result.ekf2_state
             return None if compass or isinstance(state, Unavailable) else _rms_apart(run, state)
-        judged = kf_against_truth(run, truth, run.steps.index.to_numpy())
-        if isinstance(judged, Unavailable) or judged.nees_position_mean is None:
-            return None
-        return judged.nees_position_mean, judged.count
+        return _nees(kf_against_truth(run, truth, run.steps.index.to_numpy()))
 
 
 @dataclass(frozen=True)
-class _Ekf2:
+class _Ekf2(_Changed):
     """EKF2 with changes, where the model agrees with the log and fused what was analysed."""
 
-    comparison: Comparison
-    tuning: Tuning
-    clock: ClockOffset | Unavailable
-    heading: HeadingError | Unavailable
     model: Model
     replays: dict[tuple[tuple[str, float], ...], Ekf2Replay] = field(default_factory=dict)
 
-    @classmethod
-    def of(
-        cls, comparison: Comparison, tuning: Tuning, clock: ClockOffset | Unavailable,
-        heading: HeadingError | Unavailable, model: Model | Unavailable,
-    ) -> _Ekf2 | None:  # fmt: skip
-        """None where EKF2 cannot be replayed, or fused something else."""
-        source = comparison.source
-        if isinstance(model, Unavailable) or not model.agreement.good:
-            return None
-        if source.name != model.inputs.received.source or source.alignment is not None:
-            return None
-        return cls(comparison, tuning, clock, heading, model)
+    owner = "ekf2"
 
-    def candidates(self, result: AxisComparison, of: Of) -> list[Change]:
-        """What to try along a horizontal axis."""
+    def of_stamps(self) -> list[Change]:
+        """A delay is EKF2's own to set; there is none for stamps that are early."""
+        delay = delay_asked(self.comparison, self.model, self.clock)
+        return [delay] if delay else super().of_stamps()
+
+    def of_filter(self, tuned: AxisTuning | None) -> list[Change]:
+        """The gate, parameters that are not PX4's own, and the process noise."""
         aid, flown = self.model.inputs.aid, self.model.inputs.settings
-        over, tuned = _is_over(result, "ekf2", of), tuned_for(self.tuning, result.axis.name)
-        found = list[Change]()
-        if tuned is not None and not (over and _hides_noise(self.comparison)):
-            found.append(self._noise(result, tuned))
-        if tuned is not None and not over and len(tuned.outlier_time_s):
-            found.append({OUTLIERS: float(len(tuned.outlier_time_s))})
-        # a delay is EKF2's own to set; there is none for stamps that are early
-        if delay := delay_asked(self.comparison, self.model, self.clock):
-            found.append(delay)
-        else:
-            found += _of_clock(self.comparison, self.clock, 0.0)
-        found += _of_frame(self.heading)
-        if flown[aid.gate] < PARAMETERS[aid.gate].default:
-            found.append({aid.gate: PARAMETERS[aid.gate].default})
-        found += [
-            {name: PARAMETERS[name].default}
-            for name in NOT_OF_AID
-            if name in flown and not np.isclose(flown[name], PARAMETERS[name].default, rtol=1e-3)
+        usual = {name: PARAMETERS[name].default for name in (aid.gate, *NOT_OF_AID)}
+        found: list[Change] = [
+            {name: value}
+            for name, value in usual.items()
+            if name in flown
+            and not np.isclose(flown[name], value, rtol=1e-3)
+            and (name != aid.gate or flown[name] < value)
         ]
-        if tuned is not None and not over:
-            found.append(self._shaken(tuned))
-        return [change for change in found if change]
+        shaken = {} if tuned is None else self._shaken(tuned)
+        return [*found, shaken] if shaken else found
 
     def _shaken(self, tuned: AxisTuning) -> Change:
         """The process noise that the vibration asks for, as far as PX4's range goes.
@@ -475,49 +464,44 @@ class _Ekf2:
         asked = min((tuned.filter_sigma_a.value or 0.0) * steps**0.5, most)
         return {ACC_NOISE: float(f"{asked:.2g}")} if asked > flown else {}
 
-    def _noise(self, result: AxisComparison, tuned: AxisTuning) -> Change:
-        """The source's noise, where EKF2 takes another than the data's interval allows."""
+    def of_noise(self, result: AxisComparison, tuned: AxisTuning, over: bool) -> list[Change]:
+        """The source's noise."""
         used_m, noise, statement = noise_used_m(self.model), tuned.sigma_z, result.filters["ekf2"]
         if (noise.low or 0.0) <= used_m <= (noise.high or np.inf):
-            return {}
-        if noise.value is not None:
-            return noise_change(self.model, noise.value)
-        if isinstance(statement, Unavailable):
-            return {}
-        # EKF2's own innovations bound it too, and less tightly
-        bound_m = np.hypot(statement.innovation_std_m, statement.innovation_mean_m)
-        return noise_change(self.model, float(bound_m))
+            return []
+        asked_m = noise.value
+        if asked_m is None:
+            if isinstance(statement, Unavailable):
+                return []
+            # EKF2's own innovations bound it too, and less tightly
+            asked_m = float(np.hypot(statement.innovation_std_m, statement.innovation_mean_m))
+        return [noise_change(self.model, asked_m)]
 
     def number(self, result: AxisComparison, of: Of, change: Change) -> tuple[float, int] | None:
-        """As of :class:`_Ours`, along a horizontal axis; unchanged how far apart by the log."""
-        made, direction = self._replayed(change), result.axis.direction
+        """By a replay, along a horizontal axis; unchanged how far apart by the log."""
+        made, axis, segment = self._replayed(change), result.axis, self.comparison.segment
         if TURN in change and self.comparison.source.origin.is_gnss:
             # what is put right is the attitude: its frame is turned, north is where it was
-            direction = _turned(direction, -change[TURN])
-        updates = made.updates[settled(made.updates.index, judged_from(self.model.flown))]
+            axis = replace(axis, direction=_turned(axis.direction, -change[TURN]))
+        weights = axis.direction[:2]
+        updates = made.updates[settled(made.updates.index, self.model.flown.judged_s)]
         if of == "nis":
-            nu = along(updates, INNOVATION_COLUMNS, direction[:2])
-            s = along(updates, INNOVATION_VARIANCE_COLUMNS, direction[:2] ** 2)
+            nu = along(updates, INNOVATION_COLUMNS, weights)
+            s = along(updates, INNOVATION_VARIANCE_COLUMNS, weights**2)
             return (float(np.mean(nu**2 / s)), len(nu)) if len(nu) else None
+        state = project_state(made.published, axis, segment)
         if of == "apart":
-            state = result.ekf2_state
-            if change or isinstance(state, Unavailable):
-                columns = {"position_m": POSITION_COLUMNS, "velocity_m_s": VELOCITY_COLUMNS}
-                parts = {name: along(made.published, of, direction) for name, of in columns.items()}
-                state = pd.DataFrame(parts, index=made.published.index)
-            inside = settled(state.index, judged_from(self.model.flown))
+            logged = result.ekf2_state
+            state = state if change or isinstance(logged, Unavailable) else logged
+            inside = settled(state.index, self.model.flown.judged_s)
             return _rms_apart(result.replay, state[inside])
-        if isinstance(result.truth, Unavailable):
-            return None
-        at_s, truth = updates["fused_at_s"].to_numpy(), result.truth
-        track = np.array([np.interp(at_s, made.delayed.index, made.delayed[column])
-                          for column in POSITION_COLUMNS])  # fmt: skip
-        error = direction @ track - np.interp(
-            at_s, truth.index, truth["position_m"], np.nan, np.nan
-        )
-        variance = along(updates, POSITION_VARIANCES, direction[:2] ** 2)
-        nees = (error**2 / variance)[np.isfinite(error)]
-        return (float(np.mean(nees)), len(nees)) if len(nees) else None
+        at_s, track = updates["fused_at_s"], along(made.delayed, POSITION_COLUMNS, axis.direction)
+        stated = {
+            "position_m": np.interp(at_s, made.delayed.index, track),
+            "position_variance_m2": along(updates, POSITION_VARIANCES, weights**2),
+        }
+        horizon = pd.DataFrame(stated, index=pd.Index(at_s))
+        return _nees(against_truth(state, result.ekf2_variance, result.truth, horizon))
 
     def _replayed(self, change: Change) -> Ekf2Replay:
         """EKF2 with a change, each replayed once."""

@@ -24,6 +24,7 @@ from px4fuse.flight import (
     Unavailable,
 )
 from px4fuse.origin import GIVEN_FILE, PositionKind
+from px4fuse.plain import capital
 from px4fuse.readers.mavlink_messages import POSITION_INPUTS
 from px4fuse.readers.px4_innovations import with_gnss
 from px4fuse.readers.px4_topics import TOPIC_ORIGINS
@@ -201,25 +202,22 @@ def no_source(flight: Flight) -> Unavailable:
     """Why no track of a flight is a position source by itself, and what would be one."""
     damaged = "the file is damaged, and " if flight.log.damage else ""
     unused = next((track.name for track in flight.positions if not track.origin.automatic), "")
-    hint = (
-        f"Only GPS is in it, which EKF2 did not fuse: give `position_source` {unused} to use that"
+    looked_for = "no vehicle_visual_odometry, motion capture or EKF2 innovations of external vision"
+    remedy = (
+        "set SDLOG_PROFILE to 129 and send the UWB position to PX4 as VISION_POSITION_ESTIMATE, or "
+        "give the UWB's own file with `position`."
     )
     if flight.log.format.startswith("MAVLink"):
-        return Unavailable(
-            "position source",
-            f"{damaged}no external position was sent to the autopilot in this "
-            "recording (no VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP)",
-            f"{f'{hint}, or g' if unused else 'G'}ive the positioning system's own file with "
-            "`position`"
-            f"{', or the ULog' if flight.log.has_ulog else ''}.",
+        looked_for = "no VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP"
+        ulog = ", or the ULog" if flight.log.has_ulog else ""
+        remedy = f"give the positioning system's own file with `position`{ulog}."
+    if unused:
+        remedy = (
+            "Only GPS is in it, which EKF2 did not fuse: give `position_source` "
+            f"{unused} to use that, or {remedy}"
         )
-    return Unavailable(
-        "position source",
-        f"{damaged}no external position in this log (no "
-        "vehicle_visual_odometry, motion capture or EKF2 innovations of external vision)",
-        f"{f'{hint}, or s' if unused else 'S'}et SDLOG_PROFILE to 129 and send the UWB position "
-        "to PX4 as VISION_POSITION_ESTIMATE, or give the UWB's own file with `position`.",
-    )
+    reason = f"{damaged}no external position in this log ({looked_for})"
+    return Unavailable("position source", reason, capital(remedy))
 
 
 def _why_best(flight: Flight, track: PositionTrack) -> str:

@@ -6,7 +6,7 @@ Sources: PX4-Autopilot ``EKF/aid_sources/external_vision/ev_pos_control.cpp`` an
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -182,29 +182,26 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
     flight : Flight
     """
     imu, attitude, ekf2 = flight.imu, flight.attitude, flight.ekf2
-    for part in (imu, attitude, ekf2):
-        if isinstance(part, Unavailable):
-            return Unavailable(WHAT, f"{part.what}: {part.reason}", part.remedy)
-    assert isinstance(imu, pd.DataFrame)
-    assert isinstance(attitude, pd.DataFrame)
-    assert isinstance(ekf2, Ekf2)
+    if isinstance(imu, Unavailable):
+        return imu
+    if isinstance(attitude, Unavailable):
+        return attitude
+    if isinstance(ekf2, Unavailable):
+        return ekf2
     aid = replayed_aid(ekf2)
     gnss = aid == GNSS_POS
     if gnss:
         ekf2 = with_gnss(ekf2)
     record, horizon_s = ekf2.record, ekf2.horizon_s
-    for each in (record, ekf2.innovations["north"]):
-        if isinstance(each, Unavailable):
-            return Unavailable(WHAT, each.reason, each.remedy)
-    assert isinstance(record, FusionRecord)
+    if isinstance(record, Unavailable):
+        return record
+    if isinstance(innovations := ekf2.innovations["north"], Unavailable):
+        return innovations
     if others := [one for one in record.other_aiding if not (gnss and one in OF_GNSS)]:
-        fused, remedy = "GNSS", "Fly with EKF2_OF_CTRL 0."
-        if not gnss:
-            fused = "vision position"
-            remedy = f"Fly with {GNSS_POS.switch} 0, EKF2_OF_CTRL 0 and without bit 2 of "
-            remedy += f"{EV_POS.switch}."
+        fused = "GNSS" if gnss else "vision position"
         said = f"EKF2 fused more than {fused} horizontally ({', '.join(others)})"
-        return Unavailable(WHAT, said, remedy)
+        more = "" if gnss else f", {GNSS_POS.switch} 0 and without bit 2 of {EV_POS.switch}"
+        return Unavailable(WHAT, said, f"Fly with EKF2_OF_CTRL 0{more}.")
     interval = float(np.median(np.diff(imu.index.to_numpy())))
     if interval > MAX_IMU_INTERVAL_S:
         return Unavailable(
@@ -250,21 +247,17 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
 def _rules(record: FusionRecord, step_s: float, *, gnss: bool) -> Rules:
     """What decides on starts, stops and resets, by the release's own parameters."""
     floor = 5e-8 / step_s**2 if record.per_step_biases else None
+    by_delay = "EKF2_DELAY_MAX" not in record.parameters
+    if gnss:
+        # resetHorizontalPositionTo, gps_control.cpp: from v1.16 on, which keeps latitude and
+        # longitude, with twice the variance; since main of 2026 each aid by itself
+        scale = 1.0 if np.isfinite(record.delayed["north_m"]).any() else 2.0
+        both = GNSS_MODE not in record.parameters
+        return Rules(np.inf, np.inf, 7.0, NO_LIMIT, floor, by_delay, scale, both)
     # EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h
-    old = gnss or fuses_by_mask(record.parameters)
+    old = fuses_by_mask(record.parameters)
     limits = (np.inf, 7.0, 7.0, NO_LIMIT) if old else (0.2, 0.4, 1.0, 5)
-    rules = Rules(*limits, floor, "EKF2_DELAY_MAX" not in record.parameters)
-    if not gnss:
-        return rules
-    # resetHorizontalPositionTo, gps_control.cpp: from v1.16 on, which keeps latitude and longitude,
-    # with twice the variance; since main of 2026 each aid by itself
-    latitude = not np.isfinite(record.delayed["north_m"]).any()
-    return replace(
-        rules,
-        stop_s=np.inf,
-        reset_scale=2.0 if latitude else 1.0,
-        with_velocity=GNSS_MODE not in record.parameters,
-    )
+    return Rules(*limits, floor, by_delay)
 
 
 def replayed_aid(ekf2: Ekf2) -> Aid:
@@ -297,23 +290,20 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> Received | Un
     # EKF2 believes no fix to be worse than without aiding (gps_control.cpp)
     worst_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
     stated = track.samples[POSITION_VARIANCE_COLUMNS].fillna(0.0).clip(upper=worst_m**2)
-    found = Received(
+    velocity = track.velocity[VELOCITY_COLUMNS].to_numpy()
+    fused = fuses_by_mask(parameters) or switch & GNSS_VELOCITY_BIT
+    spread = track.velocity[VELOCITY_VARIANCE_COLUMNS].fillna(0.0).to_numpy()
+    known = bool(fused and np.isfinite(velocity).all())
+    return Received(
         stamp,
         stamp,
         track.samples[POSITION_COLUMNS].to_numpy(),
         stated.to_numpy(),
         *_decisions(ekf2, record, stamp, GNSS_POS),
         track.name,
+        velocity if known else None,
+        spread if known else None,
         own_times=track.age_s == 0.0 != flown_s,
-    )
-    velocity = track.velocity[VELOCITY_COLUMNS].to_numpy()
-    fused = fuses_by_mask(parameters) or switch & GNSS_VELOCITY_BIT
-    if not fused or not np.isfinite(velocity).all():
-        return found
-    return replace(
-        found,
-        velocity_m_s=velocity,
-        velocity_variance_m2_s2=track.velocity[VELOCITY_VARIANCE_COLUMNS].fillna(0.0).to_numpy(),
     )
 
 

@@ -4,7 +4,7 @@ The model is the part of EKF2 that horizontal positions move: 15 error states ab
 attitude, started from the log's own ``estimator_states`` and fed with IMU and positions as logged,
 of GNSS with their velocities.
 It is not EKF2: what else EKF2 fuses (height, heading) is taken from its own output. How far it can
-be believed is measured on each log, see :mod:`px4fuse.ekf2.agreement`.
+be believed is measured on each log, see :mod:`px4fuse.ekf2.replay`.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array
 from px4fuse.display import brief
-from px4fuse.ekf2.agreement import REJECTING_SHARE, agreement_with_log, with_obedient
-from px4fuse.ekf2.inputs import Inputs, prepare, same_sample
+from px4fuse.ekf2.inputs import WHAT, Inputs, prepare, same_sample
 from px4fuse.ekf2.intervals import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
@@ -33,9 +32,17 @@ from px4fuse.ekf2.intervals import (
     make_intervals,
 )
 from px4fuse.ekf2.output_predictor import follow_attitude, later, publish
-from px4fuse.ekf2.recursion import HEADING, Run, Variant, run, with_compass, with_correlation
-from px4fuse.ekf2.replay import UPDATE_COLUMNS, VELOCITY_UPDATE_COLUMNS, Agreement, Ekf2Replay
-from px4fuse.ekf2_parameters import GNSS_POS, check
+from px4fuse.ekf2.recursion import HEADING, LEVEL, Run, Variant, run, with_compass, with_correlation
+from px4fuse.ekf2.replay import (
+    REJECTING_SHARE,
+    UPDATE_COLUMNS,
+    VELOCITY_UPDATE_COLUMNS,
+    Agreement,
+    Ekf2Replay,
+    agreement_with_log,
+    with_obedient,
+)
+from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS, check
 from px4fuse.errors import SettingsError
 from px4fuse.flight import STATE_COLUMNS, Ekf2, Flight, Unavailable
 from px4fuse.readers.px4_innovations import with_gnss
@@ -81,7 +88,7 @@ def open_model(flight: Flight) -> Model | Unavailable:
     """
     inputs = prepare(flight)
     if isinstance(inputs, Unavailable):
-        return inputs
+        return structs.replace(inputs, what=WHAT)
     if inputs.aid == GNSS_POS and isinstance(flight.ekf2, Ekf2):
         flight = replace(flight, ekf2=with_gnss(flight.ekf2))
     flown = Variant(inputs.settings)
@@ -127,26 +134,19 @@ def replay_settings(
     SettingsError
         A parameter that the model does not have, or a value outside PX4's range.
     """
-    changes = [check(change) for change in settings]
-    if model.inputs.rules.horizon_by_delay and any("EKF2_DELAY_MAX" in c for c in changes):
-        raise SettingsError(
-            f"EKF2_DELAY_MAX: {model.flight.log.firmware} has no such parameter; there the longest "
-            "delay makes the horizon."
-        )
-    for name in {name for change in changes for name in change}:
-        if name not in model.inputs.settings:
-            raise SettingsError(
-                f"{name}: EKF2 fused {model.inputs.aid.label} in this log, where that changes "
-                "nothing",
-                f"Here it has {', '.join(model.inputs.settings)}.",
-            )
-        if name == GNSS_POS.delay and model.inputs.received.own_times:
-            raise SettingsError(
-                f"{name} changes nothing here: EKF2 takes the receiver driver's own times."
-            )
+    changes, inputs = [check(change) for change in settings], model.inputs
+    of_others = PARAMETERS.keys() - inputs.settings.keys()
+    idle = dict.fromkeys(of_others, f"EKF2 fused {inputs.aid.label} in this log")
+    if inputs.rules.horizon_by_delay:
+        firmware = model.flight.log.firmware
+        idle["EKF2_DELAY_MAX"] = f"in {firmware} the longest delay makes the horizon"
+    if inputs.received.own_times:
+        idle[GNSS_POS.delay] = "EKF2 takes the receiver driver's own times"
+    for name in [name for change in changes for name in change if name in idle]:
+        raise SettingsError(f"{name} changes nothing here: {idle[name]}.")
     if not changes:
         return ()
-    inputs, obeys = model.inputs, left_out_s is not None
+    obeys = left_out_s is not None
     if left_out_s is not None:
         row = same_sample(inputs.received.stamp_s, left_out_s)
         rejected = np.full(len(inputs.received.stamp_s), np.nan)
@@ -274,19 +274,17 @@ def _assemble(
 
 def _updates(part: Run, at: int) -> pd.DataFrame:
     events = part.events[at]
-    seen = np.flatnonzero(np.isfinite(part.innovation_m[:, at, 0]))
+    seen = np.flatnonzero(np.isfinite(part.innovation[:, at, LEVEL.start]))
     after = part.variance[seen + 1, at]
     flags = np.stack([part.rejected, part.fused, part.reset], axis=-1)[seen, at]
-    nu, s, r = (each[seen, at] for each in (part.innovation_m, part.variance_m2, part.noise_m2))
+    told = part.innovation, part.innovation_variance, part.noise
+    nu, s, r = (each[seen, at, LEVEL] for each in told)
+    speed = [each[seen, at, :2] for each in told[:2]]
     fused_at_s = part.stretch.time_s[events.end[seen], None]
-    values = np.hstack([nu, s, flags, after[:, 6:8], after[:, 3:5], r, fused_at_s])
-    index = pd.Index(events.time_s[seen], name="time_s")
-    columns = list(UPDATE_COLUMNS)
-    velocity = [each[seen, at, :2] for each in (part.velocity_innovation_m_s,
-                                                part.velocity_variance_m2_s2)]  # fmt: skip
-    if np.isfinite(velocity[0]).any():
-        values, columns = np.hstack([values, *velocity]), columns + VELOCITY_UPDATE_COLUMNS
-    return pd.DataFrame(values, index=index, columns=columns)
+    values = np.hstack([nu, s, flags, after[:, 6:8], after[:, 3:5], r, fused_at_s, *speed])
+    index, columns = pd.Index(events.time_s[seen], name="time_s"), UPDATE_COLUMNS
+    updates = pd.DataFrame(values, index, [*columns, *VELOCITY_UPDATE_COLUMNS])
+    return updates if np.isfinite(speed[0]).any() else updates[columns]
 
 
 def _tracks(inputs: Inputs, part: Run, at: int) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -356,5 +354,5 @@ def delayed_states(part: Run, at: int) -> tuple[Array, Array]:
     reset = np.zeros((count + 1, 3))
     for e in np.flatnonzero(part.reset[:, at]):
         # measured position minus the state before: the innovation itself
-        reset[end[e] :, :2] += part.innovation_m[e, at]
+        reset[end[e] :, :2] += part.innovation[e, at, LEVEL]
     return state, reset

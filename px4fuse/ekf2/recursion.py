@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -45,7 +45,8 @@ GIVING = 0.4
 TOGETHER = 64
 # Variance by which a sample is not taken at all
 NOT_TAKEN = 1e9
-MIN_POSITION_SD_M = 0.01  # ev_pos_control.cpp
+# Of a position (m) and a velocity (m/s), ev_pos_control.cpp
+MIN_SD = 0.01
 # EKF2 takes the vertical velocity of GNSS for half as exact again (gps_control.cpp)
 VERTICAL_SCALE = np.array([1.0, 1.0, 2.25])
 MIN_GATE = 1.0
@@ -57,6 +58,8 @@ MEASURED = np.array([HEADING, DOWN, NORTH, EAST])
 # Slices are views, where indices would be copies
 OWN = slice(HEADING, DOWN + 1, DOWN - HEADING)
 HORIZONTAL = slice(NORTH, EAST + 1)
+# What a sample tells of: velocity and position. Among these, velocity, and north and east
+TOLD, SPEED, LEVEL = slice(3, 9), slice(0, 3), slice(3, 5)
 
 
 @dataclass(frozen=True)
@@ -120,14 +123,13 @@ class Run:
     variants : tuple of Variant
     events : tuple of recarray
         Of each variant.
-    innovation_m : ndarray, shape (E, S, 2)
-        Measurement minus state, north and east; NaN where the event has no sample.
-    variance_m2 : ndarray, shape (E, S, 2)
+    innovation : ndarray, shape (E, S, 6)
+        Measurement minus state of velocity (m/s) and position (m), NED; NaN where the event has no
+        sample, or EKF2 fuses no velocity.
+    innovation_variance : ndarray, shape (E, S, 6)
         S = P + R.
-    noise_m2 : ndarray, shape (E, S, 2)
+    noise : ndarray, shape (E, S, 6)
         R.
-    velocity_innovation_m_s, velocity_variance_m2_s2 : ndarray, shape (E, S, 3)
-        The same of velocity, where EKF2 fuses it.
     rejected, fused, reset : ndarray of bool, shape (E, S)
     told_rad, heading_gain : ndarray, shape (E, S)
         By how much EKF2's own heading turned that of the model, and its gain as a measurement.
@@ -140,11 +142,9 @@ class Run:
     stretch: Stretch
     variants: tuple[Variant, ...]
     events: tuple[Events, ...]
-    innovation_m: Array
-    variance_m2: Array
-    noise_m2: Array
-    velocity_innovation_m_s: Array
-    velocity_variance_m2_s2: Array
+    innovation: Array
+    innovation_variance: Array
+    noise: Array
     rejected: BoolArray
     fused: BoolArray
     reset: BoolArray
@@ -155,15 +155,15 @@ class Run:
     covariance: Array
 
 
-def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
+def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
     inputs: Inputs, stretch: Stretch, variants: Sequence[Variant], intervals: Sequence[Intervals]
 ) -> Run:
     """Run the variants through one stretch, each with its intervals."""
     size, events = len(variants), len(intervals[0].events)
     knob = {name: np.array([v.settings[name] for v in variants]) for name in variants[0].settings}
-    biases, attitude, gated, as_logged = (
+    biases, attitude, gated, as_logged, reported, fuses_velocity = (
         np.array([getattr(variant, name) for variant in variants])
-        for name in ("biases", "attitude", "gated", "as_logged")
+        for name in ("biases", "attitude", "gated", "as_logged", "reported", "velocity")
     )
     distinct = list(dict.fromkeys(intervals))
     pick = [distinct.index(each) for each in intervals] if len(distinct) > 1 else slice(None)
@@ -173,19 +173,14 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
         return np.stack([getattr(each, name)[some] for each in distinct], axis=1)[:, pick]
 
     event = stacked("events")
-    end, startable = event["end"], event["startable"]
     action = np.where(gated, event["action"], np.where(event["usable"], FUSE, IDLE))
-    now_s = stretch.time_s[end]
-    sampled = np.any(action > IDLE, axis=1)
+    end, active = event["end"], action > IDLE
+    now_s, sampled = stretch.time_s[end], np.any(active, axis=1)
     sample = np.maximum(intervals[0].events.sample, 0)
-    logged, logged_reset = inputs.received.rejected[sample], inputs.received.reset[sample]
-    # every variant fuses unless its gate says otherwise
-    quiet = (action == FUSE).all(axis=1) & ~logged_reset & ~(logged > 0.0)
-    reported = np.array([variant.reported for variant in variants])
     measured, noise = _measurements(inputs, stretch, sample, end, knob, reported)
-    speed, speed_noise = _velocities(inputs, stretch, sample, end, knob)
-    fuses_velocity = np.array([variant.velocity for variant in variants])
-    velocity_gate2 = (np.maximum(knob.get(GNSS_VEL.gate, one := np.ones(size)), one) ** 2)[:, None]
+    in_turn = inputs.received.velocity_m_s is not None
+    gates = [knob.get(GNSS_VEL.gate, np.ones(size)), knob[inputs.aid.gate]]
+    gate2 = np.maximum(np.repeat(np.stack(gates, axis=1), 3, axis=1), MIN_GATE) ** 2
     # height and heading are measured by EKF2's own
     own = np.stack([stretch.attitude_error_rad[end, HEADING], stretch.down_m[end]], axis=-1)
     own_attitude = stretch.attitude_variance_rad2[end]
@@ -194,22 +189,20 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     # a delay turns the heading; what other settings do to it is less than what is known of it
     follows = knob[inputs.aid.delay] != inputs.settings[inputs.aid.delay]
     turned = None if stretch.compass is None else stretch.compass.between(now_s)
-    gate2 = (np.maximum(knob[inputs.aid.gate], MIN_GATE) ** 2)[:, None]
     gyro2 = np.where(attitude, knob["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
     force2 = (knob["EKF2_ACC_NOISE"] ** 2)[:, None, None]
     drift, drift_limit = _drift(inputs, knob, biases, attitude)
     steps = np.diff(end, axis=0, prepend=0)[:, :, None]
     floor = inputs.rules.bias_floor
     x, P = _start(stretch, biases, attitude)
-    began = np.full(size, stretch.time_s[0])
-    fusion = _Fusion(began, began, np.zeros(size, bool), np.full(size, inputs.rules.resets))
-    innovations, variances = np.full((2, events, size, 2), np.nan)
-    velocity_innovations, velocity_variances = np.full((2, events, size, 3), np.nan)
+    logged = inputs.received.rejected[sample], inputs.received.reset[sample]
+    usable = action, event["startable"], now_s, gated, as_logged, *logged
+    fusion = _Fusion(inputs.rules, stretch.time_s[0], *usable)
+    innovations, variances = np.full((2, events, size, 6), np.nan)
     rejected, fused, reset = np.zeros((3, events, size), bool)
     states, spreads = np.empty((2, events + 1, size, STATES))
     states[0], spreads[0] = x, _diagonal(P)
     innovation, R = np.empty((2, size, 4))
-    stopped = False  # the fusion of any
     for e in range(events):
         within = e % TOGETHER
         if not within:  # intervals are long: a few at a time
@@ -230,43 +223,22 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
         if floor is not None:
             _limit_bias(P, floor, biases)
         innovation[:, 2:], R[:, 2:] = 0.0, NOT_TAKEN
-        restart = None
         if sampled[e]:
-            active = action[e] > IDLE
-            nu = measured[e, :, :2] - x[:, HORIZONTAL]
-            S = spread[:, HORIZONTAL] + noise[e, :, :2]
-            outside = (nu * nu > gate2 * S).any(axis=1)
-            innovations[e] = np.where(active[:, None], nu, np.nan)
-            variances[e] = np.where(active[:, None], S, np.nan)
-            innovation[:, 2:] = nu
-            if speed is not None:
-                nu_v = speed[e] - x[:, VELOCITY]
-                S_v = spread[:, VELOCITY] + speed_noise[e]
-                velocity_innovations[e] = np.where(active[:, None], nu_v, np.nan)
-                velocity_variances[e] = np.where(active[:, None], S_v, np.nan)
-                outside_v = (nu_v * nu_v > velocity_gate2 * S_v).any(axis=1) & gated
-                taken_v = (action[e] == FUSE) & fuses_velocity & ~outside_v
-                fusion = fusion._replace(velocity_s=np.where(taken_v, now_s[e], fusion.velocity_s))
-            if quiet[e] and not (stopped or outside.any()):
-                fusion = fusion._replace(last_s=now_s[e])
-                fused[e], R[:, 2:] = True, noise[e, :, :2]
-            else:
-                known = _Sample(
-                    action[e], startable[e], now_s[e], gated, as_logged, logged[e], logged_reset[e]
-                )
-                rejected[e], fused[e], reset[e], fusion = _decide(
-                    inputs.rules, known, outside, fusion
-                )
-                restart, stopped = reset[e], bool(fusion.stopped.any())
-                R[fused[e], 2:] = noise[e, fused[e], :2]
-            if speed is not None:
-                if restart is not None:
-                    taken_v &= ~restart
+            nu = measured[e] - x[:, TOLD]
+            S = spread[:, TOLD] + noise[e]
+            innovations[e], variances[e] = np.where(active[e, :, None], (nu, S), np.nan)
+            outside = nu * nu > gate2 * S
+            moving = fuses_velocity & ~(outside[:, SPEED].any(axis=1) & gated)
+            outside = outside[:, LEVEL].any(axis=1)
+            rejected[e], fused[e], reset[e], moving = fusion.decide(e, outside, moving)
+            if in_turn:
                 P = _surer(P, own_attitude[e, :, :HEADING])
-                x, P = _in_turn(x, P, nu_v, S_v, speed_noise[e], VELOCITY.start, taken_v)
-                x, P = _in_turn(x, P, nu, S, noise[e, :, :2], NORTH, fused[e])
-                innovation[:, 2:], R[:, 2:] = 0.0, NOT_TAKEN
+                x, P = _in_turn(x, P, nu, S, noise[e], SPEED, moving)
+                x, P = _in_turn(x, P, nu, S, noise[e], LEVEL, fused[e])
                 spread = _diagonal(P)
+            else:
+                innovation[:, 2:] = nu[:, LEVEL]
+                R[fused[e], 2:] = noise[e, fused[e], LEVEL]
         np.subtract(own[e], x[:, OWN], out=innovation[:, :2])
         R[:, :2] = _down_to(spread[:, OWN], own_variance[e])
         heading_gain[e] = spread[:, HEADING] / (spread[:, HEADING] + R[:, 0])
@@ -278,8 +250,8 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
         if inputs.vision_height:
             R[:, 1] = NOT_TAKEN
             if sampled[e]:
-                innovation[:, 1] = measured[e, :, 2] - x[:, DOWN]
-                R[:, 1] = np.where(active, noise[e, :, 2], NOT_TAKEN)
+                innovation[:, 1] = nu[:, 5]
+                R[:, 1] = np.where(active[e], noise[e, :, 5], NOT_TAKEN)
         # K = PH'(HPH' + R)⁻¹, x = x + Kν, P = P - KHP
         HP = np.take(P, MEASURED, axis=1)
         HPH = np.take(HP, MEASURED, axis=2)
@@ -289,23 +261,24 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
         x[:, HEADING] = heading
         P = P - K @ HP
         P = 0.5 * (P + np.swapaxes(P, 1, 2))
-        if restart is not None and restart.any():
-            x[restart, HORIZONTAL] = measured[e, restart, :2]
-            P[restart, :, HORIZONTAL] = 0.0
-            P[restart, HORIZONTAL, :] = 0.0
-            P[restart, NORTH, NORTH] = inputs.rules.reset_scale * noise[e, restart, 0]
-            P[restart, EAST, EAST] = inputs.rules.reset_scale * noise[e, restart, 1]
-            if speed is not None and inputs.rules.with_velocity:
-                x[restart, VELOCITY] = speed[e, restart]
-                P[restart, :, VELOCITY] = 0.0
-                P[restart, VELOCITY, :] = 0.0
-                P[restart, VELOCITY, VELOCITY] = np.eye(3) * speed_noise[e, restart, :, None]
+        if reset[e].any():
+            after = inputs.rules.reset_scale * noise[e, :, LEVEL]
+            _set(x, P, reset[e], HORIZONTAL, measured[e, :, LEVEL], after)
+            if in_turn and inputs.rules.with_velocity:
+                _set(x, P, reset[e], VELOCITY, measured[e, :, SPEED], noise[e, :, SPEED])
         states[e + 1], spreads[e + 1] = x, _diagonal(P)
     return Run(
         stretch, tuple(variants), tuple(each.events for each in intervals), innovations, variances,
-        noise[:, :, :2], velocity_innovations, velocity_variances, rejected, fused, reset, told_rad,
-        heading_gain, states, spreads, P,
+        noise, rejected, fused, reset, told_rad, heading_gain, states, spreads, P,
     )  # fmt: skip
+
+
+def _set(x: Array, P: Array, which: BoolArray, rows: slice, value: Array, variance: Array) -> None:
+    """Set some states of some variants to what was measured, with its variance."""
+    x[which, rows] = value[which]
+    P[which, :, rows] = 0.0
+    P[which, rows, :] = 0.0
+    P[which, rows, rows] = np.eye(value.shape[1]) * variance[which][:, :, None]
 
 
 def _surer(P: Array, target: Array) -> Array:
@@ -323,15 +296,15 @@ def _surer(P: Array, target: Array) -> Array:
 
 
 def _in_turn(
-    x: Array, P: Array, nu: Array, S: Array, R: Array, first: int, taken: BoolArray
+    x: Array, P: Array, nu: Array, S: Array, R: Array, part: slice, taken: BoolArray
 ) -> tuple[Array, Array]:
-    """Fuse states one after the other, by the innovations and S of before the first of them.
+    """Fuse a part of a sample one after the other, by innovations and S of before the first.
 
     As fuseDirectStateMeasurement (``ekf_helper.cpp``), in Joseph's form, which bears a gain that is
     not the optimal one.
     """
-    for j in range(nu.shape[1]):
-        row = first + j
+    for j in range(part.start, part.stop):
+        row = TOLD.start + j
         K = np.where(taken[:, None], P[:, :, row] / S[:, j, None], 0.0)
         x = x + K * nu[:, j, None]
         A = P - K[:, :, None] * P[:, None, row]
@@ -341,56 +314,67 @@ def _in_turn(
     return x, P
 
 
-@dataclass(frozen=True)
-class _Sample:
-    """What is known of a sample before it is fused: for each variant, and by the log."""
+@dataclass
+class _Fusion:
+    """Which variants reject a sample, fuse it or are reset to it, one event after the other.
 
+    As updateEvPosFusion and startEvPosFusion (``ev_pos_control.cpp``): after a time without fusion
+    a reset, some of them in a row, then a stop until a sample on which fusion may start. Arrays are
+    of shape (E, S), (S,) or (E,); ``rejected`` and ``reset`` are what the log tells of EKF2.
+    """
+
+    rules: Rules
+    began_s: float
     action: IntArray
     startable: BoolArray
     time_s: Array
     gated: BoolArray
     as_logged: BoolArray
-    rejected: float
-    reset: bool
+    rejected: Array
+    reset: BoolArray
 
+    def __post_init__(self) -> None:
+        size = len(self.gated)
+        # last fusion of position and of velocity, whether stopped, resets left
+        self.last_s, self.velocity_s = np.full((2, size), self.began_s)
+        self.stopped, self.left = np.zeros(size, bool), np.full(size, self.rules.resets)
+        # every variant fuses, unless its gate says otherwise
+        self.usual = (self.action == FUSE).all(axis=1) & ~self.reset & ~(self.rejected > 0.0)
 
-class _Fusion(NamedTuple):
-    """Of each variant: last fusion of position and of velocity, whether stopped, resets left."""
+    def decide(
+        self, e: int, outside: BoolArray, moving: BoolArray
+    ) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
+        """Whose sample is rejected, fused, reset to, and whose velocity is fused.
 
-    last_s: Array
-    velocity_s: Array
-    stopped: BoolArray
-    left: IntArray
-
-
-def _decide(
-    rules: Rules, sample: _Sample, outside: BoolArray, fusion: _Fusion
-) -> tuple[BoolArray, BoolArray, BoolArray, _Fusion]:
-    """Which variants reject a sample, fuse it, or reset their position to it.
-
-    As updateEvPosFusion and startEvPosFusion (``ev_pos_control.cpp``): after a time without fusion
-    a reset, some of them in a row, then a stop until a sample on which fusion may start.
-    """
-    action, now, gated, obeys = sample.action, sample.time_s, sample.gated, sample.as_logged
-    known = math.isfinite(sample.rejected)
-    beyond = np.where(obeys & known, sample.rejected > 0.0, outside) & gated & (action == FUSE)
-    taken = (action == FUSE) & ~beyond & ~fusion.stopped
-    starting = gated & ((action == START) | (fusion.stopped & sample.startable))
-    silent_s = now - fusion.last_s
-    failing = beyond & ~fusion.stopped & (silent_s > rules.reset_s)
-    if rules.with_velocity:
-        both = now - fusion.velocity_s > rules.reset_s
-        failing &= both | (silent_s > 2.0 * rules.reset_s)
-    restart = starting | (failing & (fusion.left > 0))
-    if known or sample.reset:
-        restart = np.where(obeys, gated & sample.reset, restart)
-        taken &= ~restart
-        failing &= ~obeys
-    last_s = np.where(taken | restart, now, fusion.last_s)
-    velocity_s = np.where(restart, now, fusion.velocity_s)
-    stopped = (fusion.stopped & ~starting) | (failing & (fusion.left == 0))
-    left = np.where(starting, rules.resets, fusion.left - (failing & (fusion.left > 0)))
-    return beyond, taken, restart, _Fusion(last_s, velocity_s, stopped, left)
+        ``outside`` is outside the gate, ``moving`` has a velocity within its own.
+        """
+        rules, now_s, action = self.rules, self.time_s[e], self.action[e]
+        gated, obeys = self.gated, self.as_logged
+        fusing, told = action == FUSE, math.isfinite(self.rejected[e])
+        moving = moving & fusing
+        self.velocity_s = np.where(moving, now_s, self.velocity_s)
+        if self.usual[e] and not (outside.any() or self.stopped.any()):
+            self.last_s = now_s
+            return outside, fusing, outside, moving
+        beyond = np.where(obeys & told, self.rejected[e] > 0.0, outside) & gated & fusing
+        taken = fusing & ~beyond & ~self.stopped
+        starting = gated & ((action == START) | (self.stopped & self.startable[e]))
+        silent_s = now_s - self.last_s
+        failing = beyond & ~self.stopped & (silent_s > rules.reset_s)
+        if rules.with_velocity:
+            both = now_s - self.velocity_s > rules.reset_s
+            failing &= both | (silent_s > 2.0 * rules.reset_s)
+        restart = starting | (failing & (self.left > 0))
+        if told or self.reset[e]:
+            restart = np.where(obeys, gated & self.reset[e], restart)
+            taken &= ~restart
+            failing &= ~obeys
+        self.last_s = np.where(taken | restart, now_s, self.last_s)
+        self.velocity_s = np.where(restart, now_s, self.velocity_s)
+        self.stopped = (self.stopped & ~starting) | (failing & (self.left == 0))
+        left = self.left - (failing & (self.left > 0))
+        self.left = np.where(starting, rules.resets, left)
+        return beyond, taken, restart, moving & ~restart
 
 
 def _drift(
@@ -473,33 +457,22 @@ def _measurements(
     knob: dict[str, Array],
     reported: BoolArray,
 ) -> tuple[Array, Array]:
-    """Measured position and its variance, both of shape (E, S, 3)."""
+    """Measured velocity and position and their variances, both of shape (E, S, 6)."""
     received, aid = inputs.received, inputs.aid
-    size = len(knob[aid.noise])
-    offset = np.stack([knob[name] for name in aid.place], -1) - inputs.imu_offset_m
-    position = np.repeat(received.position_m[sample][:, None], size, axis=1)
-    if offset.any():
-        position = position - (stretch.rotation[end] @ offset[:, :, None])[:, :, :, 0]
-    least = np.maximum(knob[aid.noise], MIN_POSITION_SD_M)[:, None] ** 2
+    offset_m = (np.stack([knob[name] for name in aid.place], -1) - inputs.imu_offset_m)[:, :, None]
+    measured, noise = np.full((2, len(end), len(offset_m), 6), np.nan)
+    lever = (stretch.rotation[end] @ offset_m)[..., 0]
+    measured[..., 3:] = received.position_m[sample][:, None] - lever
     if aid.noise_mode:
         reported = reported & (knob[aid.noise_mode] != 1.0)
     stated = np.where(reported[:, None], received.variance_m2[sample][:, None], 0.0)
-    return position, np.maximum(stated, least)
-
-
-def _velocities(
-    inputs: Inputs, stretch: Stretch, sample: IntArray, end: IntArray, knob: dict[str, Array]
-) -> tuple[Array | None, Array]:
-    """Measured velocity and its variance, both of shape (E, S, 3); None where none is fused."""
-    received = inputs.received
-    if received.velocity_m_s is None or received.velocity_variance_m2_s2 is None:
-        return None, np.empty(0)
-    size = len(knob[GNSS_VEL.noise])
-    velocity = np.repeat(received.velocity_m_s[sample][:, None], size, axis=1)
-    offset = np.stack([knob[name] for name in inputs.aid.place], -1) - inputs.imu_offset_m
-    if offset.any():  # the antenna's own, as the vehicle turns
+    noise[..., 3:] = np.maximum(stated, np.maximum(knob[aid.noise], MIN_SD)[:, None] ** 2)
+    if received.velocity_m_s is not None and received.velocity_variance_m2_s2 is not None:
+        # the antenna's own, as the vehicle turns
         turned = np.diff(stretch.rotation, axis=0)[end - 1] / stretch.step_s[end - 1, None, None]
-        velocity = velocity - (turned @ offset[:, :, None])[:, :, :, 0]
-    stated = received.velocity_variance_m2_s2[sample][:, None]
-    least = np.maximum(knob[GNSS_VEL.noise], MIN_POSITION_SD_M)[:, None] ** 2
-    return velocity, np.maximum(stated, least) * VERTICAL_SCALE
+        lever = (turned @ offset_m)[..., 0]
+        measured[..., :3] = received.velocity_m_s[sample][:, None] - lever
+        stated = received.velocity_variance_m2_s2[sample][:, None]
+        least = np.maximum(knob[GNSS_VEL.noise], MIN_SD)[:, None] ** 2
+        noise[..., :3] = np.maximum(stated, least) * VERTICAL_SCALE
+    return measured, noise

@@ -1,13 +1,29 @@
-"""What a replay of EKF2 gives, and how well one agrees with the log."""
+"""What a replay of EKF2 gives, and whether it agrees with the log, so that it may be believed."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
 import pandas as pd
+from msgspec.structs import replace
+from numpy.typing import ArrayLike
 
+from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
-from px4fuse.flight import AxisName, Unavailable
+from px4fuse.ekf2.inputs import aid_source, replayed_aid, same_sample
+from px4fuse.ekf2.stretches import SETTLING_S
+from px4fuse.ekf2_parameters import GNSS_POS
+from px4fuse.filter import signals
+from px4fuse.flight import (
+    POSITION_COLUMNS,
+    VELOCITY_COLUMNS,
+    AxisName,
+    Ekf2,
+    Flight,
+    Truth,
+    Unavailable,
+)
 from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
 
 Spans = tuple[Span, ...]
@@ -22,6 +38,23 @@ VELOCITY_UPDATE_COLUMNS = [
     "innovation_north_m_s", "innovation_east_m_s", "innovation_variance_north_m2_s2",
     "innovation_variance_east_m2_s2",
 ]  # fmt: skip
+MIN_SAMPLES = 20
+# The older topics repeat a sample until the next fusion, with the time of a later step
+MAX_REPEAT_S = 0.5
+# Measured on simulated flights of v1.13 to main: where the log is complete the correlation is
+# above 0.997 and the median ratio of S within 0.3 %; with a decimated source or with an IMU with
+# dropouts S is off by more than 5 % or the correlation below 0.9 (tests/benchmarks/bench_ekf2.py)
+MIN_CORRELATION = 0.95
+MAX_S_OFF = 0.05
+# Of the position that EKF2 publishes; there it is within 0.013 m
+MAX_PUBLISHED_OFF_M = 0.10
+# Where EKF2 rejects much, one sample on the edge of the gate decides the next ones: then shares
+# and mean NIS must agree, and single samples when the model rejects what EKF2 rejected
+REJECTING_SHARE = 0.1
+MAX_REJECTED_OFF = 0.05
+MAX_NIS_OFF = 0.25
+# What is published by a filter that rejects most of its samples wanders further
+REJECTING_LOOSER = 3.0
 
 
 class AxisAgreement(Record, frozen=True, kw_only=True):
@@ -156,3 +189,210 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
     published: pd.DataFrame
 
     __repr__ = brief
+
+    @property
+    def judged_s(self) -> Spans:
+        """Parts that are judged: each stretch without its beginning."""
+        return tuple((start + SETTLING_S, end) for start, end in self.stretches_s)
+
+
+def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavailable:
+    """Compare a replay as flown with EKF2's logged innovations and published state.
+
+    Parameters
+    ----------
+    flight : Flight
+    replay : Ekf2Replay
+        With the log's own parameters.
+    """
+    ekf2 = flight.ekf2
+    assert isinstance(ekf2, Ekf2)
+    log, model = _matched(replay, ekf2, logged_innovations(ekf2))
+    if len(log) < MIN_SAMPLES:
+        return Unavailable(
+            "EKF2 replay",
+            f"{len(log)} logged innovations to compare with are too few (at least {MIN_SAMPLES})",
+            "Fly longer on external vision, and record with SDLOG_PROFILE bit 0 (default).",
+        )
+    columns = [f"innovation_{axis}_m" for axis in HORIZONTAL]
+    if not (np.ptp(log[columns], axis=0).all() and np.ptp(model[columns], axis=0).all()):
+        return Unavailable(
+            "EKF2 replay",
+            "the innovations do not vary, so that nothing tells whether they agree",
+            "Record a flight with motion and measured positions.",
+        )
+    axes: dict[str, AxisAgreement]
+    axes = {axis: _axis(axis, log, model, ekf2, replay) for axis in HORIZONTAL}
+    north, east = axes["north"], axes["east"]
+    by_log, by_model = (frame["rejected"].to_numpy() > 0 for frame in (log, model))
+    shares = float(by_log.mean()), float(by_model.mean())
+    good, reason = _verdict(axes, *shares)
+    on_gnss = replayed_aid(ekf2) == GNSS_POS
+    apart_m = np.hypot(north.position_rms_difference_m, east.position_rms_difference_m)
+    return Agreement(
+        north=north,
+        east=east,
+        ev_pos={} if on_gnss else axes,
+        gnss_pos=axes if on_gnss else {},
+        gnss_vel=_velocity(ekf2, replay),
+        samples=len(log),
+        rejected_share_logged=shares[0],
+        rejected_share_replayed=shares[1],
+        decisions_same=float(np.mean(by_log == by_model)),
+        published_rms_difference_m=float(apart_m),
+        good=good,
+        reason=reason,
+    )
+
+
+def _velocity(ekf2: Ekf2, replay: Ekf2Replay) -> dict[str, AxisAgreement]:
+    """Agreement of the velocity of GNSS; empty where it is not fused or not logged."""
+    log = ekf2.aids.get("gnss_vel")
+    if log is None or VELOCITY_UPDATE_COLUMNS[0] not in replay.updates:
+        return {}
+    logged, model = _matched(replay, ekf2, log.samples)
+    if len(logged) < MIN_SAMPLES:
+        return {}
+    # under the names of a position's
+    names = dict(zip(VELOCITY_UPDATE_COLUMNS, UPDATE_COLUMNS, strict=False))
+    parts = ("innovation_north", "innovation_east", "variance_north", "variance_east")
+    logged = logged.rename(columns=dict(zip(parts, UPDATE_COLUMNS, strict=False)))
+    model = model[VELOCITY_UPDATE_COLUMNS].rename(columns=names)
+    return {axis: _axis(axis, logged, model, ekf2, replay) for axis in HORIZONTAL}
+
+
+def _matched(
+    replay: Ekf2Replay, ekf2: Ekf2, logged: pd.DataFrame
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """The logged innovations that are judged, and the replay's updates of the same samples."""
+    matched = match(replay, ekf2, logged.index.to_numpy())
+    use = (matched >= 0) & settled(logged.index, replay.judged_s)
+    return logged[use], replay.updates.iloc[matched[use]]
+
+
+def logged_innovations(ekf2: Ekf2) -> pd.DataFrame:
+    """Innovations, variances and rejections of north and east, one row per logged sample."""
+    parts = {}
+    for axis in HORIZONTAL:
+        frame = ekf2.innovations[axis]
+        if isinstance(frame, Unavailable):
+            return pd.DataFrame()
+        parts[f"innovation_{axis}_m"] = frame["innovation_m"]
+        parts[f"innovation_variance_{axis}_m2"] = frame["innovation_variance_m2"]
+        parts["rejected"] = frame["rejected"]
+    return pd.DataFrame(parts).dropna()
+
+
+def settled(times_s: ArrayLike, judged: Spans) -> BoolArray:
+    """Which times lie in one of some spans."""
+    times = np.asarray(times_s)
+    return np.asarray(np.any([(times > a) & (times < b) for a, b in judged], axis=0))
+
+
+def match(replay: Ekf2Replay, ekf2: Ekf2, times: Array) -> IntArray:
+    """Row of the replay's updates of each logged innovation; -1 where there is none."""
+    if aid_source(replayed_aid(ekf2)) in ekf2.innovation_topics:
+        return same_sample(replay.updates.index.to_numpy(), times)
+    fused_at = replay.updates["fused_at_s"].to_numpy()
+    at = np.searchsorted(fused_at, times + 1e-4, side="right") - 1
+    age = times - fused_at[np.maximum(at, 0)]
+    return np.where((at >= 0) & (age <= MAX_REPEAT_S), at, -1)
+
+
+def _axis(
+    axis: str, log: pd.DataFrame, model: pd.DataFrame, ekf2: Ekf2, replay: Ekf2Replay
+) -> AxisAgreement:
+    nu, nu_log = (f[f"innovation_{axis}_m"].to_numpy() for f in (model, log))
+    s, s_log = (f[f"innovation_variance_{axis}_m2"].to_numpy() for f in (model, log))
+    low, middle, high = np.percentile(s / s_log, [5, 50, 95])
+    times = ekf2.state.index[settled(ekf2.state.index, replay.judged_s)].to_numpy()
+    direction = np.eye(3)[HORIZONTAL.index(axis)]
+    position, velocity = (
+        along(replay.published, columns, direction, times)
+        - along(ekf2.state, columns, direction, times)
+        for columns in (POSITION_COLUMNS, VELOCITY_COLUMNS)
+    )
+    return AxisAgreement(
+        innovation_correlation=float(np.corrcoef(nu, nu_log)[0, 1]),
+        innovation_rms_difference=rms(nu - nu_log),
+        s_ratio_median=float(middle),
+        s_ratio_p5=float(low),
+        s_ratio_p95=float(high),
+        nis_mean_logged=float(np.mean(nu_log**2 / s_log)),
+        nis_mean_replayed=float(np.mean(nu**2 / s)),
+        position_rms_difference_m=rms(position),
+        velocity_rms_difference_m_s=rms(velocity),
+    )
+
+
+def along(frame: pd.DataFrame, columns: list[str], direction: Array, times: Array) -> Array:
+    """North and east columns of a time-indexed frame, interpolated, along a direction."""
+    summed = signals.along(frame, columns[:2], direction[:2])
+    return np.asarray(np.interp(times, frame.index, summed))
+
+
+def rms_to_truth(flight: Flight, position: Array, direction: Array, times: Array) -> float | None:
+    """Error of a horizontal position (m, RMS) in the truth's span; None where there is no truth."""
+    if not isinstance(flight.truth, Truth):
+        return None
+    truth = flight.truth.samples.dropna(subset=POSITION_COLUMNS[:2])
+    inside = (times >= truth.index[0]) & (times <= truth.index[-1])
+    error = (position - along(truth, POSITION_COLUMNS, direction, times))[inside]
+    return rms(error) if len(error) else None
+
+
+def rms(values: Array) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _verdict(
+    axes: Mapping[str, AxisAgreement],
+    logged_share: float,
+    replayed_share: float,
+    looser: float = 1.0,
+) -> tuple[bool, str]:
+    """Whether a replay may be believed, and why or why not; ``looser`` is what it publishes."""
+    ratio = max((axis.s_ratio_median for axis in axes.values()), key=lambda s: abs(s - 1.0))
+    if abs(ratio - 1.0) > MAX_S_OFF:
+        return False, (
+            f"the replayed innovation variance is {ratio:.2f} of the logged one (at most "
+            f"{MAX_S_OFF:.0%} off): EKF2 had other samples than the log holds"
+        )
+    worst = min(axis.innovation_correlation for axis in axes.values())
+    correlated = f"replayed and logged innovations correlate by {worst:.4f}"
+    if worst >= MIN_CORRELATION:
+        off_m = max(axis.position_rms_difference_m for axis in axes.values())
+        most_m = looser * MAX_PUBLISHED_OFF_M
+        if off_m > most_m:
+            return False, (
+                f"the innovations agree, but what is published is {off_m:.2f} m off the log (RMS; "
+                f"at most {most_m:g} m): EKF2's output is not of this filter alone"
+            )
+        return True, f"{correlated} or better"
+    if max(logged_share, replayed_share) < REJECTING_SHARE:
+        return False, f"{correlated} only (at least {MIN_CORRELATION:g})"
+    off = abs(replayed_share - logged_share)
+    nis = max(abs(a.nis_mean_replayed / a.nis_mean_logged - 1.0) for a in axes.values())
+    words = (
+        f"{replayed_share:.1%} of the samples are rejected, {logged_share:.1%} in the log, and "
+        f"mean NIS differs by {nis:.0%}"
+    )
+    if off > MAX_REJECTED_OFF or nis > MAX_NIS_OFF:
+        return False, f"{words} (at most {MAX_REJECTED_OFF:.0%} and {MAX_NIS_OFF:.0%} are allowed)"
+    return True, f"{words}; single samples part, since each rejection decides the next"
+
+
+def with_obedient(agreement: Agreement, obedient: Agreement) -> Agreement:
+    """The verdict where EKF2 rejects much: of a replay that rejects what EKF2 rejected.
+
+    By its own gate the replay parts from the log where one sample lies on the edge, and each
+    rejection decides the next; that says nothing of the filter.
+
+    Parameters
+    ----------
+    agreement, obedient : Agreement
+        Of the replay by its own gate, and of the other.
+    """
+    good, reason = _verdict(obedient.axes, 0.0, 0.0, REJECTING_LOOSER)
+    return replace(agreement, good=good, reason=f"with EKF2's own rejections, {reason}")

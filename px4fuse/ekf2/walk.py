@@ -23,10 +23,9 @@ import pandas as pd
 
 from px4fuse.arrays import Array
 from px4fuse.display import Shown
-from px4fuse.ekf2.agreement import along, at_times, judged_from, rms_to_truth, settled
 from px4fuse.ekf2.model import Model, delayed_variants
 from px4fuse.ekf2.recursion import Variant
-from px4fuse.ekf2.replay import Ekf2Replay, Spans
+from px4fuse.ekf2.replay import Ekf2Replay, Spans, along, rms_to_truth, settled
 from px4fuse.ekf2_parameters import GNSS_POS
 from px4fuse.filter.kalman import Replay, state_at
 from px4fuse.filter.settings import Settings
@@ -196,7 +195,7 @@ def walk(
     assert isinstance(ekf2, Ekf2)
     variants = _variants(model, settings or Settings())
     delayed, flown = delayed_variants(model, list(variants.values()))
-    judged, times = judged_from(model.flown), ekf2.state.index.to_numpy()
+    judged, times = model.flown.judged_s, ekf2.state.index.to_numpy()
     inside = settled(times, judged)
     # all stages have the replay's times
     for index in (flown.delayed.index, *(run.steps.index for run in (runs or {}).values())):
@@ -325,7 +324,7 @@ def _coast(
     begin, end = time[starts[longest]], time[min(ends[longest], len(time) - 1)]
     part = flown.delayed.loc[begin:end]
     apart = [
-        part[column].to_numpy() - at_times(ungated, column, part.index.to_numpy())
+        part[column] - np.interp(part.index, ungated.index, ungated[column])
         for column in POSITION_COLUMNS[:2]
     ]
     return Coast(

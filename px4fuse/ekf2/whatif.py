@@ -15,15 +15,23 @@ from msgspec.structs import replace
 
 from px4fuse.arrays import Array
 from px4fuse.display import Shown
-from px4fuse.ekf2.agreement import at_times, judged_from, logged_innovations, rms_to_truth, settled
 from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.ekf2.model import Model, disturbed, replay_settings
-from px4fuse.ekf2.replay import HORIZONTAL, Agreement, Ekf2Replay, Spans
+from px4fuse.ekf2.replay import (
+    HORIZONTAL,
+    Agreement,
+    Ekf2Replay,
+    Spans,
+    along,
+    logged_innovations,
+    rms_to_truth,
+    settled,
+)
 from px4fuse.ekf2_parameters import GNSS_POS, check
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.heading import heading_rad
-from px4fuse.flight import Ekf2, Flight, Unavailable
+from px4fuse.flight import POSITION_COLUMNS, Ekf2, Flight, Unavailable
 from px4fuse.record import Count, NotNegative, Record, Share
 
 WHAT = "EKF2 what-if"
@@ -173,11 +181,10 @@ def what_if(model: Model, settings: Sequence[Mapping[str, float]]) -> WhatIf | U
     SettingsError
         A parameter that the model does not have, or a value outside PX4's range.
     """
-    checked = [check(change) for change in settings]
     if not model.agreement.good:
         return model.agreement.doubted(WHAT)
-    replays = replay_settings(model, checked)
-    flight, judged = model.flight, judged_from(model.flown)
+    replays = replay_settings(model, settings)
+    flight, judged = model.flight, model.flown.judged_s
     return WhatIf(
         agreement=model.agreement,
         logged=_of_log(flight, model.flown, judged),
@@ -319,9 +326,10 @@ def _summary(
             sigma = logged
         else:
             at = logged.index[settled(logged.index, judged)].to_numpy()
-            stated = at_times(logged if variance is None else variance, f"{axis}_m2", at)
+            known = logged if variance is None else variance
+            stated = np.interp(at, known.index, known[f"{axis}_m2"])
             sigma = float(np.sqrt(np.median(stated)))
-        position = at_times(published, f"{axis}_m", times)
+        position = along(published, POSITION_COLUMNS, direction, times)
         error = rms_to_truth(flight, position, direction, times)
         axes[axis] = AxisSummary(
             nis_mean=float(np.mean(nu**2 / s)),

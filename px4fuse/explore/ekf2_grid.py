@@ -15,10 +15,9 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.ekf2.agreement import along, judged_from, rms_to_truth, settled
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, replay_settings
-from px4fuse.ekf2.replay import HORIZONTAL, Ekf2Replay
+from px4fuse.ekf2.replay import HORIZONTAL, Ekf2Replay, along, rms_to_truth, settled
 from px4fuse.ekf2.whatif import MOST_REJECTED
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.explore.packing import Packer
@@ -101,7 +100,7 @@ def _case(
     packer: Packer,
 ) -> dict[str, Any]:
     """One stop: north and east as drawn, and the numbers of each horizontal axis."""
-    judged = judged_from(model.flown)
+    judged = model.flown.judged_s
     used = replay.updates[settled(replay.updates.index.to_numpy(), judged)]
     shown = within(replay.updates, analysis.segment)
     drawn = shown.iloc[::every]

@@ -29,7 +29,7 @@ from px4fuse.ekf2.intervals import (
 )
 from px4fuse.ekf2.model import delayed_states, run_variants
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
-from px4fuse.ekf2.recursion import EAST, HEADING, NORTH, Run, Variant
+from px4fuse.ekf2.recursion import EAST, HEADING, LEVEL, NORTH, Run, Variant
 from px4fuse.ekf2.stretches import Stretch, down_sampled, step_ends
 from px4fuse.ekf2_parameters import GNSS_POS, GNSS_VEL, settings_in_force
 from px4fuse.simulation import sensors
@@ -301,7 +301,7 @@ def _held(done: Run, state: Array) -> tuple[list[tuple[int, Array]], BoolArray]:
     resets = []
     for event in np.flatnonzero(run.reset[:, 0]):
         step = int(events.end[event])
-        jump = run.innovation_m[event, 0]
+        jump = run.innovation[event, 0, LEVEL]
         if not aided[step - 1]:
             jump = state[step, horizontal] - state[step - 1, horizontal]
         resets.append((step, jump))

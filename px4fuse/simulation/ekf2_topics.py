@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.intervals import POSITION, STATES
-from px4fuse.ekf2.recursion import EAST, NORTH, VERTICAL_SCALE, Run
+from px4fuse.ekf2.recursion import EAST, LEVEL, NORTH, Run
 from px4fuse.ekf2_parameters import GNSS_POS, GNSS_VEL, Aid
 from px4fuse.readers.px4_positions import unproject
 from px4fuse.simulation import sensors
@@ -138,8 +138,8 @@ def _aid_sources(inputs: Inputs, done: Run, track: TopicTrack, rate_hz: float) -
     shown = sensors.stamps(taken_us, later_us)
     measured = received.position_m[sample, :2]
     north, east = measured.T
-    innovation, variance = run.innovation_m[seen, 0], run.variance_m2[seen, 0]
-    noise = run.noise_m2[seen, 0]
+    told = (run.innovation, run.innovation_variance, run.noise)
+    innovation, variance, noise = (each[seen, 0, LEVEL] for each in told)
     idle = np.isnan(innovation[:, :1])
     # while it is not fused, against the state that there is
     innovation = np.where(idle, measured - track.delayed[rows][:, POSITION][:, :2], innovation)
@@ -157,12 +157,10 @@ def _aid_sources(inputs: Inputs, done: Run, track: TopicTrack, rate_hz: float) -
         (innovation, variance, noise),
         (run.rejected[seen, 0], run.fused[seen, 0]),
     )
-    if received.velocity_m_s is None or received.velocity_variance_m2_s2 is None:
+    if received.velocity_m_s is None:
         return (position,)
-    moving, spread = run.velocity_innovation_m_s[seen, 0], run.velocity_variance_m2_s2[seen, 0]
-    stated = received.velocity_variance_m2_s2[sample]
-    speed_noise = VERTICAL_SCALE * np.maximum(stated, inputs.settings[GNSS_VEL.noise] ** 2)
-    outside = (moving**2 > inputs.settings[GNSS_VEL.gate] ** 2 * spread).any(axis=1)
+    moving, spread, speed_noise = (each[seen, 0, :3] for each in told)
+    outside = np.any(moving**2 > inputs.settings[GNSS_VEL.gate] ** 2 * spread, axis=1)
     return position, _aid_source(
         GNSS_VEL,
         inputs.settings,

@@ -60,7 +60,7 @@ EQUIVALENT = {
         "numpy.hypot takes a third array for its output",
     ("px4fuse/filter/causes.py", "1.5e-12 * np.eye("): "below rounding, keeps a matrix regular",
     ("px4fuse/trajectory/graph/covariance.py", "_SINGULAR = 1.5"): "below rounding",
-    ("px4fuse/ekf2/agreement.py", ">= MAX_S_OFF"): "no double is 0.05 from 1, exactly",
+    ("px4fuse/ekf2/replay.py", ">= MAX_S_OFF"): "no double is 0.05 from 1, exactly",
 }  # fmt: skip
 
 
