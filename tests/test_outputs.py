@@ -76,7 +76,7 @@ def test_a_name_that_no_font_has_is_said_before_the_report(
     run_main(monkeypatch, capsys, *f"compare l.ulg -o r.pdf --student {name}".split())
     fonts.font_of.cache_clear()
     (before,) = told
-    assert (f"No font of this machine has the Chinese characters {name}" in before) == said
+    assert (f"No font of this machine has the characters {name}" in before) == said
     assert ("Install a font that has them" in before) == said
 
 

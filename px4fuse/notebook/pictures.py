@@ -136,7 +136,7 @@ def evaluation(result: Evaluation, ax: Any = None) -> Any:
     if ax is None:
         _, ax = plt.subplots(2, 1, figsize=(7, 8), layout="constrained")
     path, over_time = ax
-    draw_path(path, result, views(result)[0], path.inset_axes((1.02, 0.0, 0.03, 1.0)))
+    draw_path(path, result, views(result)[0])
     draw_ape(over_time, result, result.time_s - zero_s(result), time_label(result))
     over_time.set_ylabel("APE (m)")
     for each in ax:

@@ -28,8 +28,8 @@ WIDEST = 4.0
 BINS = np.linspace(-WIDEST, WIDEST, 33)
 # Of the normal curve's 0.4: higher bars are cut, so that the curve stays in sight
 HIGHEST = 1.6
-# t of the mean, and p of "white", beyond which a word is said
-LARGE_T, SMALL_P = 2.0, 0.01
+# p of "white" below which a word is said
+SMALL_P = 0.01
 # Heights of the axes in points
 RUNNING, BELOW, LEGEND = 140.0, 150.0, 14.0
 GREY = "#dcdcdc"
@@ -195,12 +195,11 @@ def _nis_words(series: list[Series]) -> str:
 
 
 def _shape_words(series: list[Series]) -> str:
-    said = []
-    for one in series:
-        found, mean = one.statement, "mean near zero"
-        if abs(found.bias_t) >= LARGE_T:
-            mean = f"mean {found.innovation_mean_m:+.3f} m ({p_words(found.bias_p)})"
-        said.append(f"{capital(one.name)}: {found.outside_two_sigma:.1%} beyond 2√S, {mean}.")
+    said = [
+        f"{capital(one.name)}: {one.statement.outside_two_sigma:.1%} beyond 2√S, mean "
+        f"{one.statement.innovation_mean_m:+z.3f} m ({p_words(one.statement.bias_p)})."
+        for one in series
+    ]
     return "\n".join([*said, "4.5% are expected there."])
 
 
@@ -208,11 +207,9 @@ def _white_words(series: list[Series]) -> str:
     said = []
     for one in series:
         r, p = one.statement.lag1_autocorrelation, one.statement.ljung_box_p
-        reading = "white"
-        if p < SMALL_P:
-            reading = "not white"
-            if abs(r) > _bound(one):
-                reading = "it follows too slowly" if r > 0.0 else "it jumps after every measurement"
+        reading = "white" if p >= SMALL_P else "not white"
+        if p < SMALL_P and abs(r) > _bound(one):
+            reading = "it follows too slowly" if r > 0.0 else "it jumps after every measurement"
         said.append(f"{capital(one.name)}: lag 1 {r:+.2f}, Ljung-Box {p_words(p)}: {reading}.")
     return "\n".join(said)
 

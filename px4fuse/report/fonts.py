@@ -6,7 +6,6 @@ needs is a font that has the characters.
 
 from __future__ import annotations
 
-import unicodedata
 from functools import cache
 from pathlib import Path
 
@@ -26,8 +25,6 @@ PREFERRED = (
 BOXES = ("lastresort", "last resort", "blank", "notdef")
 NO_GLYPH = "\N{WHITE SQUARE}"
 MOST_SHOWN = 12
-# First word of Unicode's name of a character, for scripts that people call otherwise
-SCRIPTS = {"CJK": "Chinese", "HIRAGANA": "Japanese", "KATAKANA": "Japanese", "HANGUL": "Korean"}
 
 
 @cache
@@ -58,24 +55,15 @@ def missing(text: str) -> str:
 
 def advice(characters: str) -> str:
     """What to install for :func:`missing` characters, as one sentence or two."""
-    scripts = " and ".join(dict.fromkeys(map(_script, characters)))
     shown = characters[:MOST_SHOWN] + ("…" if len(characters) > MOST_SHOWN else "")
     return (
-        f"No font of this machine has the {scripts} characters {shown}: the report shows "
-        f"{NO_GLYPH} for each. Install a font that has them: Noto Sans for {scripts}, from "
-        "fonts.google.com/noto."
+        f"No font of this machine has the characters {shown}: the report shows {NO_GLYPH} for "
+        "each. Install a font that has them: Noto Sans of their script, from fonts.google.com/noto."
     )
 
 
 def _foreign(text: str) -> list[str]:
     return [c for c in dict.fromkeys(text) if not c.isascii() and c.isprintable()]
-
-
-def _script(character: str) -> str:
-    if unicodedata.category(character).startswith("S"):
-        return "symbol"
-    word = unicodedata.name(character, "unknown").split()[0]
-    return SCRIPTS.get(word, word.capitalize())
 
 
 @cache

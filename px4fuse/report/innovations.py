@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 ZOOM_UPDATES = 15
-ZOOM_RANGE_S = (1.0, 12.0)
-# Of the updates that a zoom of its length can hold, it must hold this share
-ZOOM_FILLED = 0.8
+ZOOM_LEAST_S = 1.0
+# A zoom with gaps is longer than its updates take by this factor at most
+ZOOM_GAPS = 1.25
 START_S = 5.0
 ZOOM_SHARE, ZOOM = 0.66, 125.0  # of the page's width; height of the axes in points
 
@@ -73,21 +73,19 @@ def zoom_window(result: AxisComparison, segment: Segment) -> Span:
 
     Never in a gap of the source, if it has enough updates anywhere.
     """
-    updates = result.replay.updates.index.to_numpy()
-    if len(updates) < 2:
-        return segment.start_s, min(segment.start_s + ZOOM_RANGE_S[0], segment.end_s)
-    interval = float(np.median(np.diff(updates)))
-    length = float(np.clip(ZOOM_UPDATES * interval, *ZOOM_RANGE_S))
-    times = updates
+    times = result.replay.updates.index.to_numpy()
+    if len(times) < 2:
+        return segment.start_s, min(segment.start_s + ZOOM_LEAST_S, segment.end_s)
+    interval = float(np.median(np.diff(times)))
+    count = min(max(ZOOM_UPDATES, round(ZOOM_LEAST_S / interval)), len(times) - 1)
+    spans = times[count:] - times[:-count]
+    middle = float(times[len(times) // 2])
     if isinstance(result.ekf2_innovations, pd.DataFrame) and len(result.ekf2_innovations):
-        times = result.ekf2_innovations.index.to_numpy()
-    last = max(segment.end_s - length, segment.start_s)
-    starts = np.clip(times - length / 2.0, segment.start_s, last)
-    held = np.searchsorted(updates, starts + length) - np.searchsorted(updates, starts)
-    near = np.abs(starts + length / 2.0 - times[len(times) // 2])
-    full = held >= min(ZOOM_FILLED * length / interval, float(held.max()))
-    start = float(starts[np.argmin(np.where(full, near, np.inf))])
-    return start, min(start + length, segment.end_s)
+        middle = float(result.ekf2_innovations.index[len(result.ekf2_innovations) // 2])
+    far = np.abs(times[:-count] + spans / 2.0 - middle)
+    usual = spans <= max(ZOOM_GAPS * count * interval, spans.min())
+    start = np.argmin(np.where(usual, far, np.inf))
+    return float(times[start]), float(times[start + count])
 
 
 def _sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
