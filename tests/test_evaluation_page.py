@@ -16,7 +16,7 @@ from page_tools import every
 from PIL import Image
 from pypdf import PdfReader
 from scipy.spatial.transform import Rotation
-from trajectory_tools import PUBLISHED, flight, moved, published
+from trajectory_tools import flight, moved
 
 from px4fuse.loop.sources import read_source
 from px4fuse.report.evaluation import (
@@ -27,7 +27,6 @@ from px4fuse.report.evaluation import (
     growth_words,
     picture,
     quarters,
-    score_rows,
     time_words,
     views,
 )
@@ -36,7 +35,7 @@ from px4fuse.report.pdf import render
 from px4fuse.report.style import report_style
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
 from px4fuse.trajectory.model import Frame, Trajectory
-from px4fuse.trajectory.scores import Delta, Statistics
+from px4fuse.trajectory.scores import Delta
 
 LOOP = REPOSITORY / "sample_logs" / "loop_vio.ulg"
 DELTAS = (Delta(1.0, "m"), Delta(10.0, "m"))
@@ -160,19 +159,6 @@ def test_the_growth_of_the_rpe_tells_noise_from_drift(kind: str, times: float) -
     assert "A second distance" in growth_words(wrong_by(error).rpe[:1])
 
 
-def test_the_table_holds_the_statistics() -> None:
-    score = sample()
-    rows = {label: cells for label, *cells in score_rows(score)}
-    ate = score.ate.translation_m
-    numbers = (ate.rmse, ate.mean, ate.median, ate.std, ate.max)
-    assert [rows["ATE (m)"][k] for k in (0, 2, 3, 4, 5)] == [f"{x:.4f}" for x in numbers]
-    assert len(rows) == 1 + len(score.rpe)
-    for error in score.rpe:
-        assert isinstance(error.translation_m, Statistics)
-        assert rows[f"RPE {error.delta_words} (m)"][0] == f"{error.translation_m.rmse:.4f}"
-        assert rows[f"RPE {error.delta_words} (m)"][6] == str(error.translation_m.count)
-
-
 # -- what is drawn ---------------------------------------------------------------------------------
 
 
@@ -191,36 +177,6 @@ def test_the_path_is_coloured_by_its_error_and_the_reference_crosses_no_gap() ->
     assert np.diff(score.time_s).max() > 2.0
     assert np.isnan(np.asarray(axes.get_lines()[0].get_ydata())).sum() == 1
     assert axes.get_aspect() == 1.0
-
-
-def test_both_panels_have_the_ape_and_lines_of_its_statistics() -> None:
-    score = sample()
-    for title, along in (("APE over time", score.time_s), ("APE over distance", score.distance_m)):
-        curve, *lines = panel(score, title).get_lines()
-        x, y = np.asarray(curve.get_xdata()), np.asarray(curve.get_ydata())
-        assert np.nanmax(y) == pytest.approx(score.position_error_m.max())
-        assert x[np.nanargmax(y)] == pytest.approx(along[np.argmax(score.position_error_m)])
-        assert np.isnan(y).sum() == 1  # the gap
-        ate = score.ate.translation_m
-        levels = {str(line.get_label()).split()[0]: line.get_ydata()[0] for line in lines}
-        assert levels == {
-            "max": ate.max, "RMSE": ate.rmse, "mean": ate.mean, "median": ate.median,
-        }  # fmt: skip
-
-
-def test_each_delta_has_its_rmse_and_its_interval() -> None:
-    score = sample()
-    axes = panel(score, "RPE per delta")
-    assert [text.get_text() for text in axes.get_xticklabels()] == [
-        e.delta_words for e in score.rpe
-    ]
-    lines = axes.get_lines()
-    assert [line.get_ydata()[0] for line in lines if line.get_marker() == "D"] == [
-        e.translation_m.rmse for e in score.rpe
-    ]
-    assert [tuple(line.get_ydata()) for line in lines if line.get_marker() != "D"] == [
-        (e.interval_m.low, e.interval_m.high) for e in score.rpe
-    ]
 
 
 def test_many_deltas_fill_the_table_and_some_are_named() -> None:
@@ -286,13 +242,3 @@ def test_same_bytes_with_the_results_inside_and_no_date() -> None:
     image = Image.open(io.BytesIO(drawn))
     assert image.size == (1500, 810)
     assert not any("time" in str(key).lower() or "date" in str(key).lower() for key in image.info)
-
-
-@pytest.mark.reallogs
-@pytest.mark.parametrize("pair", PUBLISHED, ids=[name for name, _ in PUBLISHED])
-def test_published_trajectories_are_drawn_on_one_page(pair: tuple[str, str]) -> None:
-    estimate, reference = map(published, pair)
-    score = evaluate(estimate, reference)
-    assert len(PdfReader(io.BytesIO(render(score, "{}"))).pages) == 1
-    text = said(score)
-    assert f"{score.ate.translation_m.rmse:.4f}" in text

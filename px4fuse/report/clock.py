@@ -5,24 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import aid_of, delay_ms
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
 from px4fuse.findings.source_clock import typed_offset_s
 from px4fuse.flight import Unavailable
 from px4fuse.plain import p_words
-from px4fuse.report import marks
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page, legend_above
-from px4fuse.report.style import OURS, OURS_BAND, OURS_LINE
+from px4fuse.report.style import OURS_BAND, OURS_LINE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Heights of the axes in points
-CURVE, PARTS = 170.0, 150.0
+CURVE = 170.0  # height of the axes in points
 # Beyond this the curve tells nothing more
 MAX_DROP = 12.0
 # How many intervals the curve is drawn over, to either side
@@ -113,8 +109,6 @@ def draw(document: Document) -> Iterator[Page]:
     )
     title = "ln of how much less likely each offset is than the best"
     draw_curve(page.panel(title, say, CURVE, above=14.0), clock)
-    if len(clock.parts) > 1:
-        _parts(page, clock, document)
     yield page
 
 
@@ -133,21 +127,3 @@ def draw_curve(axes: Axes, clock: ClockOffset) -> None:
     )
     axes.set_xlabel("offset added to the source's stamps (s)")
     legend_above(axes)
-
-
-def _parts(page: Page, clock: ClockOffset, document: Document) -> None:
-    """Offset of each part of the flight over time."""
-    said = ["Too few parts to compare them."]
-    if clock.change_p is not None:
-        same = "The offset changes" if clock.change_p < CHANGE_P else "One and the same offset fits"
-        said = [f"{same} ({p_words(clock.change_p)} for one throughout)."]
-    said.append("Band: 95 % interval of the whole flight.")
-    title = "Offset of each part of the flight by itself (s)"
-    axes = marks.panel(page, document, title, " ".join(said), PARTS)
-    axes.axhspan(*clock.interval_s, color=OURS_BAND, lw=0)
-    ends = np.array([(part.start_s, part.end_s) for part in clock.parts])
-    axes.errorbar(
-        ends.mean(axis=1), [part.offset_s for part in clock.parts],
-        xerr=np.diff(ends, axis=1)[:, 0] / 2.0, yerr=[1.96 * part.sigma_s for part in clock.parts],
-        fmt="o", color=OURS, ms=4, lw=1.0, capsize=2,
-    )  # fmt: skip

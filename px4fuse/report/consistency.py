@@ -40,11 +40,10 @@ NUMBERS: Mapping[Of, tuple[str, float]] = {
 
 
 class Series(NamedTuple):
-    """Innovations over √S of one filter, how they are drawn, and what they state."""
+    """Innovations over √S of one filter, and what they state."""
 
     name: str
     values: pd.Series[float]
-    line: dict[str, Any]
     statement: Consistency
 
 
@@ -115,12 +114,12 @@ def _series(result: AxisComparison) -> list[Series]:
             values = frame["innovation_m"] / np.sqrt(frame["innovation_variance_m2"])
             known = values[np.isfinite(values)]
             if len(known) >= MIN_INNOVATIONS:
-                series.append(Series(name, known, LINES[name], one))
+                series.append(Series(name, known, one))
     return series
 
 
 def _thin_line(one: Series) -> dict[str, Any]:
-    return {"color": one.line["color"], "lw": 0.6, "ls": (0, (1, 1.5))}
+    return {"color": LINES[one.name]["color"], "lw": 0.6, "ls": (0, (1, 1.5))}
 
 
 def _running(axes: Axes, series: list[Series]) -> None:
@@ -128,7 +127,7 @@ def _running(axes: Axes, series: list[Series]) -> None:
     for one in series:
         number = np.arange(1, len(one.values) + 1)
         running = (one.values**2).cumsum() / number
-        curve(axes, running[2:], **one.line, label=one.name)
+        curve(axes, running[2:], **LINES[one.name], label=one.name)
         shown = np.unique(np.geomspace(3, len(number), 60).astype(int))
         low, high = np.array([nis_band(int(count)) for count in shown]).T
         time = one.values.index[shown - 1]
@@ -151,7 +150,7 @@ def _histogram(axes: Axes, series: list[Series]) -> None:
     highest = 0.4
     for one in series:
         density, _ = np.histogram(one.values.clip(-WIDEST, WIDEST), bins=BINS, density=True)
-        axes.stairs(density, BINS, **one.line, label=one.name)
+        axes.stairs(density, BINS, **LINES[one.name], label=one.name)
         highest = max(highest, float(density.max()))
     axes.set_xlim(-WIDEST, WIDEST)
     axes.set_ylim(0.0, min(1.15 * highest, HIGHEST))
@@ -164,8 +163,8 @@ def _autocorrelation(axes: Axes, series: list[Series]) -> None:
         lags = min(LAGS, len(one.values) // 3)
         r = autocorrelation(np.asarray(one.values, np.float64), lags)
         at = np.arange(1, lags + 1) + shift
-        axes.vlines(at, 0.0, r, color=one.line["color"], lw=1.2)
-        filled = {"mfc": one.line["color"] if one.name == "ours" else "white"}
+        axes.vlines(at, 0.0, r, color=LINES[one.name]["color"], lw=1.2)
+        filled = {"mfc": LINES[one.name]["color"] if one.name == "ours" else "white"}
         axes.plot(at, r, **DOTS[one.name] | filled | {"ms": 3.0, "mew": 0.6}, label=one.name)
         bound = _bound(one)
         if one.name == "ours":

@@ -110,9 +110,6 @@ def facts(document: Document) -> dict[str, str]:
         f"{source.name}: {source.description}, {source.rate_hz:.1f} Hz, {source.frame}; "
         f"{comparison.source_reason}"
     )
-    received = any(part.source == "vehicle_visual_odometry" for part in comparison.missing)
-    if received and source.origin.is_vision:
-        position += ". SDLOG_PROFILE 129 would have logged it as it arrived"
     placed, clock = "", ""
     if source.alignment is not None:
         alignment, clock = source.alignment, source.clock

@@ -14,13 +14,6 @@ from matplotlib.font_manager import FontEntry, FontPath
 
 # Matplotlib's own, always there: Latin, Greek, Cyrillic, Arabic, Hebrew and symbols
 FONT = "DejaVu Sans"
-# Taken before the others that have a character. Those with PostScript outlines come late: they are
-# embedded as if they were TrueType, and not every viewer forgives that
-PREFERRED = (
-    "Noto Sans", "Noto Sans Thai", "Noto Sans Devanagari", "Leelawadee UI", "Thonburi",
-    "Nirmala UI", "Devanagari MT", "Noto Sans SC", "Microsoft YaHei", "Malgun Gothic", "Yu Gothic",
-    "WenQuanYi Zen Hei", "Arial Unicode MS", "Noto Sans CJK SC", "Hiragino Sans GB", "Segoe UI",
-)  # fmt: skip
 # These have a box for every character
 BOXES = ("lastresort", "last resort", "blank", "notdef")
 NO_GLYPH = "\N{WHITE SQUARE}"
@@ -86,11 +79,23 @@ def _others() -> tuple[tuple[str, FontPath], ...]:
 
 
 def _order(entry: FontEntry) -> tuple[object, ...]:
-    rank = PREFERRED.index(entry.name) if entry.name in PREFERRED else len(PREFERRED)
+    """Those of Noto first, then without serifs, then the most regular.
+
+    Those with PostScript outlines come late: they are embedded as if they were TrueType, and not
+    every viewer forgives that.
+    """
     weight = entry.weight if isinstance(entry.weight, int) else 400
     postscript = str(entry.fname).lower().endswith(".otf")
-    sans = "Sans" in entry.name
-    return rank, postscript, not sans, abs(weight - 400), entry.name, str(entry.fname), entry.index
+    noto, sans = entry.name.startswith("Noto Sans"), "Sans" in entry.name
+    return (
+        postscript,
+        not noto,
+        not sans,
+        abs(weight - 400),
+        entry.name,
+        str(entry.fname),
+        entry.index,
+    )
 
 
 @cache

@@ -55,9 +55,7 @@ def draw(document: Document) -> Iterator[Page]:
     factors = np.array([(a, z) for _, a, z in SETTINGS]).T
     run = states(preintegrate(result.axis, settings), *(chosen[:, None] * factors))
     _map(page, document)
-    time = result.axis.measurement_time_s[-len(run.gain) :]
-    velocity = pd.DataFrame(run.velocity_m_s, time)
-    _table(page, result, run, chosen, velocity)
+    _table(page, result, run, chosen)
     yield page
 
 
@@ -154,11 +152,9 @@ def _settled(values: Array) -> Array:
     return np.asarray(np.median(values[len(values) // 2 :], axis=0))
 
 
-def _table(
-    page: Page, result: AxisComparison, run: States, chosen: Array, velocity: pd.DataFrame
-) -> None:
+def _table(page: Page, result: AxisComparison, run: States, chosen: Array) -> None:
     """What each setting claims, beside what it does."""
-    half = slice(len(velocity) // 2, None)
+    half = slice(len(run.gain) // 2, None)
     gains, sigmas, nis = _settled(run.gain), _settled(run.sigma_p_m), run.nis[half].mean(axis=0)
     head = ["", "SIGMA_A (m/s²)", "SIGMA_Z (m)", "gain", "σ_p (m)", "mean NIS"]
     rows = []
@@ -169,10 +165,10 @@ def _table(
     if isinstance(result.truth, pd.DataFrame):
         true = result.truth["velocity_m_s"].dropna()
         if len(true):
-            settled = velocity[half]
-            error = settled.sub(np.interp(settled.index, true.index, true), axis=0)
+            time = result.axis.measurement_time_s[-len(run.gain) :][half]
+            error = run.velocity_m_s[half] - np.interp(time, true.index, true)[:, np.newaxis]
             head.append("v RMSE (m/s)")
-            for row, rmse in zip(rows, np.sqrt((error**2).mean()), strict=True):
+            for row, rmse in zip(rows, np.sqrt((error**2).mean(axis=0)), strict=True):
                 row.append(f"{rmse:.3f}")
     smaller = ""
     if nis[1] > 0.0:  # zero where the positions never change

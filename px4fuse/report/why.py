@@ -124,9 +124,6 @@ def _axis(page: Page, name: str, why: Why, document: Document) -> None:
     for start, end in why.spans_s:
         curve(axes, apart.loc[start:end], **LINES["ours"])
         curve(axes, left_over.loc[start:end], color=EKF2, lw=0.8)
-    if why.coast is not None:
-        end = why.coast.start_s + why.coast.duration_s
-        axes.axvspan(why.coast.start_s, end, color=EKF2_BAND, lw=0, zorder=0.5)
 
 
 def _waterfall(axes: Axes, names: list[str], shares: Array, left: float) -> None:
@@ -154,15 +151,7 @@ def _waterfall(axes: Axes, names: list[str], shares: Array, left: float) -> None
 def _time_words(why: Why) -> str:
     """What to see along the flight."""
     farthest = int(np.argmax(np.abs(why.apart_m)))
-    words = (
-        f"Farthest apart at {why.times_s[farthest]:.1f} s, "
-        f"{abs(why.apart_m[farthest]):.2g} m; the model leaves "
-        f"{np.sqrt(np.mean(why.left_m**2)):.2g} m RMS"
-    )
-    if why.coast is None:
-        return f"{words}."
-    start, length = why.coast.start_s, why.coast.duration_s
     return (
-        f"{words}. EKF2's longest run of rejections, {start:.1f} s to {start + length:.1f} s, "
-        "is shaded."
+        f"Farthest apart at {why.times_s[farthest]:.1f} s, {abs(why.apart_m[farthest]):.2g} m; the "
+        f"model leaves {np.sqrt(np.mean(why.left_m**2)):.2g} m RMS."
     )
