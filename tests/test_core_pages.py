@@ -109,8 +109,9 @@ def test_the_zoom_is_where_the_filter_is_updated() -> None:
     comparison = compare(made)
     start, end = innovations.zoom_window(comparison.main, comparison.segment)
     updates = comparison.main.replay.updates.index
-    assert ((updates >= start) & (updates <= end)).sum() >= 12
-    assert abs((start + end) / 2.0 - 60.0) < 17.0
+    assert ((updates >= start) & (updates <= end)).sum() == innovations.ZOOM_UPDATES + 1
+    assert end - start < 4.0  # beside the gap in the middle, not across it
+    assert abs((start + end) / 2.0 - 60.0) < 12.5
     assert "In the 20." in panels.sigma_words(document(comparison), comparison.main)
 
 

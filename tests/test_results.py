@@ -25,6 +25,7 @@ from px4fuse.results.model import Student
 from px4fuse.results.reading import read_results
 
 ROOT = Path(__file__).parent.parent
+NOTHING = {"what": "noises", "reason": "too short", "remedy": ""}
 
 
 def document(flight: px4fuse.Flight, explained: bool = True, **options: object) -> Document:
@@ -196,6 +197,10 @@ def test_what_is_no_results(given, said):
 def test_what_breaks_the_contract(values, said):
     with pytest.raises(ResultsError, match=f"does not follow the schema.*{said}|{said}"):
         decoded(changed(**values))
+
+
+def test_names_are_cleaned_as_texts_are():
+    assert list(decoded(changed(tuning={"a\u202eb": NOTHING})).tuning) == ["ab"]
 
 
 @pytest.mark.reallogs

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 ZOOM_UPDATES = 15
 ZOOM_LEAST_S = 1.0
-# A zoom with gaps is longer than its updates take by this factor at most
-ZOOM_GAPS = 1.25
 ZOOM = 125.0  # height of the axes in points
 
 
@@ -62,7 +60,7 @@ def _zoom(page: Page, document: Document) -> None:
 def zoom_window(result: AxisComparison, segment: Segment) -> Span:
     """Part of the flight with about fifteen updates, near the middle of what EKF2 logged too.
 
-    Never in a gap of the source, if it has enough updates anywhere.
+    That middle is a measurement, so that the part does not lie in a gap of the source.
     """
     times = result.replay.updates.index.to_numpy()
     if len(times) < 2:
@@ -73,9 +71,7 @@ def zoom_window(result: AxisComparison, segment: Segment) -> Span:
     middle = float(times[len(times) // 2])
     if isinstance(result.ekf2_innovations, pd.DataFrame) and len(result.ekf2_innovations):
         middle = float(result.ekf2_innovations.index[len(result.ekf2_innovations) // 2])
-    far = np.abs(times[:-count] + spans / 2.0 - middle)
-    usual = spans <= max(ZOOM_GAPS * count * interval, spans.min())
-    start = np.argmin(np.where(usual, far, np.inf))
+    start = np.argmin(np.abs(times[:-count] + spans / 2.0 - middle))
     return float(times[start]), float(times[start + count])
 
 
