@@ -20,7 +20,7 @@ from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.loop import Loop
 from px4fuse.notebook.tables import EKF2, tracks, variants
 from px4fuse.report.clock import draw_curve
-from px4fuse.report.evaluation import draw_ape, draw_path, time_label, views, zero_s
+from px4fuse.report.evaluation import draw_ape, draw_path, views
 from px4fuse.report.loop import draw_map
 from px4fuse.report.panels import ERROR, INNOVATIONS, POSITION, SIGMA_P, error_reference
 from px4fuse.report.style import EKF2 as EKF2_COLOUR
@@ -137,7 +137,7 @@ def evaluation(result: Evaluation, ax: Any = None) -> Any:
         _, ax = plt.subplots(2, 1, figsize=(7, 8), layout="constrained")
     path, over_time = ax
     draw_path(path, result, views(result)[0])
-    draw_ape(over_time, result, result.time_s - zero_s(result), time_label(result))
+    draw_ape(over_time, result, *over_time(result))
     over_time.set_ylabel("APE (m)")
     for each in ax:
         each.legend(fontsize="small")

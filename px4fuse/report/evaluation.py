@@ -36,8 +36,6 @@ _AXES: Mapping[Frame, tuple[int, int, int, bool]] = {
 FLAT = 0.1
 # Steps of so many median ones are gaps: no line crosses them
 GAP_STEPS = 10.0
-# and over time those that are this share of it: shorter ones do not show
-GAP_SHARE = 0.01
 PIECES = 1200
 # Axes of errors reach at least this far: rounding is no error to look at
 LEAST_SCALE_M = 1e-3
@@ -122,7 +120,7 @@ def picture(score: Evaluation) -> bytes:
         places["path"].set_title("the path, by its error (APE)")
         draw_path(places["path"], score, views(score)[0])
         places["ape"].set_title("APE over time (m)")
-        draw_ape(places["ape"], score, score.time_s - zero_s(score), time_label(score))
+        draw_ape(places["ape"], score, *over_time(score))
         places["rpe"].set_title("RPE per delta (m), with its 95 % interval")
         _deltas(places["rpe"], score)
         for name in ("path", "ape"):
@@ -190,7 +188,7 @@ def _panels(page: Page, score: Evaluation) -> None:
     """APE over time and over distance; RPE per delta."""
     left, right = halves()
     axes = left.panel("APE over time (m)", "", HEIGHT)
-    draw_ape(axes, score, score.time_s - zero_s(score), time_label(score))
+    draw_ape(axes, score, *over_time(score))
     page.legend(axes.get_legend_handles_labels()[0])
     left.numbers(time_words(score))
     axes = right.panel("APE over distance (m)", "", HEIGHT)
@@ -205,12 +203,18 @@ def _panels(page: Page, score: Evaluation) -> None:
 
 
 def draw_ape(axes: Axes, score: Evaluation, along: Array, label: str) -> None:
-    """APE with its statistics as lines."""
-    _line(axes, along, score.position_error_m, score.time_s, color=OURS, lw=0.8)
+    """APE with its statistics as lines; thinned to its extremes, no gap in time is crossed."""
+    error, low, high = score.position_error_m, float(along[0]), float(along[-1])
+    kept, values = style.thin(along, error, style.MAX_POINTS_NARROW)
+    after = np.searchsorted(kept, along[_gaps(score.time_s)])
+    axes.plot(np.insert(kept, after, np.nan), np.insert(values, after, np.nan), color=OURS, lw=0.8)
     for name, title, looks in STATISTICS:
         value = getattr(score.ate.translation_m, name)
         axes.axhline(value, label=f"{title} {metres(value)}", zorder=3, **looks)
-    _from_zero(axes, along, float(score.position_error_m.max()), label)
+    axes.set(xlim=(low, max(high, low + 1e-6)), xlabel=label)
+    axes.set_ylim(0.0, 1.08 * max(float(error.max()), LEAST_SCALE_M))
+    axes.locator_params(axis="x", nbins=6)
+    axes.locator_params(axis="y", nbins=4)
 
 
 def _deltas(axes: Axes, score: Evaluation) -> None:
@@ -231,31 +235,16 @@ def _known(score: Evaluation) -> list[tuple[PairwiseError, Statistics]]:
     return [(e, e.translation_m) for e in score.rpe if isinstance(e.translation_m, Statistics)]
 
 
-def time_label(score: Evaluation) -> str:
-    """What the axis of time counts from."""
-    return "time from the first pose (s)" if zero_s(score) else "time (s)"
+def over_time(score: Evaluation) -> tuple[Array, str]:
+    """Time of each pose on the page, and what its axis is called."""
+    zero = zero_s(score)
+    return score.time_s - zero, "time from the first pose (s)" if zero else "time (s)"
 
 
-def _from_zero(axes: Axes, along: Array, highest: float, label: str) -> None:
-    axes.set_ylim(0.0, 1.08 * max(highest, LEAST_SCALE_M))
-    axes.set_xlim(float(along[0]), max(float(along[-1]), float(along[0]) + 1e-6))
-    axes.locator_params(axis="x", nbins=6)
-    axes.locator_params(axis="y", nbins=4)
-    axes.set_xlabel(label)
-
-
-def _gaps(time_s: Array, least_s: float = 0.0) -> IntArray:
+def _gaps(time_s: Array) -> IntArray:
     """Indices of the poses after a gap in time."""
     steps = np.diff(time_s)
-    longest = max(GAP_STEPS * float(np.median(steps)), least_s) if len(steps) else least_s
-    return np.asarray(np.flatnonzero(steps > longest) + 1)
-
-
-def _line(axes: Axes, x: Array, y: Array, time_s: Array, **looks: Any) -> None:
-    """A line over time or distance, thinned to its extremes; no gap that shows is crossed."""
-    kept, values = style.thin(x, y, style.MAX_POINTS_NARROW)
-    after = np.searchsorted(kept, x[_gaps(time_s, GAP_SHARE * float(time_s[-1] - time_s[0]))])
-    axes.plot(np.insert(kept, after, np.nan), np.insert(values, after, np.nan), **looks)
+    return np.asarray(np.flatnonzero(steps > GAP_STEPS * np.median(steps)) + 1)
 
 
 def way(axes: Axes, seen: Array, time_s: Array, **style: Any) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping
-from functools import cache
 from importlib import metadata
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -133,9 +132,11 @@ def compiled(report: Mapping[str, Any], template: str | None = None) -> bytes:
     typst.TypstError
         The template is not right, or asks for a file.
     """
+    if template is None:
+        template = Path(__file__).with_name("report.typ").read_text(encoding="utf-8")
     with TemporaryDirectory() as empty:
         compiler = typst.Compiler(
-            input=(_template() if template is None else template).encode(),
+            input=template.encode(),
             root=empty,
             font_paths=typst.Fonts(
                 include_system_fonts=False,
@@ -149,8 +150,3 @@ def compiled(report: Mapping[str, Any], template: str | None = None) -> bytes:
         made = compiler.compile(format="pdf", pdf_standards=STANDARDS)
     assert isinstance(made, bytes)
     return sealed(made)
-
-
-@cache
-def _template() -> str:
-    return Path(__file__).with_name("report.typ").read_text(encoding="utf-8")

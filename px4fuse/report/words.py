@@ -52,12 +52,6 @@ def filters(result: AxisComparison) -> dict[str, FilterSummary | Unjudged]:
     return known
 
 
-def band_words(statement: Consistency) -> str:
-    """The 95 % band of the mean NIS."""
-    low, high = statement.nis_band
-    return f"{low:.2f} – {high:.2f}"
-
-
 VERDICT_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "innovation\nvariance")
 
 
@@ -72,7 +66,7 @@ def verdict_rows(
             label = result.axis.name if name == "ours" else ""
             nis, colour = ("", ""), MUTED
             if isinstance(one, Consistency):
-                nis = (number_words(one.nis_mean), band_words(one))
+                nis = (number_words(one.nis_mean), "{:.2f} – {:.2f}".format(*one.nis_band))
                 colour = GOOD if one.verdict == "consistent" else SEVERITY_COLOURS["warning"]
             rows.append([label, name, *nis, (verdict_words(one), colour), *more(result, name, one)])
     return rows
