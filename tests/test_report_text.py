@@ -23,7 +23,7 @@ from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
 from px4fuse.origin import RECEIVED
 from px4fuse.recording import ClockMap
-from px4fuse.report import clock, fonts, notes, pdf
+from px4fuse.report import clock, fonts, notes
 from px4fuse.report.document import Document
 from px4fuse.report.notes import write
 from px4fuse.report.page import Block, Page, data, printable
@@ -110,11 +110,6 @@ def test_code_keeps_its_spaces_and_dollars() -> None:
     assert printable("\N{NO-BREAK SPACE}x\n") == "\N{NO-BREAK SPACE}x\n"
     (code,) = written("```\nif x:\n    $y$ <b>\n```")
     assert code["text"].replace("\N{NO-BREAK SPACE}", " ") == "if x:\n    $y$ <b>"
-
-
-def test_a_table_is_a_table() -> None:
-    (table,) = written("| a | *b* |\n|---|--:|\n| 1 | $x^2$ |\n")
-    assert (table["head"], table["rows"]) == (["a", "b"], [["1", "x^2"]])
 
 
 @pytest.mark.parametrize(
@@ -290,8 +285,3 @@ def test_how_a_clock_was_mapped_is_told_by_its_figures_or_by_its_note() -> None:
         replace(mapped, note="over the link, at its own speed"),
     ):  # fmt: skip
         assert clock_words(by_note) == f"the sender's clock: {by_note.note}"
-
-
-def test_a_line_of_a_documents_properties_is_cut_with_a_mark() -> None:
-    assert pdf._line("so  it\nis", 8) == "so it is"
-    assert pdf._line("so it is it", 8) == "so it i…"

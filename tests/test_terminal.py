@@ -22,7 +22,6 @@ from px4fuse.analysis import run_loop, run_preparation, run_what_if
 from px4fuse.cli import cli, compare, loop, tune, whatif
 from px4fuse.cli.compare import default_report
 from px4fuse.cli.outputs import progress, terminal
-from px4fuse.cli.quantity import NAMES, in_unit
 from px4fuse.comparison.estimates import tuned
 from px4fuse.findings import find
 from px4fuse.report import screen
@@ -217,12 +216,6 @@ def test_slips_are_one_line_that_says_what_to_type(desk, monkeypatch, capsys, wo
     assert len(err.splitlines()) == 1
     assert said in err
     assert [path.name for path in desk.iterdir()] == ["l.ulg"]
-
-
-@pytest.mark.parametrize("unit", NAMES)
-def test_every_unit_is_read_with_itself(unit) -> None:
-    assert in_unit(f"2.5{unit}", unit) == in_unit("2,5", unit) == 2.5
-    assert in_unit("1.2.3", unit) is in_unit("2.5 apples", unit) is None
 
 
 # --- files ---

@@ -100,9 +100,12 @@ def plain_ticks(axis: Axis) -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def bare_x(axes: Axes) -> None:
-    """Leave out the numbers of an x axis that another below it shows."""
-    axes.tick_params(axis="x", labelbottom=False)
+def time_axis(axes: Axes, last: bool) -> None:
+    """Name an axis of time, or leave out its numbers where another below it shows them."""
+    if last:
+        axes.set_xlabel(TIME_LABEL)
+    else:
+        axes.tick_params(axis="x", labelbottom=False)
 
 
 def as_map(axes: Axes, right: str, up: str) -> None:
