@@ -20,7 +20,7 @@ from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.loop import Loop
 from px4fuse.notebook.tables import EKF2, tracks, variants
 from px4fuse.report.clock import draw_curve
-from px4fuse.report.evaluation import draw_ape, draw_path, views
+from px4fuse.report.evaluation import draw_ape, draw_path, over_time, views
 from px4fuse.report.loop import draw_map
 from px4fuse.report.panels import ERROR, INNOVATIONS, POSITION, SIGMA_P, error_reference
 from px4fuse.report.style import EKF2 as EKF2_COLOUR
@@ -135,10 +135,10 @@ def evaluation(result: Evaluation, ax: Any = None) -> Any:
     """The path coloured by its error, and the error over time, as in the report: two axes."""
     if ax is None:
         _, ax = plt.subplots(2, 1, figsize=(7, 8), layout="constrained")
-    path, over_time = ax
+    path, ape = ax
     draw_path(path, result, views(result)[0])
-    draw_ape(over_time, result, *over_time(result))
-    over_time.set_ylabel("APE (m)")
+    draw_ape(ape, result, *over_time(result))
+    ape.set_ylabel("APE (m)")
     for each in ax:
         each.legend(fontsize="small")
     return ax
