@@ -17,7 +17,6 @@ from matplotlib.axis import Axis
 from matplotlib.collections import Collection
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -132,10 +131,6 @@ def of_artist(artist: Any) -> Iterator[str]:
                 letters = f"{value(artist.get_size())} {colour(artist.get_color())}"
                 letters += f" {artist.get_weight()} {value(artist.get_rotation())}"
                 yield f"Text {artist.get_text()!r} at {place} {side} {letters}"
-        case AxesImage():
-            yield f"{name} {value(artist.get_extent())} {value(artist.get_clim())}: " + numbers(
-                artist.get_array()
-            )
         case Collection():
             paths = [path.vertices for path in artist.get_paths()]
             shape = numbers(np.concatenate(paths)) if paths else "0"
@@ -174,7 +169,7 @@ def of_axes(axes: Axes) -> Iterator[str]:
     yield f"  labels {labels} ticks {axes.xaxis.get_tick_params()['labelbottom']}"
     yield f"  x {ticks(axes.xaxis)} y {ticks(axes.yaxis)}"
     legend = axes.get_legend()
-    drawn = [*axes.lines, *axes.collections, *axes.patches, *axes.images, *axes.texts]
+    drawn = [*axes.lines, *axes.collections, *axes.patches, *axes.texts]
     for artist in [*drawn, *([legend] if legend else [])]:
         yield from (f"  {line}" for line in of_artist(artist))
 

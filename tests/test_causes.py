@@ -86,10 +86,8 @@ def comparison(sample_flight: Flight) -> Comparison:
 
 
 def test_verdicts_that_could_be_misread_have_a_sentence(comparison: Comparison) -> None:
-    small, same, white = verdict_notes(comparison)
+    small, white = verdict_notes(comparison)
     assert "ours aisle overstated 1.09× in σ" in small
-    assert "EKF2 has nearly the same mean NIS (0.84, 0.86)" in same
-    assert "with 624 samples against 250" in same
     assert "ours down p < 0.001" in white
 
 

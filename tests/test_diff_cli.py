@@ -107,11 +107,10 @@ def test_a_log_is_analysed_with_the_settings_of_the_other_ones_results(settings,
     assert attached["texts"] == []
 
 
-def test_pages_show_both_flights_side_by_side(tmp_path):
+def test_the_page_says_what_changed(tmp_path):
     done = ran("diff", SAMPLE, SAMPLE.with_suffix(".tlog"), "-o", tmp_path / "d.pdf")
     pages = [page.extract_text() for page in PdfReader(tmp_path / "d.pdf").pages]
     assert "What changed from A to B" in pages[0]
-    assert any("A and B along the aisle" in page and "B: Innovation" in page for page in pages)
     assert "tested numbers changed by more than chance from A to B" in done
     # EKF2's innovations are not in a MAVLink recording
     assert "in A alone" in done

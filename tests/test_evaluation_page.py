@@ -12,11 +12,10 @@ import pytest
 from conftest import REPOSITORY
 from exchange import replace
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from page_tools import every
 from pypdf import PdfReader
 from scipy.spatial.transform import Rotation
-from trajectory_tools import PUBLISHED, flight, moved, published
+from trajectory_tools import flight, moved
 
 from px4fuse.loop.sources import read_source
 from px4fuse.report.evaluation import (
@@ -26,8 +25,6 @@ from px4fuse.report.evaluation import (
     draw,
     growth_words,
     quarters,
-    score_rows,
-    summary,
     time_words,
     views,
 )
@@ -36,7 +33,7 @@ from px4fuse.report.pdf import render
 from px4fuse.report.style import report_style
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
 from px4fuse.trajectory.model import Frame, Trajectory
-from px4fuse.trajectory.scores import Delta, Statistics
+from px4fuse.trajectory.scores import Delta
 
 LOOP = REPOSITORY / "sample_logs" / "loop_vio.ulg"
 DELTAS = (Delta(1.0, "m"), Delta(10.0, "m"))
@@ -129,35 +126,18 @@ def test_an_error_that_grows_with_distance_has_the_quarters_of_a_ramp() -> None:
     expected = np.sqrt((ends[1:] ** 3 - ends[:-1] ** 3) / 3.0)
     np.testing.assert_allclose(quarters(score), expected, rtol=0.01)
     assert ", ".join(f"{q:.3f}" for q in quarters(score)) in distance_words(score)
-    assert "grows along the path, as drift does" in distance_words(score)
 
 
 @pytest.mark.parametrize(
-    ("error", "words"),
-    [
-        (np.abs(np.linspace(-2.0, 2.0, 2001)), "high at both ends"),
-        (np.linspace(2.0, 0.1, 2001), "largest in the first, no steady growth"),
-        (np.where(np.arange(2001) // 500 == 2, 1.0, 0.1), "largest in the third"),
-    ],
-    ids=["both ends", "falling", "a quarter"],
-)
-def test_other_shapes_along_the_path_are_no_growth(error: np.ndarray, words: str) -> None:
-    assert words in distance_words(wrong_by(across(error)))
-
-
-@pytest.mark.parametrize(
-    ("error", "words"),
-    [
-        (np.full(2000, 0.3), "makes 10% of the squared error: it is spread over time"),
-        (np.arange(2000) // 100 == 7, "makes 100% of the squared error: a few moments decide"),
-        (np.zeros(2000), "There is no error at any time."),
-    ],
+    ("error", "share"),
+    [(np.full(2000, 0.3), "10%"), (np.arange(2000) // 100 == 7, "100%"), (np.zeros(2000), "0%")],
     ids=["even", "a peak", "none"],
 )
 def test_whether_a_few_moments_decide_is_the_share_of_the_worst_tenth(
-    error: np.ndarray, words: str
+    error: np.ndarray, share: str
 ) -> None:
-    assert words in time_words(wrong_by(across(error.astype(np.float64))))
+    words = time_words(wrong_by(across(error.astype(np.float64))))
+    assert f"makes {share} of the squared error" in words
 
 
 @pytest.mark.parametrize(("kind", "times"), [("noise", 1.0), ("walk", 10**0.5), ("scale", 10.0)])
@@ -177,98 +157,33 @@ def test_the_growth_of_the_rpe_tells_noise_from_drift(kind: str, times: float) -
     assert "A second distance" in growth_words(wrong_by(error).rpe[:1])
 
 
-def test_the_table_holds_the_statistics() -> None:
-    score = sample()
-    rows = {label: cells for label, *cells in score_rows(score)}
-    ate = score.ate.translation_m
-    numbers = (ate.rmse, ate.mean, ate.median, ate.std, ate.max)
-    assert [rows["ATE (m)"][k] for k in (0, 2, 3, 4, 5)] == [f"{x:.4f}" for x in numbers]
-    assert len(rows) == 1 + len(score.rpe)
-    for error in score.rpe:
-        assert isinstance(error.translation_m, Statistics)
-        assert rows[f"RPE {error.delta_words} (m)"][0] == f"{error.translation_m.rmse:.4f}"
-        assert rows[f"RPE {error.delta_words} (m)"][6] == str(error.translation_m.count)
-
-
-def test_no_error_is_said_to_be_none() -> None:
-    score = wrong_by(np.zeros((2001, 3)))
-    assert "there is no error." in distance_words(score)
-    assert "as large" not in growth_words(score.rpe)
-
-
 # -- what is drawn ---------------------------------------------------------------------------------
 
 
-def test_the_path_is_coloured_by_its_error_and_crosses_no_gap() -> None:
+def test_the_path_is_coloured_by_its_error_and_the_reference_crosses_no_gap() -> None:
     score = sample()
-    axes = panel(score, "After alignment, by error, from above")
-    (path,) = (c for c in axes.collections if isinstance(c, LineCollection))
-    values = np.asarray(path.get_array())
-    assert values.max() == pytest.approx(score.position_error_m.max())
+    axes = panel(score, "After alignment, by error")
+    (path,) = axes.collections
+    values, places = np.asarray(path.get_array()), np.asarray(path.get_offsets())
     assert path.norm.vmin == 0.0
     assert path.norm.vmax == pytest.approx(score.position_error_m.max())
     assert score.reference.frame == "camera"
     seen = score.estimate_m[:, (0, 2)]  # right and forward
-    gap = int(np.argmax(np.diff(score.time_s)))
-    assert np.diff(score.time_s)[gap] > 2.0
-    pieces = np.array(path.get_segments())
-    assert len(pieces) > 1000
-    for (start, end), value in zip(pieces, values, strict=True):
-        first, last = (int(np.argmin(((seen - at) ** 2).sum(axis=1))) for at in (start, end))
-        assert 0 < last - first < 5
-        assert value == score.position_error_m[first:last].max()
-        assert not first <= gap < last
+    assert len(places) > 1000
+    for place, value in zip(places[::50], values[::50], strict=True):
+        assert value == score.position_error_m[int(np.argmin(((seen - place) ** 2).sum(axis=1)))]
+    assert np.diff(score.time_s).max() > 2.0
+    assert np.isnan(np.asarray(axes.get_lines()[0].get_ydata())).sum() == 1
     assert axes.get_aspect() == 1.0
 
 
-def test_both_panels_have_the_ape_and_lines_of_its_statistics() -> None:
-    score = sample()
-    for title, along in (("APE over time", score.time_s), ("APE over distance", score.distance_m)):
-        curve, *lines = panel(score, title).get_lines()
-        x, y = np.asarray(curve.get_xdata()), np.asarray(curve.get_ydata())
-        assert np.nanmax(y) == pytest.approx(score.position_error_m.max())
-        assert x[np.nanargmax(y)] == pytest.approx(along[np.argmax(score.position_error_m)])
-        assert np.isnan(y).sum() == 1  # the gap
-        ate = score.ate.translation_m
-        levels = {str(line.get_label()).split()[0]: line.get_ydata()[0] for line in lines}
-        assert levels == {
-            "max": ate.max, "RMSE": ate.rmse, "mean": ate.mean, "median": ate.median,
-        }  # fmt: skip
-
-
-def test_the_rpe_stands_at_the_end_of_each_motion_as_evo_draws_it() -> None:
-    score = sample()
-    axes = panel(score, "RPE over time")
-    shown = {str(line.get_label()): line for line in axes.get_lines()}
-    assert list(shown) == ["1 m", "5 m", "10 m"]
-    for error in score.rpe:
-        if error.delta_words in shown:
-            curve = shown[error.delta_words]
-            x, y = np.asarray(curve.get_xdata()), np.asarray(curve.get_ydata())
-            worst = int(np.argmax(error.translation_error_m))
-            assert np.nanmax(y) == pytest.approx(error.translation_error_m[worst])
-            assert x[np.nanargmax(y)] == pytest.approx(score.time_s[error.end[worst]])
-
-
-def test_each_delta_has_a_box_and_its_rmse() -> None:
-    score = sample()
-    axes = panel(score, "RPE per delta")
-    assert [text.get_text() for text in axes.get_xticklabels()] == [
-        e.delta_words for e in score.rpe
-    ]
-    drawn = [line.get_ydata()[0] for line in axes.get_lines() if line.get_marker() == "D"]
-    assert drawn == [
-        e.translation_m.rmse for e in score.rpe if isinstance(e.translation_m, Statistics)
-    ]
-
-
-def test_many_deltas_fill_the_table_and_some_boxes() -> None:
+def test_many_deltas_fill_the_table_and_some_are_named() -> None:
     score, deltas = sample(), [Delta(0.5 * k, "m") for k in range(1, 61)]
     many = evaluate(score.estimate, score.reference, rpe_deltas=deltas)
     text = said(many)
     assert "RPE 0.5 m (m)" in text
     assert "RPE 30 m (m)" in text
-    assert len(panel(many, "RPE per delta").get_xticklabels()) == 12
+    assert len(panel(many, "RPE per delta").get_xticklabels()) == 10
 
 
 @pytest.mark.parametrize(
@@ -292,16 +207,11 @@ def test_a_flat_path_is_seen_from_above_and_another_from_the_side_too(
     assert side.down == (frame in ("NED", "FRD", "camera"))
 
 
-def test_without_alignment_there_is_no_panel_before_it() -> None:
-    score = wrong_by(across(np.full(2001, 0.3)))
-    assert not any("alignment" in title for title in panels(score))
-    assert "without alignment" in summary(score)
-
-
-def test_without_orientations_the_page_says_why_there_is_no_rpe() -> None:
-    bare = replace(flight(), rotation=None, kind="vio")
-    score = evaluate(bare, flight())
-    assert said(score).count("the estimate has no orientation") >= 2
+def test_what_is_not_done_has_no_panel() -> None:
+    assert not any("alignment" in title for title in panels(wrong_by(across(np.full(2001, 0.3)))))
+    bare = evaluate(replace(flight(), rotation=None, kind="vio"), flight())
+    assert "the estimate has no orientation" in said(bare)
+    assert not any("RPE" in title for title in panels(bare))
 
 
 def test_the_colours_darken_so_that_grey_shows_them() -> None:
@@ -324,13 +234,3 @@ def test_same_bytes_with_the_results_inside_and_no_date() -> None:
     assert reader.metadata is not None
     assert str(reader.metadata.creation_date).startswith("2000-01-01")
     assert len(reader.pages) == 1
-
-
-@pytest.mark.reallogs
-@pytest.mark.parametrize("pair", PUBLISHED, ids=[name for name, _ in PUBLISHED])
-def test_published_trajectories_are_drawn_on_one_page(pair: tuple[str, str]) -> None:
-    estimate, reference = map(published, pair)
-    score = evaluate(estimate, reference)
-    assert len(PdfReader(io.BytesIO(render(score, "{}"))).pages) == 1
-    text = said(score)
-    assert f"{score.ate.translation_m.rmse:.4f}" in text

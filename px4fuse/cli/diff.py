@@ -42,7 +42,6 @@ def diff(
     """
     from px4fuse.fleet.changes import diff as compared
     from px4fuse.report.changes import print_changes
-    from px4fuse.report.document import ChangesDocument
 
     alone = json_path == STANDARD_OUTPUT
     report_paths(output or Path("reports/LOG.pdf"), json_path)  # before the work, not after it
@@ -51,8 +50,7 @@ def diff(
         results = found.results
         if output is None and not alone:
             output = free_report(f"{a.stem}_to_{b.stem}", "", results)
-        document = ChangesDocument(results, found.a.analysis, found.b.analysis)
-        contents = result_files(results, json_path, output, document, step)
+        contents = result_files(results, json_path, output, results, step)
     finish(contents, lambda console: print_changes(console, results))
     if fail_on is not None and found.is_worse:
         sys.exit(1)

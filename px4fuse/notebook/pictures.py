@@ -21,7 +21,7 @@ from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.loop import Loop
 from px4fuse.notebook.tables import EKF2, tracks, variants
 from px4fuse.report.clock import draw_curve
-from px4fuse.report.evaluation import draw_ape, draw_path, time_label, views, zero_s
+from px4fuse.report.evaluation import draw_ape, draw_path, over_time, views
 from px4fuse.report.loop import draw_map
 from px4fuse.report.panels import ERROR, INNOVATIONS, POSITION, SIGMA_P, error_reference
 from px4fuse.report.style import EKF2 as EKF2_COLOUR
@@ -122,10 +122,10 @@ def trajectory(result: Trajectory, ax: Axes) -> Axes:
 
 def evaluation(result: Evaluation, ax: Any) -> Any:
     """The path coloured by its error, and the error over time, as in the report: two axes."""
-    path, over_time = ax
-    draw_path(path, result, views(result)[0], path.inset_axes((1.02, 0.0, 0.03, 1.0)))
-    draw_ape(over_time, result, result.time_s - zero_s(result), time_label(result))
-    over_time.set_ylabel("APE (m)")
+    path, ape = ax
+    draw_path(path, result, views(result)[0])
+    draw_ape(ape, result, *over_time(result))
+    ape.set_ylabel("APE (m)")
     for each in ax:
         each.legend(fontsize="small")
     return ax

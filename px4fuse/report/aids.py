@@ -20,9 +20,8 @@ from px4fuse.report.style import (
     GOOD,
     MUTED,
     SEVERITY_COLOURS,
-    TIME_LABEL,
-    bare_x,
     thin,
+    time_axis,
 )
 from px4fuse.request import with_options
 
@@ -151,7 +150,4 @@ def _strip(
         off = at_times(log.meant, pd.Index(grid)) <= 0.0
         axes.fill_between(grid, -WIDEST, WIDEST, where=off.tolist(), zorder=0.1, **GROUND)
     axes.set(xlim=span, ylim=(-1.1 * WIDEST, 1.1 * WIDEST), yticks=(-2.0, 2.0))
-    if last:
-        axes.set_xlabel(TIME_LABEL)
-    else:
-        bare_x(axes)
+    time_axis(axes, last)

@@ -1,29 +1,24 @@
-"""What changed from A to B: the words of it, the pages, and the same numbers on the terminal."""
+"""What changed from A to B: its words and numbers, on a page and on the terminal."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-import pandas as pd
 from rich.console import Console
 
-from px4fuse.comparison.model import AxisComparison
 from px4fuse.plain import number_words
-from px4fuse.report import panels
-from px4fuse.report.document import ChangesDocument
-from px4fuse.report.page import Cell, Page, halves, words
+from px4fuse.report.page import Cell, Page, words
 from px4fuse.report.screen import show
-from px4fuse.report.style import GOOD, MUTED, SEVERITY_COLOURS, TIME_LABEL
+from px4fuse.report.style import GOOD, MUTED, SEVERITY_COLOURS
 from px4fuse.results.changes import NumberChange
 from px4fuse.results.contract import ChangeResults
 
 COLOURS = {"worse": SEVERITY_COLOURS["error"], "better": GOOD}
-SIZE, HEIGHT = 7.6, 105.0
+SIZE = 7.6
 SHARES = (7.5, 28.0, 7.5, 10.0, 25.0, 9.0)
 HEADS = ("", "number", "A", "B", "change (95 %)", "by chance?")
 # Columns and rows of the table, notes, and sentences of the summary that fit on a screen
 SCREEN = (5, 15, 2, 1)
-PANELS = (panels.POSITION, panels.ERROR, panels.INNOVATIONS, panels.SIGMA_P)
 # A number without a test is printed where it moved by so much
 PRINTED_RATIO = 0.25
 LABELS = {"setting": "Setting", "parameter": "PX4", "flight": "Flight", "B": "New", "A": "Gone"}
@@ -36,15 +31,11 @@ _NOT_SHOWN = {
 }
 
 
-def draw(document: ChangesDocument) -> Iterator[Page]:
-    """Draw the summary, and where both logs are at hand what they show."""
+def draw(results: ChangeResults) -> Iterator[Page]:
+    """One page, and more where much changed."""
     page = Page("What changed from A to B")
-    _write(page, document.results)
+    _write(page, results)
     yield page
-    a, b = document.a, document.b
-    if a is not None and b is not None and (common := [name for name in a.axes if name in b.axes]):
-        name = a.main.axis.name if a.main.axis.name in common else common[0]
-        yield _flights(a[name], b[name])
 
 
 def print_changes(console: Console, results: ChangeResults) -> None:
@@ -83,30 +74,6 @@ def _write(page: Page, results: ChangeResults, *, short: bool = False) -> None:
         page.labelled(LABELS[finding.only_in], words(said, SIZE, colour), size=SIZE)
     for text in results.notes[:most_notes]:
         page.write(text, size=SIZE, colour=MUTED, above=3.0)
-
-
-def _flights(a: AxisComparison, b: AxisComparison) -> Page:
-    """Both flights along one axis, with common scales."""
-    page = Page(
-        f"A and B along {a.axis.called}",
-        "A at the left, B at the right. Ours is dark and solid, EKF2 lighter and dashed, the truth "
-        "dotted. An error is the distance from the truth, and without one that of ours from EKF2.",
-    )
-    known = [isinstance(panels.error_reference(result), pd.DataFrame) for result in (a, b)]
-    for panel in PANELS:
-        if panel is panels.ERROR and not all(known):
-            continue
-        columns, drawn = halves(), []
-        for side, result, column in zip("AB", (a, b), columns, strict=True):
-            axes = column.panel(f"{side}: {panel.named(result)}", panel.numbers(result), HEIGHT)
-            panel.draw(axes, result)
-            axes.set_xlabel(TIME_LABEL)
-            drawn.append(axes)
-        low, high = zip(*(axes.get_ylim() for axes in drawn), strict=True)
-        for axes in drawn:
-            axes.set_ylim(min(low), max(high))
-        page.beside(*columns)
-    return page
 
 
 # ---------------------------------------------------------------------------------------- words

@@ -5,32 +5,28 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import aid_of, delay_ms
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
 from px4fuse.findings.source_clock import typed_offset_s
 from px4fuse.flight import Unavailable
 from px4fuse.plain import p_words
-from px4fuse.report import marks
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page, legend_above
-from px4fuse.report.style import OURS, OURS_BAND, OURS_LINE
+from px4fuse.report.style import OURS_BAND, OURS_LINE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Heights of the axes in points
-CURVE, PARTS = 170.0, 150.0
+CURVE = 170.0  # height of the axes in points
 # Beyond this the curve tells nothing more
 MAX_DROP = 12.0
 # How many intervals the curve is drawn over, to either side
 REACH = 2.5
 # One update of EKF2 (EKF2_PREDICT_US)
 NEGLIGIBLE_S = 0.010
-# |z| of which CHANGE_P is the two-sided p-value
-DRIFT_SIGMAS = 2.81
+# What is said about the clock in a finding has its page
+FINDINGS = ("source_clock_changes", "source_clock_offset", "ekf2_ev_delay_wrong")
 
 
 def line(document: Document) -> str:
@@ -46,33 +42,7 @@ def has_page(document: Document) -> bool:
     clock = document.analysis.clock
     if isinstance(clock, Unavailable):
         return False
-    wrong = _stamps_wrong(clock) or _delay_wrong(document.analysis, clock)
-    return not clock.determinable or wrong or _changes(clock) or _drifts(clock)
-
-
-def _stamps_wrong(clock: ClockOffset) -> bool:
-    """Whether the stamps of the source are late or early beyond doubt, as they were recorded."""
-    low, high = clock.interval_s
-    negligible = abs(clock.offset_s) < NEGLIGIBLE_S
-    return clock.determinable and not (low <= 0.0 <= high or negligible)
-
-
-def _delay_wrong(comparison: Comparison, clock: ClockOffset) -> bool:
-    """Whether EKF2's delay for the source is known, and not what the data ask for."""
-    delay = delay_ms(comparison)
-    if delay is None or not clock.determinable:
-        return False
-    least, most = (comparison.source.age_s - end for end in reversed(clock.interval_s))
-    return not least - NEGLIGIBLE_S <= delay * 1e-3 <= most + NEGLIGIBLE_S
-
-
-def _changes(clock: ClockOffset) -> bool:
-    return clock.change_p is not None and clock.change_p < CHANGE_P
-
-
-def _drifts(clock: ClockOffset) -> bool:
-    drift, sigma = clock.drift_ppm, clock.drift_sigma_ppm
-    return drift is not None and sigma is not None and abs(drift) > DRIFT_SIGMAS * sigma
+    return not clock.determinable or any(one.id in FINDINGS for one in document.findings)
 
 
 def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> dict[str, str]:
@@ -90,24 +60,25 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
         "of the source",
         "Reading": "the stamps are right as far as this flight can tell",
     }
-    if _stamps_wrong(clock):
+    if not (low <= 0.0 <= high or abs(offset) < NEGLIGIBLE_S):
         side = "late" if offset < 0.0 else "early"
         advice["Reading"] = f"the stamps are {side} by {abs(offset):.3f} s"
         typed = typed_offset_s(comparison, clock)
         advice["Re-run"] = f"px4fuse compare LOG --clock-offset {typed:.3f}"
     delay, name = delay_ms(comparison), aid_of(comparison).delay
     age_s = comparison.source.age_s
-    if delay is not None and not _delay_wrong(comparison, clock):
+    least, most = age_s - high, age_s - low
+    if delay is not None and least - NEGLIGIBLE_S <= delay * 1e-3 <= most + NEGLIGIBLE_S:
         advice["PX4"] = f"{name} {delay:g} ms fits"
     elif delay is not None and offset > age_s and delay <= 0.0:
         advice["PX4"] = f"{name} is 0 ms and cannot be negative: correct the sender's clock"
     elif delay is not None:
-        asked, least, most = (max(1e3 * (age_s - s), 0.0) for s in (offset, high, low))
+        asked, least, most = (max(1e3 * s, 0.0) for s in (age_s - offset, least, most))
         advice["PX4"] = (
             f"{name} is {delay:g} ms, the data ask for {asked:.0f} ms ({least:.0f} to "
             f"{most:.0f}); set it, or correct the sender's clock"
         )
-    if clock.change_p is not None and _changes(clock):
+    if clock.change_p is not None and clock.change_p < CHANGE_P:
         parts = ", ".join(f"{p.offset_s:+.2f} s from {p.start_s:.0f} s" for p in clock.parts)
         advice["Changes"] = (
             f"the offset is not the same throughout ({p_words(clock.change_p)}): {parts}"
@@ -131,13 +102,6 @@ def draw(document: Document) -> Iterator[Page]:
     )
     for label, text in clock_advice(document.analysis, clock).items():
         page.labelled(label, text, size=8.5)
-    _curve(page, clock)
-    if len(clock.parts) > 1:
-        _parts(page, clock, document)
-    yield page
-
-
-def _curve(page: Page, clock: ClockOffset) -> None:
     (low, high), best = clock.interval_s, clock.offset_s
     say = (
         f"Best at {best:+.3f} s; 95 % from {low:+.3f} to {high:+.3f} s, wider than the curve alone "
@@ -145,6 +109,7 @@ def _curve(page: Page, clock: ClockOffset) -> None:
     )
     title = "ln of how much less likely each offset is than the best"
     draw_curve(page.panel(title, say, CURVE, above=14.0), clock)
+    yield page
 
 
 def draw_curve(axes: Axes, clock: ClockOffset) -> None:
@@ -162,26 +127,3 @@ def draw_curve(axes: Axes, clock: ClockOffset) -> None:
     )
     axes.set_xlabel("offset added to the source's stamps (s)")
     legend_above(axes)
-
-
-def _parts(page: Page, clock: ClockOffset, document: Document) -> None:
-    """Offset of each part of the flight over time."""
-    said = ["Too few parts to compare them."]
-    if clock.change_p is not None:
-        same = "The offset changes" if _changes(clock) else "One and the same offset fits"
-        said = [f"{same} ({p_words(clock.change_p)} for one throughout)."]
-    if clock.drift_ppm is not None and clock.drift_sigma_ppm is not None:
-        sure = "" if _drifts(clock) else ", which may be chance"
-        said.append(
-            f"Drift {clock.drift_ppm:+,.0f} ± {1.96 * clock.drift_sigma_ppm:,.0f} ppm{sure}."
-        )
-    said.append("Band: 95 % interval of the whole flight.")
-    title = "Offset of each part of the flight by itself (s)"
-    axes = marks.panel(page, document, title, " ".join(said), PARTS)
-    axes.axhspan(*clock.interval_s, color=OURS_BAND, lw=0)
-    ends = np.array([(part.start_s, part.end_s) for part in clock.parts])
-    axes.errorbar(
-        ends.mean(axis=1), [part.offset_s for part in clock.parts],
-        xerr=np.diff(ends, axis=1)[:, 0] / 2.0, yerr=[1.96 * part.sigma_s for part in clock.parts],
-        fmt="o", color=OURS, ms=4, lw=1.0, capsize=2,
-    )  # fmt: skip

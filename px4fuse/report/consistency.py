@@ -28,8 +28,8 @@ WIDEST = 4.0
 BINS = np.linspace(-WIDEST, WIDEST, 33)
 # Of the normal curve's 0.4: higher bars are cut, so that the curve stays in sight
 HIGHEST = 1.6
-# t of the mean, and p of "white", beyond which a word is said
-LARGE_T, SMALL_P = 2.0, 0.01
+# p of "white" below which a word is said
+SMALL_P = 0.01
 # Heights of the axes in points
 RUNNING, BELOW, LEGEND = 140.0, 150.0, 14.0
 GREY = "#dcdcdc"
@@ -40,11 +40,10 @@ NUMBERS: Mapping[Of, tuple[str, float]] = {
 
 
 class Series(NamedTuple):
-    """Innovations over √S of one filter, how they are drawn, and what they state."""
+    """Innovations over √S of one filter, and what they state."""
 
     name: str
     values: pd.Series[float]
-    line: dict[str, Any]
     statement: Consistency
 
 
@@ -115,12 +114,12 @@ def _series(result: AxisComparison) -> list[Series]:
             values = frame["innovation_m"] / np.sqrt(frame["innovation_variance_m2"])
             known = values[np.isfinite(values)]
             if len(known) >= MIN_INNOVATIONS:
-                series.append(Series(name, known, LINES[name], one))
+                series.append(Series(name, known, one))
     return series
 
 
 def _thin_line(one: Series) -> dict[str, Any]:
-    return {"color": one.line["color"], "lw": 0.6, "ls": (0, (1, 1.5))}
+    return {"color": LINES[one.name]["color"], "lw": 0.6, "ls": (0, (1, 1.5))}
 
 
 def _running(axes: Axes, series: list[Series]) -> None:
@@ -128,7 +127,7 @@ def _running(axes: Axes, series: list[Series]) -> None:
     for one in series:
         number = np.arange(1, len(one.values) + 1)
         running = (one.values**2).cumsum() / number
-        curve(axes, running[2:], **one.line, label=one.name)
+        curve(axes, running[2:], **LINES[one.name], label=one.name)
         shown = np.unique(np.geomspace(3, len(number), 60).astype(int))
         low, high = np.array([nis_band(int(count)) for count in shown]).T
         time = one.values.index[shown - 1]
@@ -151,7 +150,7 @@ def _histogram(axes: Axes, series: list[Series]) -> None:
     highest = 0.4
     for one in series:
         density, _ = np.histogram(one.values.clip(-WIDEST, WIDEST), bins=BINS, density=True)
-        axes.stairs(density, BINS, **one.line, label=one.name)
+        axes.stairs(density, BINS, **LINES[one.name], label=one.name)
         highest = max(highest, float(density.max()))
     axes.set_xlim(-WIDEST, WIDEST)
     axes.set_ylim(0.0, min(1.15 * highest, HIGHEST))
@@ -164,8 +163,8 @@ def _autocorrelation(axes: Axes, series: list[Series]) -> None:
         lags = min(LAGS, len(one.values) // 3)
         r = autocorrelation(np.asarray(one.values, np.float64), lags)
         at = np.arange(1, lags + 1) + shift
-        axes.vlines(at, 0.0, r, color=one.line["color"], lw=1.2)
-        filled = {"mfc": one.line["color"] if one.name == "ours" else "white"}
+        axes.vlines(at, 0.0, r, color=LINES[one.name]["color"], lw=1.2)
+        filled = {"mfc": LINES[one.name]["color"] if one.name == "ours" else "white"}
         axes.plot(at, r, **DOTS[one.name] | filled | {"ms": 3.0, "mew": 0.6}, label=one.name)
         bound = _bound(one)
         if one.name == "ours":
@@ -195,12 +194,11 @@ def _nis_words(series: list[Series]) -> str:
 
 
 def _shape_words(series: list[Series]) -> str:
-    said = []
-    for one in series:
-        found, mean = one.statement, "mean near zero"
-        if abs(found.bias_t) >= LARGE_T:
-            mean = f"mean {found.innovation_mean_m:+.3f} m ({p_words(found.bias_p)})"
-        said.append(f"{capital(one.name)}: {found.outside_two_sigma:.1%} beyond 2√S, {mean}.")
+    said = [
+        f"{capital(one.name)}: {one.statement.outside_two_sigma:.1%} beyond 2√S, mean "
+        f"{one.statement.innovation_mean_m:+z.3f} m ({p_words(one.statement.bias_p)})."
+        for one in series
+    ]
     return "\n".join([*said, "4.5% are expected there."])
 
 
@@ -208,11 +206,9 @@ def _white_words(series: list[Series]) -> str:
     said = []
     for one in series:
         r, p = one.statement.lag1_autocorrelation, one.statement.ljung_box_p
-        reading = "white"
-        if p < SMALL_P:
-            reading = "not white"
-            if abs(r) > _bound(one):
-                reading = "it follows too slowly" if r > 0.0 else "it jumps after every measurement"
+        reading = "white" if p >= SMALL_P else "not white"
+        if p < SMALL_P and abs(r) > _bound(one):
+            reading = "it follows too slowly" if r > 0.0 else "it jumps after every measurement"
         said.append(f"{capital(one.name)}: lag 1 {r:+.2f}, Ljung-Box {p_words(p)}: {reading}.")
     return "\n".join(said)
 

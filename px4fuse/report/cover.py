@@ -39,6 +39,7 @@ LONG = 2.2
 TALLEST, LOWEST, BESIDE, WIDE = 120.0, 56.0, 150.0, 256.0  # points
 MOST_POINTS = 2000
 Pair = tuple[Array, Array]
+NORTH_EAST = ("north", "east")
 EXPLANATION = (
     "Mean NIS is 1 where the innovations are as large as a filter's own variance says; below its "
     "95 % band the variance is overstated, above it understated."
@@ -109,9 +110,6 @@ def facts(document: Document) -> dict[str, str]:
         f"{source.name}: {source.description}, {source.rate_hz:.1f} Hz, {source.frame}; "
         f"{comparison.source_reason}"
     )
-    received = any(part.source == "vehicle_visual_odometry" for part in comparison.missing)
-    if received and source.origin.is_vision:
-        position += ". SDLOG_PROFILE 129 would have logged it as it arrived"
     placed, clock = "", ""
     if source.alignment is not None:
         alignment, clock = source.alignment, source.clock
@@ -182,7 +180,7 @@ def _plan(document: Document, facts: Mapping[str, str]) -> Page:
     facts : mapping from labels to sentences
     """
     tracks = _tracks(document.analysis)
-    along = _along(document.analysis, np.column_stack(tracks["measurement"]))
+    along = _along(document.analysis)
     wide, high = (float(np.ptp(values)) for values in along.of(*tracks["measurement"]))
     is_long = wide >= LONG * max(high, 1e-6)
     page, view, height = Page(), NORTH_UP, BESIDE
@@ -211,30 +209,23 @@ def _tracks(comparison: Comparison) -> dict[str, Pair]:
     tracks = {"measurement": cut(comparison.source.samples)}
     if isinstance(flight.truth, Truth):
         tracks["truth"] = cut(flight.truth.samples)
-    if {"north", "east"} <= comparison.axes.keys():
-        both = [comparison.axes[name] for name in ("north", "east")]
-        theirs, ours = [one.ekf2_state for one in both], [one.replay.steps for one in both]
-        for name, frames in (("EKF2", theirs), ("ours", ours)):
-            known = [f["position_m"].to_numpy() for f in frames if isinstance(f, pd.DataFrame)]
-            if len(known) == len(both):
-                tracks[name] = known[0], known[1]
-    elif isinstance(flight.ekf2, Ekf2):
+    if isinstance(flight.ekf2, Ekf2):
         tracks["EKF2"] = cut(flight.ekf2.state)
+    if set(NORTH_EAST) <= comparison.axes.keys():
+        north, east = (
+            comparison.axes[name].replay.steps["position_m"].to_numpy() for name in NORTH_EAST
+        )
+        tracks["ours"] = north, east
     return tracks
 
 
-def _along(comparison: Comparison, points: Array) -> MapView:
-    """Along the aisle, or else the longest direction of the track; north is up, not down."""
+def _along(comparison: Comparison) -> MapView:
+    """Along the aisle where one is known; north is up, not down."""
     aisle = _aisle(comparison)
-    if aisle is not None and aisle.heading_deg is not None:
-        heading = np.deg2rad(aisle.heading_deg)
-    else:
-        direction = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][0]
-        heading = float(np.arctan2(direction[1], direction[0]))
-    if np.sin(heading) < 0.0:
-        heading += np.pi
-    degrees = np.rad2deg(heading) % 360.0
-    return MapView(heading, (f"along {degrees:.0f}° from north", "to its left"))
+    if aisle is None or aisle.heading_deg is None:
+        return NORTH_UP
+    degrees = aisle.heading_deg % 180.0
+    return MapView(np.deg2rad(degrees), (f"along {degrees:.0f}° from north", "to its left"))
 
 
 def _map(axes: Axes, document: Document, view: MapView, tracks: Mapping[str, Pair]) -> None:
@@ -254,12 +245,4 @@ def _map(axes: Axes, document: Document, view: MapView, tracks: Mapping[str, Pai
             signs = view.of(near["north_m"], near["east_m"])
             axes.plot(*signs, **{**looks, "ms": 7.0, "mec": "white", "mew": 0.6}, label=label)
     as_map(axes, *view.labels)
-    if view is not NORTH_UP:
-        x, y = view.of(20.0, 0.0)
-        arrow = {"arrowstyle": "<-", "color": MUTED, "lw": 0.8, "shrinkA": 1, "shrinkB": 0}
-        axes.annotate(
-            "N", xy=(0.97, 0.6), xycoords="axes fraction", xytext=(float(x), float(y)),
-            textcoords="offset points", arrowprops=arrow, size=7, color=MUTED, ha="center",
-            va="center",
-        )  # fmt: skip
     legend_above(axes, columns=3 if view is NORTH_UP else 9, handlelength=1.8)

@@ -12,7 +12,6 @@ from px4fuse.findings import Finding
 from px4fuse.findings.story import story
 from px4fuse.flight import Unavailable
 from px4fuse.loop.loop import Loop
-from px4fuse.results.contract import ChangeResults
 from px4fuse.results.model import Provenance, Student
 
 
@@ -96,22 +95,6 @@ class WhatIfDocument:
 
     made_of: Counterfactual
     command: str
-
-
-@dataclass(frozen=True)
-class ChangesDocument:
-    """Pages on what changed from A to B.
-
-    Attributes
-    ----------
-    results : ChangeResults
-    a, b : Analysis or None
-        Where their logs are at hand.
-    """
-
-    results: ChangeResults
-    a: Analysis | None
-    b: Analysis | None
 
 
 @dataclass(frozen=True)

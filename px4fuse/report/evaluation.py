@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import cache
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -14,7 +13,7 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.flight import Unavailable
 from px4fuse.loop.analysis import SMALLEST_STAMP_S
 from px4fuse.report import style
-from px4fuse.report.page import WIDTH, Page, halves, legend_above
+from px4fuse.report.page import WIDTH, Page, halves
 from px4fuse.report.screen import show
 from px4fuse.report.style import EKF2, MUTED, OURS, TRUTH
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
@@ -34,14 +33,12 @@ _AXES: Mapping[Frame, tuple[int, int, int, bool]] = {
 FLAT = 0.1
 # Steps of so many median ones are gaps: no line crosses them
 GAP_STEPS = 10.0
-# and over time those that are this share of it: shorter ones do not show
-GAP_SHARE = 0.01
 PIECES = 1200
 # Axes of errors reach at least this far: rounding is no error to look at
 LEAST_SCALE_M = 1e-3
 # In points: heights of a panel, of the maps and of a legend, and between the maps
 HEIGHT, MAPS, GAP = 76.0, 128.0, 16.0
-MOST_CURVES, MOST_BOXES = 3, 12
+MOST_DELTAS = 12
 REFERENCE: dict[str, Any] = {"color": TRUTH, "lw": 0.8, "ls": (0, (4, 2))}
 STATISTICS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("max", "max", {"color": MUTED, "lw": 0.8, "ls": (0, (1, 1.5))}),
@@ -49,15 +46,6 @@ STATISTICS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("mean", "mean", {"color": "black", "lw": 0.9, "ls": (0, (5, 2))}),
     ("median", "median", {"color": "black", "lw": 0.9, "ls": (0, (5, 1.5, 1, 1.5))}),
 )
-CURVES: tuple[dict[str, Any], ...] = (
-    {"color": "#9db7d5", "lw": 0.8},
-    {"color": "#4f7fb5", "lw": 0.9, "ls": (0, (4, 1))},
-    {"color": OURS, "lw": 1.1},
-)
-# Above this share of the squared error the worst tenth of the poses is what there is to look at
-FEW_DECIDE = 0.5
-# Quarters of a path differ if one is so many times the other
-DIFFERS = 1.3
 # Rounding: no error to say anything about
 NEGLIGIBLE_M = 1e-6
 SHADES = "The darker the path, the larger its error; × is the largest."
@@ -78,12 +66,12 @@ def colours() -> Colormap:
 
 
 class View(NamedTuple):
-    """From where a path is seen: the axes across and up the page."""
+    """From where a path is seen: the axes across and up the page, and their names."""
 
-    title: str
     across: int
     up: int
-    down: bool = False
+    down: bool
+    names: tuple[str, str]
 
     def of(self, position_m: Array) -> Array:
         """Coordinates on the page, shape (n, 3) to (n, 2)."""
@@ -93,13 +81,13 @@ class View(NamedTuple):
 def views(score: Evaluation) -> list[View]:
     """From above; and from the side where the path is not flat."""
     across, up, vertical, down = _AXES[score.reference.frame]
+    names = AXES_OF_FRAME[score.reference.frame]
     extent = np.maximum(np.ptp(score.reference_m, axis=0), np.ptp(score.estimate_m, axis=0))
     level = across if extent[across] >= extent[up] else up
-    titles = ["from above", "from the side"]
-    if score.reference.frame == "unknown":
-        names = AXES_OF_FRAME["unknown"]
-        titles = [f"{names[across]} and {names[up]}", f"{names[level]} and {names[vertical]}"]
-    seen = [View(titles[0], across, up), View(titles[1], level, vertical, down)]
+    seen = [
+        View(across, up, False, (names[across], names[up])),
+        View(level, vertical, down, (names[level], names[vertical])),
+    ]
     return seen if extent[vertical] > FLAT * extent[level] else seen[:1]
 
 
@@ -120,71 +108,50 @@ def draw(score: Evaluation) -> Iterator[Page]:
 def _maps(page: Page, score: Evaluation) -> None:
     """The two as they stand, and the aligned path by its error, from one or two sides."""
     seen, is_aligned = views(score), score.alignment != "none"
-    title = "After alignment, by error" if is_aligned else "By error"
-    parts = {f"{title}, {view.title}": side_words(score, view.up) for view in seen}
-    parts[f"{title}, {seen[0].title}"] = SHADES
+    count = len(seen) + is_aligned
+    width = (WIDTH - GAP * (count - 1)) / count
+    columns, estimate = [], []
     if is_aligned:
-        parts = {"Before alignment": before_words(score), **parts}
-    width = (WIDTH - GAP * (len(parts) - 1)) / len(parts)
-    columns = [Page(width=width) for _ in parts]
-    panels = [
-        column.panel(head, "", MAPS, left=34.0, right=34.0 if column is columns[-1] else 4.0)
-        for column, head in zip(columns, parts, strict=True)
-    ]
-    for axes, view in zip(panels[int(is_aligned) :], seen, strict=True):
-        scale = axes.inset_axes((1.02, 0.0, 0.03, 1.0)) if axes is panels[-1] else None
-        draw_path(axes, score, view, scale)
-    if is_aligned:
-        _before(panels[0], score, seen[0])
-    entries = {
-        label: handle
-        for axes in panels[: 1 + is_aligned]
-        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
-    }
-    page.legend(list(entries.values()))
-    for column, text in zip(columns, parts.values(), strict=True):
-        column.numbers(text)
+        columns.append(Page(width=width))
+        axes = columns[-1].panel("Before alignment", "", MAPS, left=34.0)
+        for position, looks, label in (
+            (score.reference_m, REFERENCE, "reference"),
+            (score.unaligned_m, {"color": OURS, "lw": 1.2}, "estimate"),
+        ):
+            way(axes, seen[0].of(position), score.time_s, label=label, **looks)
+        _framed(axes, seen[0])
+        estimate = axes.get_legend_handles_labels()[0][1:]
+        columns[-1].numbers(before_words(score))
+    for view in seen:
+        columns.append(Page(width=width))
+        title = f"{'After alignment, by' if is_aligned else 'By'} error"
+        axes = columns[-1].panel(title, "", MAPS, left=34.0, right=40.0)
+        draw_path(axes, score, view)
+        columns[-1].numbers(SHADES if view is seen[0] else side_words(score, view.up))
+    page.legend([*axes.get_legend_handles_labels()[0], *estimate])
     page.beside(*columns, gap=GAP)
 
 
-def _before(axes: Axes, score: Evaluation, view: View) -> None:
-    for position, looks, label in (
-        (score.reference_m, REFERENCE, "reference"),
-        (score.unaligned_m, {"color": OURS, "lw": 1.2}, "estimate before alignment"),
-    ):
-        way(axes, view.of(position), score.time_s, label=label, **looks)
-    _framed(axes, score, view)
-
-
-def draw_path(axes: Axes, score: Evaluation, view: View, scale: Axes | None) -> None:
+def draw_path(axes: Axes, score: Evaluation, view: View) -> None:
     """The aligned path by its error, the reference dashed upon it."""
-    from matplotlib.collections import LineCollection  # noqa: PLC0415
-
-    error, gaps = score.position_error_m, _gaps(score.time_s)
-    at = np.unique(np.linspace(0, len(error) - 1, min(len(error), PIECES)).astype(np.intp))
-    corners = view.of(score.estimate_m)[at]
-    before_gap = np.searchsorted(gaps, at, side="right")  # how many gaps come before each corner
-    unbroken = np.diff(before_gap) == 0
-    pieces = np.stack([corners[:-1], corners[1:]], axis=1)[unbroken]
-    drawn = LineCollection(list(pieces), cmap=colours(), lw=3.0, capstyle="round")
-    drawn.set_array(np.maximum.reduceat(error, at[:-1])[unbroken])
-    drawn.set_clim(0.0, max(float(error.max()), LEAST_SCALE_M))
-    axes.add_collection(drawn)
+    error, path = score.position_error_m, view.of(score.estimate_m)
+    every = max(1, len(error) // PIECES)
+    shown = axes.scatter(
+        path[::every, 0], path[::every, 1], c=error[::every], s=9.0, cmap=colours(), linewidths=0,
+        vmin=0.0, vmax=max(float(error.max()), LEAST_SCALE_M),
+    )  # fmt: skip
     way(axes, view.of(score.reference_m), score.time_s, label="reference", **REFERENCE)
-    start, worst = view.of(score.estimate_m)[[0, int(np.argmax(error))]]
-    axes.plot(*start, "o", color="white", mec="black", ms=5, mew=1.0, label="start", zorder=5)
+    axes.plot(*path[0], "o", color="white", mec="black", ms=5, mew=1.0, label="start", zorder=5)
+    worst = path[np.argmax(error)]
     axes.plot(*worst, "x", color="black", ms=7, mew=1.6, label="largest error", zorder=5)
-    _framed(axes, score, view)
-    if scale is not None:
-        bar = scale.figure.colorbar(drawn, cax=scale)
-        bar.set_label("APE (m)", labelpad=1)
-        bar.outline.set_linewidth(0.5)
+    _framed(axes, view)
+    bar = axes.figure.colorbar(shown, cax=axes.inset_axes((1.02, 0.0, 0.03, 1.0)))
+    bar.set_label("APE (m)", labelpad=1)
+    bar.outline.set_linewidth(0.5)
 
 
-def _framed(axes: Axes, score: Evaluation, view: View) -> None:
-    names = AXES_OF_FRAME[score.reference.frame]
-    axes.autoscale_view()
-    style.as_map(axes, names[view.across], names[view.up])
+def _framed(axes: Axes, view: View) -> None:
+    style.as_map(axes, *view.names)
     axes.locator_params(axis="x", nbins=4)
     axes.locator_params(axis="y", nbins=6)
     if view.down:
@@ -192,105 +159,66 @@ def _framed(axes: Axes, score: Evaluation, view: View) -> None:
 
 
 def _panels(page: Page, score: Evaluation) -> None:
-    """APE over time and over distance; RPE over time and per delta."""
+    """APE over time and over distance; RPE per delta."""
     left, right = halves()
     axes = left.panel("APE over time (m)", "", HEIGHT)
-    draw_ape(axes, score, score.time_s - zero_s(score), time_label(score))
+    draw_ape(axes, score, *over_time(score))
     page.legend(axes.get_legend_handles_labels()[0])
     left.numbers(time_words(score))
     axes = right.panel("APE over distance (m)", "", HEIGHT)
     draw_ape(axes, score, score.distance_m, "distance along the reference (m)")
     right.numbers(distance_words(score))
     page.beside(left, right)
-    left, right = halves()
-    axes = left.panel("RPE over time (m)", "", HEIGHT, above=14.0)
-    if known := [e for e in score.rpe if isinstance(e.translation_m, Statistics)]:
-        left.numbers(relative_words(_relative(axes, score, known), score.time_s, zero_s(score)))
-        _boxes(right.panel("RPE per delta (m)", "", HEIGHT, above=14.0), score)
-        right.numbers(growth_words(score.rpe))
-    else:
-        _none(axes, score)
-    page.beside(left, right)
+    if _known(score):
+        left, right = halves()
+        _deltas(left.panel("RPE per delta (m)", "", HEIGHT), score)
+        right.write(growth_words(score.rpe), size=7.0, colour=MUTED, above=24.0)
+        page.beside(left, right)
 
 
 def draw_ape(axes: Axes, score: Evaluation, along: Array, label: str) -> None:
-    """APE with its statistics as lines."""
-    _line(axes, along, score.position_error_m, score.time_s, color=OURS, lw=0.8)
+    """APE with its statistics as lines; thinned to its extremes, no gap in time is crossed."""
+    error, low, high = score.position_error_m, float(along[0]), float(along[-1])
+    kept, values = style.thin(along, error, style.MAX_POINTS_NARROW)
+    after = np.searchsorted(kept, along[_gaps(score.time_s)])
+    axes.plot(np.insert(kept, after, np.nan), np.insert(values, after, np.nan), color=OURS, lw=0.8)
     for name, title, looks in STATISTICS:
         value = getattr(score.ate.translation_m, name)
         axes.axhline(value, label=f"{title} {metres(value)}", zorder=3, **looks)
-    _from_zero(axes, along, float(score.position_error_m.max()), label)
+    axes.set(xlim=(low, max(high, low + 1e-6)), xlabel=label)
+    axes.set_ylim(0.0, 1.08 * max(float(error.max()), LEAST_SCALE_M))
+    axes.locator_params(axis="x", nbins=6)
+    axes.locator_params(axis="y", nbins=4)
 
 
-def _relative(axes: Axes, score: Evaluation, known: list[PairwiseError]) -> list[PairwiseError]:
-    """RPE over time, of the distances where there are any; returns what is shown."""
-    unit = "m" if any(e.unit == "m" for e in known) else known[0].unit
-    shown = [e for e in known if e.unit == unit][-MOST_CURVES:]
-    zero = zero_s(score)
-    for error, looks in zip(shown, CURVES[-len(shown) :], strict=True):
-        ends = score.time_s[error.end]
-        _line(axes, ends - zero, error.translation_error_m, ends, label=error.delta_words, **looks)
-    highest = max(float(error.translation_error_m.max()) for error in shown)
-    _from_zero(axes, score.time_s - zero, highest, time_label(score))
-    legend_above(axes, handlelength=1.8)
-    return shown
-
-
-def _boxes(axes: Axes, score: Evaluation) -> None:
-    """RPE of every delta as a box, with its RMSE and the interval of that."""
-    known = [(e, e.translation_m) for e in score.rpe if isinstance(e.translation_m, Statistics)]
-    if not known:
-        _none(axes, score)
-        return
-    known = known[:: -(-len(known) // MOST_BOXES)]
-    edge, middle = {"color": OURS, "lw": 0.8}, {"color": "black", "lw": 1.0}
-    axes.boxplot(
-        [error.translation_error_m for error, _ in known], whis=(0, 100), widths=0.5,
-        tick_labels=[error.delta_words for error, _ in known], patch_artist=True,
-        boxprops={"facecolor": "#dbe5f1", "edgecolor": OURS, "lw": 0.8}, medianprops=middle,
-        whiskerprops=edge, capprops=edge,
-    )  # fmt: skip
-    for place, (error, found) in enumerate(known, start=1):
+def _deltas(axes: Axes, score: Evaluation) -> None:
+    """RMSE of the RPE of every delta, with its 95 % interval."""
+    for place, (error, found) in enumerate(known := _known(score)):
         if isinstance(error.interval_m, Interval):
-            ends = (error.interval_m.low, error.interval_m.high)
-            axes.plot([place + 0.36] * 2, ends, color=EKF2, lw=1.2, solid_capstyle="butt")
-        axes.plot(place + 0.36, found.rmse, "D", color=EKF2, mec="black", mew=0.5, ms=3.6)
-    axes.set_ylim(0.0, max(axes.get_ylim()[1], LEAST_SCALE_M))
-    axes.set_xlim(0.5, len(known) + 0.6)
+            ends = error.interval_m.low, error.interval_m.high
+            axes.plot([place] * 2, ends, color=OURS, lw=1.6, solid_capstyle="butt")
+        axes.plot(place, found.rmse, "D", color=EKF2, mec="black", mew=0.5, ms=3.6)
+    shown = range(0, len(known), 1 + len(known) // MOST_DELTAS)
+    axes.set_xticks(shown, [known[place][0].delta_words for place in shown])
+    axes.set_ylim(0.0, max(1.05 * axes.get_ylim()[1], LEAST_SCALE_M))
+    axes.margins(x=0.1)
     axes.set_xlabel("delta")
 
 
-def _none(axes: Axes, score: Evaluation) -> None:
-    missing = [e.translation_m for e in score.rpe if isinstance(e.translation_m, Unavailable)]
-    reason = missing[0].reason if missing else "the path is too short for a delta"
-    style.empty(axes, f"No RPE: {reason}.")
+def _known(score: Evaluation) -> list[tuple[PairwiseError, Statistics]]:
+    return [(e, e.translation_m) for e in score.rpe if isinstance(e.translation_m, Statistics)]
 
 
-def time_label(score: Evaluation) -> str:
-    """What the axis of time counts from."""
-    return "time from the first pose (s)" if zero_s(score) else "time (s)"
+def over_time(score: Evaluation) -> tuple[Array, str]:
+    """Time of each pose on the page, and what its axis is called."""
+    zero = zero_s(score)
+    return score.time_s - zero, "time from the first pose (s)" if zero else "time (s)"
 
 
-def _from_zero(axes: Axes, along: Array, highest: float, label: str) -> None:
-    axes.set_ylim(0.0, 1.08 * max(highest, LEAST_SCALE_M))
-    axes.set_xlim(float(along[0]), max(float(along[-1]), float(along[0]) + 1e-6))
-    axes.locator_params(axis="x", nbins=6)
-    axes.locator_params(axis="y", nbins=4)
-    axes.set_xlabel(label)
-
-
-def _gaps(time_s: Array, least_s: float = 0.0) -> IntArray:
+def _gaps(time_s: Array) -> IntArray:
     """Indices of the poses after a gap in time."""
     steps = np.diff(time_s)
-    longest = max(GAP_STEPS * float(np.median(steps)), least_s) if len(steps) else least_s
-    return np.asarray(np.flatnonzero(steps > longest) + 1)
-
-
-def _line(axes: Axes, x: Array, y: Array, time_s: Array, **looks: Any) -> None:
-    """A line over time or distance, thinned to its extremes; no gap that shows is crossed."""
-    kept, values = style.thin(x, y, style.MAX_POINTS_NARROW)
-    after = np.searchsorted(kept, x[_gaps(time_s, GAP_SHARE * float(time_s[-1] - time_s[0]))])
-    axes.plot(np.insert(kept, after, np.nan), np.insert(values, after, np.nan), **looks)
+    return np.asarray(np.flatnonzero(steps > GAP_STEPS * np.median(steps)) + 1)
 
 
 def way(axes: Axes, seen: Array, time_s: Array, **style: Any) -> None:
@@ -329,16 +257,13 @@ def zero_s(score: Evaluation) -> float:
 def summary(score: Evaluation) -> str:
     """The score in one sentence."""
     worst = int(np.argmax(score.position_error_m))
+    aligned = "without" if score.alignment == "none" else "after"
     return (
         f"{score.estimate.name} is {metres(score.ate.translation_m.rmse)} (RMSE) from "
-        f"{score.reference.name} {_aligned(score)}; farthest, "
+        f"{score.reference.name} {aligned} alignment; farthest, "
         f"{metres(score.ate.translation_m.max)}, at {score.time_s[worst] - zero_s(score):.1f} s, "
         f"{score.distance_m[worst]:.1f} m along."
     )
-
-
-def _aligned(score: Evaluation) -> str:
-    return "without alignment" if score.alignment == "none" else "after alignment"
 
 
 def write_evaluation(page: Page, score: Evaluation) -> None:
@@ -404,14 +329,11 @@ def side_words(score: Evaluation, axis: int) -> str:
 def time_words(score: Evaluation) -> str:
     """Whether a few moments decide."""
     squares = np.sort(score.position_error_m**2)
-    total = float(squares.sum())
-    if score.ate.translation_m.rmse < NEGLIGIBLE_M:
-        return "There is no error at any time."
-    share = float(squares[-max(1, len(squares) // 10) :].sum()) / total
-    said = "it is spread over time, and no matter of a few moments"
-    if share > FEW_DECIDE:
-        said = "a few moments decide, look at these"
-    return f"The worst tenth of the poses makes {share:.0%} of the squared error: {said}."
+    worst = squares[-max(1, len(squares) // 10) :].sum() / max(squares.sum(), NEGLIGIBLE_M**2)
+    return (
+        f"The worst tenth of the poses makes {worst:.0%} of the squared error: 10% is an error "
+        "that is the same throughout, with much more a few moments decide."
+    )
 
 
 def quarters(score: Evaluation) -> list[float]:
@@ -425,50 +347,32 @@ def quarters(score: Evaluation) -> list[float]:
 
 def distance_words(score: Evaluation) -> str:
     """Whether the error grows along the path."""
-    found = quarters(score)
-    said = f"RMSE by quarters of the path {', '.join(f'{q:.3f}' for q in found)} m: "
-    if len(found) < 4:
-        return f"{said}the poses do not cover all of it."
-    if score.ate.translation_m.rmse < NEGLIGIBLE_M:
-        return f"{said}there is no error."
-    first, *middle, last = found
-    if min(first, last) > DIFFERS * max(middle):
-        return f"{said}high at both ends, as drift looks after an alignment."
-    if all(a <= b for a, b in pairwise(found)) and last > DIFFERS * first:
-        return f"{said}it grows along the path, as drift does."
-    where = ("first", "second", "third", "last")[int(np.argmax(found))]
-    return f"{said}largest in the {where}, no steady growth as a drift from the start has."
-
-
-def relative_words(shown: list[PairwiseError], times: Array, zero: float) -> str:
-    """Where the motion itself is worst."""
-    last = shown[-1]
-    worst = int(np.argmax(last.translation_error_m))
+    found = ", ".join(f"{q:.3f}" for q in quarters(score))
     return (
-        "What a motion over the delta is wrong by, wherever the path was before, drawn at its end: "
-        f"a peak is where it went wrong. Largest over {last.delta}: "
-        f"{metres(float(last.translation_error_m[worst]))}, from "
-        f"{times[last.start[worst]] - zero:.1f} to {times[last.end[worst]] - zero:.1f} s."
+        f"RMSE by quarters of the path {found} m. Drift grows along the path; after an alignment "
+        "it is high at both ends."
     )
 
 
 def growth_words(rpe: tuple[PairwiseError, ...]) -> str:
     """How the RPE grows with its delta, which tells noise from drift."""
-    boxes = "Box: middle half; whiskers: all; diamond: RMSE with its 95 % interval."
-    by_unit: dict[str, list[tuple[float, float]]] = {}
-    for error in rpe:
-        if isinstance(error.translation_m, Statistics) and error.translation_m.rmse > NEGLIGIBLE_M:
-            by_unit.setdefault(error.unit, []).append((error.delta, error.translation_m.rmse))
-    several = max(by_unit.values(), key=len, default=[])
-    (low, small), (high, large) = min(several, default=(0, 0)), max(several, default=(0, 0))
-    if not low < high:
-        return f"{boxes} A second distance would tell noise from drift."
-    ratio = high / low
-    unit = next(unit for unit, found in by_unit.items() if found is several)
+    said = "RMSE with its 95 % interval."
+    rmse: dict[tuple[str, float], float] = {
+        (error.unit, error.delta): error.translation_m.rmse
+        for error in rpe
+        if isinstance(error.translation_m, Statistics) and error.translation_m.rmse > NEGLIGIBLE_M
+    }
+    units = [unit for unit, _ in rmse]
+    unit = max(units, key=units.count, default="")
+    deltas = sorted(delta for one, delta in rmse if one == unit)
+    if len(deltas) < 2:
+        return f"{said} A second distance would tell noise from drift."
+    low, high = deltas[0], deltas[-1]
+    ratio, grown = high / low, rmse[unit, high] / rmse[unit, low]
     return (
-        f"{boxes} From {low:g} to {high:g} {unit}, {ratio:.3g} times, the RMSE is "
-        f"{large / small:.2g} times as large: 1 is noise of each pose, {np.sqrt(ratio):.2g} a "
-        f"random walk, {ratio:.3g} a wrong scale or heading."
+        f"{said} From {low:g} to {high:g} {unit}, {ratio:.3g} times, the RMSE is {grown:.2g} times "
+        f"as large: 1 is noise of each pose, {np.sqrt(ratio):.2g} a random walk, {ratio:.3g} a "
+        "wrong scale or heading."
     )
 
 

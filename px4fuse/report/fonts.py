@@ -6,7 +6,6 @@ needs is a font that has the characters.
 
 from __future__ import annotations
 
-import unicodedata
 from functools import cache
 from pathlib import Path
 
@@ -15,19 +14,10 @@ from matplotlib.font_manager import FontEntry, FontPath
 
 # Matplotlib's own, always there: Latin, Greek, Cyrillic, Arabic, Hebrew and symbols
 FONT = "DejaVu Sans"
-# Taken before the others that have a character. Those with PostScript outlines come late: they are
-# embedded as if they were TrueType, and not every viewer forgives that
-PREFERRED = (
-    "Noto Sans", "Noto Sans Thai", "Noto Sans Devanagari", "Leelawadee UI", "Thonburi",
-    "Nirmala UI", "Devanagari MT", "Noto Sans SC", "Microsoft YaHei", "Malgun Gothic", "Yu Gothic",
-    "WenQuanYi Zen Hei", "Arial Unicode MS", "Noto Sans CJK SC", "Hiragino Sans GB", "Segoe UI",
-)  # fmt: skip
 # These have a box for every character
 BOXES = ("lastresort", "last resort", "blank", "notdef")
 NO_GLYPH = "\N{WHITE SQUARE}"
 MOST_SHOWN = 12
-# First word of Unicode's name of a character, for scripts that people call otherwise
-SCRIPTS = {"CJK": "Chinese", "HIRAGANA": "Japanese", "KATAKANA": "Japanese", "HANGUL": "Korean"}
 
 
 @cache
@@ -58,24 +48,15 @@ def missing(text: str) -> str:
 
 def advice(characters: str) -> str:
     """What to install for :func:`missing` characters, as one sentence or two."""
-    scripts = " and ".join(dict.fromkeys(map(_script, characters)))
     shown = characters[:MOST_SHOWN] + ("…" if len(characters) > MOST_SHOWN else "")
     return (
-        f"No font of this machine has the {scripts} characters {shown}: the report shows "
-        f"{NO_GLYPH} for each. Install a font that has them: Noto Sans for {scripts}, from "
-        "fonts.google.com/noto."
+        f"No font of this machine has the characters {shown}: the report shows {NO_GLYPH} for "
+        "each. Install a font that has them: Noto Sans of their script, from fonts.google.com/noto."
     )
 
 
 def _foreign(text: str) -> list[str]:
     return [c for c in dict.fromkeys(text) if not c.isascii() and c.isprintable()]
-
-
-def _script(character: str) -> str:
-    if unicodedata.category(character).startswith("S"):
-        return "symbol"
-    word = unicodedata.name(character, "unknown").split()[0]
-    return SCRIPTS.get(word, word.capitalize())
 
 
 @cache
@@ -98,11 +79,23 @@ def _others() -> tuple[tuple[str, FontPath], ...]:
 
 
 def _order(entry: FontEntry) -> tuple[object, ...]:
-    rank = PREFERRED.index(entry.name) if entry.name in PREFERRED else len(PREFERRED)
+    """Those of Noto first, then without serifs, then the most regular.
+
+    Those with PostScript outlines come late: they are embedded as if they were TrueType, and not
+    every viewer forgives that.
+    """
     weight = entry.weight if isinstance(entry.weight, int) else 400
     postscript = str(entry.fname).lower().endswith(".otf")
-    sans = "Sans" in entry.name
-    return rank, postscript, not sans, abs(weight - 400), entry.name, str(entry.fname), entry.index
+    noto, sans = entry.name.startswith("Noto Sans"), "Sans" in entry.name
+    return (
+        postscript,
+        not noto,
+        not sans,
+        abs(weight - 400),
+        entry.name,
+        str(entry.fname),
+        entry.index,
+    )
 
 
 @cache

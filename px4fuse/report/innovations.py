@@ -13,52 +13,41 @@ from px4fuse.comparison.model import AxisComparison
 from px4fuse.filter.signals import Segment
 from px4fuse.report import panels
 from px4fuse.report.document import Document
-from px4fuse.report.page import Page, halves
-from px4fuse.report.style import EKF2, MEASUREMENT, OURS, TIME_LABEL, log_ticks
+from px4fuse.report.page import Page
+from px4fuse.report.style import EKF2, MEASUREMENT, OURS, TIME_LABEL
 from px4fuse.report.words import filters, verdict_notes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 ZOOM_UPDATES = 15
-ZOOM_RANGE_S = (1.0, 12.0)
-# Of the updates that a zoom of its length can hold, it must hold this share
-ZOOM_FILLED = 0.8
-START_S = 5.0
-ZOOM_SHARE, ZOOM = 0.66, 125.0  # of the page's width; height of the axes in points
+ZOOM_LEAST_S = 1.0
+ZOOM = 125.0  # height of the axes in points
 
 
 def draw(document: Document) -> Iterator[Page]:
-    """Draw one page: innovations, σ_p and σ_v on one time axis, then the zooms."""
+    """Draw one page: innovations, σ_p and σ_v on one time axis, then a zoom."""
     result = document.analysis.main
     page = Page(f"Innovations and variances along {result.axis.called}")
     for panel in (panels.INNOVATIONS, panels.SIGMA_P, panels.SIGMA_V):
         last, first = panel is panels.SIGMA_V, panel is panels.INNOVATIONS
         panel.put(page, document, result, last=last, strip=first)
-    _zooms(page, document)
+    _zoom(page, document)
     for note in verdict_notes(document.analysis):
         page.numbers(note)
     yield page
 
 
-def _zooms(page: Page, document: Document) -> None:
-    """Two zooms beside one another: in flight, and from the start."""
-    result, segment = document.analysis.main, document.analysis.segment
-    start_s, end_s = window = zoom_window(result, segment)
-    left, right = halves(ZOOM_SHARE)
-    axes = left.panel(
-        f"σ of position (m), {end_s - start_s:.1f} s of the flight", zoom_words(result), ZOOM
-    )
-    start = right.panel("The first seconds, log scale", start_words(result), ZOOM)
-    page.beside(left, right)
+def _zoom(page: Page, document: Document) -> None:
+    """Predict and update, seen near."""
+    result = document.analysis.main
+    start_s, end_s = window = zoom_window(result, document.analysis.segment)
+    title = f"σ of position (m), {end_s - start_s:.1f} s of the flight"
+    axes = page.panel(title, zoom_words(result), ZOOM)
     _sawtooth(axes, result, window)
-    first = float(result.replay.steps.index[0])
-    _sawtooth(start, result, (first, min(first + START_S, segment.end_s)))
-    log_ticks(start)
     updates = result.replay.updates.loc[start_s:end_s].index
     axes.vlines(updates, 0.0, 0.03, transform=axes.get_xaxis_transform(), color=MEASUREMENT, lw=1.2)
     axes.set_xlabel(TIME_LABEL)
-    start.set_xlabel("time (s)")
     shown = []
     if isinstance(result.ekf2_innovations, pd.DataFrame):
         shown += ["triangle up just before an update", "down just after"]
@@ -71,23 +60,19 @@ def _zooms(page: Page, document: Document) -> None:
 def zoom_window(result: AxisComparison, segment: Segment) -> Span:
     """Part of the flight with about fifteen updates, near the middle of what EKF2 logged too.
 
-    Never in a gap of the source, if it has enough updates anywhere.
+    That middle is a measurement, so that the part does not lie in a gap of the source.
     """
-    updates = result.replay.updates.index.to_numpy()
-    if len(updates) < 2:
-        return segment.start_s, min(segment.start_s + ZOOM_RANGE_S[0], segment.end_s)
-    interval = float(np.median(np.diff(updates)))
-    length = float(np.clip(ZOOM_UPDATES * interval, *ZOOM_RANGE_S))
-    times = updates
+    times = result.replay.updates.index.to_numpy()
+    if len(times) < 2:
+        return segment.start_s, min(segment.start_s + ZOOM_LEAST_S, segment.end_s)
+    interval = float(np.median(np.diff(times)))
+    count = min(max(ZOOM_UPDATES, round(ZOOM_LEAST_S / interval)), len(times) - 1)
+    spans = times[count:] - times[:-count]
+    middle = float(times[len(times) // 2])
     if isinstance(result.ekf2_innovations, pd.DataFrame) and len(result.ekf2_innovations):
-        times = result.ekf2_innovations.index.to_numpy()
-    last = max(segment.end_s - length, segment.start_s)
-    starts = np.clip(times - length / 2.0, segment.start_s, last)
-    held = np.searchsorted(updates, starts + length) - np.searchsorted(updates, starts)
-    near = np.abs(starts + length / 2.0 - times[len(times) // 2])
-    full = held >= min(ZOOM_FILLED * length / interval, float(held.max()))
-    start = float(starts[np.argmin(np.where(full, near, np.inf))])
-    return start, min(start + length, segment.end_s)
+        middle = float(result.ekf2_innovations.index[len(result.ekf2_innovations) // 2])
+    start = np.argmin(np.abs(times[:-count] + spans / 2.0 - middle))
+    return float(times[start]), float(times[start + count])
 
 
 def _sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
@@ -127,14 +112,3 @@ def zoom_words(result: AxisComparison) -> str:
             )
         said.append(shrinks)
     return f"{'; '.join(said)}." if said else ""
-
-
-def start_words(result: AxisComparison) -> str:
-    """What to see in the first seconds."""
-    sigma = np.sqrt(result.replay.steps["position_variance_m2"])
-    first = f"From σ {sigma.iloc[0]:g} m (P₀)"
-    steady = result.filters["kf"].sigma_p_after_update_m
-    settled = sigma.index[(sigma < 1.2 * (steady or 0.0)).to_numpy()]
-    if steady is None or not len(settled):
-        return f"{first} on."
-    return f"{first} to its steady {steady:.2g} m within {settled[0] - sigma.index[0]:.1f} s."

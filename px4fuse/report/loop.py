@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 from rich.console import Console
 
-from px4fuse.arrays import Array
 from px4fuse.findings import Finding, by_root
 from px4fuse.flight import Unavailable
 from px4fuse.loop import corrections
@@ -22,9 +20,9 @@ from px4fuse.report import style
 from px4fuse.report.cover import write_finding
 from px4fuse.report.document import Document, LoopDocument, who
 from px4fuse.report.evaluation import interval_words, score_words, way
-from px4fuse.report.page import AXIS_LABEL, TICKS, Cell, Page, appendix, legend_above
+from px4fuse.report.page import AXIS_LABEL, TICKS, Cell, Page, appendix
 from px4fuse.report.screen import show
-from px4fuse.report.style import EKF2, LINES, MUTED, OURS, as_map, bare_x, curve
+from px4fuse.report.style import EKF2, LINES, MUTED, OURS, as_map
 from px4fuse.request import LoopRequest
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import MANY_CLOSURES, SOLUTIONS, SolvedGraph
@@ -58,50 +56,41 @@ TITLE, LEAD = (
     "headings too), or as a pose graph weighs it. A closure that is not true would warp the whole "
     "path, so that each one is tested before its use.",
 )
-WARPED = SOLUTIONS["all"]  # by closures that are not true
 MAP_POINTS = 2000
-MAP, HEIGHT, LEGEND = 290.0, 105.0, 38.0  # of the axes, and of a legend, in points
+MAP, LEGEND = 290.0, 38.0  # of the axes, and of the legend below them, in points
 
 
 def draw(document: Document) -> Iterator[Page]:
-    """Draw the loop's pages; none where the flight holds no loop."""
+    """Draw the loop's page; none where the flight holds no loop."""
     if isinstance(document.analysis.loop, Loop):
-        yield from _draw(document.analysis.loop, Page(appendix(TITLE), LEAD), appendix)
+        page = Page(appendix(TITLE), LEAD)
+        _write(page, document.analysis.loop)
+        yield page
 
 
 def draw_report(document: LoopDocument) -> Iterator[Page]:
-    """Draw the pages of a report on a loop alone, its findings on the first."""
+    """Draw the page of a report on a loop alone, with its findings."""
     page = Page(TITLE, LEAD)
     if student := who(document.student, ", "):
         page.labelled("Student", student)
     page.labelled("SHA-256", document.loop.odometry.trajectory.sha256)
-    yield from _draw(document.loop, page, str, document.findings)
+    _write(page, document.loop, document.findings)
+    yield page
 
 
-def _draw(
-    loop: Loop, page: Page, name: Callable[[str], str], findings: tuple[Finding, ...] = ()
-) -> Iterator[Page]:
-    """Draw the first page to its end and those after it, their titles made by ``name``."""
+def _write(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
+    """Write what was found, the map, and the scores; as many sheets as that takes."""
     write_loop(page, loop, findings)
     _map(page, loop)
-    yield page
-    page = Page(
-        name("Along the path"),
-        "How far each correction moved each pose, and how far the path is from the reference after "
-        "alignment. A correction that helps brings the error down along most of the path, not only "
-        "at its end.",
-    )
-    _along(page, loop)
-    yield page
-    page = Page(
-        name("Closures and scores"),
+    page.heading("Closures and scores", 10.5, above=14.0)
+    page.write(
         "d² is the squared misclosure against what drift and closure explain together; p is the "
         "chance of a larger one if the closure is true. Robust solving (dynamic covariance "
         "scaling, DCS; graduated non-convexity, GNC) weighs each closure by how well the others "
         "agree with it: 1 keeps it, 0 drops it.",
+        colour=MUTED,
     )
     write_scores(page, loop)
-    yield page
 
 
 def shown(loop: Loop) -> list[CorrectedPath]:
@@ -137,59 +126,12 @@ def draw_map(axes: Axes, loop: Loop) -> None:
 
 
 def _reference(axes: Axes, loop: Loop) -> None:
-    """The reference in the odometry's frame, placed by the best correction there is."""
-    for name in (reference.name for reference in loop.references):
-        for part in reversed(shown(loop)):
-            score = part.scores.get(name)
-            if not isinstance(score, Evaluation):
-                continue
-            position = score.transform.undo(score.reference_m)
-            way(axes, position[:, (1, 0)], score.time_s, label=name, **LINES["truth"], zorder=4)
-            return
-
-
-def _along(page: Page, loop: Loop) -> None:
-    """Height of each path, how far it moved, and its error: a panel for each, over distance."""
-    height = f"{capital(AXES_OF_FRAME[loop.odometry.trajectory.frame][2])} (m)"
-    along, paths = loop.distance_m, shown(loop)
-    panels: dict[str, dict[str, tuple[Array, Array, str]]] = {
-        height: {part.name: (along, part.trajectory.position_m[:, 2], "") for part in paths},
-        "How far each pose moved (m)": {
-            part.name: (along, part.moved_m, f"at most {part.moved_m.max():.2f} m")
-            for part in paths
-            if part is not loop.odometry
-        },
-    }
-    for reference in loop.references:
-        scores = [(part, part.scores[reference.name]) for part in paths]
-        panels[f"Distance to {reference.name} after alignment (m)"] = {
-            part.name: (
-                np.interp(score.time_s, part.trajectory.time_s, along),
-                score.position_error_m,
-                f"RMSE {score.ate.translation_m.rmse:.3f} m, max "
-                f"{score.ate.translation_m.max:.3f} m",
-            )
-            for part, score in scores
-            if isinstance(score, Evaluation)
-        }
-    drawn = {title: curves for title, curves in panels.items() if curves}
-    for place, (title, curves) in enumerate(drawn.items(), start=1):
-        axes = page.panel(title, "", HEIGHT, above=14.0 if title == height else 4.0)
-        for name, (x, y, _) in curves.items():
-            curve(axes, pd.Series(y, x), label=name, **STYLES[name])
-        axes.set_xlim(0.0, loop.path_length_m)
-        if place == len(drawn):
-            axes.set_xlabel("distance along the path (m)")
-        else:
-            bare_x(axes)
-        if title == height:
-            legend_above(axes)
-            continue
-        # a path that a false closure warps runs out of sight
-        used = [float(np.nanmax(y)) for name, (_, y, _) in curves.items() if name != WARPED]
-        if used:
-            axes.set_ylim(0.0, 1.15 * max(*used, 1e-3))
-        page.numbers("; ".join(f"{name}: {said}" for name, (*_, said) in curves.items()))
+    """The first reference in the odometry's frame, placed by the best correction there is."""
+    for reference in loop.references[:1]:
+        score = loop.best.scores.get(reference.name)
+        if isinstance(score, Evaluation):
+            at = score.transform.undo(score.reference_m)[:, (1, 0)]
+            way(axes, at, score.time_s, label=reference.name, **LINES["truth"], zorder=4)
 
 
 # ---------------------------------------------------------------------------------------- words
@@ -322,16 +264,13 @@ def by_distance_words(loop: Loop) -> str:
     """What the corrections by distance are; nothing where there is none."""
     if "by_distance_plain" not in loop.paths:
         return ""
-    example = (
-        "By distance, positions only, is the lesson's Example 2: each position moves by its share "
-        "of the gap, and the path keeps the bend of its headings."
-    )
     turned = loop.heading_error_deg
+    headings = "Headings too: each step is first turned back by its share of the heading error."
     if isinstance(turned, Unavailable):
-        return f"{example} Headings are not turned: {turned.reason}."
+        headings = f"Headings are not turned: {turned.reason}."
     return (
-        f"{example} Headings too: each step is first turned back by its share of the {turned:+.1f}°"
-        " that the heading is off at the end, and what is left of the gap is spread as before."
+        "By distance, positions only, is the lesson's Example 2: each position moves by its share "
+        f"of the gap, and the path keeps the bend of its headings. {headings}"
     )
 
 
@@ -380,10 +319,7 @@ def print_graph(console: Console, solved: SolvedGraph) -> None:
         page.labelled("Gate", "no closures to judge: every edge is odometry")
     else:
         rejected = [gate for gate in gates if not gate.accepted]
-        said = [
-            f"{gate.first} – {gate.second}: d² {gate.d2:.1f}, p {gate.p:.2g}"
-            for gate in rejected[:MOST_ROWS]
-        ]
+        said = [f"{g.first} – {g.second}: d² {g.d2:.1f}, p {g.p:.2g}" for g in rejected[:MOST_ROWS]]
         said += [f"and {len(rejected) - MOST_ROWS} more"] if len(rejected) > MOST_ROWS else []
         page.labelled("Gate", f"rejects {len(rejected)} of {len(gates)} closures", *said)
     if len(solved.solutions) == 1 and (~solved.graph.successive).sum() > MANY_CLOSURES:

@@ -11,7 +11,7 @@ from px4fuse.arrays import Array
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page
-from px4fuse.report.style import EKF2_REJECTED, MUTED, TIME_LABEL, bare_x
+from px4fuse.report.style import EKF2_REJECTED, MUTED, time_axis
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -111,10 +111,7 @@ def panel(
     strip = strip and bool(document.events.modes)
     axes = page.panel(title, say, height, above=max(above, STRIP if strip else 0.0))
     draw(axes, document, axis=axis, strip=strip)
-    if last:
-        axes.set_xlabel(TIME_LABEL)
-    else:
-        bare_x(axes)
+    time_axis(axes, last)
     return axes
 
 

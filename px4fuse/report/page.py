@@ -15,7 +15,6 @@ from px4fuse.report.style import MUTED
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 # Points: width of the text, of the numbers beside an axes, of the labels before sentences
 WIDTH, AXIS_LEFT, LABEL = 512.0, 26.0, 52.0
@@ -115,10 +114,6 @@ class Page:
         _place(block)
         return axes
 
-    def drawing(self, figure: Figure, alt: str) -> None:
-        """A figure as it is, with the sentence that a screen reader gets."""
-        self.add("panel", title="", say="", alt=alt, width=self.width, figure=figure)
-
     def legend(self, *rows: Sequence[Artist]) -> None:
         """Legend of several panels, a line for each row of entries."""
         from matplotlib.figure import Figure  # noqa: PLC0415
@@ -132,7 +127,8 @@ class Page:
                 columnspacing=1.2,
             )  # fmt: skip
         named = ", ".join(str(artist.get_label()) for row in kept for artist in row)
-        self.drawing(figure, f"Legend: {named}")
+        alt = f"Legend: {named}"
+        self.add("panel", title="", say="", alt=alt, width=self.width, figure=figure)
 
     def beside(self, *columns: Page, gap: float = 14.0, above: float = 6.0) -> None:
         """Put columns beside one another, so many points below what stands above."""

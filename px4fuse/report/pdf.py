@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping
-from functools import cache
 from importlib import metadata
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -35,7 +34,6 @@ from px4fuse.report import (
 )
 from px4fuse.report.document import (
     AidsDocument,
-    ChangesDocument,
     Document,
     LoopDocument,
     WhatIfDocument,
@@ -44,9 +42,10 @@ from px4fuse.report.document import (
 from px4fuse.report.page import Page, data, printable
 from px4fuse.report.seal import sealed
 from px4fuse.report.style import report_style
+from px4fuse.results.contract import ChangeResults
 from px4fuse.trajectory.evaluation import Evaluation
 
-Report = Document | AidsDocument | LoopDocument | WhatIfDocument | Evaluation | ChangesDocument
+Report = Document | AidsDocument | LoopDocument | WhatIfDocument | Evaluation | ChangeResults
 RESULTS_NAME = "results.json"
 STANDARDS: list[Any] = ["a-3a", "ua-1"]
 PAGES: Mapping[type, tuple[Callable[[Any], Iterator[Page]], ...]] = {
@@ -59,29 +58,23 @@ PAGES: Mapping[type, tuple[Callable[[Any], Iterator[Page]], ...]] = {
     LoopDocument: (loop.draw_report, notes.draw, provenance.draw_loop),
     WhatIfDocument: (whatif.draw,),
     Evaluation: (evaluation.draw,),
-    ChangesDocument: (changes.draw,),
+    ChangeResults: (changes.draw,),
 }  # fmt: skip
 
 
 def _named(document: Report) -> tuple[str, str, str]:
     """Title of the PDF, and name and SHA-256 of the file that it is about."""
     match document:
-        case Document(analysis):
-            log = analysis.flight.log
-            return f"px4fuse compare {log.name}", log.name, log.sha256
-        case AidsDocument(alone):
-            log = alone.flight.log
-            return f"px4fuse compare {log.name}", log.name, log.sha256
-        case WhatIfDocument(made_of):
-            log = made_of.flight.log
-            return f"px4fuse whatif {log.name}", log.name, log.sha256
+        case Document(analysis=of) | AidsDocument(alone=of) | WhatIfDocument(made_of=of):
+            command = "whatif" if isinstance(document, WhatIfDocument) else "compare"
+            log = of.flight.log
+            return f"px4fuse {command} {log.name}", log.name, log.sha256
         case LoopDocument(loop=found):
             track = found.odometry.trajectory
             return f"px4fuse loop {track.name}", track.name, track.sha256
         case Evaluation(estimate=one, reference=other):
             return f"px4fuse evaluate {one.name} {other.name}", one.name, one.sha256
-        case ChangesDocument(results):
-            a, b = results.a, results.b
+        case ChangeResults(a=a, b=b):
             name = f"A {a.log}, SHA-256 {a.log_sha256[:12]} · B {b.log}"
             return f"px4fuse diff {a.given} {b.given}", name, b.log_sha256
 
@@ -91,7 +84,7 @@ def render(document: Report, results_json: str) -> bytes:
 
     Parameters
     ----------
-    document : Document, AidsDocument, LoopDocument, WhatIfDocument, Evaluation or ChangesDocument
+    document : Document, AidsDocument, LoopDocument, WhatIfDocument, Evaluation or ChangeResults
     results_json : str
         Attached inside the PDF as ``results.json``, so that the PDF alone can be checked.
 
@@ -139,9 +132,11 @@ def compiled(report: Mapping[str, Any], template: str | None = None) -> bytes:
     typst.TypstError
         The template is not right, or asks for a file.
     """
+    if template is None:
+        template = Path(__file__).with_name("report.typ").read_text(encoding="utf-8")
     with TemporaryDirectory() as empty:
         compiler = typst.Compiler(
-            input=(_template() if template is None else template).encode(),
+            input=template.encode(),
             root=empty,
             font_paths=typst.Fonts(
                 include_system_fonts=False,
@@ -155,8 +150,3 @@ def compiled(report: Mapping[str, Any], template: str | None = None) -> bytes:
         made = compiler.compile(format="pdf", pdf_standards=STANDARDS)
     assert isinstance(made, bytes)
     return sealed(made)
-
-
-@cache
-def _template() -> str:
-    return Path(__file__).with_name("report.typ").read_text(encoding="utf-8")

@@ -6,7 +6,6 @@ in grey. Text from outside (names, notes) is drawn as it is: no mathematics, no 
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -101,9 +100,12 @@ def plain_ticks(axis: Axis) -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def bare_x(axes: Axes) -> None:
-    """Leave out the numbers of an x axis that another below it shows."""
-    axes.tick_params(axis="x", labelbottom=False)
+def time_axis(axes: Axes, last: bool) -> None:
+    """Name an axis of time, or leave out its numbers where another below it shows them."""
+    if last:
+        axes.set_xlabel(TIME_LABEL)
+    else:
+        axes.tick_params(axis="x", labelbottom=False)
 
 
 def as_map(axes: Axes, right: str, up: str) -> None:
@@ -111,16 +113,6 @@ def as_map(axes: Axes, right: str, up: str) -> None:
     axes.set_aspect("equal", adjustable="datalim", anchor="W")
     axes.grid(True, axis="both")
     axes.set(xlabel=f"{right} (m)", ylabel=f"{up} (m)")
-
-
-def empty(axes: Axes, reason: str) -> None:
-    """Say in an axes why there is nothing to draw."""
-    axes.set_axis_off()
-    width = max(20, int(axes.get_position().width * 95))
-    axes.text(
-        0.5, 0.5, textwrap.fill(reason, width), ha="center", va="center", size=7.5, color=MUTED,
-        transform=axes.transAxes,
-    )  # fmt: skip
 
 
 def thin(time: Array, value: Array, limit: int = MAX_POINTS) -> tuple[Array, Array]:

@@ -1,10 +1,9 @@
-"""What if EKF2 had had other parameters: side by side, and over the values of one."""
+"""What if EKF2 had had other parameters: side by side, and a row for each value of one."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
 
 from rich.console import Console
 
@@ -14,21 +13,13 @@ from px4fuse.ekf2.whatif import DISTURBED_M, MOST_REJECTED, Summary
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
-from px4fuse.plain import capital, number_words
+from px4fuse.plain import number_words
 from px4fuse.report.document import WhatIfDocument
 from px4fuse.report.page import Page
 from px4fuse.report.screen import show
-from px4fuse.report.style import EKF2_BAND, EKF2_LINE, OURS_LINE, log_ticks
 from px4fuse.report.why import agreement_words, write_why
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 SIZE = 8.0
-PANEL_POINTS = 60.0
-MAX_TICKS = 10
-WIDE = 5.0  # values that span more are drawn on a logarithmic scale
-Of = Callable[[Summary, str], float | Unavailable]
 CHAOTIC = "chaotic"
 # Of each EKF2 along an axis
 AXIS_ROWS: tuple[tuple[str, Callable[[Summary, str], str]], ...] = (
@@ -156,7 +147,7 @@ def _number(value: float | Unavailable, digits: int = 3) -> str:
 
 
 def draw(document: WhatIfDocument) -> Iterator[Page]:
-    """Draw one page, and another where a sweep needs it."""
+    """One page of tables."""
     page = Page(
         "EKF2 with other parameters",
         "EKF2 replayed from the log by px4fuse's model of it, which is not PX4's own code: as "
@@ -164,8 +155,6 @@ def draw(document: WhatIfDocument) -> Iterator[Page]:
     )
     page.labelled("Command", document.command)
     _tables(page, document.made_of)
-    if sweep_of(document.made_of):
-        _panels(page, document.made_of)
     yield page
 
 
@@ -199,44 +188,3 @@ def _tables(page: Page, made_of: Counterfactual) -> None:
         page.table(sweep_heads(made_of), sweep_rows(made_of), right=range(1, 7), size=SIZE)
     for line in reading(made_of):
         page.write(line, size=8.5, above=2.0)
-
-
-def _panels(page: Page, made_of: Counterfactual) -> None:
-    """Mean NIS, share rejected, and error or σ_p over the values."""
-    summaries, name = [one for one in sweep_of(made_of) if one.steady], swept(made_of)
-    if not summaries:
-        return
-    values = [summary.changed[name] for summary in summaries]
-    panels: dict[str, Of] = {
-        "mean NIS": lambda s, axis: s.axes[axis].nis_mean,
-        "rejected (%)": lambda s, _: 100.0 * s.rejected_share,
-        "σ_p (m)": lambda s, axis: s.axes[axis].sigma_p_median_m,
-    }
-    if isinstance(summaries[0].position_rmse_to_truth_m, float):
-        del panels["σ_p (m)"]
-        panels["position RMSE to truth (m)"] = lambda s, ax: s.axes[ax].position_rmse_to_truth_m
-    for title, of in panels.items():
-        axes = page.panel(capital(title), "", PANEL_POINTS)
-        _curves(axes, values, [[of(s, axis) for s in summaries] for axis in HORIZONTAL])
-        if title == "rejected (%)":
-            axes.set_ylim(0.0, max(1.0, axes.get_ylim()[1]))
-        elif axes.dataLim.ymax > WIDE * axes.dataLim.ymin:
-            log_ticks(axes)
-        if title == "mean NIS":
-            band = made_of.whatif.replayed.axes["north"].nis_band
-            axes.axhspan(*band, color=EKF2_BAND, lw=0)
-            axes.legend(loc="upper right", ncols=2)
-    axes.set_xlabel(_named(name))
-
-
-def _curves(axes: Axes, values: list[float], lines: list[list[float | Unavailable]]) -> None:
-    """A line for north and one for east, over the values of a parameter."""
-    for axis, line, style in zip(HORIZONTAL, lines, (OURS_LINE, EKF2_LINE), strict=True):
-        known = [(x, y) for x, y in zip(values, line, strict=True) if isinstance(y, float)]
-        axes.plot(*zip(*known, strict=True), marker=".", label=axis, **style)
-    if min(values) > 0.0:
-        axes.set_xscale("log")
-    ticks = values[:: math.ceil(len(values) / MAX_TICKS)]
-    axes.set_xticks(ticks, [number_words(value) for value in ticks])
-    axes.minorticks_off()
-    axes.margins(x=0.02)

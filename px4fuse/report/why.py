@@ -16,7 +16,7 @@ from px4fuse.flight import Unavailable
 from px4fuse.plain import capital
 from px4fuse.report import marks
 from px4fuse.report.document import Document
-from px4fuse.report.page import Page
+from px4fuse.report.page import Page, halves
 from px4fuse.report.style import EKF2, EKF2_BAND, LINES, MUTED, OURS, OURS_BAND, curve
 
 if TYPE_CHECKING:
@@ -28,9 +28,8 @@ LEAD = (
     "px4fuse's own model of it. A bar is by how much that brings our track nearer to EKF2's (mean "
     "square; hatched: farther away, which later steps make good). They add up to the whole."
 )
-ROW_POINTS = 12.0
-AROUND = 42.0  # points above and below the bars
-LABELS, GAP = 0.25, 0.04  # of the width: names of the steps, and between both
+ROW_POINTS, LABELS, GAP = 12.0, 128.0, 14.0  # height of a bar, width of the names of steps
+WITH_NAMES = 0.62  # of the width: the bars that have the names of steps beside them
 TIME_POINTS = 105.0
 AWAY = {"color": "white", "hatch": "////"}  # bars of steps that lead away from EKF2
 
@@ -102,38 +101,29 @@ def agreement_words(agreement: Agreement) -> str:
 
 
 def _axis(page: Page, name: str, why: Why, document: Document) -> None:
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
     spans = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in why.spans_s)
     page.heading(f"{name}, {spans}", 9.5, above=10.0)
     for sentence in why.sentences:
         page.write(sentence, size=8.5, above=1.0)
     names = [step.name for step in why.steps]
-    height = ROW_POINTS * (len(names) + 2) + AROUND
-    figure = Figure(figsize=(page.width / 72.0, height / 72.0))
-    share = (0.985 - LABELS - GAP) / 2.0
-    for column, (what, unit, power) in enumerate(
-        (("position", "m", "m2"), ("velocity", "m/s", "m2_s2"))
+    columns = halves(WITH_NAMES, gap=GAP)
+    for column, left, (what, unit, power) in zip(
+        columns, (LABELS, 4.0), (("position", "m", "m2"), ("velocity", "m/s", "m2_s2")), strict=True
     ):
-        start = LABELS + column * (share + GAP)
-        axes = figure.add_axes((start, 26.0 / height, share, 1.0 - AROUND / height))
         total = getattr(why, f"{what}_mean_square_{power}")
         steps = np.array([getattr(step, f"{what}_mean_square_{power}") for step in why.steps])
-        left = getattr(why, f"{what}_left_mean_square_{power}")
-        _waterfall(axes, names, 100.0 * steps / total, 100.0 * left / total)
-        axes.set_title(f"{what}, {np.sqrt(total):.3f} {unit} rms")
-        if column:
-            axes.set_yticklabels([])
-    page.drawing(figure, f"What each step brings, in per cent: {', '.join(names)}")
+        unexplained = getattr(why, f"{what}_left_mean_square_{power}")
+        title, height = f"{what}, {np.sqrt(total):.3f} {unit} rms", ROW_POINTS * (len(names) + 2)
+        axes = column.panel(title, "", height, left=left)
+        _waterfall(axes, names, 100.0 * steps / total, 100.0 * unexplained / total)
+    axes.set_yticklabels([])
+    page.beside(*columns, gap=GAP)
     title = "Position apart (m): ours - EKF2 (dark), and what the model leaves of it (light)"
     axes = marks.panel(page, document, title, _time_words(why), TIME_POINTS, axis=name, strip=True)
     apart, left_over = (pd.Series(v, why.times_s) for v in (why.apart_m, why.left_m))
     for start, end in why.spans_s:
         curve(axes, apart.loc[start:end], **LINES["ours"])
         curve(axes, left_over.loc[start:end], color=EKF2, lw=0.8)
-    if why.coast is not None:
-        end = why.coast.start_s + why.coast.duration_s
-        axes.axvspan(why.coast.start_s, end, color=EKF2_BAND, lw=0, zorder=0.5)
 
 
 def _waterfall(axes: Axes, names: list[str], shares: Array, left: float) -> None:
@@ -161,15 +151,7 @@ def _waterfall(axes: Axes, names: list[str], shares: Array, left: float) -> None
 def _time_words(why: Why) -> str:
     """What to see along the flight."""
     farthest = int(np.argmax(np.abs(why.apart_m)))
-    words = (
-        f"Farthest apart at {why.times_s[farthest]:.1f} s, "
-        f"{abs(why.apart_m[farthest]):.2g} m; the model leaves "
-        f"{np.sqrt(np.mean(why.left_m**2)):.2g} m RMS"
-    )
-    if why.coast is None:
-        return f"{words}."
-    start, length = why.coast.start_s, why.coast.duration_s
     return (
-        f"{words}. EKF2's longest run of rejections, {start:.1f} s to {start + length:.1f} s, "
-        "is shaded."
+        f"Farthest apart at {why.times_s[farthest]:.1f} s, {abs(why.apart_m[farthest]):.2g} m; the "
+        f"model leaves {np.sqrt(np.mean(why.left_m**2)):.2g} m RMS."
     )

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from itertools import permutations
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from px4fuse.comparison.model import AxisComparison, Comparison, Difference, FilterSummary
 from px4fuse.comparison.model import UnjudgedFilter as Unjudged
-from px4fuse.filter.consistency import SIGMA_OFF, Consistency, verdict_of
+from px4fuse.filter.consistency import SIGMA_OFF, Consistency
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings import Finding
@@ -41,7 +40,8 @@ def verdict_words(statement: Consistency | Unavailable) -> str:
         return "not available"
     if statement.verdict == "consistent":
         return "consistent"
-    return f"{_side(statement)} {factor_words(statement.times_off)}× in σ"
+    side = statement.verdict.removeprefix("variance ")
+    return f"{side} {factor_words(statement.times_off)}× in σ"
 
 
 def filters(result: AxisComparison) -> dict[str, FilterSummary | Unjudged]:
@@ -50,12 +50,6 @@ def filters(result: AxisComparison) -> dict[str, FilterSummary | Unjudged]:
     if not isinstance(result.ekf2_state, Unavailable):
         known["EKF2"] = result.filters["ekf2"]
     return known
-
-
-def band_words(statement: Consistency) -> str:
-    """The 95 % band of the mean NIS."""
-    low, high = statement.nis_band
-    return f"{low:.2f} – {high:.2f}"
 
 
 VERDICT_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "innovation\nvariance")
@@ -72,7 +66,7 @@ def verdict_rows(
             label = result.axis.name if name == "ours" else ""
             nis, colour = ("", ""), MUTED
             if isinstance(one, Consistency):
-                nis = (number_words(one.nis_mean), band_words(one))
+                nis = (number_words(one.nis_mean), "{:.2f} – {:.2f}".format(*one.nis_band))
                 colour = GOOD if one.verdict == "consistent" else SEVERITY_COLOURS["warning"]
             rows.append([label, name, *nis, (verdict_words(one), colour), *more(result, name, one)])
     return rows
@@ -102,15 +96,11 @@ def _metres(part: object, field: str) -> str:
     return "" if value is None else f"{value:.3f}"
 
 
-def _side(statement: Consistency) -> str:
-    return statement.verdict.removeprefix("variance ")
-
-
 def verdict_notes(comparison: Comparison) -> list[str]:
     """What the verdicts mean where they could be misread, a sentence each.
 
-    A source that may drift; factors that are too small for a finding; one mean NIS and two
-    verdicts; innovations of the right size that are not white.
+    A source that may drift; factors that are too small for a finding; innovations of the right
+    size that are not white.
     """
     stated = [
         (result.axis.name, owner, statement)
@@ -134,7 +124,6 @@ def verdict_notes(comparison: Comparison) -> list[str]:
             f"{', '.join(small)}: more than chance, but less than {SIGMA_OFF:g}×, from "
             "where it is a finding."
         )
-    notes += _same_nis(stated)
     coloured = [
         f"{owner} {axis} {p_words(statement.ljung_box_p)}, lag-1 "
         f"{statement.lag1_autocorrelation:+.2f}"
@@ -148,23 +137,6 @@ def verdict_notes(comparison: Comparison) -> list[str]:
             "small), with a negative one it overshoots (SIGMA_A is large)."
         )
     return notes
-
-
-def _same_nis(stated: Sequence[tuple[str, str, Consistency]]) -> Iterator[str]:
-    """Two filters on one axis of which only the one with more samples is called wrong."""
-    for (axis, owner, wrong), (on, other, fine) in permutations(stated, 2):
-        if on != axis or wrong.verdict == "consistent" or fine.verdict != "consistent":
-            continue
-        # the same mean in the wider band of the other
-        outside = verdict_of(fine.nis_mean, wrong.nis_band) == wrong.verdict
-        inside = verdict_of(wrong.nis_mean, fine.nis_band) == "consistent"
-        if outside and inside and fine.count < wrong.count:
-            bands = " and ".join("{:.2f}-{:.2f}".format(*one.nis_band) for one in (wrong, fine))
-            yield (
-                f"Along {axis} only {owner} is called {_side(wrong)} although {other} has "
-                f"nearly the same mean NIS ({wrong.nis_mean:.2f}, {fine.nis_mean:.2f}): with "
-                f"{wrong.count} samples against {fine.count} the band is narrower ({bands})."
-            )
 
 
 def consequences_words(followers: Sequence[Finding]) -> str:
@@ -219,12 +191,9 @@ def tuning_advice(
     advice, sigma_a, sigma_z = {}, found.filter_sigma_a, found.sigma_z
     drifts, log = comparison.source.origin.may_drift, comparison.flight.log
     if drifts:
-        noise = sigma_z.value or sigma_z.high
         advice["Drift"] = (
-            "the source may drift: these noises make a filter follow it"
-            + ("" if noise is None else f", {noise:.2g} m is how it scatters from second to second")
-            + ", not how wrong it is. Take no SIGMA_Z and no EKF2_EVP_NOISE below what truth or a "
-            "loop shows."
+            "the source may drift: these noises make a filter follow it and are not how wrong it "
+            "is. Take no SIGMA_Z and no EKF2_EVP_NOISE below what truth or a loop shows."
         )
     options = [
         f" {option} {noise.value:.3g}"
@@ -234,9 +203,7 @@ def tuning_advice(
     if options:
         typed = f"px4fuse compare LOG{''.join(options)}"
         advice["Re-run"] = f"with the noises of {name}: {typed}"
-    if sigma_z.value is None and sigma_z.low is not None:
-        advice["SIGMA_Z"] = f"is at least {sigma_z.low:.2g} m: is this a position source at all?"
-    elif sigma_z.value is None:
+    if sigma_z.value is None:
         bound = "" if sigma_z.high is None else f" (at most {sigma_z.high:.2g} m)"
         advice["SIGMA_Z"] = (
             f"is below what this logging rate can show{bound}: between samples the process noise "
@@ -244,32 +211,19 @@ def tuning_advice(
         )
     elif log.autopilot == "PX4" and not drifts and comparison.source.origin.is_vision:
         now = log.parameters.get("EKF2_EVP_NOISE")
-        advice["PX4"] = f"EKF2_EVP_NOISE {sigma_z.value:.3g}"
-        advice["PX4"] += "" if now is None else f" (now {now:g})"
+        said = "" if now is None else f" (now {now:g})"
+        advice["PX4"] = f"EKF2_EVP_NOISE {sigma_z.value:.3g}{said}"
     if sigma_a.value is None:
-        advice["SIGMA_A"] = (
-            "is not determined by this flight: too little motion, or too short."
-            if sigma_a.low is None
-            else f"is at least {sigma_a.low:.2g} m/s²: the acceleration is wrong."
-        )
-    elif found.biases_fitted:
-        alone = found.sigma_a.value or found.sigma_a.high
+        advice["SIGMA_A"] = "is not determined by this flight: too little motion, or too short."
+    elif found.biases_fitted and (alone := found.sigma_a.value or found.sigma_a.high) is not None:
         bound = "" if found.sigma_a.value is not None else "at most "
         advice["SIGMA_A"] = (
-            "covers noise, bias and tilt together; this flight does not tell them apart"
-            if alone is None
-            else f"of the acceleration alone is {bound}{alone:.2g} m/s²; the filter has no state "
-            f"for the accelerometer's bias and tilt, and needs {sigma_a.value:.2g} m/s² to cover "
-            "them"
+            f"of the acceleration alone is {bound}{alone:.2g} m/s²; the filter has no state for "
+            f"the accelerometer's bias and tilt, and needs {sigma_a.value:.2g} m/s² to cover them"
         )
     if len(found.outlier_time_s):
         advice["Outliers"] = (
             f"{len(found.outlier_time_s)} of {found.count} measurements ({name}), the first at "
             f"{found.outlier_time_s[0]:.1f} s; they do not enter the noises"
-        )
-    if not isinstance(found.held_out, Unavailable) and found.held_out.gain_nats <= 0.0:
-        advice["Held out"] = (
-            "the settings found on the first half do no better on the second than the chosen "
-            "ones: these are as good as any"
         )
     return advice

@@ -14,7 +14,7 @@ from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import Finding
 from px4fuse.findings.story import story
-from px4fuse.flight import Flight, PositionTrack, Unavailable
+from px4fuse.flight import Flight, Unavailable
 from px4fuse.record import written
 from px4fuse.request import AxisName, ComparisonRequest, WhatIfRequest
 from px4fuse.results.comparison import AvailableTrack, ChosenSettings, Log, PositionSource
@@ -145,7 +145,12 @@ def _of_flight(
         clock=track.clock,
         reconstructed=origin.reconstructed,
         topics=track.topics,
-        available=tuple(map(_available, comparison.flight.positions)),
+        available=tuple(
+            AvailableTrack(
+                one.name, one.origin.kind, one.origin.passage, len(one.samples), one.rate_hz
+            )
+            for one in comparison.flight.positions
+        ),
         not_in_log=tuple(part for part in comparison.missing if part.source),
         log=track.log,
         alignment=track.alignment,
@@ -164,10 +169,3 @@ def _of_flight(
         ),
         "provenance": provenance(command),
     }
-
-
-def _available(track: PositionTrack) -> AvailableTrack:
-    origin = track.origin
-    return AvailableTrack(
-        track.name, origin.kind, origin.passage, len(track.samples), track.rate_hz
-    )
