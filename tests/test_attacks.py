@@ -307,7 +307,7 @@ LOOPS: dict[str, tuple[Any, str, dict[str, Any], dict[str, Any], float, float]] 
         OPEN, "", {"landed_at": {"forward_m": 1.42, "right_m": 0.0}}, {}, 0, 10,
     ),
     "landed elsewhere although it came back": (CLOSED, ELSEWHERE, LANDED, {}, 0, 10),
-    "closed although it landed elsewhere": (OPEN, "", {}, {}, 0, 20),
+    "closed although it landed elsewhere": (OPEN, "", {}, {}, 10, 10),
 }  # fmt: skip
 
 

@@ -349,6 +349,18 @@ def _landed_m(evidence: Evidence) -> float | None:
     return None if evidence.answer is None else evidence.answer.truth.get("closure_error_m")
 
 
+def _assumed_closed(evidence: Evidence) -> Iterator[str]:
+    """What is wrong with a loop that is taken for closed and is not, by where it truly landed."""
+    results, landed = evidence.results, _landed_m(evidence)
+    if landed is None or landed <= TAPE_M or not isinstance(results, LoopResults):
+        return
+    if results.request.came_back and results.request.landed_at is None:
+        yield (
+            "It did not land at the place of take-off: say where it did (--landed-at) or leave the "
+            "end open (--open)."
+        )
+
+
 def _open_end(evidence: Evidence) -> Scored:
     """What the words "it did not come back" are worth, and why."""
     landed = _landed_m(evidence)
@@ -389,12 +401,7 @@ class LoopItem(RubricItem, frozen=True, kw_only=True, tag="loop"):
             worth = (1.0 + 2.0 * share) / 3.0 if share or rejected else 0.0
             false = "; the closure was rejected as false" if rejected else ""
             return worth, f"{said}{false}, {why}."
-        landed = _landed_m(evidence) or 0.0
-        if landed > TAPE_M and request and request.landed_at is None and not opened:
-            wrong.append(
-                "It did not land at the place of take-off: say where it did (--landed-at) or leave "
-                "the end open (--open)."
-            )
+        wrong += _assumed_closed(evidence)
         if wrong:
             return 1 / 3, f"{said}. {wrong[0]}"
         share, comment = self._corrected(loop.corrections)
@@ -458,6 +465,8 @@ class ClosureItem(RubricItem, frozen=True, kw_only=True, tag="closure"):
             if _landed_m(evidence) is None and not loop.closures:
                 share = min(share, self.open_unknown)
             return share if evidence.claims(OPEN) else 0.0, f"Your loop is not closed, {why}."
+        for wrong in _assumed_closed(evidence):
+            return 0.0, wrong
         # a larger drift that was stated explains any error
         scale = max(_stated_drift(results), 1.0) ** 2
         p = min(float(chi2.sf(one.d2 * scale, one.degrees_of_freedom)) for one in accepted)

@@ -101,13 +101,18 @@ class Evidence:
         return None if self.key is None else self.key.of_log(log_sha256(self.results))
 
     @cached_property
+    def given(self) -> Answer | None:
+        """What the answer key gave to this student; the platform knows better who that is."""
+        if self.key is None:
+            return None
+        claimed = self.key.of_student(text_of(self.results.student.id))
+        return self.key.of_student(self.owner_id) or claimed
+
+    @cached_property
     def own(self) -> bool:
         """Whether the answer key gave this log to this student; without a key nobody knows."""
-        if self.key is None:
-            return True
-        claimed = self.key.of_student(text_of(self.results.student.id))
-        given = self.key.of_student(self.owner_id) or claimed
-        return given is not None and given.sha256 == log_sha256(self.results)
+        given = self.given
+        return self.key is None or (given is not None and given.sha256 == log_sha256(self.results))
 
     @cached_property
     def form(self) -> Answers | str:
@@ -126,9 +131,8 @@ class Evidence:
     @cached_property
     def form_points(self) -> FormPoints | str:
         """What the form is worth, or why nothing."""
-        theirs = self.key and self.key.of_student(self.results.student.id)
-        if self.answer is None or (theirs and theirs.sha256 != self.answer.sha256):
-            given = f" ({text_of(theirs.file)})" if theirs else ""
+        if self.answer is None or (self.given and not self.own):
+            given = f" ({text_of(self.given.file)})" if self.given else ""
             return (
                 f"this report is not about the log that you were given{given}: make it of that "
                 "log, with your --id"
