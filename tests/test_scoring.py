@@ -197,9 +197,7 @@ class TestForm:
         assert "not about the log that you were given" in comment
 
     @pytest.mark.parametrize(("owner_id", "points"), [("", 0.0), ("s01", 30.0), ("zz", 0.0)])
-    def test_a_mistyped_id_costs_nothing_where_the_platform_knows_it(
-        self, owner_id, points
-    ):
+    def test_a_mistyped_id_costs_nothing_where_the_platform_knows_it(self, owner_id, points):
         mistyped = filled(["dropout"], student__id="s02")
         items = assessed(mistyped, key=key(), owner_id=owner_id).items
         assert [item.points for item in items if "your flight" in item.title] == [points]
