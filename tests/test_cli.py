@@ -65,7 +65,7 @@ def test_report_and_results_say_the_same_and_name_no_folder_and_no_person(made):
 def test_awkward_text_reaches_the_pages_as_it_is(made):
     pages = [page.extract_text() for page in pypdf.PdfReader(made[0] / "report.pdf").pages]
     assert "Ana $x$ Müller" in pages[0]
-    assert "Costs $5 and x² or \\frac{1}{2}; bold, under, tag." in "\n".join(pages)
+    assert "Costs $5 and x^2 or \\frac{1}{2}; bold, under, tag." in "\n".join(pages)
     assert sum("line line line" in page for page in pages) > 1  # long notes run on
 
 

@@ -18,6 +18,7 @@ from mavlink_tools import (
     UNIX_S,
     Aisle,
     Recorder,
+    frame,
     heartbeat,
     message,
     ms,
@@ -426,6 +427,8 @@ def test_senders_and_what_they_lost_are_described(read):
         parts[i] = b""
     for i in of_companion[7::20]:  # and some come again over a slower link
         parts[i + 5] += parts[i]
+    end_us, silent = recorder.frames()[-1][0], (1, 190)  # one that numbers nothing
+    parts += 5 * [stamp(end_us) + frame(heartbeat(kind=6, autopilot=8), silent, 7)]
     path.write_bytes(b"".join(parts))
     flight = read_log(path)
     described = {(s.system, s.component): s for s in flight.log.senders}
@@ -434,7 +437,8 @@ def test_senders_and_what_they_lost_are_described(read):
     assert described[GROUND].description == "ground station"
     assert described[COMPANION].lost_share == pytest.approx(0.1, abs=0.005)
     assert described[AUTOPILOT].lost_share == 0.0
-    assert [*described] == [AUTOPILOT, COMPANION, GROUND]  # most messages first
+    assert described[silent].lost_share is None
+    assert [*described] == [AUTOPILOT, COMPANION, GROUND, silent]  # most messages first
 
 
 # ---- the map itself -----------------------------------------------------------------------------

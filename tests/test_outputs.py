@@ -231,7 +231,7 @@ def test_position_files_that_do_not_fit_are_said_not_to(
             named = [each for each in placement(found) if each["severity"] == "error"]
             assert len(named) == 1
             assert f"as {frame}" in named[0]["message"]
-            assert f"--position-frame {frame}" in named[0]["remedy"]
+            assert f"--position-frame {frame}" in named[0]["message"]
 
     with subtests.test("upside down"):
         flipped = rows.copy()
@@ -306,4 +306,4 @@ def test_a_pipe_that_nobody_reads_is_not_waited_for(
     assert "nobody reads this pipe" in str(outcome.exception)
     words = ["grade", str(tmp_path / "pipe"), "-o", str(tmp_path / "out")]
     outcome = CliRunner().invoke(cli, words, standalone_mode=False)
-    assert "not a regular file (a device, pipe or socket)" in str(outcome.exception)
+    assert "no regular file, and no folder" in str(outcome.exception)

@@ -192,6 +192,7 @@ TIMES: dict[str, tuple[str, list[str], int, str]] = {
         "field.header.stamp", exact(1000 * (UNIX_US + TIME_US), 0), UNIX_US, "UNIX",
     ),
     "timeMs": ("timeMs", exact(LOCAL_US + TIME_US, 3), LOCAL_US, "local"),
+    "time_boot_ms": ("time_boot_ms", exact(LOCAL_US + TIME_US, 3), LOCAL_US, "local"),
     "local s": ("time", exact(TIME_US, 6), 0, "local"),
     "local ms": ("time", exact(LOCAL_US + TIME_US, 3), LOCAL_US, "local"),
     "local us": ("time", exact(TIME_US, 0), 0, "local"),
@@ -353,6 +354,8 @@ SIGMA = fixed(SIGMA_M, 3)
         ({"accuracy_mm": fixed(1000 * SIGMA_M, 0)}, (1, 1, 1)),
         ({"sx": SIGMA, "sy": fixed(2 * SIGMA_M, 3), "sz": fixed(3 * SIGMA_M, 3)}, (1, 2, 3)),
         ({"std_x_m": SIGMA, "y_std": fixed(2 * SIGMA_M, 3)}, (1, 2, np.nan)),
+        ({"stdev": SIGMA}, (1, 1, 1)),
+        ({"raw_sigma": SIGMA, "filtered_sigma": fixed(9 * SIGMA_M, 3)}, (1, 1, 1)),
     ],
 )
 def test_sigma(read, columns, factors):
@@ -419,8 +422,9 @@ def test_stamps_that_go_back_are_dropped(read, shifts_us, dropped):
     said(file, f"{len(dropped)} row", "dropped: their time stamps repeat, go back")
 
 
-def test_several_tags_are_pointed_out(read):
-    file = read(table({"tag_id": ["A1", "B2"] * (ROWS // 2), **PLAIN}))
+@pytest.mark.parametrize("name", ["tag_id", "tagid", "node"])
+def test_several_tags_are_pointed_out(read, name):
+    file = read(table({name: ["A1", "B2"] * (ROWS // 2), **PLAIN}))
     said(file, "several tags ('A1', 'B2')")
 
 

@@ -176,6 +176,7 @@ def with_field(line: int, column: int, field: str) -> str:
     return changed(line, " ".join(fields))
 
 
+STAMPS_S = range(1403636579, 1403636588)
 REFUSED: dict[str, tuple[str | bytes, str]] = {
     "empty": ("", "the file is empty"),
     "comments": ("# a\n# b\n\n  \n", "poses: 0, at least 3 are needed"),
@@ -185,6 +186,10 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
     "KITTI": ("1 0 0 0 0 1 0 0 0 0 1 0\n" * 5, "12 columns; TUM has 8"),
     "other columns": ("t,x,y,z\n" + "1,2,3,4\n" * 5, "4 columns; TUM has 8"),
     "other 8 columns": ("time,x,y,z,vx,vy,vz,sigma\n" + "1,2,3,4,5,6,7,8\n" * 5, "w is not known"),
+    "other names of 8 columns": (
+        "time,x,y,z,rx,ry,rz,rw\n" + "".join(f"{n}000000000,1,2,3,0,0,0,1\n" for n in STAMPS_S),
+        "line 2: the place of the quaternion's w is not known",
+    ),
     "commas, no header": (text(rows(",")), "the place of the quaternion's w is not known"),
     "two poses": (text(TUM_ROWS[:2]), "poses: 2, at least 3 are needed"),
     "text within": (with_field(7, 2, "abc"), "line 7: '1403636579.963555584 "),

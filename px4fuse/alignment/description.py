@@ -76,7 +76,7 @@ def describe(
     warnings = [
         *(_match_warnings(match) if match else ()),
         *_frame_warnings(match, compared, yaw_rad, auto),
-        *_height_warnings(flight, placed),
+        *([] if match and match.better_frame else _height_warnings(flight, placed)),
         *_unix_warnings(flight, file, clock_offset_s),
     ]
     alignment = Alignment(
@@ -183,6 +183,11 @@ def _frame_warnings(
                 "The IMU tells the yaw to a few degrees only (1° to 6° off on simulated flights), "
                 "and not the origin of the file's frame, which was left at 0."
             )
+    elif match and turned and match.better_frame:
+        yield (
+            f"The file does not fit the {name} as {match.frame}, but it does as "
+            f"{match.better_frame}: give --position-frame {match.better_frame}."
+        )
     elif match and turned:
         yaw = np.degrees(np.angle(np.exp(1j * (match.free.yaw_rad - yaw_rad))))
         shift = np.hypot(*match.free.origin_m[:2])

@@ -86,6 +86,8 @@ class Match:
         With the yaw found in any case.
     turned : bool
         Whether the file's frame is clearly not EKF2's, so that the clock is taken from ``free``.
+    better_frame : str
+        Frame in which the file fits without a turn, where that is not the one asked for.
     """
 
     reference: OwnTrack
@@ -94,6 +96,7 @@ class Match:
     fit: Fit
     free: Fit
     turned: bool
+    better_frame: str = ""
 
     @property
     def clock(self) -> Fit:
@@ -152,7 +155,13 @@ def _match(references: list[OwnTrack], asked: Question) -> Match:
         turned = is_sound(free, name) and (
             fit.concordance < MIN_CONCORDANCE[name] or is_turned(fit.horizontal_rms_m, free, name)
         )
-        matches.append(Match(reference, best, misfits, fit, free, turned))
+        better = ""
+        if turned and frame and yaw_rad is not None:
+            others = {tried: fitted(tried, yaw_rad) for tried in FRAMES if tried != frame}
+            other, there = min(others.items(), key=lambda item: item[1].rms_m)
+            fits_well = there.concordance >= GOOD_CONCORDANCE[name]
+            better = other if fits_well and TURNED_RATIO * there.rms_m < fit.rms_m else ""
+        matches.append(Match(reference, best, misfits, fit, free, turned, better))
     return min(matches, key=lambda match: match.clock.rms_m)
 
 

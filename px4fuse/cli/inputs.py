@@ -127,8 +127,8 @@ json_option = path_option(
     "--json",
     "json_path",
     metavar="FILE",
-    help="The results as JSON; - prints them alone on standard output, and without -o writes no "
-    "report.  [default: beside the PDF]",
+    help="The results as JSON; - prints them alone on standard output. Without -o, no report is "
+    "written then.  [default: beside the report, where there is one]",
 )
 
 

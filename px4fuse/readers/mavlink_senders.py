@@ -204,4 +204,5 @@ def _lost_share(frames: Frames, address: Address) -> float | None:
     step = (np.diff(frames.sequence[own].astype(np.int64)) + MOST_LATE) % 256 - MOST_LATE
     place = np.append(0, np.cumsum(step))
     share = float(1.0 - len(np.unique(place)) / (np.ptp(place) + 1))
-    return share if share < SEQUENCE_MEANS_NOTHING else None
+    counts = len(place) == 1 or bool(place.any())
+    return share if counts and share < SEQUENCE_MEANS_NOTHING else None

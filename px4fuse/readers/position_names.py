@@ -42,10 +42,11 @@ _AXES = _words(
     }
 )
 _TEXTS = {
-    "time": "time timestamp stamp t ts unix unixtime epoch utc elapsed",
+    "time": "time timestamp stamp t ts unix unixtime epoch utc elapsed boot",
     "measured": "header measurement sample sensor",
     "recorded": "bag rosbag recv receive received rx arrival log record host",
-    "sigma": "sigma std stddev sd s accuracy uncertainty",
+    "sigma": "sigma std stdev stddev sd s accuracy uncertainty",
+    "tag": "tag tagid id node address serial",
     "context": "p t pos position pose point translation transform location coord coordinate field "
     "msg data uwb rtls tag est estimate estimated measured raw filtered local world map",
 }
@@ -85,7 +86,7 @@ def meaning(name: str) -> Meaning:
     if told & _ROLES["time"] and told <= _TIME_ROLES and unit not in LENGTH_UNITS:
         kinds = [bool(told & _ROLES["measured"]), not told & _ROLES["recorded"], True]
         return Meaning("time", TIME_KINDS[kinds.index(True)], unit)
-    if told and told <= {"tag", "id"}:
+    if told and told <= _ROLES["tag"]:
         return Meaning("tag")
     parts: list[str] = []
     for word in words:
@@ -116,7 +117,8 @@ def find_position(meanings: Sequence[Meaning]) -> tuple[str | None, Position] | 
 
 def find_sigma(meanings: Sequence[Meaning], frame: str | None) -> tuple[int | None, ...]:
     """Columns of sigma of the frame's axes; one without an axis is for all of them."""
-    sigmas = {m.key: at for at, m in enumerate(meanings) if m.kind == "sigma"}
+    # of several with one meaning the first is kept, as of positions
+    sigmas = {m.key: at for at, m in [*enumerate(meanings)][::-1] if m.kind == "sigma"}
     axes = next(axes for name, axes in _FRAMES if name == frame)
     return tuple(
         sigmas.get(axis, sigmas.get(letter, sigmas.get("")))

@@ -199,11 +199,13 @@ def _order(rows: Rows, separator: str | None, comments: str) -> tuple[bool, str]
     order = "".join(_NAME_OF_AXIS.findall(comments.casefold())[-4:])
     w_first = order == "wxyz"
     if order not in ("wxyz", "xyzw") and separator is not None:
-        w_first = float(_fields(rows.lines[0][1])[0]) * 1e-9 >= UNIX_START_S
+        first = _fields(rows.lines[0][1])
+        has_header = any(len(line.split(",")) == len(first) for line in comments.split("\n"))
+        w_first = not has_header and float(first[0]) * 1e-9 >= UNIX_START_S
         if not w_first:
             raise rows.refuse(
                 0,
-                "the place of the quaternion's w is not known, as no header names the columns",
+                "the place of the quaternion's w is not known, as no header names it",
                 "Add the line '#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z' with the columns in "
                 "their order.",
             )
