@@ -24,11 +24,13 @@ from px4fuse.filter.tuning import (
     MIN_MEASUREMENTS,
     SIGMA_Z_SEARCH_M,
     AxisTuning,
+    Noise,
     tune,
     tune_axes,
 )
 from px4fuse.flight import POSITION_COLUMNS, Flight, Unavailable
 from px4fuse.readers import read_log
+from px4fuse.report.sensitivity import noise_words
 
 SIGMA_A, SIGMA_Z, SEEDS = TRUE.sigma_a_m_s2, TRUE.sigma_z_m, 40
 
@@ -264,3 +266,17 @@ def test_nlos_is_found(shared_logs) -> None:
     right = np.count_nonzero(distance < 0.02)
     assert right / len(found.outlier_time_s) > 0.9
     assert right / len(truly) > 0.9
+
+
+@pytest.mark.parametrize(
+    ("noise", "said"),
+    [
+        (Noise(0.1, 0.05, 0.2), "0.1 m (0.05 to 0.2)"),
+        (Noise(0.1, None, None), "0.1 m or more"),
+        (Noise(None, None, 0.05), "at most 0.05 m"),
+        (Noise(None, 8.0, None), "at least 8 m"),
+        (Noise(None, None, None), "not determined"),
+    ],
+)
+def test_a_noise_at_an_end_of_the_search_is_a_bound(noise: Noise, said: str) -> None:
+    assert noise_words(noise, "m") == said

@@ -115,18 +115,21 @@ def _map_words(found: AxisTuning) -> str:
     wanders = found.noises.walk_m > found.noises.sigma_z_m
     wander = " What the source wanders is not in them." if wanders else ""
     return (
-        f"Asked for: SIGMA_A {_words(found.filter_sigma_a, 'm/s²')}, SIGMA_Z "
-        f"{_words(found.sigma_z, 'm')}. The chosen pair lies {lost} below (ln). Along a dotted "
-        f"line the gain is the same.{wander}"
+        f"Asked for: SIGMA_A {noise_words(found.filter_sigma_a, 'm/s²')}, SIGMA_Z "
+        f"{noise_words(found.sigma_z, 'm')}. The chosen pair lies {lost} below (ln). Along a "
+        f"dotted line the gain is the same.{wander}"
     )
 
 
-def _words(noise: Noise, unit: str) -> str:
-    value, low, high = (
-        "?" if number is None else number_words(number)
-        for number in (noise.value, noise.low or 0.0, noise.high)
-    )
-    return f"{value} {unit} ({low} to {high})"
+def noise_words(noise: Noise, unit: str) -> str:
+    """A noise with its interval, or the bound that the data set where the search ended."""
+    if noise.value is None:
+        ends = (("at least", noise.low), ("at most", noise.high))
+        known = [f"{word} {number_words(end)} {unit}" for word, end in ends if end is not None]
+        return " and ".join(known) or "not determined"
+    low, high = (number_words(end or 0.0) for end in (noise.low, noise.high))
+    within = "or more" if noise.high is None else f"({low} to {high})"
+    return f"{number_words(noise.value)} {unit} {within}"
 
 
 def _point(noise: Noise) -> float:

@@ -203,7 +203,9 @@ def tuning_advice(
     if options:
         typed = f"px4fuse compare LOG{''.join(options)}"
         advice["Re-run"] = f"with the noises of {name}: {typed}"
-    if sigma_z.value is None:
+    if sigma_z.value is None and sigma_z.low is not None:
+        advice["SIGMA_Z"] = f"is at least {sigma_z.low:.2g} m: is this a position source at all?"
+    elif sigma_z.value is None:
         bound = "" if sigma_z.high is None else f" (at most {sigma_z.high:.2g} m)"
         advice["SIGMA_Z"] = (
             f"is below what this logging rate can show{bound}: between samples the process noise "
@@ -214,7 +216,11 @@ def tuning_advice(
         said = "" if now is None else f" (now {now:g})"
         advice["PX4"] = f"EKF2_EVP_NOISE {sigma_z.value:.3g}{said}"
     if sigma_a.value is None:
-        advice["SIGMA_A"] = "is not determined by this flight: too little motion, or too short."
+        advice["SIGMA_A"] = (
+            "is not determined by this flight: too little motion, or too short."
+            if sigma_a.low is None
+            else f"is at least {sigma_a.low:.2g} m/s²: the acceleration is wrong."
+        )
     elif found.biases_fitted and (alone := found.sigma_a.value or found.sigma_a.high) is not None:
         bound = "" if found.sigma_a.value is not None else "at most "
         advice["SIGMA_A"] = (
