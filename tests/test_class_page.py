@@ -11,6 +11,7 @@ import re
 import struct
 import unicodedata
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -231,6 +232,19 @@ def test_an_anonymous_class_names_nobody() -> None:
     # in the order of the pseudonyms, which says nothing of the names
     names = [row[0][0][0] for row in content(text)["rows"]]
     assert names == sorted(names)
+
+
+def test_short_ids_leave_the_numbers_of_a_text() -> None:
+    one = replace(CLASS[0].counting, notes="Two of 12 m, said Ada.")
+    entry = Entry("Ada", "12", one, pseudonym="Student 001", flags=("Like 12.",))
+    text = html_text([entry], "Class", "px4fuse 1")
+    assert "Two of 12 m, said Student 001." in text
+    assert "Like Student 001." in text
+
+
+def test_a_minute_late_is_not_nothing() -> None:
+    text = html_text([Entry("Ada", "1", CLASS[0].counting, late_s=61.0)], "Class", "px4fuse 1")
+    assert "2 min late" in text
 
 
 # ------------------------------------------------------------------ in a browser

@@ -275,6 +275,7 @@ def test_bombs_and_lies(tmp_path, monkeypatch):
     ("limit", "value", "said"),
     [
         ("MAX_INNER_BYTES", 200, "it holds too many zip files"),
+        ("MAX_TOTAL_BYTES", 200, "it unpacks to more than"),
         ("MAX_ENTRIES", 3, "more than 3 entries"),
         ("MAX_DIRECTORY_BYTES", 100, "damaged"),
     ],

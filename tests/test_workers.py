@@ -123,6 +123,19 @@ def test_modules_in_the_current_folder_are_not_imported(tmp_path):
     assert not (work / "executed").exists()
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
+def test_what_hangs_ends_with_a_parent_that_is_killed(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(INTERRUPTED.format(tests=os.path.dirname(__file__)))  # noqa: PTH120
+    with subprocess.Popen(
+        [sys.executable, script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as parent:
+        parent.stdout.readline()
+        parent.kill()
+        # its workers have the other ends of these pipes, which end with the last of them
+        parent.communicate(timeout=30)
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for one process")
 def test_ctrl_c_ends_all(tmp_path):
     script = tmp_path / "script.py"

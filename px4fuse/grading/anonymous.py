@@ -38,15 +38,22 @@ class Veil:
             rf"(?<![^\W_])(?:{'|'.join(map(re.escape, longest_first))})(?![^\W_])", re.IGNORECASE
         )
 
-    def hide(self, text: str) -> str:
-        """A text without names."""
+    def hide(self, text: str, *, own_words: bool = False) -> str:
+        """A text without names; ``own_words`` are a student's, in which short ids are numbers."""
         if not self._instead:
             return text
         composed = unicodedata.normalize("NFC", text)
-        return self._names.sub(lambda found: self._instead[_key(found[0])], composed)
+
+        def instead(found: re.Match[str]) -> str:
+            kept = own_words and POINTS.fullmatch(found[0])
+            return found[0] if kept else self._instead[_key(found[0])]
+
+        return self._names.sub(instead, composed)
 
     def of_part(self, part: Part) -> Part:
         """What a row unfolds to, with every text in it without names; its kind stays."""
+        if part[0] == "prose":
+            return [*part[:2], self.hide(part[2], own_words=True)]
         return [part[0], *map(self._hidden, part[1:])]
 
     def _hidden(self, value: Any) -> Any:

@@ -7,6 +7,7 @@ and PDFs stand in folders beside the page and are loaded as they are unfolded.
 from __future__ import annotations
 
 import base64
+import math
 import statistics
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -142,7 +143,10 @@ def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str], veil: Veil)
     count = len(entry.flags)
     few = f"{count} flag{'s' if count > 1 else ''}" if count else ""
     file = one.submission if one and not entry.pseudonym else ""
-    late = f"{entry.late_s / 3600.0:.1f} h late" if entry.late_s else ""
+    late_s = entry.late_s or 0.0
+    late = f"{late_s / 3600.0:.1f} h late" if late_s >= 3600.0 else ""
+    if 0.0 < late_s < 3600.0:
+        late = f"{math.ceil(late_s / 60.0)} min late"
     points = {item.title: item.points for item in one.items} if one else {}
     held = one.numbers if one else {}
     cells = (

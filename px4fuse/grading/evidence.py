@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -178,11 +178,11 @@ def flattened(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 def values_at(values: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
     """Paths and values where a path leads; ``*`` is every key, quotes may enclose names with dots.
 
-    >>> values_at({"a.b.c.0": 1, "a.d.0": 2}, 'a."b.c".*')
+    >>> values_at({"a.b.c.0": 1, "a.b.c.d.0": 2}, 'a."b.c".*')
     [('a.b.c.0', 1)]
     """
-    pattern = path.replace('"', "")
-    return [(name, value) for name, value in values.items() if fnmatchcase(name, pattern)]
+    pattern = re.compile(re.escape(path.replace('"', "")).replace(r"\*", "[^.]*"))
+    return [(name, value) for name, value in values.items() if pattern.fullmatch(name)]
 
 
 def falling(off: float, factor: float) -> float:

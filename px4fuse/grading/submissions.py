@@ -30,7 +30,8 @@ from px4fuse.verification.model import Refused
 MAX_ENTRIES = 10_000
 # Of the table of contents, which zipfile reads in one piece before it can be counted
 MAX_DIRECTORY_BYTES = 4_000_000
-# Of the zip files in one zip file, unpacked one at a time
+# Of all that is in one zip file, whose entries may share their bytes; and of the zip files in it
+MAX_TOTAL_BYTES = 4_000_000_000
 MAX_INNER_BYTES = 500_000_000
 # PDFs are compressed inside; what still shrinks a hundred times is empty
 MAX_RATIO = 100
@@ -114,6 +115,9 @@ class _Search:
     def _take_zip(self, place: _Place, stream: IO[bytes]) -> None:
         with _archive(stream) as archive:
             entries = [one for one in archive.infolist() if not one.is_dir()]
+            # zipfile gives no more than the declared size
+            if sum(one.file_size for one in entries) > MAX_TOTAL_BYTES:
+                raise _EntryError(f"it unpacks to more than {MAX_TOTAL_BYTES // 10**9} GB.")
             last = {one.filename: one for one in entries}
             if len(last) < len(entries):
                 self.notes.append(

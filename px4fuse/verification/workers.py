@@ -11,6 +11,7 @@ import multiprocessing
 import os
 import pickle
 import signal
+import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
@@ -194,6 +195,7 @@ def _serve(pipe: Connection, function: Callable[[Any], Any], memory_bytes: int |
     """Life of a worker: ready, then job by job until the pipe ends."""
     # Ctrl-C is for the parent, which ends us
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     _limit_memory(memory_bytes)
     pipe.send((True, None))
     while True:
@@ -215,6 +217,14 @@ def _serve(pipe: Connection, function: Callable[[Any], Any], memory_bytes: int |
             message = pickle.dumps((True, Failed(one_line(f"{kind}{error}", 300))))
         del job
         pipe.send_bytes(message)
+
+
+def _end_with_parent() -> None:
+    """Not to hang for ever where the parent was killed and can end nobody."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _limit_memory(memory_bytes: int | None) -> None:
