@@ -17,6 +17,8 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 import msgspec
 
 AUTO: Literal["auto"] = "auto"
+# The filter's settings where nobody chooses
+SIGMA_A_M_S2, SIGMA_Z_M, DT_S = 0.5, 0.10, 0.1
 AxisName = Literal["north", "east", "down", "aisle"]
 InputName = Literal["imu", "zero"]
 # What a log does not tell of a position source
@@ -105,9 +107,9 @@ class ComparisonRequest(_Asked, frozen=True, kw_only=True, tag_field="command", 
     position: PositionFile | None = None
     position_source: str | None = None
     source_kind: SourceKind | None = None
-    sigma_a_m_s2: float = 0.5
+    sigma_a_m_s2: float = SIGMA_A_M_S2
     sigma_z_m: float | None = None
-    dt_s: float = 0.1
+    dt_s: float = DT_S
     input: InputName | None = None
     axes: tuple[AxisName, ...] = ()
     heading_deg: float | None = None

@@ -107,6 +107,14 @@ if __name__ == "__main__":
 """
 
 
+def hanging(folder):
+    """A program whose worker hangs after it has told its process id."""
+    script = folder / "script.py"
+    script.write_text(INTERRUPTED.format(tests=os.path.dirname(__file__)))  # noqa: PTH120
+    pipe = subprocess.PIPE
+    return subprocess.Popen([sys.executable, script], stdout=pipe, stderr=pipe, text=True)
+
+
 def test_modules_in_the_current_folder_are_not_imported(tmp_path):
     """An instructor grades inside the folder of submissions; one of them is called types.py."""
     script = tmp_path / "program" / "script.py"
@@ -125,11 +133,7 @@ def test_modules_in_the_current_folder_are_not_imported(tmp_path):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
 def test_what_hangs_ends_with_a_parent_that_is_killed(tmp_path):
-    script = tmp_path / "script.py"
-    script.write_text(INTERRUPTED.format(tests=os.path.dirname(__file__)))  # noqa: PTH120
-    with subprocess.Popen(
-        [sys.executable, script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as parent:
+    with hanging(tmp_path) as parent:
         parent.stdout.readline()
         parent.kill()
         # its workers have the other ends of these pipes, which end with the last of them
@@ -138,11 +142,7 @@ def test_what_hangs_ends_with_a_parent_that_is_killed(tmp_path):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for one process")
 def test_ctrl_c_ends_all(tmp_path):
-    script = tmp_path / "script.py"
-    script.write_text(INTERRUPTED.format(tests=os.path.dirname(__file__)))  # noqa: PTH120
-    with subprocess.Popen(
-        [sys.executable, script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as parent:
+    with hanging(tmp_path) as parent:
         worker = int(parent.stdout.readline())
         parent.send_signal(signal.SIGINT)
         _, said = parent.communicate(timeout=60)

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from px4fuse.cli.inputs import Named, json_option, max_size_option, open_option, path_option
 from px4fuse.cli.outputs import finish, free_report, progress, report_paths, result_files
 from px4fuse.writing import STANDARD_OUTPUT
-
-if TYPE_CHECKING:
-    pass
 
 
 @click.command()

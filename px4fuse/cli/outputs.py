@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import signal
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -133,12 +132,12 @@ def _is_ours(file: Path, mine: Results) -> bool:
 
 def _of_what(results: Results) -> tuple[object, tuple[str, ...]]:
     """What was asked of which files, and whose report it is."""
-    from px4fuse.results.contract import to_json
+    from px4fuse.results.contract import files_named, to_json
 
     student = getattr(results, "student", None)
     names = (student.name, student.id) if student is not None else ()
     asked = getattr(results, "request", results.provenance.command)
-    files = re.findall(r'sha256": *"(\w+)"', to_json(results))
+    files = files_named(to_json(results))
     return (type(results), asked, files), names if any(names) else ()
 
 

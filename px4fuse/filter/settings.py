@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import get_args
 
 from px4fuse.errors import SettingsError
-from px4fuse.request import InputName
+from px4fuse.request import DT_S, SIGMA_A_M_S2, SIGMA_Z_M, InputName
 
 INPUT_NAMES: tuple[InputName, ...] = get_args(InputName)
 
@@ -40,9 +40,9 @@ class Settings:
         A value is outside its documented range, or not a number.
     """
 
-    sigma_a_m_s2: float = 0.5
-    sigma_z_m: float = 0.10
-    dt_s: float = 0.1
+    sigma_a_m_s2: float = SIGMA_A_M_S2
+    sigma_z_m: float = SIGMA_Z_M
+    dt_s: float = DT_S
     input: InputName = "imu"
     clock_offset_s: float = 0.0
 

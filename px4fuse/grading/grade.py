@@ -13,7 +13,6 @@ from px4fuse.assignment.key import AnswerKey
 from px4fuse.assignment.roster import people_of_sheet, person_of_row
 from px4fuse.grading import submissions
 from px4fuse.grading.entries import Course, class_entries
-from px4fuse.grading.evidence import flattened
 from px4fuse.grading.exports import grade_column, kind_of
 from px4fuse.grading.flags import own_flags
 from px4fuse.grading.lateness import moodle_time
@@ -25,20 +24,10 @@ from px4fuse.grading.roster import Register, people_of_key
 from px4fuse.grading.rubric import Rubric
 from px4fuse.grading.scoring import assess, refused
 from px4fuse.reading import files_by_sha256, max_log_bytes
-from px4fuse.results.contract import to_plain
 from px4fuse.verification.model import Refused, Verdict
 from px4fuse.verification.workers import Failed, run_bounded
 
 FAILED = "Do not open it: ask for the report as px4fuse wrote it."
-# For the class table: column title, and where in the results
-NUMBERS = (
-    ("SIGMA_A (m/s²)", "settings.sigma_a_m_s2"),
-    ("SIGMA_Z (m)", "settings.sigma_z_m"),
-    ("mean NIS north", "axes.north.filters.kf.nis_mean"),
-    ("mean NIS east", "axes.east.filters.kf.nis_mean"),
-    ("position RMSE to truth, aisle (m)", "axes.aisle.filters.kf.truth.position_rmse_m"),
-    ("closure error (m)", "loop.closure_error_m"),
-)
 
 
 @dataclass(frozen=True)
@@ -200,12 +189,10 @@ def grade_one(
     if isinstance(found, Refused):
         return replace(refused(rubric, key, found), sha256=sha256), recalled
     results, verdict, page = found
-    values = dict(flattened(to_plain(results)))
     made = assess(results, verdict, rubric, key, owner_id)
     whole = replace(
         made,
         flags=(*_page_flags(verdict), *own_flags(results, key is not None), *made.flags),
-        numbers={title: float(values[path]) for title, path in NUMBERS if path in values},
         sha256=sha256,
         page=page,
     )

@@ -8,7 +8,6 @@ request. Rubric, answer key, roster and overrides are not in it.
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -19,7 +18,7 @@ from pathlib import Path
 import msgspec
 
 from px4fuse.errors import ResultsError
-from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json
+from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, files_named, to_json
 from px4fuse.results.reading import read_results
 from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import Refused, Verdict
@@ -33,7 +32,6 @@ from px4fuse.writing import write_all
 RECORDS = "records"
 HANDED_IN, REDRAWN = ".handed-in.png", ".pdf"
 MADE_WITH = ("px4fuse", "numpy", "scipy", "matplotlib", "pypdfium2", "pillow")
-_SHA256 = re.compile(r'"([0-9a-f]{64})"')
 
 
 @dataclass(frozen=True)
@@ -113,7 +111,7 @@ def _files(results: str, logs: Mapping[str, Path], handed_out: frozenset[str]) -
     """Where every file is that a report rests on."""
     return {
         name: "here" if name in logs else "handed out" if name in handed_out else "away"
-        for name in sorted(set(_SHA256.findall(results)))
+        for name in sorted(set(files_named(results)))
     }
 
 

@@ -17,6 +17,16 @@ from px4fuse.results.contract import Reported
 from px4fuse.verification.model import Refused, Verdict
 from px4fuse.verification.rerun import log_sha256
 
+# For the class table: column title, and where in the results
+NUMBERS = (
+    ("SIGMA_A (m/s²)", "settings.sigma_a_m_s2"),
+    ("SIGMA_Z (m)", "settings.sigma_z_m"),
+    ("mean NIS north", "axes.north.filters.kf.nis_mean"),
+    ("mean NIS east", "axes.east.filters.kf.nis_mean"),
+    ("position RMSE to truth, aisle (m)", "axes.aisle.filters.kf.truth.position_rmse_m"),
+    ("closure error (m)", "loop.closure_error_m"),
+)
+
 
 def assess(
     results: Reported, verdict: Verdict, rubric: Rubric, key: AnswerKey | None, owner_id: str = ""
@@ -40,7 +50,7 @@ def assess(
         waits = item.by_hand and bool(student.notes.strip()) and fate != "zero"
         points = round(item.points * min(max(share, 0.0), 1.0), 2)
         made.append(Item(item.title, points, item.points, comment, item.by_hand, waits))
-    found = evidence.form_points
+    found, values = evidence.form_points, evidence.values
     return Graded(
         "",
         student.name,
@@ -55,6 +65,7 @@ def assess(
         pending=why if fate == "pending" else "",
         mistakes={} if isinstance(found, str) or not evidence.own else found.named,
         form=evidence.form if isinstance(evidence.form, Answers) else None,
+        numbers={title: float(values[path]) for title, path in NUMBERS if path in values},
         log_sha256=log_sha256(results),
         version=results.provenance.px4fuse,
         notes=student.notes,

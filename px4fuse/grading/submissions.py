@@ -243,7 +243,7 @@ def _files(path: Path, notes: list[str]) -> Iterator[tuple[Path, str]]:
         raise SettingsError(f"{one_line(str(path), MAX_NAME)}: no regular file, and no folder.")
     root = path.resolve()
     outside = 0
-    for whole in root.rglob("*"):  # symbolic links to folders are not entered
+    for whole in sorted(root.rglob("*")):  # symbolic links to folders are not entered
         name = whole.relative_to(root)
         if any(map(_hidden, name.parts)) or (whole.is_dir() and not whole.is_symlink()):
             continue

@@ -106,8 +106,9 @@ def analyse(
     spacing = key_frame_spacing_m(path.position_m) if spacing_m is None else spacing_m
     frames, distance = _key_frames(path, spacing)
     graph, nodes, statement = pose_graph(path, frames, claims, noise)
-    untold = f"the truth does not tell where it ended: {by_truth}"
-    notes = (*whole.notes, statement, untold if isinstance(by_truth, str) else "")
+    notes = [*whole.notes, statement]
+    if isinstance(by_truth, str):
+        notes.append(f"the truth does not tell where it ended: {by_truth}")
     judged = judge(graph, claims)
     solved, judged = solve_all(path, nodes, graph, judged, progress)
     end_m, heading = path.position_m[-1] - path.position_m[0], heading_change_deg(path)

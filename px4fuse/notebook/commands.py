@@ -20,6 +20,8 @@ from px4fuse.loop.sources import LoopSource, read_source
 from px4fuse.readers import read_log
 from px4fuse.request import (
     AUTO,
+    DT_S,
+    SIGMA_A_M_S2,
     AxisName,
     ComparisonRequest,
     FrameName,
@@ -42,9 +44,9 @@ Progress = Callable[[str], None]
 def compare(
     log: Pathlike | Flight,
     *,
-    sigma_a_m_s2: float = 0.5,
+    sigma_a_m_s2: float = SIGMA_A_M_S2,
     sigma_z_m: float | None = None,
-    dt_s: float = 0.1,
+    dt_s: float = DT_S,
     input: InputName | None = None,  # noqa: A002 - the name of the setting
     clock_offset_s: float | Literal["auto"] | None = None,
     axes: AxisName | Sequence[AxisName] = (),

@@ -7,6 +7,7 @@ raises the minor one.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -306,3 +307,8 @@ def to_json(results: msgspec.Struct | dict[str, Any]) -> str:
     """
     found = to_plain(results) if isinstance(results, msgspec.Struct) else results
     return json.dumps(found, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def files_named(text: str) -> list[str]:
+    """SHA-256 of every file that results as JSON rest on, as they stand there."""
+    return re.findall(r'"([0-9a-f]{64})"', text)
