@@ -312,7 +312,7 @@ def run_preparation(
         # that of a position file is spent on placing it
         clock_offset_s=asked if isinstance(asked, float) and request.position is None else 0.0,
     )
-    alike = ("heading_deg", "position_source", "source_kind", "start_s", "end_s")
+    alike = ("heading_deg", "position_source", "source_kind", "height", "start_s", "end_s")
     choices: dict[str, Any] = {name: getattr(request, name) for name in alike}
     choices |= {
         "input_required": request.input == "imu",

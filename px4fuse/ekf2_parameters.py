@@ -91,6 +91,10 @@ def _vision(name: str, label: str, noise: str, gate: str, unit: str) -> Aid:
                label=f"external vision, {label}", unit=unit, reported=_SENDER)  # fmt: skip
 
 
+BAROMETER = Aid(
+    "baro_hgt", "EKF2_BARO_CTRL", "EKF2_BARO_NOISE", "EKF2_BARO_GATE", "EKF2_BARO_DELAY",
+    label="barometer", reported="EKF2_BARO_NOISE and the variance of its bias",
+)  # fmt: skip
 GNSS_VEL = _gnss("gnss_vel", "GNSS velocity", "EKF2_GPS_V_NOISE", "EKF2_GPS_V_GATE", "m/s")
 # What EKF2 can fuse, in the order in which it is told. gate, noise and what else forms R: PX4's
 # EKF/aid_sources of v1.13 to main
@@ -105,8 +109,7 @@ AIDS: Mapping[str, Aid] = {
         _vision("ev_vel", "velocity", "EKF2_EVV_NOISE", "EKF2_EVV_GATE", "m/s"),
         _vision("ev_hgt", "height", EV_POS.noise, EV_POS.gate, "m"),
         _vision("ev_yaw", "yaw", "EKF2_EVA_NOISE", "EKF2_HDG_GATE", "rad"),
-        Aid("baro_hgt", "EKF2_BARO_CTRL", "EKF2_BARO_NOISE", "EKF2_BARO_GATE", "EKF2_BARO_DELAY",
-            label="barometer", reported="EKF2_BARO_NOISE and the variance of its bias"),
+        BAROMETER,
         Aid("rng_hgt", "EKF2_RNG_CTRL", "EKF2_RNG_NOISE", "EKF2_RNG_GATE", "EKF2_RNG_DELAY",
             label="range to the ground",
             reported="EKF2_RNG_NOISE, EKF2_RNG_SFE and the height's own variance"),
@@ -162,6 +165,7 @@ PARAMETERS: Mapping[str, Parameter] = {
     GNSS_POS.delay: Parameter("ms", 110.0, 0.0, 300.0),
     GNSS_VEL.noise: Parameter("m/s", 0.3, 0.01, 5.0),
     GNSS_VEL.gate: Parameter("SD", 5.0, 1.0, 1e3),
+    BAROMETER.noise: Parameter("m", 3.5, 0.01, 15.0),
     "EKF2_DELAY_MAX": Parameter("ms", 200.0, 0.0, 1e3),
     **dict.fromkeys((*EV_POS.place, *GNSS_POS.place), Parameter("m", 0.0, -math.inf, math.inf)),
     "EKF2_ACC_NOISE": Parameter("m/s^2", 0.35, 0.01, 1.0),
@@ -195,7 +199,7 @@ def settings_in_force(logged: Mapping[str, float], aid: Aid = EV_POS) -> dict[st
     """
     of_others = {
         name
-        for other in (EV_POS, GNSS_POS, GNSS_VEL)
+        for other in (EV_POS, GNSS_POS, GNSS_VEL, BAROMETER)
         if other.switch != aid.switch
         for name in (*other.own, *other.place)
     }

@@ -21,6 +21,7 @@ import pandas as pd
 
 from px4fuse.arrays import Array
 from px4fuse.display import Shown, brief
+from px4fuse.ekf2_parameters import BAROMETER, Aid
 from px4fuse.origin import Origin
 from px4fuse.record import NotNegative, Record, Vector
 from px4fuse.record import Unavailable as Unavailable  # noqa: PLC0414 - for everybody
@@ -151,6 +152,8 @@ class PositionTrack:
         ``samples``, where the source measures it by itself: GNSS.
     age_s : float
         What EKF2 takes a sample to be older than its stamp, as far as that was taken off already.
+    barometer : DataFrame or None
+        ``down_m`` by the barometer, at times of its own, where that is what "down" is to be.
     place_m : tuple of float
         Where EKF2 takes the sensor to be in the body (forward, right, down); the positions are the
         sensor's.
@@ -171,10 +174,15 @@ class PositionTrack:
     orientation: pd.DataFrame | None = None
     velocity: pd.DataFrame | None = None
     age_s: float = 0.0
+    barometer: pd.DataFrame | None = None
     place_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     notes: tuple[str, ...] = ()
 
     __repr__ = brief
+
+    def aid(self, axis: str) -> Aid | None:
+        """What EKF2 takes it as along an axis; None where EKF2 never fuses it."""
+        return self.origin.aid if axis != "down" or self.barometer is None else BAROMETER
 
     @property
     def rate_hz(self) -> float:
@@ -407,6 +415,8 @@ class Flight(Shown):
         Files read beside the log.
     modes : tuple of FlightMode, or Unavailable
         In order of time, without overlap.
+    barometer : DataFrame or None
+        ``down_m`` by the pressure, from a height that is not known.
     """
 
     log: LogInfo
@@ -422,6 +432,7 @@ class Flight(Shown):
     unused: tuple[Unused, ...] = ()
     inputs: tuple[InputFile, ...] = ()
     modes: tuple[FlightMode, ...] | Unavailable = MODES_NOT_LOGGED
+    barometer: pd.DataFrame | None = None
 
 
 def best_first(tracks: Iterable[PositionTrack]) -> tuple[PositionTrack, ...]:

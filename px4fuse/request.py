@@ -23,6 +23,8 @@ AxisName = Literal["north", "east", "down", "aisle"]
 InputName = Literal["imu", "zero"]
 # What a log does not tell of a position source
 SourceKind = Literal["uwb", "vio", "mocap", "gnss"]
+# What the height of a GNSS flight is from
+HeightName = Literal["gnss", "barometer"]
 # What a trajectory file's axes may be said to be
 FrameName = Literal["NED", "FRD", "ENU", "camera"]
 System = Annotated[int, msgspec.Meta(ge=0, le=255)]
@@ -85,6 +87,8 @@ class ComparisonRequest(_Asked, frozen=True, kw_only=True, tag_field="command", 
         Name of a track of the flight; None for the best.
     source_kind : {"uwb", "vio", "mocap", "gnss"} or None
         What the source is; None for what its messages make of it.
+    height : {"gnss", "barometer"} or None
+        What "down" is from where the source is GNSS; None for the one that EKF2 fused, GNSS first.
     sigma_a_m_s2, dt_s : float
         As :class:`px4fuse.filter.settings.Settings`.
     sigma_z_m : float or None
@@ -107,6 +111,7 @@ class ComparisonRequest(_Asked, frozen=True, kw_only=True, tag_field="command", 
     position: PositionFile | None = None
     position_source: str | None = None
     source_kind: SourceKind | None = None
+    height: HeightName | None = None
     sigma_a_m_s2: float = SIGMA_A_M_S2
     sigma_z_m: float | None = None
     dt_s: float = DT_S
@@ -334,6 +339,10 @@ FILTER_OPTIONS = {
         "What the position source is, where its messages do not tell: odometry (vio) drifts, "
         "motion capture that is sent in the same messages does not.  [default: vio with an "
         "orientation that turns]",
+    ),
+    "height": Option(
+        "--height",
+        "What --axis down is from with GNSS.  [default: what EKF2 fused, GNSS first]",
     ),
 }  # fmt: skip
 CLOCK_OPTION = {

@@ -29,7 +29,7 @@ from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.stretches import Compass
 from px4fuse.ekf2.walk import ATTITUDE, GATE, NOISE, SPEED, STAMPS, Why
 from px4fuse.ekf2.whatif import WhatIf, what_if
-from px4fuse.errors import SettingsError
+from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.findings import find, noises
 from px4fuse.flight import (
     POSITION_COLUMNS,
@@ -233,6 +233,74 @@ def test_ekf2_s_innovations_are_those_of_gnss(tmp_path: Path) -> None:
     assert ekf2.gate == 5.0
     # those of the flight are as they were
     assert isinstance(flight.ekf2.innovations["north"], Unavailable)  # type: ignore[union-attr]
+
+
+ALTITUDE_OFF_M = 37.0
+
+
+def with_barometer(log: Log, *, fused: bool = True) -> Log:
+    """The same with the altitude by the pressure, which is off by a constant, and its fusion."""
+    at = stamps(SECONDS, 5.0, 0.1)
+    altitude_m = ORIGIN[2] + ALTITUDE_OFF_M - position(seconds_of(at))[:, 2]
+    log.add(topic("vehicle_air_data", at, {"baro_alt_meter": altitude_m}, sampled=True))
+    if fused:
+        flags = log["estimator_status_flags"]
+        flags["cs_baro_hgt"] = np.ones(len(flags["timestamp"]), np.bool_)
+        logged, ones = np.full(len(at), 0.2), np.ones(len(at))
+        log.add(topic("estimator_aid_src_baro_hgt", at, {
+            "innovation": logged, "innovation_variance": 0.25 * ones,
+            "observation_variance": 0.16 * ones, "test_ratio": logged, "fused": ones > 0.0,
+            "innovation_rejected": ones < 0.0,
+        }, sampled=True))  # fmt: skip
+    log.parameters["EKF2_BARO_NOISE"] = 0.4
+    return log
+
+
+def test_down_is_by_the_barometer_where_ekf2_fused_that(tmp_path: Path) -> None:
+    flight = flight_of(with_barometer(outdoors()), tmp_path)
+    request = ComparisonRequest(log="a.ulg", axes=("down", "north"))
+    prepared = run_preparation(request, flight=flight)
+    down, north = prepared.lines
+    at = down.measurement_time_s
+    np.testing.assert_allclose(at % 0.2, 0.1, atol=1e-6)  # of the barometer, not of the fixes
+    np.testing.assert_allclose(down.measurement_m, position(at)[:, 2], atol=1e-4)
+    np.testing.assert_allclose(north.measurement_m, position(north.measurement_time_s)[:, 0],
+                               atol=1e-4)  # fmt: skip
+    assert prepared.settings.sigma_z_m == pytest.approx(0.4)  # EKF2_BARO_NOISE
+    innovations = prepared.flight.ekf2.innovations["down"]  # type: ignore[union-attr]
+    np.testing.assert_allclose(innovations["innovation_m"], -0.2, rtol=1e-6)
+    by_gnss = run_preparation(replace(request, height="gnss"), flight=flight)
+    assert not np.isin(by_gnss.lines[0].measurement_time_s, at).any()
+    assert isinstance(by_gnss.flight.ekf2.innovations["down"], Unavailable)  # type: ignore[union-attr]
+
+
+def test_down_is_by_gnss_unless_ekf2_fused_the_barometer_alone_or_it_is_asked_for(
+    tmp_path: Path,
+) -> None:
+    flight = flight_of(with_barometer(outdoors(), fused=False), tmp_path)
+    assert prepare(flight, axes=("down",)).source.barometer is None
+    asked = prepare(flight, axes=("down",), height="barometer")
+    assert asked.source.barometer is not None
+    bare = flight_of(outdoors(), tmp_path)
+    with pytest.raises(MissingDataError, match="no height by a barometer"):
+        prepare(bare, height="barometer")
+    vision = simulate_flight(scenario_of("aisle", seed=1))
+    with pytest.raises(SettingsError, match="`height` is for GNSS"):
+        prepare(vision, height="gnss")
+
+
+@pytest.mark.reallogs
+def test_a_flight_whose_height_is_the_barometers(shared_logs: Path) -> None:
+    """EKF2 of v1.13 follows the barometer, unless it is told otherwise."""
+    log = shared_logs / "gps" / "v1.13.3_gps_profile1.ulg"
+    analysis = px4fuse.compare(log, axes="down")
+    ekf2, ours = (analysis.axes["down"].filters[name] for name in ("ekf2", "kf"))
+    aid = analysis.aids["baro_hgt"].axes["down"]  # type: ignore[index]
+    assert ekf2.nis_mean == pytest.approx(aid.nis_mean, rel=0.02)  # type: ignore[union-attr]
+    assert ours.truth.position_rmse_m < 0.35  # type: ignore[union-attr]
+    assert ours.verdict == "consistent"  # type: ignore[union-attr]
+    said = " ".join(f"{one.message} {one.remedy}" for one in find(analysis))
+    assert "EKF2_GPS" not in said
 
 
 @pytest.mark.parametrize("fused", [True, False])
@@ -568,7 +636,7 @@ def test_resets_to_gnss_by_release(
 def test_the_clock_speaks_of_ekf2s_delay_of_gnss(
     delay_ms: float, age_s: float, remaining_s: float, said: str | None
 ) -> None:
-    source = SimpleNamespace(origin=GNSS, age_s=age_s, alignment=None)
+    source = SimpleNamespace(origin=GNSS, age_s=age_s, alignment=None, aid=lambda _: GNSS.aid)
     log = SimpleNamespace(name="x.ulg", parameters={"EKF2_GPS_DELAY": delay_ms})
     comparison = SimpleNamespace(source=source, flight=SimpleNamespace(log=log))
     clock = late(remaining_s, drift_ppm=None, drift_sigma_ppm=None)

@@ -67,6 +67,7 @@ from px4fuse.inspect.inventory import take_inventory
 from px4fuse.origin import MOTION_CAPTURE, RECEIVED
 from px4fuse.readers import read_log
 from px4fuse.readers.mavlink_frames import wire_layout
+from px4fuse.readers.mavlink_positions import pressure_altitude
 from px4fuse.readers.mavlink_recording import _in_ned
 from px4fuse.readers.px4_positions import unproject
 
@@ -535,6 +536,24 @@ def test_gnss_is_a_position_about_the_autopilots_origin(read, origin):
     result = compare(flight, sigma_z_given=False)
     assert result.source.name == "GPS_RAW_INT"
     assert result.settings.sigma_z_m == 0.5  # EKF2_GPS_P_NOISE where nothing larger is stated
+
+
+def test_the_height_of_a_recording_may_be_the_barometers(read):
+    """Pressures of the standard atmosphere's table (ISO 2533), at 400 m and 1 km."""
+    assert pressure_altitude(np.array([1013.25, 966.114, 898.746])) == pytest.approx(
+        [0.0, 400.0, 1000.0], abs=0.1
+    )
+
+    def pressure(boot_s):
+        altitude_m = 400.0 - Aisle().path(boot_s)[0][2]
+        hpa = 1013.25 * (1.0 - 0.0065 * altitude_m / 288.15) ** 5.25588
+        return message("SCALED_PRESSURE", time_boot_ms=ms(boot_s), press_abs=hpa)
+
+    flight = read(add(outdoors(), 5.0, pressure))
+    assert compare(flight, axes=("down",)).source.barometer is None
+    (down,) = compare(flight, axes=("down",), height="barometer").lines
+    true = np.array([Aisle().path(BOOT_S + t)[0][2] for t in down.measurement_time_s])
+    assert down.measurement_m - true == pytest.approx(0.0, abs=0.05)
 
 
 def test_gnss_is_not_taken_by_itself_where_the_autopilot_does_not_know_where_it_is(read):

@@ -10,7 +10,7 @@ from msgspec import structs
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.projection import observation_variance
-from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS
+from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
 from px4fuse.errors import MissingDataError, SettingsError, did_you_mean
 from px4fuse.filter.settings import SIGMA_Z_RANGE_M, Settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, make_axes, within
@@ -26,8 +26,9 @@ from px4fuse.flight import (
 from px4fuse.origin import GIVEN_FILE, PositionKind
 from px4fuse.plain import capital
 from px4fuse.readers.mavlink_messages import POSITION_INPUTS
-from px4fuse.readers.px4_innovations import with_gnss
+from px4fuse.readers.px4_innovations import GNSS, GNSS_AND_BAROMETER, fuses, with_gnss
 from px4fuse.readers.px4_topics import TOPIC_ORIGINS
+from px4fuse.request import HeightName
 from px4fuse.trajectory.rotation import interpolate, matrix
 
 # Of the names under which logs have external positions, PX4's topics and MAVLink's messages
@@ -57,6 +58,9 @@ class Choices(TypedDict, total=False):
         Name of a track of the flight.
     source_kind : {"uwb", "vio", "mocap", "gnss"}
         What it is; by default what its messages make of it.
+    height : {"gnss", "barometer"}
+        What "down" is from where the source is GNSS; by default the one that EKF2 fused, GNSS
+        first.
     start_s, end_s : float
         Segment, seconds from the first data.
     input_required : bool
@@ -70,6 +74,7 @@ class Choices(TypedDict, total=False):
     heading_deg: float | None
     position_source: str | None
     source_kind: PositionKind | None
+    height: HeightName | None
     start_s: float | None
     end_s: float | None
     input_required: bool
@@ -102,6 +107,7 @@ def prepare(
     if kind := choices.get("source_kind"):
         track = replace(track, origin=structs.replace(track.origin, kind=kind))
     track = _of_vehicle(shift_clock(track, settings.clock_offset_s), flight)
+    track = _by_barometer(track, flight, choices.get("height"))
     flight = of_source(flight, track)
     missing = flight.missing
     segment = choose_segment(flight, track, choices.get("start_s"), choices.get("end_s"))
@@ -132,7 +138,8 @@ def of_source(flight: Flight, track: PositionTrack) -> Flight:
     if isinstance(flight.ekf2, Unavailable) or not track.origin.by_gnss:
         return flight
     # what the log lacks of another source is no lack here
-    of_vision, ekf2, streams = _lacking(flight.ekf2), with_gnss(flight.ekf2), dict(flight.streams)
+    of_vision, streams = _lacking(flight.ekf2), dict(flight.streams)
+    ekf2 = with_gnss(flight.ekf2, GNSS if track.barometer is None else GNSS_AND_BAROMETER)
     missing = tuple(part for part in flight.missing if not part.source and part not in of_vision)
     if "ekf2_state" in streams and ekf2.aids:
         streams["ekf2_innovations"] = replace(streams["ekf2_state"], topics=ekf2.innovation_topics)
@@ -196,6 +203,31 @@ def _of_vehicle(track: PositionTrack, flight: Flight) -> PositionTrack:
         f"{right:g} m right and {down:g} m down of it, as EKF2 takes it"
     )
     return replace(track, samples=samples, notes=(*track.notes, note))
+
+
+def _by_barometer(track: PositionTrack, flight: Flight, asked: HeightName | None) -> PositionTrack:
+    """The track with the barometer for its height, where that is asked for or what EKF2 fused.
+
+    A barometer has no zero: it is put where EKF2's is.
+    """
+    ekf2, heights, name = flight.ekf2, flight.barometer, flight.log.name
+    if asked and not track.origin.by_gnss:
+        raise SettingsError(f"{name}: `height` is for GNSS, and the position is {track.name}.")
+    of_ekf2 = fuses(ekf2, BAROMETER.name) and not fuses(ekf2, GNSS.vertical)
+    wanted = asked == "barometer" or (asked is None and track.origin.by_gnss and of_ekf2)
+    if not wanted or heights is None:
+        if asked == "barometer":
+            raise MissingDataError(f"{name}: no height by a barometer.", GNSS.to_log)
+        return track
+    zero, whence = heights["down_m"].iloc[0], "its first height"
+    if isinstance(ekf2, Ekf2):
+        down = np.interp(heights.index, ekf2.state.index, ekf2.state["down_m"], np.nan, np.nan)
+        apart = float(np.nanmedian(heights["down_m"] - down)) if np.isfinite(down).any() else zero
+        zero, whence = apart, "where it is EKF2's in the median"
+    note = f"down is by the barometer, from {whence}"
+    description = f"{track.description}, height by the barometer"
+    notes = (*track.notes, note)
+    return replace(track, barometer=heights - zero, description=description, notes=notes)
 
 
 def no_source(flight: Flight) -> Unavailable:

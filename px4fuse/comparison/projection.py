@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array
-from px4fuse.ekf2_parameters import GNSS_POS
+from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS
 from px4fuse.filter.signals import AISLE, Axis, Segment, along, within
 from px4fuse.flight import (
     AXIS_NAMES,
@@ -167,7 +167,7 @@ def project_innovations(
     Columns as :attr:`Ekf2.innovations` plus ``prior_variance_m2`` (P⁻ = S - R) and
     ``posterior_variance_m2`` (P⁺ = P⁻R/S, or P⁻ where rejected), NaN where R is unknown.
     """
-    if track.origin.aid is None:
+    if track.aid(axis.name) is None:
         return Unavailable(
             "EKF2 innovations",
             f"EKF2 never fuses {track.name}: those in the log belong to another source",
@@ -222,16 +222,20 @@ def observation_variance(
 
     R = EKF2_EVP_NOISE², or the sender's variance if larger, unless EKF2_EV_NOISE_MD is 1
     (EKF2.cpp, ev_pos_control.cpp); of GNSS EKF2_GPS_P_NOISE², half as much again in σ for height,
-    or the receiver's accuracy if larger (gps_control.cpp, gnss_height_control.cpp).
+    or the receiver's accuracy if larger (gps_control.cpp, gnss_height_control.cpp); of the
+    barometer EKF2_BARO_NOISE² (baro_height_control.cpp).
     """
-    aid, parameters = track.origin.aid, flight.log.parameters
+    aid, parameters, ekf2 = track.aid(axis.name), flight.log.parameters, flight.ekf2
+    if aid is not None and isinstance(ekf2, Ekf2) and aid.name in ekf2.aids:
+        parameters = {**parameters, **ekf2.aids[aid.name].parameters}
     noise_m = usual_m if aid is None else parameters.get(aid.noise, usual_m)
     if aid is None or math.isnan(noise_m):
         return math.nan
     scale = GNSS_HEIGHT_SCALE if aid == GNSS_POS and axis.name == "down" else 1.0
     r = max(scale * noise_m, EKF2_MIN_NOISE_M) ** 2
     # what a file of its own reports is not what EKF2 was sent
-    if parameters.get(aid.noise_mode) == 1.0 or track.alignment is not None:
+    theirs = track.alignment is not None or aid == BAROMETER
+    if theirs or parameters.get(aid.noise_mode) == 1.0:
         return r
     reported = within(track.samples, segment)[POSITION_VARIANCE_COLUMNS].median()
     reported_along = float(np.nansum(reported.to_numpy() * axis.direction**2))

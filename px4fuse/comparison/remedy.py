@@ -92,9 +92,9 @@ def delay_asked(
     return delay_change(model, 1e3 * (age_s - clock.offset_s))
 
 
-def aid_of(comparison: Comparison) -> Aid:
-    """What EKF2 takes the source as, with the names of its parameters."""
-    return comparison.source.origin.aid or EV_POS
+def aid_of(comparison: Comparison, axis: str = "") -> Aid:
+    """What EKF2 takes the source as along an axis, with the names of its parameters."""
+    return comparison.source.aid(axis) or EV_POS
 
 
 def delay_ms(comparison: Comparison) -> float | None:

@@ -37,8 +37,8 @@ from px4fuse.flight import (
     Unavailable,
 )
 from px4fuse.origin import GIVEN_FILE
-from px4fuse.readers.px4_innovations import with_gnss
-from px4fuse.readers.px4_positions import THINNED_HZ, fuses_gnss
+from px4fuse.readers.px4_innovations import fuses, with_gnss
+from px4fuse.readers.px4_positions import THINNED_HZ
 from px4fuse.readers.px4_topics import DEFAULT_PROFILE
 from px4fuse.trajectory.rotation import conjugate, interpolate, matrix, multiply
 
@@ -264,7 +264,7 @@ def replayed_aid(ekf2: Ekf2) -> Aid:
     """What EKF2's horizontal position rests on: external vision, or GNSS where it fused that."""
     vision = ekf2.aids.get(EV_POS.name)
     used = vision is not None and (vision.meant is None or bool(vision.meant.any()))
-    return GNSS_POS if fuses_gnss(ekf2) and not used else EV_POS
+    return GNSS_POS if fuses(ekf2) and not used else EV_POS
 
 
 def _gnss(flight: Flight) -> PositionTrack | None:

@@ -42,7 +42,7 @@ from px4fuse.ekf2.replay import (
     agreement_with_log,
     with_obedient,
 )
-from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS, check
+from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS, check
 from px4fuse.errors import SettingsError
 from px4fuse.flight import STATE_COLUMNS, Ekf2, Flight, Unavailable
 from px4fuse.readers.px4_innovations import with_gnss
@@ -137,6 +137,7 @@ def replay_settings(
     changes, inputs = [check(change) for change in settings], model.inputs
     of_others = PARAMETERS.keys() - inputs.settings.keys()
     idle = dict.fromkeys(of_others, f"EKF2 fused {inputs.aid.label} in this log")
+    idle[BAROMETER.noise] = "the model takes height from EKF2 itself"
     if inputs.rules.horizon_by_delay:
         firmware = model.flight.log.firmware
         idle["EKF2_DELAY_MAX"] = f"in {firmware} the longest delay makes the horizon"

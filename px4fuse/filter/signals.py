@@ -200,7 +200,6 @@ def make_axes(
     SettingsError
         An axis has an unknown name, or the heading is not between 0 and 360.
     """
-    samples = within(track.samples, segment)
     acceleration = ned_acceleration(flight)
     known = (*AXIS_NAMES, AISLE)
     asked = tuple(dict.fromkeys(known if names is None else names))
@@ -214,6 +213,10 @@ def make_axes(
     axes = []
     for name in asked:
         direction, heading, note, elongation = _direction(name, track, segment, heading_deg)
+        samples = track.samples
+        if name == "down" and track.barometer is not None:
+            samples = track.barometer.reindex(columns=POSITION_COLUMNS)
+        samples = within(samples, segment)
         projected = along(samples, POSITION_COLUMNS, direction)
         finite = np.isfinite(projected)
         if np.count_nonzero(finite) < MIN_MEASUREMENTS:

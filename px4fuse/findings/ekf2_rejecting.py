@@ -69,7 +69,9 @@ def _rejections(analysis: Analysis) -> Found:
                 "ekf2_rejecting",
                 f"EKF2 rejected {share:.1%} of the source's samples for {what}",
                 f" (outside {ekf2.gate:g} √S): outliers, a noise set too small, or a late clock.",
-                in_order(remedy.aid_of(analysis)) if name == "down" else _remedy(analysis, name),
+                in_order(remedy.aid_of(analysis, name))
+                if name == "down"
+                else _remedy(analysis, name),
                 {"rejected_share": share, "count": len(frame), "axis": name},
                 moments(known.index[known > 0.0]),
             )

@@ -6,6 +6,7 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
+from px4fuse.ekf2_parameters import BAROMETER
 from px4fuse.findings.model import Found, info, warning
 from px4fuse.flight import Ekf2, Unavailable
 from px4fuse.origin import RECEIVED
@@ -80,17 +81,22 @@ def source_as_sent(analysis: Comparison) -> Found:
 def innovations(analysis: Comparison) -> Found:
     """Too few innovations of EKF2 for the measurements, which are not made of them."""
     ekf2, axes = analysis.flight.ekf2, analysis.axes.values()
-    frames = (result.ekf2_innovations for result in axes)
-    logged = next((len(frame) for frame in frames if isinstance(frame, pd.DataFrame)), None)
-    if logged is None or analysis.source.origin.reconstructed or not isinstance(ekf2, Ekf2):
+    found = (
+        (result.axis.name, len(frame))
+        for result in axes
+        if isinstance(frame := result.ekf2_innovations, pd.DataFrame)
+    )
+    axis, logged = next(found, ("", 0))
+    if not axis or analysis.source.origin.reconstructed or not isinstance(ekf2, Ekf2):
         return
     count = len(next(iter(axes)).replay.updates)
     if logged / count < MIN_INNOVATION_SHARE:
+        air = analysis.source.aid(axis) == BAROMETER
+        topic = (ekf2.aids[BAROMETER.name].topics if air else ekf2.innovation_topics)[0]
         yield info(
             "ekf2_innovations_decimated",
             f"The log holds {logged} EKF2 innovations for {count} measurements",
             f": {1 - logged / count:.0%} of what EKF2 did with the source is not in it.",
-            f'Put the line "{ekf2.innovation_topics[0]} 0" into etc/logging/logger_topics.txt on '
-            "the SD card.",
+            f'Put the line "{topic} 0" into etc/logging/logger_topics.txt on the SD card.',
             {"logged": logged, "measurements": count},
         )

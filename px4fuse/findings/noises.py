@@ -35,7 +35,7 @@ from px4fuse.comparison.remedy import (
     remedy_words,
     settings_words,
 )
-from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.ekf2_parameters import BAROMETER, PARAMETERS
 from px4fuse.filter.consistency import SIGMA_OFF, Consistency
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import within
@@ -86,8 +86,8 @@ AGAINST_DRIFT = (
     "the filter follows it, not how wrong both are."
 )
 AGAINST_SLOW_ERRORS = (
-    "Lower no noise for these innovations: errors of GNSS are slow for the most part, which R has "
-    "to cover and innovations do not show."
+    "Lower no noise for these innovations: errors of {} are slow for the most part, which R has to "
+    "cover and innovations do not show."
 )
 AGAINST_TRUTH = (
     "Lower no noise for these innovations: the filter would claim less than its errors against the "
@@ -270,9 +270,11 @@ def _of_group(analysis: Analysis, owner: FilterName, group: str, members: list[M
     if over and analysis.source.origin.may_drift:
         severity, remedy, cause = "info", AGAINST_DRIFT, ELSEWHERE
     elif over and analysis.source.origin.is_gnss:
-        remedy = _above_stated(analysis) if owner == "ekf2" else ""
+        air = analysis.source.aid(result.axis.name) == BAROMETER
+        remedy = _above_stated(analysis) if owner == "ekf2" and not air else ""
         cause = NOISE if remedy else ELSEWHERE
-        severity, remedy = severity if remedy else "info", remedy or AGAINST_SLOW_ERRORS
+        slow = AGAINST_SLOW_ERRORS.format("a barometer" if air else "GNSS")
+        severity, remedy = severity if remedy else "info", remedy or slow
     elif over and any(hidden.owner == owner for hidden in hidden_errors(analysis)):
         remedy, cause = AGAINST_TRUTH, ELSEWHERE
     else:
@@ -322,7 +324,7 @@ def _is_default(analysis: Analysis, owner: FilterName, result: AxisComparison) -
     if owner == "kf":
         chosen, own = analysis.settings, Settings()
         return (chosen.sigma_z_m, chosen.sigma_a_m_s2) == (own.sigma_z_m, own.sigma_a_m_s2)
-    name = aid_of(analysis).noise
+    name = aid_of(analysis, result.axis.name).noise
     default = PARAMETERS[name].default
     untouched = analysis.flight.log.parameters.get(name, default) == default
     # a sender that reports a larger variance has chosen it
@@ -371,7 +373,7 @@ def _without_cause(
 
 def _not_replayed(analysis: Analysis, result: AxisComparison, tuned: AxisTuning | None) -> str:
     """What the data ask of EKF2's noise where no replay can confirm it."""
-    aid, model = aid_of(analysis), analysis.ekf2_model
+    aid, model = aid_of(analysis, result.axis.name), analysis.ekf2_model
     why: Unavailable | None = model if isinstance(model, Unavailable) else None
     if result.axis.name == "down":
         why = ONLY_HORIZONTAL

@@ -28,7 +28,7 @@ Progress = Callable[[str], None]
 # A log is analysed with these settings of the other one's results, and with more of them where
 # they are of the same log
 _FILTER = ("sigma_a_m_s2", "sigma_z_m", "dt_s", "input", "axes", "clock_offset_s")
-_PART = ("heading_deg", "start_s", "end_s", "position_source", "source_kind")
+_PART = ("heading_deg", "start_s", "end_s", "position_source", "source_kind", "height")
 
 
 @dataclass(frozen=True, repr=False)

@@ -26,6 +26,7 @@ from px4fuse.request import (
     ComparisonRequest,
     FrameName,
     GivenClosure,
+    HeightName,
     InputName,
     PositionFile,
     SourceKind,
@@ -55,6 +56,7 @@ def compare(
     end_s: float | None = None,
     position_source: str | None = None,
     source_kind: SourceKind | None = None,
+    height: HeightName | None = None,
     position: Pathlike | PositionFile | None = None,
     mavlink: Pathlike | None = None,
     system: int | None = None,
@@ -80,6 +82,8 @@ def compare(
         Name of a track of the flight.
     source_kind : {"uwb", "vio", "mocap", "gnss"}, optional
         What the source is, where its messages do not tell.
+    height : {"gnss", "barometer"}, optional
+        What "down" is from where the source is GNSS; by default the one that EKF2 fused.
     position : str, Path or PositionFile, optional
         The positioning system's own recording.
     mavlink : str or Path, optional
@@ -117,6 +121,7 @@ def compare(
         position=PositionFile(path=str(position)) if isinstance(position, str | Path) else position,
         position_source=position_source,
         source_kind=source_kind,
+        height=height,
         sigma_a_m_s2=sigma_a_m_s2,
         sigma_z_m=sigma_z_m,
         dt_s=dt_s,

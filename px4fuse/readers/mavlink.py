@@ -29,7 +29,7 @@ from px4fuse.flight import (
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers.mavlink_clocks import UNIX_FROM_S
 from px4fuse.readers.mavlink_frames import message_ids, read_frames
-from px4fuse.readers.mavlink_positions import read_positions, read_truth
+from px4fuse.readers.mavlink_positions import pressure_altitude, read_positions, read_truth
 from px4fuse.readers.mavlink_recording import (
     BOOT_CLOCK,
     RECEIPT_CLOCK,
@@ -53,6 +53,7 @@ from px4fuse.readers.parts import (
     stretches_of_modes,
     with_attitude,
 )
+from px4fuse.readers.px4_positions import barometer
 from px4fuse.readers.ulog_topics import NO_SELECTOR, dropped_note
 from px4fuse.recording import LogInfo, Unused
 
@@ -113,6 +114,7 @@ def read_mavlink(path: Path, system: int | None = None) -> Flight:
         ekf2=ekf2,
         truth=truth,
         airborne=airborne,
+        barometer=barometer(pressure_altitude(recording.read(messages.PRESSURE)["pressure_hpa"])),
         modes=_read_modes(recording) if autopilot == "PX4" else messages.NO_MODES,
         missing=(*missing_parts(imu, attitude, ekf2, truth), *missing_positions),
         streams=MappingProxyType(recording.streams),

@@ -233,6 +233,7 @@ GNSS_INPUTS = tuple(
     )
     for message in ("GPS_RAW_INT", "GPS2_RAW")
 )
+PRESSURE = Layout("SCALED_PRESSURE", {"pressure_hpa": "press_abs"})
 ORIGIN = Layout(
     "GPS_GLOBAL_ORIGIN",
     {"latitude_deg": "latitude", "longitude_deg": "longitude", "altitude_m": "altitude"},

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import pandas as pd
 from msgspec import structs
+from scipy import constants
 
 from px4fuse.flight import (
     POSITION_COLUMNS,
@@ -175,6 +176,12 @@ def _read_gnss(recording: Recording, layout: Layout, delay_s: float) -> Position
         log=recording.frames.name,
         age_s=delay_s,
     )
+
+
+def pressure_altitude(pressure_hpa: pd.Series[float]) -> pd.Series[float]:
+    """Altitude (m) of a pressure in the standard atmosphere, troposphere (ISO 2533:1975)."""
+    exponent = constants.R * 0.0065 / (constants.g * 0.0289644)
+    return 288.15 / 0.0065 * (1.0 - (pressure_hpa / 1013.25) ** exponent)
 
 
 def local_origin(recording: Recording) -> tuple[float, float, float] | None:

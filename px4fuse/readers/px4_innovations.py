@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from px4fuse.ekf2_parameters import GNSS_POS
+from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS
 from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Ekf2, Unavailable
 from px4fuse.readers.px4_topics import HOW_TO_FUSE
 
@@ -17,13 +17,17 @@ Innovations = dict[AxisName, pd.DataFrame | Unavailable]
 
 @dataclass(frozen=True)
 class Fused:
-    """A position source as EKF2 knows it: its name, its aids, and what has EKF2 fuse them."""
+    """A position source as EKF2 knows it: its name, its aids, and what has EKF2 fuse them.
+
+    ``height`` is the name of what its height is from, where that is something else.
+    """
 
     name: str
     horizontal: str
     vertical: str
     remedies: Mapping[str, str]
     to_log: str
+    height: str = ""
 
 
 VISION = Fused(
@@ -38,13 +42,26 @@ GNSS = Fused(
                  "fuse its height."},
     "Record with SDLOG_PROFILE bit 0 (default).",
 )  # fmt: skip
+GNSS_AND_BAROMETER = replace(
+    GNSS, vertical=BAROMETER.name, height="the barometer",
+    remedies={**GNSS.remedies, "vertical": f"Set {BAROMETER.switch} to 1 (EKF2_HGT_MODE to 0 "
+              "before v1.14) if EKF2 is to fuse its height."},
+)  # fmt: skip
 
 
-def with_gnss(ekf2: Ekf2) -> Ekf2:
+def fuses(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
+    """Whether EKF2 fused an aid, or meant to fuse it, at any time."""
+    log = None if isinstance(ekf2, Unavailable) else ekf2.aids.get(aid)
+    if log is None:
+        return False
+    return bool(log.samples["fused"].any() if "fused" in log.samples else log.meant is not None)
+
+
+def with_gnss(ekf2: Ekf2, source: Fused = GNSS) -> Ekf2:
     """EKF2 with its innovations of GNSS in place of those of external vision."""
     meant = {
         group: log.meant
-        for group, name in (("horizontal", "gnss_pos"), ("vertical", "gnss_hgt"))
+        for group, name in (("horizontal", source.horizontal), ("vertical", source.vertical))
         if (log := ekf2.aids.get(name)) is not None and log.meant is not None
     }
     fusing: pd.DataFrame | Unavailable = Unavailable(
@@ -56,7 +73,7 @@ def with_gnss(ekf2: Ekf2) -> Ekf2:
     log = ekf2.aids.get("gnss_pos")
     logged = {} if log is None else log.parameters
     gate = logged.get(GNSS_POS.gate, GNSS_POS.default_gate)
-    innovations, topics = innovations_of(ekf2.aids, fusing, gate, GNSS)
+    innovations, topics = innovations_of(ekf2.aids, fusing, gate, source)
     return replace(
         ekf2, innovations=innovations, innovation_topics=topics, fusing=fusing, gate=gate
     )
@@ -83,13 +100,14 @@ def innovations_of(
     used: dict[str, None] = {}
     for axis in AXIS_NAMES:
         group = "vertical" if axis == "down" else "horizontal"
+        sensor = (axis == "down" and source.height) or source.name
         log = aids.get(source.vertical if axis == "down" else source.horizontal)
         frame = None if log is None else _along(log, axis, gate)
         if isinstance(fusing, pd.DataFrame) and not fusing[group].any():
             quantity = "height" if axis == "down" else "horizontal position"
             found[axis] = Unavailable(
                 f"EKF2 innovations, {axis}",
-                f"EKF2 never fused {source.name} for {quantity} in this log",
+                f"EKF2 never fused {sensor} for {quantity} in this log",
                 source.remedies[group],
             )
         elif log is None or frame is None or frame.empty:
@@ -97,7 +115,7 @@ def innovations_of(
                 f"EKF2 innovations, {axis}",
                 f"no usable estimator_aid_src_{source.horizontal}, "
                 f"estimator_aid_src_{source.vertical}, estimator_innovations or ekf2_innovations "
-                f"sample while {source.name} was fused",
+                f"sample while {sensor} was fused",
                 source.to_log,
             )
         else:

@@ -30,6 +30,7 @@ from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.parts import attitude_of, finite_rows, orientation_of
 from px4fuse.readers.px4_ekf2 import target_step_s
 from px4fuse.readers.px4_fixes import left_out_fixes, rebuilt_fixes
+from px4fuse.readers.px4_innovations import fuses
 from px4fuse.readers.px4_topics import (
     ANTENNA_COLUMNS,
     GPS_POSITION,
@@ -300,14 +301,6 @@ def projected(geo: pd.DataFrame, origin: tuple[float, float, float] | None) -> p
     )
 
 
-def fuses_gnss(ekf2: Ekf2 | Unavailable) -> bool:
-    """Whether EKF2 fused, or meant to fuse, the position of GNSS at any time."""
-    log = None if isinstance(ekf2, Unavailable) else ekf2.aids.get("gnss_pos")
-    if log is None:
-        return False
-    return bool(log.samples["fused"].any() if "fused" in log.samples else log.meant is not None)
-
-
 def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unavailable:
     """GNSS at the times that EKF2 takes its fixes to have been measured at.
 
@@ -368,7 +361,15 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     )  # fmt: skip
     if isinstance(found, Unavailable):
         return found
-    return replace(found, origin=structs.replace(found.origin, automatic=fuses_gnss(ekf2)))
+    return replace(found, origin=structs.replace(found.origin, automatic=fuses(ekf2)))
+
+
+def barometer(altitude_m: pd.Series[float] | None, delay_s: float = 0.0) -> pd.DataFrame | None:
+    """Height by the pressure, ``down_m``, None where there is none."""
+    heights = None if altitude_m is None else altitude_m[np.isfinite(altitude_m)]
+    if heights is None or len(heights) < MIN_TRACK_SAMPLES:
+        return None
+    return _later(-heights.to_frame("down_m"), -delay_s)
 
 
 def _velocity(gps: pd.DataFrame) -> pd.DataFrame:
@@ -392,7 +393,7 @@ def read_truth(
     geo = topics.read(px4.TRUTH_GLOBAL)
     geo = None if geo is None else finite_rows(geo, GLOBAL_COLUMNS[:2])
     if local is not None and len(local := local.dropna()):
-        if geo is not None and len(geo) and fuses_gnss(ekf2):
+        if geo is not None and len(geo) and fuses(ekf2):
             local = _about_origin(local, projected(geo, _local_origin(topics)))
         return Truth(px4.TRUTH_LOCAL[0].topic, local, attitude)
     if geo is not None and len(geo):

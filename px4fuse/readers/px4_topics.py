@@ -97,6 +97,8 @@ TRUTH_GLOBAL = (
 )
 TRUTH_ATTITUDE = (Layout("vehicle_attitude_groundtruth", elements(QUATERNION_COLUMNS, "q")),)
 
+BAROMETER = (Layout("vehicle_air_data", {"altitude_m": "baro_alt_meter"}),)
+
 _GPS_OPTIONAL = {
     "eph_m": "eph", "epv_m": "epv", "fix_type": "fix_type", "utc_us": "time_utc_usec",
     "published_us": "timestamp", "north_m_s": "vel_n_m_s", "east_m_s": "vel_e_m_s",
@@ -272,7 +274,7 @@ UNUSED: Mapping[str, str] = {
 def topics() -> list[str]:
     """Every topic named in this table, sorted: all that a reader needs to decode."""
     groups = (
-        IMU, ATTITUDE, LOCAL_POSITION, SENSOR_BIAS, SELECTOR, LAND_DETECTED, FLIGHT_MODE,
+        IMU, ATTITUDE, LOCAL_POSITION, SENSOR_BIAS, SELECTOR, LAND_DETECTED, FLIGHT_MODE, BAROMETER,
         TRUTH_LOCAL, TRUTH_GLOBAL, TRUTH_ATTITUDE, AID_OBSERVATION_HORIZONTAL,
         AID_OBSERVATION_VERTICAL, *(track.layouts for track in _TRACKS),
     )  # fmt: skip

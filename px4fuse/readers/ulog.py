@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
+from px4fuse.ekf2_parameters import BAROMETER
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
     MODES_NOT_LOGGED,
@@ -29,7 +30,7 @@ from px4fuse.readers.parts import (
     with_attitude,
 )
 from px4fuse.readers.px4_ekf2 import ekf2_topics, read_ekf2
-from px4fuse.readers.px4_positions import GPS_3D_FIX, read_positions, read_truth
+from px4fuse.readers.px4_positions import GPS_3D_FIX, barometer, read_positions, read_truth
 from px4fuse.readers.ulog_topics import (
     ACCELEROMETER_OFFSET_INVALID_US,
     AT_MEASUREMENT,
@@ -72,6 +73,7 @@ def to_flight(topics: Topics) -> Flight:
     positions, missing_positions = read_positions(topics, ekf2)
     truth = read_truth(topics, positions, ekf2)
     airborne = _read_airborne(topics)
+    air = topics.read(px4.BAROMETER)
     in_flight = ends_in_flight(airborne, topics.log.duration_s)
     dropped = tuple(
         dropped_note(count, topic, "zero or go back")
@@ -100,6 +102,9 @@ def to_flight(topics: Topics) -> Flight:
         truth=truth,
         airborne=airborne,
         modes=_read_modes(topics),
+        barometer=None
+        if air is None
+        else barometer(air["altitude_m"], topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3),
         missing=(*missing_parts(imu, attitude, ekf2, truth), *missing_positions),
         streams={part: _stream(topics, part, names) for part, names in used.items() if names},
         unused=tuple(
