@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 import pytest
 from exchange import replace
 from filter_tools import any_axis, any_settings, sample_axes
@@ -20,6 +21,7 @@ from px4fuse.filter.likelihood import (
     states,
     total_over_grid,
 )
+from px4fuse.filter.quick import quick_replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.flight import Flight
@@ -57,6 +59,10 @@ def test_grid_on_the_sample_log_equals_the_replay_at_every_setting(sample_flight
 def test_any_axis_and_setting_equals_the_replay(axis: Axis, chosen: Settings) -> None:
     ours = innovations(preintegrate(axis, chosen), chosen.sigma_a_m_s2, chosen.sigma_z_m)
     np.testing.assert_allclose(ours, replayed(axis, chosen), rtol=1e-9, atol=1e-9)
+    quick, exact = quick_replay(axis, chosen), replay(axis, chosen)
+    for table in ("steps", "updates"):
+        frames = getattr(quick, table), getattr(exact, table)
+        pd.testing.assert_frame_equal(*frames, rtol=1e-9, atol=1e-9)
 
 
 def test_an_imu_gap_costs_the_same_in_both_filters() -> None:

@@ -41,8 +41,9 @@ from px4fuse.filter.causes import Explained
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.consistency import SIGMA_OFF, nis_band
 from px4fuse.filter.heading import HeadingError
-from px4fuse.filter.kalman import Replay, replay
+from px4fuse.filter.kalman import Replay
 from px4fuse.filter.likelihood import innovations, preintegrate
+from px4fuse.filter.quick import quick_replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import (
     Acceleration,
@@ -416,7 +417,7 @@ class _Ours(_Changed):
             legs = preintegrate(axis, settings)
             nu, s = innovations(legs, settings.sigma_a_m_s2, settings.sigma_z_m)
             return float(np.mean(nu**2 / s)), len(nu)
-        run = replay(axis, settings)
+        run = quick_replay(axis, settings)
         if of == "apart":
             state = result.ekf2_state
             return None if compass or isinstance(state, Unavailable) else _rms_apart(run, state)

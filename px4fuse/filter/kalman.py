@@ -6,12 +6,13 @@ State x = [position, velocity] along one axis; the input u is the acceleration o
     update     y = z - Hx         S = HPHᵀ + R      K = PHᵀS⁻¹
                x = x + Ky         P = (I - KH)P
 
-F, B, Q and H stand in :mod:`px4fuse.filter.model`, the steps in :mod:`px4fuse.filter.steps`. The
-likelihoods in this folder need many runs and have recursions of their own, the same to 1e-9.
+F, B, Q and H stand in :mod:`px4fuse.filter.model`, the steps in :mod:`px4fuse.filter.steps`. What
+is run many times in this folder (likelihoods, ``quick``) has its own recursion, the same to 1e-9.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -33,8 +34,9 @@ from px4fuse.filter.model import (
 )
 from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
-from px4fuse.filter.steps import timeline
+from px4fuse.filter.steps import Timeline, timeline
 
+Row = tuple[float, ...]
 # Columns of ``Replay.updates``
 UPDATES = [
     "measurement_m", "innovation_m", "innovation_variance_m2", "gain_position", "gain_velocity",
@@ -115,6 +117,13 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
             x, P = kalman.x_prior, kalman.P_prior
             updates.append((z, y, S, *K, x[0, 0], P[0, 0], P[1, 1]))
         states.append(_row(kalman.x, kalman.P))
+    return as_replay(axis, settings, line, states, updates)
+
+
+def as_replay(
+    axis: Axis, settings: Settings, line: Timeline, states: Sequence[Row], updates: Sequence[Row]
+) -> Replay:
+    """A replay of its rows: state and covariance after each step, and what each update was."""
     time, fused = (
         pd.Index(at, name="time_s") for at in (line.time_s, line.time_s[line.measurement >= 0])
     )
@@ -124,7 +133,7 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
     return Replay(axis, settings, steps, pd.DataFrame(updates, fused, UPDATES), line.input_gap_s)
 
 
-def _row(x: Array, P: Array) -> tuple[float, ...]:
+def _row(x: Array, P: Array) -> Row:
     """State and covariance as a row of ``Replay.steps``."""
     return x[0, 0], x[1, 0], P[0, 0], P[0, 1], P[1, 1]
 
