@@ -96,6 +96,8 @@ class Alignment(Record, frozen=True, kw_only=True):
         Of the file's track with the reference after alignment (1 is perfect).
     residual_rms_m : float or None
         Horizontal, root mean square per axis; None where the reference has no position.
+    misplaced : tuple of str
+        Where its frame is another one, each a sentence.
     warnings : tuple of str
         What is poorly determined, each a sentence.
     """
@@ -112,6 +114,7 @@ class Alignment(Record, frozen=True, kw_only=True):
     reference: str
     correlation: float | None = None
     residual_rms_m: NotNegative | None = None
+    misplaced: tuple[str, ...] = ()
     warnings: tuple[str, ...]
 
 

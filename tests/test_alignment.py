@@ -198,7 +198,7 @@ def test_sample_file_is_placed_without_any_option(
     assert error < min(0.03, 3.0 * (alignment.clock_offset_sigma_s or 0.0))
     assert alignment.correlation == pytest.approx(0.9994, abs=3e-4)
     assert alignment.residual_rms_m == pytest.approx(0.115, abs=0.01)
-    assert alignment.warnings == ()
+    assert alignment.misplaced == alignment.warnings == ()
     assert len(track.samples) == len(external.samples)
     assert track.samples[POSITION_VARIANCE_COLUMNS].isna().to_numpy().all()
 
@@ -233,7 +233,7 @@ def test_any_clock_frame_yaw_and_origin_is_recovered(
         assert alignment.frame == {"ned": "ned"}.get(frame, "enu")
     assert_same_track(track, flight.positions[0], 0.1)
     assert off_s(alignment, offset_s, (5e-4, 0.02)) < 0.03
-    assert alignment.warnings == ()
+    assert alignment.misplaced == alignment.warnings == ()
 
 
 def test_sigmas_of_clock_and_yaw_are_the_scatter_over_many_flights() -> None:
@@ -319,7 +319,7 @@ def test_a_turned_frame_is_warned_of_and_does_not_spoil_the_clock(
     alignment, _ = placed(flight, file, frame="enu")
     assert alignment.yaw_deg == 0.0
     assert off_s(alignment) < 0.03
-    (warning,) = alignment.warnings
+    (warning,) = alignment.misplaced
     seen = re.search(r"turned by ([-0-9.]+)° and shifted by ([0-9.]+) m against", warning)
     assert seen
     turned, shifted = map(float, seen.groups())
@@ -327,7 +327,7 @@ def test_a_turned_frame_is_warned_of_and_does_not_spoil_the_clock(
     assert shifted == pytest.approx(np.hypot(*origin_m[:2]), abs=0.1)
     assert warning.endswith("give --position-yaw auto.")
     alignment, _ = placed(flight, file, frame="enu", yaw_deg="auto")
-    assert alignment.warnings == ()
+    assert alignment.misplaced == alignment.warnings == ()
 
 
 def test_a_given_offset_is_used_and_warned_of_where_it_is_wrong(flight: Flight) -> None:
@@ -346,7 +346,8 @@ def test_a_height_that_runs_against_ekf2s_and_another_day_are_warned_of(flight: 
     file = recorded(flight)
     file.samples["z_m"] *= -1.0
     other = replace(flight, log=replace(flight.log, start_unix_s=BOOT_S - OFFSET_S - 100.0))
-    height, day = placed(other, file, frame="enu")[0].warnings
+    alignment = placed(other, file, frame="enu")[0]
+    (height,), (day,) = alignment.misplaced, alignment.warnings
     assert "height runs against EKF2's" in height
     assert "file and log are 100 s apart" in day
 
@@ -370,7 +371,7 @@ def test_a_reset_of_ekf2_does_no_harm(delta: tuple[float, float, float]) -> None
         assert off_s(alignment) < 0.03
         assert alignment.residual_rms_m == pytest.approx(0.11, abs=0.02)
         assert_same_track(track, flight.positions[0], 0.1)
-        assert alignment.warnings == ()
+        assert alignment.misplaced == alignment.warnings == ()
 
 
 # -- the IMU as the reference ----------------------------------------------------------------------
@@ -398,8 +399,8 @@ def test_the_imu_tells_the_frame_and_that_it_is_turned() -> None:
     assert placed(blind, recorded(flight, frame="nwu"))[0].frame == "nwu"
     alignment, _ = placed(blind, recorded(flight, yaw_deg=120.0), frame="enu")
     assert off_s(alignment) < 0.05
-    assert "seems turned by 1" in alignment.warnings[-1]
-    assert "shifted" not in alignment.warnings[-1]
+    assert "seems turned by 1" in alignment.misplaced[-1]
+    assert "shifted" not in alignment.misplaced[-1]
     # an EKF2 that stands still leaves it to the IMU
     still = replace(flight, ekf2=replace(flight.ekf2, state=flight.ekf2.state * 0.0))
     alignment, _ = placed(still, recorded(flight), frame="enu")
@@ -421,7 +422,7 @@ def test_what_stands_still_is_placed_by_a_given_offset_alone() -> None:
         assert caught.match(r"Give `clock_offset_s`\.$")
         assert "\n" not in str(caught.value)
     alignment, track = placed(flight, recorded(flight), frame="enu", clock_offset_s=OFFSET_S)
-    assert alignment.warnings == ()
+    assert alignment.misplaced == alignment.warnings == ()
     assert alignment.correlation is None
     assert alignment.residual_rms_m == pytest.approx(0.11, abs=0.02)
     assert_same_track(track, flight.positions[0], 1e-9)

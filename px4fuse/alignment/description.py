@@ -73,12 +73,14 @@ def describe(
     compared = None if reference == IMU else _compare(flight, placed)
     if compared:
         reference, correlation = EKF2_POSITION, compared[1]
+    other = [] if auto else [*_other_frame(match, compared, yaw_rad)]
     warnings = [
         *(_match_warnings(match) if match else ()),
-        *_frame_warnings(match, compared, yaw_rad, auto),
-        *([] if match and match.better_frame else _height_warnings(flight, placed)),
+        *([] if other else _poor_fit(match, compared, auto)),
         *_unix_warnings(flight, file, clock_offset_s),
     ]
+    if not (match and match.better_frame):
+        other += _other_height(flight, placed)
     alignment = Alignment(
         frame=frame,
         frame_reason=frame_reason,
@@ -92,6 +94,7 @@ def describe(
         reference=reference,
         correlation=correlation,
         residual_rms_m=float(np.sqrt(np.mean(compared[0] ** 2) / 2.0)) if compared else None,
+        misplaced=tuple(other),
         warnings=tuple(warnings),
     )
     return alignment, placed
@@ -133,7 +136,7 @@ def _match_warnings(match: Match) -> Iterator[str]:
         )
 
 
-def _height_warnings(flight: Flight, placed: pd.DataFrame) -> Iterator[str]:
+def _other_height(flight: Flight, placed: pd.DataFrame) -> Iterator[str]:
     """Whether the file's height runs against EKF2's: then its frame is another one."""
     if isinstance(flight.ekf2, Unavailable):
         return
@@ -165,30 +168,22 @@ def _unix_warnings(
         )
 
 
-def _frame_warnings(
-    match: Match | None, compared: tuple[Array, float | None] | None, yaw_rad: float, auto: bool
+def _other_frame(
+    match: Match | None, compared: tuple[Array, float | None] | None, yaw_rad: float
 ) -> Iterator[str]:
-    """Whether the file's frame is EKF2's, where it was not fitted to be, and where it cannot be."""
-    name = match.reference.name if match else EKF2_POSITION
-    turned, correlation = match is not None and match.turned, None
+    """Whether the file's frame is another one than EKF2's."""
+    if match is None:
+        return
+    name, turned = match.reference.name, match.turned
     if compared:
-        distance_m, correlation = compared
-        rms_m = capped_rms(distance_m) / np.sqrt(2.0)
-        turned = (
-            match is not None and is_sound(match.free, name) and is_turned(rms_m, match.free, name)
-        )
-    if auto:
-        if name == IMU:
-            yield (
-                "The IMU tells the yaw to a few degrees only (1° to 6° off on simulated flights), "
-                "and not the origin of the file's frame, which was left at 0."
-            )
-    elif match and turned and match.better_frame:
+        rms_m = capped_rms(compared[0]) / np.sqrt(2.0)
+        turned = is_sound(match.free, name) and is_turned(rms_m, match.free, name)
+    if turned and match.better_frame:
         yield (
             f"The file does not fit the {name} as {match.frame}, but it does as "
             f"{match.better_frame}: give --position-frame {match.better_frame}."
         )
-    elif match and turned:
+    elif turned:
         yaw = np.degrees(np.angle(np.exp(1j * (match.free.yaw_rad - yaw_rad))))
         shift = np.hypot(*match.free.origin_m[:2])
         how = f" and shifted by {shift:.1f} m" if compared else ""
@@ -196,6 +191,19 @@ def _frame_warnings(
             f"The file's frame seems turned by {yaw:.1f}°{how} against the {name}: give "
             "--position-yaw auto."
         )
+
+
+def _poor_fit(
+    match: Match | None, compared: tuple[Array, float | None] | None, auto: bool
+) -> Iterator[str]:
+    """What cannot be told of the frame, or does not fit however it is turned."""
+    correlation = compared[1] if compared else None
+    if auto:
+        if match is not None and match.reference.name == IMU:
+            yield (
+                "The IMU tells the yaw to a few degrees only (1° to 6° off on simulated flights), "
+                "and not the origin of the file's frame, which was left at 0."
+            )
     elif correlation is not None and correlation < MIN_CONCORDANCE[EKF2_POSITION]:
         yield (
             f"The file hardly follows the EKF2 position (correlation {correlation:.2f}): check "

@@ -141,12 +141,16 @@ def _drifting(source: str, heading: HeadingError, remedy: str, *, gnss: bool) ->
 
 def placement(analysis: Analysis) -> Found:
     """What is poorly determined about where a position file lies in the flight."""
-    source = analysis.source
-    for doubt in source.alignment.warnings if source.alignment is not None else ():
-        yield finding(
-            "error" if "--position-" in doubt else "warning",
-            "position_file_placement",
-            f"{source.name}: {capital(doubt.rstrip('.'))}",
-            ".",
-            "Give --clock-offset, --position-frame and --position-yaw where you know them.",
-        )
+    found = analysis.source.alignment
+    doubts: dict[Severity, tuple[str, ...]] = {}
+    if found is not None:
+        doubts = {"error": found.misplaced, "warning": found.warnings}
+    for severity, sentences in doubts.items():
+        for sentence in sentences:
+            yield finding(
+                severity,
+                "position_file_placement",
+                f"{analysis.source.name}: {capital(sentence.rstrip('.'))}",
+                ".",
+                "Give --clock-offset, --position-frame and --position-yaw where you know them.",
+            )
