@@ -103,6 +103,7 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
     kalman.P = matrix(INITIAL_COVARIANCE)
     kalman.H = H
     kalman.R = np.array([[settings.sigma_z_m**2]])
+    kalman.inv = np.reciprocal  # S is 1 by 1
     states, updates = [_row(kalman.x, kalman.P)], []
     for dt, u, extra, measurement in zip(
         np.diff(line.time_s), line.acceleration_m_s2, line.input_variance_m2_s4,

@@ -250,7 +250,9 @@ def _(tuning: AxisTuning) -> str:
 def noise_words(noise: Noise) -> str:
     """A noise and its interval, without a unit."""
     if noise.value is None:
-        return "not determinable" if noise.high is None else f"at most {noise.high:.2g}"
+        ends = (("at most", noise.high), ("at least", noise.low))
+        known = (f"{word} {end:.2g}" for word, end in ends if end is not None)
+        return next(known, "not determinable")
     low = "0" if noise.low is None else f"{noise.low:.2g}"
     high = "?" if noise.high is None else f"{noise.high:.2g}"
     return f"{noise.value:.3g} ({low}-{high})"
