@@ -20,6 +20,7 @@ from px4fuse.ekf2.aids import AidResult, judge_aids
 from px4fuse.ekf2_parameters import AIDS
 from px4fuse.errors import MissingDataError
 from px4fuse.findings import find_aids
+from px4fuse.findings.aids import find_in
 from px4fuse.flight import AidLog, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_innovations import innovations_of
@@ -183,6 +184,24 @@ def test_findings_name_the_aid_its_figures_and_when() -> None:
     assert "EKF2_BARO_NOISE" in by_id["aid_understated"].remedy
     assert by_id["aid_biased"].evidence["aid"] == "mag"
     assert by_id["aid_biased"].evidence["innovation_mean"] == pytest.approx(-0.4, abs=0.05)
+
+
+def test_an_aid_that_changes_in_flight_is_told_with_the_time() -> None:
+    log = aid_log()
+    changed = log.samples.copy()
+    changed.loc[35.0:, "innovation_east"] -= 0.7  # 1.4 √S
+    found = judged(replace(log, samples=changed))
+    assert found.axes["north"].change is None
+    when_s, moved = found.axes["east"].change  # type: ignore[misc]
+    assert when_s == pytest.approx(35.0, abs=10.0)
+    assert moved == pytest.approx(-1.4, abs=0.4)
+    (told,) = find_aids({"mag": found})
+    assert (told.id, told.severity, told.evidence["axis"]) == ("aid_changed", "warning", "east")
+    # what is our filter's source too is judged beside it
+    assert not [*find_in({"gnss_vel": found}, "gnss_pos")]
+    little = log.samples.copy()
+    little.loc[35.0:, "innovation_east"] -= 0.2
+    assert judged(replace(log, samples=little)).axes["east"].change is None
 
 
 # --------------------------------------------------------------------------------- read

@@ -233,8 +233,8 @@ FAULTS = [
 ]  # fmt: skip
 # Tested where their estimates are
 ELSEWHERE = {
-    "accelerometer_bias", "aid_biased", "aid_starved", "aid_understated", "ekf2_ev_delay_wrong",
-    "ekf2_gate_small",
+    "accelerometer_bias", "aid_biased", "aid_changed", "aid_starved", "aid_understated",
+    "ekf2_ev_delay_wrong", "ekf2_gate_small",
     "ekf2_heading_wrong", "false_loop_closure",
     "loop_closure_doubtful", "loop_drift_understated", "loop_end_assumed", "loop_of_absolute_track",
     "sigma_a_large", "sigma_a_small", "sigma_z_large", "sigma_z_small", "source_axes_unequal",

@@ -361,7 +361,7 @@ def test_a_smaller_r_is_advised_only_where_the_parameter_holds_it_up(
 FLIGHTS = {
     "main202603_gps_outage_flow": "source_gap",
     "v1.13.3_gps_profile1": None,
-    "v1.14.4_gps_magdist": None,
+    "v1.14.4_gps_magdist": "aid_changed",
     "v1.16.1_gps_delay0": "source_clock_offset",
     "v1.16.1_gps_fullrate": None,
     "v1.16.1_gps_nominal": None,

@@ -26,6 +26,9 @@ AidVerdict = Literal[
 # An aid pulls EKF2 to one side where the mean is half of what the innovations are, root mean
 # square, and a fifth of √S: then averaging does not take it away, and EKF2 follows
 BIASED, FELT = 0.5, 0.2
+# A change in flight: in windows of so many seconds the mean moves by half of √S, and by six times
+# what those before scatter
+WINDOW_S, IN_WINDOW, WINDOWS_BEFORE, CHANGED, CHANGED_SIGMAS = 10.0, 5, 3, 0.5, 6.0
 # Longest time (s) without a sample fused while EKF2 means to fuse it. EKF2 itself resets to an aid
 # after 7 s (reset_timeout_max); rates of 2 Hz are the slowest of the default profile
 STARVED_S = 5.0
@@ -53,6 +56,8 @@ class AidAxis(Record, frozen=True, kw_only=True):
         Outside the gate along this axis.
     lag1_autocorrelation, ljung_box_p, bias_p : float
         As :class:`~px4fuse.filter.consistency.Consistency` has them.
+    change : (float, float) or None
+        When (s), and by how many √S, its mean moved farthest in flight, where it clearly did.
     """
 
     samples: Count
@@ -66,6 +71,7 @@ class AidAxis(Record, frozen=True, kw_only=True):
     lag1_autocorrelation: Correlation
     ljung_box_p: Share
     bias_p: Share
+    change: Span | None = None
 
     @property
     def pull(self) -> float:
@@ -214,6 +220,9 @@ def _judge(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidResult:
                 nis_mean=found.nis_mean, nis_band=found.nis_band, sigma_factor=found.sigma_factor,
                 rejected_share=found.outside_gate, bias_p=found.bias_p,
                 lag1_autocorrelation=found.lag1_autocorrelation, ljung_box_p=found.ljung_box_p,
+                change=_change(
+                    times[tried], innovation[tried, number] / np.sqrt(variance[tried, number])
+                ),
             )  # fmt: skip
     idle = not tried.any()
     return AidResult(
@@ -226,6 +235,21 @@ def _judge(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidResult:
             axes, without_s[1] - without_s[0], times[fused & (not fused_logged)]
         ),
     )  # fmt: skip
+
+
+def _change(time_s: Array, pull: Array) -> Span | None:
+    """In which window the mean of ν/√S moves farthest, from all before to two after; how far."""
+    window = np.floor((time_s - time_s[0]) / WINDOW_S)
+    found = pd.Series(pull).groupby(window).agg(["mean", "size"]).query("size >= @IN_WINDOW")
+    mean, worst = found["mean"].to_numpy(), None
+    for at in range(WINDOWS_BEFORE, len(mean) - 2):
+        moved = float(np.mean(mean[at + 1 : at + 3]) - np.mean(mean[:at]))
+        before = pull[window < found.index[at]]
+        chance = float(np.std(before)) / math.sqrt(2.0 * found["size"].iloc[:at].median())
+        scatter = max(float(np.std(mean[:at], ddof=1)), chance)
+        if abs(moved) > max(CHANGED, CHANGED_SIGMAS * scatter, abs(worst[1]) if worst else 0.0):
+            worst = float(time_s[0] + WINDOW_S * found.index[at]), moved
+    return worst
 
 
 def _share(some: BoolArray, of: BoolArray) -> float:

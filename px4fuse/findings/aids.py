@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from px4fuse.analysis import Analysis
-from px4fuse.ekf2.aids import STARVED_S, AidResult
+from px4fuse.ekf2.aids import STARVED_S, WINDOW_S, AidResult
 from px4fuse.ekf2_parameters import AIDS
 from px4fuse.findings.causes import CAUSE, SENSOR
 from px4fuse.findings.model import Found, info, warning
@@ -50,7 +50,21 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
             (longest.longest_without_s,),
         )  # fmt: skip
     for name, aid in judged.items():
-        if aid.verdict == "variance understated" and name != source:
+        changes = {axis: one.change for axis, one in aid.axes.items() if one.change is not None}
+        if changes and not _sensor(AIDS[name].switch, source):
+            axis, (time_s, moved) = max(changes.items(), key=lambda item: abs(item[1][1]))
+            yield warning(
+                "aid_changed",
+                f"Innovations of {aid.label} change in flight: from about {time_s:.0f} s on their "
+                f"mean is {abs(moved):.1f} √S from where it was ({axis})",
+                ": the sensor and what else EKF2 fuses contradict each other since, and EKF2 is "
+                "pulled until its own states have taken it in.",
+                "See what was switched, moved or passed near the sensor then (current, metal, "
+                "wash, heat).",
+                {"aid": name, "axis": axis, "time_s": time_s, "moved": moved},
+                ((time_s, time_s + WINDOW_S),),
+            )
+        elif aid.verdict == "variance understated" and name != source:
             factor, noise = aid.nis_mean**0.5, AIDS[name].noise
             raised = f"raise {noise}" if noise else "its reported accuracy is too small"
             yield warning(

@@ -55,6 +55,7 @@ NAMES: Mapping[str, str] = {
     "ekf2_ev_delay_wrong": "a delay set in EKF2 that is not that of the positions",
     "aid_starved": "an aid that EKF2 went without for long",
     "aid_understated": "an aid that EKF2 trusts too much",
+    "aid_changed": "an aid that changes in flight",
     "aid_biased": "an aid that pulls EKF2 to one side",
     "companion_not_synchronised": "a companion computer without time synchronisation",
     "position_file_placement": "the placing of the position file",
