@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextvars
+import json
 import os
 import random
 import shutil
@@ -16,6 +17,7 @@ from typing import Any
 
 import bad_jobs
 import batch_tools
+import jsonschema
 import pandas as pd
 import psutil
 import pytest
@@ -38,6 +40,7 @@ from px4fuse.fleet.run import Fleet
 from px4fuse.fleet.store import kept_in
 from px4fuse.fleet.terminal import print_fleet
 from px4fuse.request import ComparisonRequest
+from px4fuse.results.contract import schema, to_json
 from px4fuse.results.reading import read_results
 from px4fuse.verification import workers
 from px4fuse.verification.workers import Failed, run_bounded
@@ -494,13 +497,17 @@ def test_all_shared_logs_in_one_run(shared_logs, tmp_path):
         for file in sorted(shared_logs.rglob("*"))
         if file.is_file() and file.suffix not in (".json", ".md")
     ]
-    table = px4fuse.batch(files, tmp_path)
+    table = px4fuse.batch(files, tmp_path, reports=True)
     assert set(table["log"]) == set(files)
+    validator = jsonschema.Draft202012Validator(schema())
     for log, rows in table.groupby("log"):
         first = rows.iloc[0]
         if first["axis"]:
             assert rows["kf_nis_mean"].notna().any() or first["reason"], log
-            assert (tmp_path / first["results"]).is_file()
+            text = (tmp_path / first["results"]).read_text(encoding="utf-8")
+            validator.validate(json.loads(text))
+            assert to_json(read_results(text.encode())) == text
+            assert (tmp_path / first["report"]).read_bytes().startswith(b"%PDF-")
         else:
             assert len(rows) == 1
             assert first["reason"], log

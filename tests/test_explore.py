@@ -175,17 +175,6 @@ def test_dragging_gives_what_the_command_on_the_page_gives(
     assert re.fullmatch(r"understated [\d,]+(\.\d+)?× in σ", shown["Verdict"][0])
 
 
-def test_as_it_opens_it_says_what_the_report_says(
-    page: Browser, explored: tuple[Path, Analysis]
-) -> None:
-    told = cells(explored[1].main)
-    shown = page.ask(TABLE)
-    assert {name: shown[name] for name in told} == told
-    assert page.ask("document.querySelector('#command-0').textContent") == (
-        "px4fuse compare aisle_uwb.ulg"
-    )
-
-
 def test_buttons_and_address(page: Browser, explored: tuple[Path, Analysis]) -> None:
     tuned = explored[1].tuning["horizontal"]
     assert not isinstance(tuned, Unavailable)

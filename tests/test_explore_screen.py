@@ -284,31 +284,6 @@ def test_the_ellipse_is_the_replays_p_at_every_step(
             assert mean[0] == pytest.approx(steps["position_m"].iloc[i], abs=1e-9)
 
 
-def test_one_step_is_drawn_and_its_equations_hold(page: Browser) -> None:
-    open_view(page, "step")
-    ask(page, "Explore.then((e) => { e.stepper.go(40); })")
-    settle(page)
-    rows = page.ask(
-        "[...document.querySelectorAll('#numbers-0 tr')].map((row) => row.cells[1].textContent)"
-    )
-    numbers = {
-        name: [float(word) for word in re.findall(r"-?\d+\.?\d*(?:e-?\d+)?", line.split("= [")[-1])]
-        for name in ("P⁺", "F ", "Q ", "P⁻")
-        for line in rows[:7]
-        if line.startswith(name)
-    }
-    dt = numbers["F "][1]
-    f = np.array([[1.0, dt], [0.0, 1.0]])
-
-    def matrix(name: str) -> Any:
-        a, b, c, d = numbers[name][:4]
-        return np.array([[a, b], [c, d]])
-
-    np.testing.assert_allclose(
-        f @ matrix("P⁺") @ f.T + matrix("Q "), matrix("P⁻"), rtol=0.0, atol=3e-5
-    )
-
-
 def test_space_plays_and_pauses(page: Browser) -> None:
     page.ask("document.activeElement.blur()")
     steps = "Explore.then((e) => e.stepper.at())"

@@ -27,7 +27,6 @@ from px4fuse.comparison.preparation import choose_source, prepare
 from px4fuse.ekf2.inputs import Received, _rules, read_gnss
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.stretches import Compass
-from px4fuse.ekf2.walk import ATTITUDE, GATE, NOISE, SPEED, STAMPS, Why
 from px4fuse.ekf2.whatif import WhatIf, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.findings import find, noises
@@ -329,61 +328,14 @@ def test_flights_on_gnss(name: str, shared_logs: Path) -> None:
     assert not [word for word in OF_OTHERS if word in said]
 
 
-REPLAYED = ("delay0", "fullrate", "nominal", "overconfident")
-
-
 @pytest.fixture(scope="module")
 def models(shared_logs: Path) -> dict[str, Model]:
     found = {}
-    for name in REPLAYED:
+    for name in ("delay0", "nominal"):
         model = px4fuse.open_model(read_log(shared_logs / "gps" / f"v1.16.1_gps_{name}.ulg"))
         assert isinstance(model, Model)
         found[name] = model
     return found
-
-
-@pytest.mark.reallogs
-def test_ekf2_on_gnss_is_replayed(models: dict[str, Model]) -> None:
-    """Where it rejects nothing; where it rejects, single samples part and the shares agree."""
-    for name in ("delay0", "fullrate", "nominal"):
-        agreement = models[name].agreement
-        assert agreement.good
-        assert agreement.ev_pos == {}
-        for axis in agreement.gnss_pos.values():
-            assert axis.innovation_correlation > 0.998
-            assert axis.s_ratio_median == pytest.approx(1.0, abs=0.0015)
-            assert axis.position_rms_difference_m < 0.03
-        for axis in agreement.gnss_vel.values():
-            assert axis.innovation_correlation > 0.998
-            assert axis.s_ratio_median == pytest.approx(1.0, abs=0.006)
-        assert agreement.rejected_share_replayed == agreement.rejected_share_logged == 0.0
-    for axis in models["fullrate"].agreement.gnss_pos.values():
-        assert axis.innovation_correlation > 0.9995
-        assert axis.innovation_rms_difference < 0.012
-    rejecting = models["overconfident"].agreement
-    assert rejecting.good
-    assert rejecting.rejected_share_replayed == pytest.approx(
-        rejecting.rejected_share_logged, abs=0.03
-    )
-
-
-@pytest.mark.reallogs
-def test_what_other_settings_of_gnss_would_have_done(models: dict[str, Model]) -> None:
-    """The delay that was injected, and the noise; figures of an independent replay beside them."""
-
-    def error_m(name: str, **settings: float) -> tuple[float, float, float]:
-        found = what_if(models[name], [settings])
-        assert isinstance(found, WhatIf)
-        (after,) = found.whatif
-        error = after.position_rmse_to_truth_m
-        assert isinstance(error, float)
-        return error, after.nis_mean, after.rejected_share
-
-    assert error_m("delay0")[0] == pytest.approx(0.688, rel=0.03)
-    assert error_m("delay0", EKF2_GPS_DELAY=200.0)[0] == pytest.approx(0.233, rel=0.06)
-    assert error_m("nominal", EKF2_GPS_P_NOISE=0.8)[:2] == pytest.approx((0.193, 0.26), rel=0.05)
-    less = error_m("overconfident", EKF2_GPS_P_NOISE=0.72)
-    assert less == pytest.approx((0.737, 0.41, 0.0), rel=0.05)
 
 
 @pytest.mark.reallogs
@@ -446,25 +398,6 @@ def test_a_log_that_does_not_hold_what_was_fused(name: str, reason: str, shared_
     model = px4fuse.open_model(read_log(shared_logs / "gps" / f"{name}.ulg"))
     assert isinstance(model, Unavailable)
     assert re.search(reason, model.reason)
-
-
-@pytest.mark.reallogs
-def test_why_ekf2_differs_on_gnss(shared_logs: Path) -> None:
-    analysis = px4fuse.compare(shared_logs / "gps" / "v1.16.1_gps_nominal.ulg")
-    for axis in ("north", "east"):
-        why = analysis.why[axis]
-        assert isinstance(why, Why)
-        names = [step.name for step in why.steps]
-        assert names[names.index(SPEED) - 1 :][:3] == [ATTITUDE, SPEED, GATE]
-        total = sum(step.position_mean_square_m2 for step in why.steps)
-        assert total + why.position_left_mean_square_m2 == pytest.approx(
-            why.position_mean_square_m2
-        )
-        assert why.position_left_share < 0.1
-        steps = {step.name: step for step in why.steps}
-        # EKF2 has half a prediction step besides the delay
-        assert abs(steps[STAMPS].position_mean_square_m2) < 0.1 * total
-        assert abs(steps[NOISE].position_mean_square_m2) < 0.02 * total
 
 
 def test_fixes_that_the_logger_left_out_are_filled_in(tmp_path: Path) -> None:

@@ -470,13 +470,3 @@ def test_frames_cut_to_their_stamp_cost_a_bounded_amount_each(tmp_path, name, se
     tracemalloc.stop()
     assert len(read_frames(path)) == count + 3
     assert peak < path.stat().st_size + DECODED_BYTES * count + TINY_BYTES
-
-
-def test_the_sample_takes_less_than_four_times_its_size(sample_log):
-    path = sample_log.with_suffix(".tlog")
-    read_log(path)  # tables that are made once
-    tracemalloc.start()
-    read_log(path)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 4 * path.stat().st_size

@@ -9,7 +9,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from cli_tools import contents, run, run_main
 from click.testing import CliRunner
@@ -23,12 +22,6 @@ from px4fuse.request import ComparisonRequest
 pytestmark = pytest.mark.usefixtures("analysed_once")
 
 SECONDS = 20.0
-
-
-@pytest.fixture
-def no_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pages take most of the time, and none of them is looked at here."""
-    monkeypatch.setattr(pdf, "render", lambda document, text: b"%PDF-")
 
 
 @pytest.fixture
@@ -121,7 +114,7 @@ def test_extract_keeps_the_tables_of_two_logs_apart(desk, monkeypatch, capsys) -
     assert run_main(monkeypatch, capsys, "extract", "renamed.ulg", "-o", "tables")[0] == 0
 
 
-@pytest.mark.parametrize("command", ["info", "tune", "sync", "extract"])
+@pytest.mark.parametrize("command", ["info", "extract"])
 def test_a_reader_that_leaves_is_no_error(desk, command) -> None:
     """As in px4fuse info LOG | head -1, when head has gone before anything is printed."""
     arguments = [sys.executable, "-m", "px4fuse", command, "l.ulg"]
@@ -187,83 +180,7 @@ def test_auto_brings_late_stamps_to_the_truth(shared_logs, tmp_path, monkeypatch
 # --- what is said about position files and stamps ---
 
 
-def findings_of(monkeypatch, capsys, out: Path, *arguments: object) -> list[dict[str, str]]:
-    code, _, err = run_main(
-        monkeypatch, capsys, "compare", *arguments, "--axis", "north", "-o", out
-    )
-    assert (code, err) == (0, "")
-    return json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))["findings"]
-
-
-def external(sample_log: Path) -> tuple[str, np.ndarray]:
-    file = sample_log.with_name("aisle_uwb_external.csv")
-    header = file.read_text(encoding="utf-8").splitlines()[0]
-    return header, np.loadtxt(file, delimiter=",", skiprows=1)
-
-
-def write_csv(path: Path, header: str, rows: np.ndarray) -> Path:
-    np.savetxt(path, rows, delimiter=",", header=header, comments="", fmt="%.6f")
-    return path
-
-
-def placement(findings: list[dict[str, str]]) -> list[dict[str, str]]:
-    return [each for each in findings if each["id"] == "position_file_placement"]
-
-
-@pytest.mark.usefixtures("no_drawing")
-def test_position_files_that_do_not_fit_are_said_not_to(
-    tmp_path, monkeypatch, capsys, sample_log, subtests
-) -> None:
-    header, rows = external(sample_log)
-    out = tmp_path / "r.pdf"
-    file = sample_log.with_name("aisle_uwb_external.csv")
-
-    with subtests.test("the file as it is"):
-        found = findings_of(monkeypatch, capsys, out, sample_log, "--position", file)
-        fitted = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
-        assert not placement(found)
-    frame = fitted["source"]["alignment"]["frame"]
-
-    for given in {"ned", "enu", "nwu"} - {frame}:
-        with subtests.test("another frame", given=given):
-            found = findings_of(monkeypatch, capsys, out, sample_log, "--position", file,
-                                "--position-frame", given)  # fmt: skip
-            named = [each for each in placement(found) if each["severity"] == "error"]
-            assert len(named) == 1
-            assert f"as {frame}" in named[0]["message"]
-            assert f"--position-frame {frame}" in named[0]["message"]
-
-    with subtests.test("upside down"):
-        flipped = rows.copy()
-        flipped[:, 3] *= -1.0
-        found = findings_of(monkeypatch, capsys, out, sample_log, "--position",
-                            write_csv(tmp_path / "f.csv", header, flipped),
-                            "--position-frame", frame)  # fmt: skip
-        assert any("height runs against" in each["message"] for each in placement(found))
-
-    with subtests.test("another day"):
-        late = rows.copy()
-        late[:, 0] += 86400.0
-        tlog = sample_log.with_suffix(".tlog")
-        found = findings_of(monkeypatch, capsys, out, tlog, "--position",
-                            write_csv(tmp_path / "d.csv", header, late))  # fmt: skip
-        apart = [each for each in placement(found) if "By their UNIX times" in each["message"]]
-        assert len(apart) == 1
-        assert apart[0]["severity"] == "warning"
-        assert "86" in apart[0]["message"]
-
-
 # ---- places that take no output ------------------------------------------------------------------
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
-@pytest.mark.parametrize("words", ["--version", "lesson kalman"])
-def test_a_full_place_is_one_line(words: str) -> None:
-    command = f"{sys.executable} -m px4fuse {words} >/dev/full"
-    done = subprocess.run(["sh", "-c", command], stderr=subprocess.PIPE, check=False)
-    assert done.returncode == 2
-    assert done.stderr.startswith(b"px4fuse: standard output: cannot be written")
-    assert done.stderr.count(b"\n") == 1
 
 
 @pytest.mark.skipif(os.name != "posix", reason="closes a file descriptor")

@@ -10,15 +10,13 @@ import pytest
 from exchange import replace
 from flights import unexplained
 
-from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.ekf2.model import MODEL_NOTE, Model, open_model
 from px4fuse.ekf2.replay import Agreement
-from px4fuse.ekf2.whatif import WhatIf, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.settings import Settings
-from px4fuse.findings import find, source_clock
+from px4fuse.findings import find
 from px4fuse.flight import Ekf2, Flight, FusionRecord, Truth, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_ekf2 import samples_per_step
@@ -70,11 +68,6 @@ def named(flight: Flight) -> set[str]:
 @pytest.fixture(scope="module")
 def clean() -> Flight:
     return flown()
-
-
-@pytest.fixture(scope="module")
-def overconfident() -> Flight:
-    return flown("ekf2-noise=0.02")
 
 
 # --- the model, from take-off
@@ -215,31 +208,6 @@ def test_samples_with_older_stamps_than_the_last_are_not_taken() -> None:
 
 
 # --- mistakes of EKF2's own
-
-
-def test_overconfident_ekf2_rejects_and_is_named(overconfident: Flight) -> None:
-    assert fused(overconfident)["rejected"].mean() > 0.3
-    assert {"ekf2_rejecting", "ekf2_variance_understated", "ekf2_resets"} <= named(overconfident)
-    model = open_model(overconfident)
-    assert not isinstance(model, Unavailable)
-    assert model.agreement.good
-    answer = what_if(model, [{"EKF2_EVP_NOISE": 0.1}])
-    assert isinstance(answer, WhatIf)
-    (cured,) = answer.whatif
-    assert cured.rejected_share == 0.0
-    assert cured.axes["north"].nis_mean == pytest.approx(1.0, abs=0.3)
-
-
-def test_a_delay_in_force_is_asked_away() -> None:
-    flight = flown("ekf2-delay=175ms", scenario=Scenario(seed=100))
-    # it takes positions for older than they are: its track runs ahead
-    ahead = rmse(flight, 10.0, 110.0)
-    assert ahead > 1.3 * rmse(flown(scenario=Scenario(seed=100)), 10.0, 110.0)
-    analysis = explain(compare(flight, RIGHT, axes=("north", "east")))
-    (finding,) = [f for f in source_clock.detect(analysis) if f.id == "ekf2_ev_delay_wrong"]
-    assert finding.evidence["ekf2_ev_delay_ms"] == 175.0
-    assert finding.evidence["asked_ms"] == pytest.approx(0.0, abs=60.0)
-    assert "EKF2_EV_DELAY" in finding.remedy
 
 
 def test_ekf2_that_is_not_told_to_fuse_only_looks(clean: Flight) -> None:
