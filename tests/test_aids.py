@@ -62,7 +62,6 @@ def aid_log(
 def judged(log: AidLog, name: str = "gnss_pos") -> AidResult:
     flight = aisle_flight(duration_s=60.0)
     found = judge_aids(replace(flight, ekf2=replace(flight.ekf2, aids={name: log})))
-    assert not isinstance(found, Unavailable)
     return found[name]
 
 
@@ -269,7 +268,6 @@ def test_flights_of_the_real_ekf2(name: str, shared_logs: Path) -> None:
     """NIS as PX4's own figures have it (computed from the logs without px4fuse)."""
     folder = shared_logs / "gps"
     found = judge_aids(read_log(folder / f"{name}.ulg"))
-    assert not isinstance(found, Unavailable)
     assert SEEN[name] == {aid: found[aid].verdict for aid in SEEN[name]}
     truth = json.loads((folder / f"{name}.json").read_text())["truth"]
     compared = 0
@@ -300,7 +298,6 @@ def test_a_rejection_that_is_not_logged_is_beyond_the_gate_and_of_both_axes() ->
     found, topics = innovations_of({"ev_pos": replace(log, samples=samples)}, fusing, 5.0)
     for axis in ("north", "east"):
         frame = found[axis]
-        assert isinstance(frame, pd.DataFrame)
         assert np.flatnonzero(frame["rejected"]).tolist() == [20]
     assert isinstance(found["down"], Unavailable)
     assert topics == ("a_topic",)

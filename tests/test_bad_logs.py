@@ -125,7 +125,6 @@ def test_a_log_of_topics_that_are_none_of_ours(tmp_path):
     at = stamps(2.0, 10.0)
     log = Log([topic("battery_status", at, {"voltage_v": np.full(len(at), 16.0)})])
     flight = outcome(log.write(tmp_path / "battery.ulg"))
-    assert isinstance(flight, Flight)
     parts = (flight.imu, flight.attitude, flight.ekf2, flight.truth, flight.airborne)
     assert all(isinstance(part, Unavailable) for part in parts)
     assert set(parts[:4]) <= set(flight.missing)
@@ -163,7 +162,6 @@ def test_a_release_number_of_another_type(tmp_path, key):
     path = tmp_path / "release.ulg"
     path.write_bytes(content[: at - 3] + new + content[at + 1 + len(old) :])
     flight = outcome(path)
-    assert isinstance(flight, Flight)
     assert len(flight.imu) == 100
 
 
@@ -304,7 +302,6 @@ def test_not_a_number_everywhere(tmp_path, name, field, value):
     log = make_log("v1.16", 2.0)
     log[name][field][:] = value
     flight = analysed(log.write(tmp_path / "made.ulg"))
-    assert flight is not None
     part = NOT_THERE[name, field](flight)
     if part is None:
         assert name not in [track.name for track in flight.positions]

@@ -258,7 +258,6 @@ def exact_imu() -> tuple[Flight, ClockOffset, list[tuple[Array, Array]]]:
         positions=(replace(track, samples=samples),),
     )
     found = estimate(flight)
-    assert isinstance(found, ClockOffset)
     # what the search can shift is used, in stretches of equal length of at most 30 s
     used = samples[(samples.index >= 0.6) & (samples.index <= 49.4)]
     first = used.index < (used.index[0] + used.index[-1]) / 2.0

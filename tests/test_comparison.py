@@ -26,7 +26,7 @@ from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.kalman import variance_at
 from px4fuse.filter.settings import Settings
-from px4fuse.flight import Ekf2, Flight, Reset, Truth, Unavailable
+from px4fuse.flight import Flight, Reset, Truth, Unavailable
 from px4fuse.readers import read_log
 
 # How many times EKF2 overstates its horizontal innovation variance in real motion-capture flights
@@ -337,7 +337,6 @@ class TestRobustness:
 
         def frames() -> list[pd.DataFrame]:
             ekf2 = flight.ekf2
-            assert isinstance(ekf2, Ekf2)
             return [
                 flight.imu, flight.attitude, flight.positions[0].samples, flight.truth.samples,
                 ekf2.state, ekf2.variance, ekf2.fusing, *ekf2.innovations.values(),

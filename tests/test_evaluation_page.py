@@ -99,7 +99,6 @@ def test_before_alignment_the_error_is_that_of_evo_without_alignment() -> None:
     score = evaluate(replace(estimate, kind="vio"), true)
 
     def of_evo(one: Trajectory) -> Any:
-        assert one.rotation is not None
         return PoseTrajectory3D(
             positions_xyz=one.position_m,
             orientations_quat_wxyz=one.rotation.as_quat(scalar_first=True),
@@ -150,7 +149,6 @@ def test_the_growth_of_the_rpe_tells_noise_from_drift(kind: str, times: float) -
     }[kind]
     words = growth_words(wrong_by(error).rpe)
     found = re.search(r"From 1 to 10 m, 10 times, the RMSE is ([\d.]+) times as large", words)
-    assert found is not None
     assert float(found[1]) == pytest.approx(times, rel=0.1)
     assert "1 is noise of each pose, 3.2 a random walk, 10 a wrong scale" in words
     assert "A second distance" in growth_words(wrong_by(error).rpe[:1])

@@ -29,7 +29,6 @@ from px4fuse.comparison.model import FILTERS, AxisComparison
 from px4fuse.ekf2.model import replay_settings
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.explore.page import html_text
-from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import within
 from px4fuse.flight import Flight, Unavailable
@@ -177,7 +176,6 @@ def test_dragging_gives_what_the_command_on_the_page_gives(
 
 def test_buttons_and_address(page: Browser, explored: tuple[Path, Analysis]) -> None:
     tuned = explored[1].tuning["horizontal"]
-    assert not isinstance(tuned, Unavailable)
     page.click("#likely")
     settle(page)
     a, z = (float(page.ask(f"document.getElementById('{name}-value').value"))
@@ -189,7 +187,6 @@ def test_buttons_and_address(page: Browser, explored: tuple[Path, Analysis]) -> 
     page.click("#ekf2-r")
     settle(page)
     frame = explored[1].main.ekf2_innovations
-    assert not isinstance(frame, Unavailable)
     r = float(np.sqrt(frame["observation_variance_m2"].median()))
     assert float(page.ask("document.getElementById('sigma-z-value').value")) == pytest.approx(r)
     page.click("#lesson")
@@ -271,7 +268,6 @@ def test_ekf2_at_a_stop_is_what_whatif_says(page: Browser, explored: tuple[Path,
     assert not isinstance(model, Unavailable)
     changes = {"EKF2_EVP_NOISE": 0.05, "EKF2_EV_DELAY": 200.0, "EKF2_EVP_GATE": 3.0}
     asked = what_if(model, [changes])
-    assert not isinstance(asked, Unavailable)
     (told,) = asked.whatif
     page.click("#axes input[value=north]")
     for name, value in changes.items():
@@ -374,7 +370,6 @@ def test_two_flights_stand_on_the_same_axes(browser: Browser, tmp_path: Path) ->
     for number, analysis in enumerate(pair):
         comparison = compare(analysis.flight, Settings(sigma_z_m=z))
         statement = comparison.main.filters["kf"]
-        assert isinstance(statement, Consistency)
         shown = browser.ask(TABLE.replace("#tables", f"#table-{number}"))
         assert shown["Mean NIS (1 is consistent)"][0] == f"{statement.nis_mean:.2f}"
         line = browser.ask(f"document.querySelector('#command-{number}').textContent")

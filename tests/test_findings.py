@@ -29,7 +29,6 @@ from px4fuse.flight import (
     Ekf2,
     Flight,
     Reset,
-    Truth,
     Unavailable,
 )
 from px4fuse.origin import ALIGNED, KEPT
@@ -106,7 +105,6 @@ def as_recording(flight: Flight) -> Flight:
 
 def biased(flight: Flight) -> Flight:
     """EKF2 that found a bias along the body's axes."""
-    assert isinstance(flight.ekf2, Ekf2)
     none = flight.ekf2.state.iloc[:, :3].set_axis(SPECIFIC_FORCE_COLUMNS, axis=1) * 0.0
     return with_ekf2(accelerometer_bias=none + np.array([0.2, -0.1, 0.2]))(flight)
 
@@ -122,7 +120,6 @@ def as_odometry(flight: Flight) -> Flight:
 
 def apart(flight: Flight, *, grows: bool) -> Flight:
     """The truth is a metre from where source and EKF2 are, on average where that grows."""
-    assert isinstance(flight.truth, Truth)
     samples = flight.truth.samples.copy()
     samples["north_m"] += np.linspace(0.0, np.sqrt(3.0), len(samples)) if grows else 1.0
     return replace(flight, truth=replace(flight.truth, samples=samples))

@@ -15,8 +15,8 @@ from flights import aisle_flight, unavailable, unexplained
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import noises_and_clock
-from px4fuse.filter.causes import Explained, explained, fit
-from px4fuse.filter.coloured import Smoothing, smoothing
+from px4fuse.filter.causes import explained, fit
+from px4fuse.filter.coloured import smoothing
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings
@@ -104,8 +104,6 @@ def test_a_fit_is_least_squares_with_the_prior_as_one_more_measurement() -> None
 
 def test_a_clean_flight_has_no_causes_beyond_noise() -> None:
     causes, low_pass = flown().explained, flown().smoothing
-    assert isinstance(causes, Explained)
-    assert isinstance(low_pass, Smoothing)
     assert causes.jumps == ()
     assert low_pass.correlation == 0.0
     assert causes.sigma_a_m_s2 == pytest.approx(0.2, rel=0.35)  # the white noise alone
@@ -147,7 +145,6 @@ def test_a_scale_is_not_drawn_to_zero_by_the_noise_of_the_acceleration() -> None
             outlier_time_s=np.array([]),
             clock_offset_s=0.0,
         )
-        assert isinstance(found, Explained)
         scales.append(found.scale.value)
     assert np.mean(scales) == pytest.approx(0.0, abs=0.04)
 
@@ -159,7 +156,6 @@ def test_outliers_that_end_are_no_jump_and_a_jump_is_no_outliers() -> None:
 
 def test_a_jump_is_where_it_was_made() -> None:
     causes = flown("jump=1,40s").explained
-    assert isinstance(causes, Explained)
     (jump,) = causes.jumps
     assert jump.time_s == pytest.approx(40.0, abs=0.5)
     heading = np.degrees(np.arctan2(jump.step_m[1].value, jump.step_m[0].value))
@@ -176,7 +172,6 @@ def test_a_shift_of_the_stamps_that_explains_as_much_is_no_smoothing() -> None:
     axes = tuple(result.axis for result in late.axes.values())
     given = {"sigma_a_m_s2": 0.27, "sigma_z_m": 0.10, "outlier_time_s": np.array([])}
     told = smoothing(axes, RIGHT, **given, clock_offset_s=-0.25)
-    assert isinstance(told, Smoothing)
     assert told.gain_nats == 0.0
 
 

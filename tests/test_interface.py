@@ -392,7 +392,6 @@ def test_report_and_page_are_written_as_by_the_commands(
     assert report.read_bytes().startswith(b"%PDF")
     assert page.read_bytes().startswith(b"<!DOCTYPE html>")
     results = read_results((tmp_path / "x.json").read_bytes())
-    assert isinstance(results, ComparisonResults)
     assert results.request.sigma_z_m == 0.2
     assert results.provenance.command == "px4fuse compare aisle_uwb.ulg --sigma-z 0.2"
     verified = CliRunner().invoke(

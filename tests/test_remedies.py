@@ -109,7 +109,6 @@ def test_no_remedy_increases_the_error_to_the_truth(settings, mistakes) -> None:
             followed += 1
         if theirs := parameters(remedy):
             done = what_if(model, [theirs])
-            assert not isinstance(done, Unavailable)
             before, after = (
                 each.position_rmse_to_truth_m for each in (done.replayed, *done.whatif)
             )
@@ -131,7 +130,6 @@ def test_on_a_loop_of_vio_the_truth_is_told_first_and_no_noise_is_lowered(seed, 
     for finding in findings:
         assert "set EKF2_EVP_NOISE" not in finding.remedy
         assert "--sigma-z" not in finding.remedy
-    assert isinstance(analysis.ekf2_model, Model)
     asked = asked_of_ekf2(analysis, analysis.ekf2_model, analysis.tuning, analysis.clock)
     flown_with = analysis.ekf2_model.inputs.settings["EKF2_EVP_NOISE"]
     assert asked.get("EKF2_EVP_NOISE", flown_with) >= flown_with

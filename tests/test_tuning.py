@@ -190,7 +190,6 @@ def test_axes_are_named_and_pooled_only_where_they_share_their_times() -> None:
 def horizontal(flight: Flight, *, imu: bool = True, drifts: bool = False) -> AxisTuning:
     axes, given = compare(flight, SETTINGS).lines, flight if imu else None
     found = tune(axes, SETTINGS, (HORIZONTAL,), flight=given, drifts=drifts)[HORIZONTAL]
-    assert isinstance(found, AxisTuning)
     assert found.biases_fitted == imu
     return found
 
