@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -245,48 +244,6 @@ def test_on_the_ground_there_is_nothing_to_judge(tmp_path: Path) -> None:
     assert "not flown, nothing to judge: the vehicle never took off" in str(done.exception)
     assert "px4fuse info a.ulg says what is logged" in str(done.exception)
     assert not (tmp_path / "a.pdf").exists()
-
-
-# --------------------------------------------------------------------- flights of the real EKF2
-
-# What the facts of each flight leave to be seen in its aids, by PX4's names
-SEEN = {
-    "main202603_gps_outage_flow": {"gnss_pos": "starved", "gnss_vel": "starved"},
-    "v1.13.3_gps_profile1": {"gnss_pos": "consistent", "gnss_vel": "consistent"},
-    "v1.14.4_gps_magdist": {"gnss_pos": "consistent", "mag": "biased"},
-    "v1.16.1_gps_delay0": {"gnss_pos": "consistent", "gnss_vel": "consistent"},
-    "v1.16.1_gps_fullrate": {"gnss_pos": "consistent", "gnss_hgt": "consistent"},
-    "v1.16.1_gps_nominal": {"gnss_pos": "consistent", "gravity": "idle"},
-    "v1.16.1_gps_overconfident": {"gnss_pos": "variance understated", "gnss_vel": "consistent"},
-    "v1.16.1_gps_stock_flow": {"gnss_pos": "variance overstated", "rng_hgt": "variance overstated"},
-}
-
-
-@pytest.mark.reallogs
-@pytest.mark.parametrize("name", SEEN)
-def test_flights_of_the_real_ekf2(name: str, shared_logs: Path) -> None:
-    """NIS as PX4's own figures have it (computed from the logs without px4fuse)."""
-    folder = shared_logs / "gps"
-    found = judge_aids(read_log(folder / f"{name}.ulg"))
-    assert SEEN[name] == {aid: found[aid].verdict for aid in SEEN[name]}
-    truth = json.loads((folder / f"{name}.json").read_text())["truth"]
-    compared = 0
-    for aid, stated in truth["aid_sources"].items():
-        all_rows = stated["rejected_share"] > 0.0  # theirs without the rejected is another number
-        expected = stated["mean_nis" if all_rows else "mean_nis_fused"]
-        if aid in found and found[aid].axes:
-            nis = [axis.nis_mean for axis in found[aid].axes.values()]
-            # flight is from one metre up here, from take-off there
-            assert nis == pytest.approx(expected, rel=0.02, abs=0.002), aid
-            compared += 1
-    if not truth["aid_sources"]:
-        for aid, fields in (("gnss_pos", ("gps_hpos[0]", "gps_hpos[1]")),
-                            ("gnss_vel", ("gps_hvel[0]", "gps_hvel[1]", "gps_vvel"))):  # fmt: skip
-            stated = [truth["estimator_innovations"][field]["mean_nis"] for field in fields]
-            nis = [axis.nis_mean for axis in found[aid].axes.values()]
-            assert nis == pytest.approx(stated, rel=0.02)
-            compared += 1
-    assert compared >= 2
 
 
 def test_a_rejection_that_is_not_logged_is_beyond_the_gate_and_of_both_axes() -> None:

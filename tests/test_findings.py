@@ -6,7 +6,6 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,7 +31,6 @@ from px4fuse.flight import (
     Unavailable,
 )
 from px4fuse.origin import ALIGNED, KEPT
-from px4fuse.readers import read_log
 from px4fuse.recording import ClockMap, Dropout
 
 ALIGNED_TOPIC = "estimator_visual_odometry_aligned"
@@ -360,51 +358,3 @@ def test_a_flight_of_a_moment_does_not_break_a_detector(fault: Fault, duration_s
     comparison = compare(fault.fly(**short), Settings(**fault.settings))
     few = len(next(iter(comparison.axes.values())).replay.updates) < MIN_INNOVATIONS
     assert ("too_few_innovations" in ids(found(comparison))) == few
-
-
-REAL_LOGS = [
-    ("simulated/*_aisle_overconfident.ulg", "ekf2_variance_understated", "error",
-     {"nis_mean": about(22.0, 0.2), "sigma_z_asked_m": about(0.10, 0.2)}, ""),
-    ("simulated/*_aisle_2hz_stock.ulg", "ekf2_not_fusing", "error",
-     {"fusing_share": 0.0, "source_interval_s": about(0.5, 0.05)}, "10 Hz"),
-    ("simulated/*_aisle_nlos.ulg", "source_gap", "warning", {"longest_s": about(8.0, 0.04)}, ""),
-    ("simulated/*_aisle_nlos.ulg", "kf_variance_understated", None, {}, "Remove the outliers"),
-    ("simulated/*_aisle_hwlog.ulg", "source_not_logged", "warning", {}, "SDLOG_PROFILE to 129"),
-    ("simulated/*_aisle_hwlog.ulg", "source_decimated", "warning", {"logger_limit_hz": 2.0}, ""),
-    ("real/mengchaoheng*test3.ulg", "logger_dropouts", "warning", {"total_s": about(0.82)}, ""),
-    ("real/mengchaoheng*test3.ulg", "imu_gap", "warning", {"total_s": about(0.82, 0.12)}, ""),
-]  # fmt: skip
-
-
-@pytest.mark.reallogs
-@pytest.mark.parametrize(("pattern", "name", "severity", "evidence", "remedy"), REAL_LOGS)
-def test_real_logs(shared_logs: Path, pattern, name, severity, evidence, remedy) -> None:
-    (path,) = shared_logs.glob(pattern)
-    finding = next(f for f in found(compare(read_log(path)), tuned=True) if f.id == name)
-    assert severity in (None, finding.severity)
-    assert {key: finding.evidence[key] for key in evidence} == evidence
-    assert remedy in finding.remedy
-
-
-@pytest.mark.reallogs
-@pytest.mark.parametrize("version", ["v1.14.4", "v1.16.1"])
-def test_a_nominal_flight_has_no_error_and_no_warning(shared_logs: Path, version: str) -> None:
-    flight = read_log(shared_logs / f"simulated/{version}_aisle_nominal.ulg")
-    assert {finding.severity for finding in found(compare(flight), tuned=True)} <= {"info"}
-
-
-@pytest.mark.reallogs
-@pytest.mark.parametrize("name", ["log_3", "min_snap_01", "square2", "battery_brownout"])
-def test_motion_capture_flights_overstate_the_variance_and_nobody_is_blamed(
-    shared_logs: Path, name: str
-) -> None:
-    """Sent with an orientation, as odometry is; all noises are the programs' own."""
-    (path,) = shared_logs.glob(f"real/*{name}*.ulg")
-    findings = found(compare(read_log(path)), tuned=True)
-    drift = next(at for at, finding in enumerate(findings) if finding.id == "source_may_drift")
-    behind = findings[drift + 1 : drift + 5]
-    assert [finding.id for finding in behind] == (
-        ["kf_variance_overstated"] * 2 + ["ekf2_variance_overstated"] * 2
-    )
-    assert behind[2].evidence["sigma_factor"] > 2.0
-    assert not [f for f in findings if f.severity == "error" and f.caused_by is None]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from functools import cache
-from pathlib import Path
 
 import pytest
 from exchange import replace
@@ -29,7 +28,6 @@ from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding, ekf2_rejecting, find, source_clock
 from px4fuse.flight import Flight, Unavailable
-from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
@@ -309,21 +307,3 @@ def test_a_delay_that_the_replay_confirms_is(sample: Analysis) -> None:
     remedy = only("ekf2_ev_delay_wrong", late).remedy
     assert remedy.startswith("Set EKF2_EV_DELAY to 0 ms: mean NIS")
     assert remedy.endswith("(replayed).")
-
-
-@pytest.mark.reallogs
-@pytest.mark.parametrize(
-    ("log", "name", "said"),
-    [
-        ("v1.16.1_aisle_overconfident", "ekf2_variance_understated",
-         "Set EKF2_EVP_NOISE to 0.098 m: rejected 53% → 0%, mean NIS 22 → 1.0, position error 0.31 "
-         "→ 0.11 m (replayed)"),
-        ("v1.16.1_aisle_nlos", "ekf2_variance_understated", "Remove the outliers"),
-        ("v1.16.1_aisle_clock_late", "ekf2_ev_delay_wrong", "position error 0.34 → 0.11 m"),
-        ("v1.16.1_aisle_clock_late", "source_clock_offset", "for EKF2 set EKF2_EV_DELAY to 264 ms"),
-        ("v1.13.3_aisle_evdelay175", "ekf2_ev_delay_wrong", "position error 0.15 → 0.10 m"),
-    ],
-)  # fmt: skip
-def test_flown_flights(shared_logs: Path, log: str, name: str, said: str) -> None:
-    found = find(explain(compare(read_log(shared_logs / "simulated" / f"{log}.ulg"))))
-    assert any(said in finding.remedy for finding in found if finding.id == name)
