@@ -79,54 +79,6 @@ def test_same_input_gives_the_same_bytes_and_fail_on_another_exit_code(tmp_path,
         assert first == second
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        ["--sigma-a", "0"],
-        ["--sigma-z", "nan"],
-        ["--clock-offset", "inf"],
-        ["--heading", "nan"],
-        ["--start", "500"],
-        ["--start", "50", "--end", "40"],
-        ["--position-source", "nonsense"],
-        ["--notes", "absent.md"],
-        ["-o", "report.txt"],
-        ["-o", __file__ + "/r.pdf"],
-        ["--axis", "up"],
-        ["--no-such-option"],
-    ],
-)
-def test_bad_settings_give_one_line_and_leave_nothing(
-    tmp_path, monkeypatch, capsys, sample_log, options
-):
-    monkeypatch.chdir(tmp_path)
-    code, out, err = run_main(monkeypatch, capsys, "compare", sample_log.resolve(), *options)
-    assert code == 2
-    assert out == ""
-    assert err.startswith("px4fuse: ")
-    assert len(err.strip().splitlines()) == 1
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("content", [None, b"", b"no log at all"])
-@pytest.mark.parametrize("command", ["compare", "info", "extract -o tables", "tune", "sync"])
-def test_bad_logs_give_one_line_and_write_nothing(tmp_path, monkeypatch, capsys, command, content):
-    monkeypatch.chdir(tmp_path)
-    old, log = Path("reports", "bad.pdf"), Path("bad.ulg")
-    old.parent.mkdir()
-    old.write_text("an older report")
-    if content is not None:
-        log.write_bytes(content)
-    code, out, err = run_main(monkeypatch, capsys, *command.split(), "bad.ulg")
-    assert (code, out) == (2, "")
-    assert len(err.strip().splitlines()) == 1
-    assert err.startswith("px4fuse: bad.ulg: ")
-    if content is None:
-        assert err == "px4fuse: bad.ulg: cannot be read (No such file or directory).\n"
-    assert old.read_text() == "an older report"
-    assert {path.name for path in Path().rglob("*")} - {"bad.ulg"} == {"reports", "bad.pdf"}
-
-
 def test_help_imports_nothing_heavy():
     """--help answers at once: it may import neither pandas nor matplotlib nor scipy."""
     code = (

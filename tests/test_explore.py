@@ -415,30 +415,6 @@ def explore(*words: str | Path) -> Result:
     return CliRunner().invoke(cli, ["explore", *map(str, words)])
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["missing.ulg"], "missing.ulg"),
-        (["LOG", "-o", "page.pdf"], "ends in .html"),
-        (["LOG", "LOG", "LOG"], "give one, or two"),
-        (["LOG", "LOG", "--mavlink", "a.tlog"], "only one LOG"),
-        (["LOG", "--sigma-a", "0"], "--sigma-a 0 is out of range"),
-    ],
-)
-def test_bad_input_leaves_nothing(
-    sample_log: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    words: list[str],
-    said: str,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    done = explore(*(sample_log if word == "LOG" else word for word in words))
-    assert done.exit_code != 0
-    assert said in f"{done.output}{done.exception}"
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_without_a_log_it_is_the_sample_flight(
     sample_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

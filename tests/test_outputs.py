@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +11,7 @@ from pathlib import Path
 import pytest
 from cli_tools import contents, run, run_main
 from click.testing import CliRunner
-from ulog_tools import ev_error, ev_stamps, make_log, position
+from ulog_tools import make_log
 
 from px4fuse.analysis import run_comparison
 from px4fuse.cli import cli
@@ -26,30 +25,10 @@ SECONDS = 20.0
 
 @pytest.fixture
 def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a short log, its positions as CSV and notes; the commands run there."""
+    """A folder with a short log; the commands run there."""
     make_log("v1.16", SECONDS).write(tmp_path / "l.ulg")
-    time = ev_stamps(SECONDS) * 1e-6
-    measured = position(time - 5.0) + ev_error(time - 5.0)
-    rows = [f"{t:.6f},{n:.4f},{e:.4f},{d:.4f}" for t, (n, e, d) in zip(time, measured, strict=True)]
-    (tmp_path / "c.csv").write_text("\n".join(["time_s,north,east,down", *rows, ""]))
-    (tmp_path / "n.md").write_text("my own words")
-    (tmp_path / "hard.json").hardlink_to(tmp_path / "l.ulg")
-    (tmp_path / "soft.json").symlink_to(tmp_path / "l.ulg")
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-REFUSED = {
-    "info": "info l.ulg --json l.ulg",
-    "info by soft link": "info l.ulg --json soft.json",
-    "tune by hard link": "tune l.ulg --axis north --json hard.json",
-    "sync": "sync l.ulg --json ./l.ulg",
-    "sync over positions": "sync l.ulg --position c.csv --clock-offset 0 --json c.csv",
-    "compare by hard link": "compare l.ulg -o r.pdf --json hard.json",
-    "compare over positions": "compare l.ulg --position c.csv --clock-offset 0 -o r.pdf "
-    "--json ../{folder}/c.csv",
-    "compare over notes": "compare l.ulg --notes n.md -o r.pdf --json n.md",
-}
 
 
 @pytest.mark.parametrize(("name", "said"), [("王小明", True), ("Ångström", False)])
@@ -85,19 +64,6 @@ def test_what_was_written_is_told_without_acting_on_the_terminal(desk, command: 
     assert any({"\x1b", "\u202e"} & set(path.name) for path in desk.iterdir())
 
 
-@pytest.mark.usefixtures("no_drawing")
-@pytest.mark.parametrize("command", REFUSED.values(), ids=REFUSED)
-def test_no_command_writes_over_what_it_reads(desk, monkeypatch, capsys, command) -> None:
-    before = contents(desk)
-    code, out, err = run_main(monkeypatch, capsys, *command.format(folder=desk.name).split())
-    assert code == 2
-    assert out == ""
-    assert err.startswith("px4fuse: ")
-    assert len(err.splitlines()) == 1
-    assert "not overwritten" in err
-    assert contents(desk) == before  # nor was anything else written
-
-
 def test_extract_keeps_the_tables_of_two_logs_apart(desk, monkeypatch, capsys) -> None:
     make_log("v1.14", SECONDS).write(desk / "other.ulg")
     for _ in range(2):  # the same log again
@@ -124,15 +90,6 @@ def test_a_reader_that_leaves_is_no_error(desk, command) -> None:
     complaint = process.stderr.read()
     process.stderr.close()
     assert (process.wait(), complaint) == (0, b"")
-
-
-def test_a_recording_is_not_joined_with_itself(monkeypatch, capsys, sample_log) -> None:
-    tlog = sample_log.with_suffix(".tlog")
-    code, out, err = run_main(monkeypatch, capsys, "compare", tlog, "--mavlink", tlog)
-    assert code == 2
-    assert out == ""
-    assert "the same recording twice" in err
-    assert len(err.splitlines()) == 1
 
 
 # --- --clock-offset auto ---
@@ -191,25 +148,6 @@ def test_a_closed_standard_output_is_no_error(words: str) -> None:
         stderr=subprocess.PIPE, check=False,
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (0, b"")
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("info {log} --json {long}.json", "File name too long"),
-        ("extract {log} -o ''", "the name is empty"),
-        ("batch '' -o {folder}", "the name of a log is empty"),
-        ("tune {log} --start 126", "no noise could be determined"),
-        ("sync {log} --end 3", "no clock offset could be determined"),
-    ],
-)
-def test_what_is_not_done_is_one_line_and_no_success(
-    words: str, said: str, sample_log: Path, tmp_path: Path
-) -> None:
-    typed = words.format(log=sample_log, long="x" * 300, folder=tmp_path)
-    outcome = CliRunner().invoke(cli, shlex.split(typed), standalone_mode=False)
-    assert said in str(outcome.exception)
-    assert "\n" not in str(outcome.exception)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="named pipes are of POSIX")

@@ -13,7 +13,7 @@ from scipy.integrate import cumulative_simpson
 from scipy.spatial.transform import Rotation
 
 import px4fuse
-from px4fuse.cli import cli, main
+from px4fuse.cli import cli
 from px4fuse.comparison.comparison import compare
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
@@ -474,24 +474,3 @@ def test_command_writes_log_and_answer_the_same_again(tmp_path):
     assert run("-o", again, "--seed", 8, *options[2:], "--no-truth").exit_code == 0
     assert again.read_bytes() != log.read_bytes()
     assert b"groundtruth" not in again.read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["-o", "flight.ulg", "--mistake", "fog"], "not a known mistake"),
-        (["-o", "flight.ulg", "--sigma-uwb", "-1"], "--sigma-uwb -1 is out of range"),
-        (["-o", "flight.pdf"], "ends in .ulg"),
-        (["-o", "flight.ulg", "--answer", "flight.ulg"], "name the same file"),
-    ],
-)
-def test_bad_options_are_one_line_and_write_nothing(arguments, said, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sys.argv", ["px4fuse", "simulate", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 2
-    error = capsys.readouterr().err
-    assert said in error
-    assert error.count("\n") == 1
-    assert not list(tmp_path.iterdir())
