@@ -1,6 +1,6 @@
 """What a MAVLink recording means: units, frames, directions, and the ULog of the same flight.
 
-The fuzz tests make PX4FUSE_FUZZ_CASES cases (100 unless that environment variable says
+The fuzz tests make PX4FUSE_FUZZ_CASES cases (60 unless that environment variable says
 otherwise), the same ones every time::
 
     PX4FUSE_FUZZ_CASES=20000 python -m pytest tests/test_mavlink.py -k fuzz
@@ -70,7 +70,7 @@ from px4fuse.readers.mavlink_frames import wire_layout
 from px4fuse.readers.mavlink_recording import _in_ned
 from px4fuse.readers.px4_positions import unproject
 
-FUZZ_CASES = int(os.environ.get("PX4FUSE_FUZZ_CASES", "100"))
+FUZZ_CASES = int(os.environ.get("PX4FUSE_FUZZ_CASES", "60"))
 VARIANCE_COLUMNS = POSITION_VARIANCE_COLUMNS + VELOCITY_VARIANCE_COLUMNS
 PAIRS = ("v1.13.3_aisle_hwlogvision", "v1.16.1_aisle_clock_late", "v1.16.1_aisle_clock_nosync")
 

@@ -10,6 +10,8 @@ import pytest
 from cli_tools import contents, run_main
 from conftest import REPOSITORY
 
+pytestmark = pytest.mark.usefixtures("analysed_once")
+
 SAMPLES = REPOSITORY / "sample_logs"
 ROWS = [
     line

@@ -82,7 +82,6 @@ def parameters(remedy: str) -> dict[str, float]:
         ({}, ()),
         ({"sigma_z_m": 0.02}, ()),
         ({}, ("ekf2-noise=4cm",)),
-        ({}, ("ekf2-noise=50cm",)),
         ({}, ("ekf2-delay=175ms",)),
         ({}, ("clock-offset=250ms",)),
         ({}, ("nlos=5%",)),
