@@ -30,6 +30,7 @@ from px4fuse.simulation.scenario import DT_S, Scenario
 
 NO_MISTAKES = Mistakes()
 AISLE = Scenario(passes=2, seed=4)
+UNFILTERED = replace(AISLE, ekf2=False)
 LOOP = Scenario(kind="loop", passes=1, length_m=8.0, seed=4)
 FOLLOWING = Scenario(passes=2, yaw="follow", seed=4)
 # Errors of the sensors other than white noise switched off
@@ -47,7 +48,7 @@ def motion_of(scenario, mistakes=NO_MISTAKES):
 
 def position_error(scenario, *texts):
     """What the source measured beyond the truth at its own true times, and those times."""
-    source = simulate(scenario, parse(texts)).positions
+    source = simulate(replace(scenario, ekf2=False), parse(texts)).positions
     return source.error_m, source.measured_s
 
 
@@ -188,7 +189,7 @@ class TestMistakes:
         [("clock-offset=80ms", 0.08, 0), ("clock-drift=500ppm", 0, 5e-4)],
     )
     def test_a_wrong_clock_shifts_the_stamps_and_nothing_else(self, text, offset_s, share):
-        late = simulate(AISLE, parse([text]))
+        late = simulate(UNFILTERED, parse([text]))
         time = late.positions.measured_s
         assert np.allclose(stamps_s(late) - time, offset_s + share * time, atol=1e-6)
         arrivals = (s.positions.topic.fields["timestamp"] for s in (late, self.CLEAN))
@@ -227,7 +228,7 @@ class TestMistakes:
         [("dropout=6s,12s", 12.0, 18.0), ("dropout=6", None, None)],
     )
     def test_dropout_silences_the_source(self, text, start, end):
-        gone = simulate(AISLE, parse([text]))
+        gone = simulate(UNFILTERED, parse([text]))
         middle = gone.motion.duration_s / 2.0
         start, end = start or middle - 3.0, end or middle + 3.0
         clean = self.CLEAN.positions.measured_s
@@ -413,7 +414,7 @@ def test_log_does_not_give_the_mistakes_away():
 
 def nis(scenario, names=("north", "east", "down")):
     """Mean NIS per axis at the true noises, by the fast filter, and its 95 % band."""
-    flight = simulate_flight(scenario)
+    flight = simulate_flight(replace(scenario, ekf2=False))
     (start, end) = flight.airborne[0]
     settings = Settings(sigma_a_m_s2=scenario.sigma_a_m_s2, sigma_z_m=scenario.sigma_uwb_m)
     found = []
