@@ -134,9 +134,6 @@ def test_auto_brings_late_stamps_to_the_truth(shared_logs, tmp_path, monkeypatch
     assert rmse["auto"] < 0.1 < rmse["0"]
 
 
-# --- what is said about position files and stamps ---
-
-
 # ---- places that take no output ------------------------------------------------------------------
 
 

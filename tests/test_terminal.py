@@ -185,9 +185,6 @@ def test_the_command_of_a_finding_removes_it(desk) -> None:
     assert "source_clock_offset" in findings[0] - findings[1]
 
 
-# --- what is typed wrongly ---
-
-
 # --- files ---
 
 
