@@ -1,4 +1,4 @@
-"""The page of explore in a real browser, its numbers against Python; the command's refusals."""
+"""The page of explore in a real browser, its numbers against Python; the command."""
 
 from __future__ import annotations
 
@@ -432,6 +432,7 @@ def test_without_a_log_it_is_the_sample_flight(
     assert (tmp_path / "reports" / "aisle_uwb_start-20_end-40.html").is_file()
 
 
+@pytest.mark.usefixtures("no_drawing")
 def test_open_opens_what_is_looked_at(
     sample_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
