@@ -79,65 +79,6 @@ def test_same_input_gives_the_same_bytes_and_fail_on_another_exit_code(tmp_path,
         assert first == second
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        ["--sigma-a", "0"],
-        ["--sigma-z", "nan"],
-        ["--clock-offset", "inf"],
-        ["--heading", "nan"],
-        ["--start", "500"],
-        ["--start", "50", "--end", "40"],
-        ["--position-source", "nonsense"],
-        ["--notes", "absent.md"],
-        ["-o", "report.txt"],
-        ["-o", __file__ + "/r.pdf"],
-        ["--axis", "up"],
-        ["--no-such-option"],
-    ],
-)
-def test_bad_settings_give_one_line_and_leave_nothing(
-    tmp_path, monkeypatch, capsys, sample_log, options
-):
-    monkeypatch.chdir(tmp_path)
-    code, out, err = run_main(monkeypatch, capsys, "compare", sample_log.resolve(), *options)
-    assert code == 2
-    assert out == ""
-    assert err.startswith("px4fuse: ")
-    assert len(err.strip().splitlines()) == 1
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("content", [None, b"", b"no log at all"])
-@pytest.mark.parametrize("command", ["compare", "info", "extract -o tables", "tune", "sync"])
-def test_bad_logs_give_one_line_and_write_nothing(tmp_path, monkeypatch, capsys, command, content):
-    monkeypatch.chdir(tmp_path)
-    old, log = Path("reports", "bad.pdf"), Path("bad.ulg")
-    old.parent.mkdir()
-    old.write_text("an older report")
-    if content is not None:
-        log.write_bytes(content)
-    code, out, err = run_main(monkeypatch, capsys, *command.split(), "bad.ulg")
-    assert (code, out) == (2, "")
-    assert len(err.strip().splitlines()) == 1
-    assert err.startswith("px4fuse: bad.ulg: ")
-    if content is None:
-        assert err == "px4fuse: bad.ulg: cannot be read (No such file or directory).\n"
-    assert old.read_text() == "an older report"
-    assert {path.name for path in Path().rglob("*")} - {"bad.ulg"} == {"reports", "bad.pdf"}
-
-
-def test_a_pipe_that_closes_early_is_no_traceback(tmp_path, sample_log):
-    """As in px4fuse compare ... | head: the reader is gone before the summary is printed."""
-    command = [sys.executable, "-m", "px4fuse", "compare", str(sample_log), "--axis", "down",
-               "--start", "20", "--end", "40", "-o", str(tmp_path / "r.pdf")]  # fmt: skip
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    process.stdout.close()
-    assert process.stderr.read() == b""
-    process.stderr.close()
-    assert process.wait() in (0, 1)
-
-
 def test_help_imports_nothing_heavy():
     """--help answers at once: it may import neither pandas nor matplotlib nor scipy."""
     code = (
@@ -209,7 +150,7 @@ def test_without_the_samples_it_says_what_to_install(monkeypatch, capsys) -> Non
 
 @pytest.mark.parametrize(
     ("words", "loaded"),
-    [(("info", "{log}"), False), (("extract", "{log}", "-o", "{out}"), True), ((), False)],
+    [(("info", "{log}"), False), (("extract", "{log}", "-o", "{out}"), True)],
 )
 def test_an_extra_costs_nothing_where_it_is_not_used(
     words: tuple[str, ...], loaded: bool, sample_log: Path, tmp_path: Path
@@ -227,21 +168,19 @@ def test_an_extra_costs_nothing_where_it_is_not_used(
     assert done.stdout.splitlines()[-1] == f"pyarrow {loaded} False"
 
 
-@pytest.mark.parametrize(
-    "words",
-    [("compare", "{log}", "-o", "r.pdf"), ("extract", "{log}", "-o", "t"), ("explore", "{log}"),
-     ("simulate", "--passes", "1", "-o", "s.ulg"), ("answers", "{log}", "-o", "a.toml"),
-     ("grade", "--write-rubric", "r.toml")],
-)  # fmt: skip
-def test_no_file_is_opened_in_the_encoding_of_the_machine(
-    words: tuple[str, ...], sample_log: Path, tmp_path: Path
-) -> None:
+def test_no_file_is_opened_in_the_encoding_of_the_machine(sample_log: Path, tmp_path: Path) -> None:
     """With a console of Windows' western code page, and a decimal comma where there is one."""
-    typed = [word.format(log=sample_log) for word in words]
+    shutil.copy(sample_log, tmp_path / "l.ulg")
+    typed = [
+        "compare l.ulg -o r.pdf", "extract l.ulg -o t", "explore l.ulg",
+        "simulate --passes 1 -o s.ulg", "answers l.ulg -o a.toml", "grade --write-rubric r.toml",
+    ]  # fmt: skip
     script = (
         "import warnings, sys\n"
         "warnings.filterwarnings('error', category=EncodingWarning, module='px4fuse')\n"
-        f"sys.argv[1:] = {typed!r}\nfrom px4fuse.cli import main\nmain()"
+        f"from px4fuse.cli import main\nfor words in {typed!r}:\n"
+        "    sys.argv[1:] = words.split()\n"
+        "    try:\n        main()\n    except SystemExit as ended:\n        assert not ended.code\n"
     )
     console = {"PYTHONUTF8": "0", "LC_ALL": "de_DE.UTF-8", "PYTHONIOENCODING": "cp1252"}
     environment = {**os.environ, **console, "PYTHONPATH": os.pathsep.join(sys.path)}

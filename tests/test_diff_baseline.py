@@ -168,7 +168,6 @@ def test_what_is_no_table_of_batch_is_refused(tmp_path):
 def made(table: pd.DataFrame) -> ET.Element:
     """The suite, whose counts must be those of its cases."""
     suite = ET.fromstring(junit(table)).find("testsuite")
-    assert suite is not None
     for name, path in (("tests", "testcase"), ("failures", "testcase/failure"),
                        ("skipped", "testcase/skipped")):  # fmt: skip
         assert int(suite.attrib[name]) == len(suite.findall(path))

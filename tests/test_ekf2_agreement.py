@@ -159,7 +159,6 @@ def compared(count: int, *, varying: bool = True) -> Agreement | Unavailable:
 
 def test_twenty_innovations_are_enough_to_compare() -> None:
     found = compared(20)
-    assert isinstance(found, Agreement)
     assert found.samples == 20
     assert found.good
     shares = found.rejected_share_logged, found.rejected_share_replayed, found.decisions_same

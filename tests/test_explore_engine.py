@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 from browser import Browser
 from exchange import replace
@@ -115,7 +114,6 @@ def flights(name: str, sample_log: Path) -> Comparison:
         return compare(log, start_s=30.0, end_s=45.0)
     if name == "IMU with a gap":
         flight = aisle_flight(duration_s=30.0, imu=Imu(gap_s=(9.0, 11.5)))
-        assert isinstance(flight.imu, pd.DataFrame)
         # and ends before the source does
         return compare(replace(flight, imu=flight.imu.loc[:27.0]))
     return compare(aisle_flight(duration_s=30.0, imu=None, uwb=Uwb(gap_s=(12.0, 16.0))))

@@ -291,16 +291,3 @@ def test_the_lesson_by_hand_is_what_compare_does(
     assert np.sqrt(np.mean((velocity[inside] - ours[1]) ** 2)) < 0.1
     settled = north.replay.updates["gain_position"].loc[20.0:120.0].median()
     assert np.median(gain[inside]) == pytest.approx(settled, rel=0.1)
-
-
-@pytest.mark.reallogs
-def test_every_log_is_extracted(shared_logs):
-    for path in sorted(shared_logs.glob("real/*.ulg")):
-        flight = extraction.of_best_source(read_log(path))
-        tables = extraction.tables(flight)
-        dictionary = extraction.data_dictionary(flight)
-        assert len(dictionary) == sum(len(table.columns) for table in tables.values()), path.name
-        for name, table in tables.items():
-            if "time_s" in table:
-                assert table.columns[0] == "time_s"
-                assert np.isfinite(table["time_s"]).all(), (path.name, name)

@@ -6,7 +6,6 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,11 +28,9 @@ from px4fuse.flight import (
     Ekf2,
     Flight,
     Reset,
-    Truth,
     Unavailable,
 )
 from px4fuse.origin import ALIGNED, KEPT
-from px4fuse.readers import read_log
 from px4fuse.recording import ClockMap, Dropout
 
 ALIGNED_TOPIC = "estimator_visual_odometry_aligned"
@@ -106,7 +103,6 @@ def as_recording(flight: Flight) -> Flight:
 
 def biased(flight: Flight) -> Flight:
     """EKF2 that found a bias along the body's axes."""
-    assert isinstance(flight.ekf2, Ekf2)
     none = flight.ekf2.state.iloc[:, :3].set_axis(SPECIFIC_FORCE_COLUMNS, axis=1) * 0.0
     return with_ekf2(accelerometer_bias=none + np.array([0.2, -0.1, 0.2]))(flight)
 
@@ -122,7 +118,6 @@ def as_odometry(flight: Flight) -> Flight:
 
 def apart(flight: Flight, *, grows: bool) -> Flight:
     """The truth is a metre from where source and EKF2 are, on average where that grows."""
-    assert isinstance(flight.truth, Truth)
     samples = flight.truth.samples.copy()
     samples["north_m"] += np.linspace(0.0, np.sqrt(3.0), len(samples)) if grows else 1.0
     return replace(flight, truth=replace(flight.truth, samples=samples))
@@ -363,68 +358,3 @@ def test_a_flight_of_a_moment_does_not_break_a_detector(fault: Fault, duration_s
     comparison = compare(fault.fly(**short), Settings(**fault.settings))
     few = len(next(iter(comparison.axes.values())).replay.updates) < MIN_INNOVATIONS
     assert ("too_few_innovations" in ids(found(comparison))) == few
-
-
-def test_the_remedy_for_the_sample_log_is_right_and_typing_it_removes_the_finding(
-    sample_flight: Flight,
-) -> None:
-    assert {each.severity for each in found(compare(sample_flight))} <= {"info"}
-    for sigma_z, direction in ((0.01, "under"), (1.0, "over")):
-        findings = found(compare(sample_flight, Settings(sigma_z_m=sigma_z)), tuned=True)
-        named = [each for each in findings if each.id == f"kf_variance_{direction}stated"]
-        assert len(named) == 2  # horizontal, vertical
-        for each in named:
-            assert each.severity == "error"
-            typed = re.search(r"--sigma-z ([0-9.]+\d)", each.remedy)
-            assert float(typed[1]) == pytest.approx(0.10, rel=0.2)
-        asked = named[0].evidence["sigma_z_asked_m"]
-        cured = ids(found(compare(sample_flight, Settings(sigma_z_m=asked))))
-        assert not cured & {"kf_variance_understated", "kf_variance_overstated"}
-
-
-REAL_LOGS = [
-    ("simulated/*_aisle_overconfident.ulg", "ekf2_variance_understated", "error",
-     {"nis_mean": about(22.0, 0.2), "sigma_z_asked_m": about(0.10, 0.2)}, ""),
-    ("simulated/*_aisle_2hz_stock.ulg", "ekf2_not_fusing", "error",
-     {"fusing_share": 0.0, "source_interval_s": about(0.5, 0.05)}, "10 Hz"),
-    ("simulated/*_aisle_nlos.ulg", "source_gap", "warning", {"longest_s": about(8.0, 0.04)}, ""),
-    ("simulated/*_aisle_nlos.ulg", "kf_variance_understated", None, {}, "Remove the outliers"),
-    ("simulated/*_aisle_hwlog.ulg", "source_not_logged", "warning", {}, "SDLOG_PROFILE to 129"),
-    ("simulated/*_aisle_hwlog.ulg", "source_decimated", "warning", {"logger_limit_hz": 2.0}, ""),
-    ("real/mengchaoheng*test3.ulg", "logger_dropouts", "warning", {"total_s": about(0.82)}, ""),
-    ("real/mengchaoheng*test3.ulg", "imu_gap", "warning", {"total_s": about(0.82, 0.12)}, ""),
-]  # fmt: skip
-
-
-@pytest.mark.reallogs
-@pytest.mark.parametrize(("pattern", "name", "severity", "evidence", "remedy"), REAL_LOGS)
-def test_real_logs(shared_logs: Path, pattern, name, severity, evidence, remedy) -> None:
-    (path,) = shared_logs.glob(pattern)
-    finding = next(f for f in found(compare(read_log(path)), tuned=True) if f.id == name)
-    assert severity in (None, finding.severity)
-    assert {key: finding.evidence[key] for key in evidence} == evidence
-    assert remedy in finding.remedy
-
-
-@pytest.mark.reallogs
-@pytest.mark.parametrize("version", ["v1.14.4", "v1.16.1"])
-def test_a_nominal_flight_has_no_error_and_no_warning(shared_logs: Path, version: str) -> None:
-    flight = read_log(shared_logs / f"simulated/{version}_aisle_nominal.ulg")
-    assert {finding.severity for finding in found(compare(flight), tuned=True)} <= {"info"}
-
-
-@pytest.mark.reallogs
-@pytest.mark.parametrize("name", ["log_3", "min_snap_01", "square2", "battery_brownout"])
-def test_motion_capture_flights_overstate_the_variance_and_nobody_is_blamed(
-    shared_logs: Path, name: str
-) -> None:
-    """Sent with an orientation, as odometry is; all noises are the programs' own."""
-    (path,) = shared_logs.glob(f"real/*{name}*.ulg")
-    findings = found(compare(read_log(path)), tuned=True)
-    drift = next(at for at, finding in enumerate(findings) if finding.id == "source_may_drift")
-    behind = findings[drift + 1 : drift + 5]
-    assert [finding.id for finding in behind] == (
-        ["kf_variance_overstated"] * 2 + ["ekf2_variance_overstated"] * 2
-    )
-    assert behind[2].evidence["sigma_factor"] > 2.0
-    assert not [f for f in findings if f.severity == "error" and f.caused_by is None]

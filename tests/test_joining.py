@@ -187,16 +187,3 @@ def test_two_flights_whose_boot_clocks_overlap_are_told_apart(shared_logs, sampl
     other = replace(other, log=replace(other.log, boot_time_s=sample_flight.log.boot_time_s))
     with pytest.raises(MissingDataError, match="not of the same flight"):
         join(sample_flight, other)
-
-
-@pytest.mark.reallogs
-@pytest.mark.parametrize(
-    "name", ["v1.13.3_aisle_hwlogvision", "v1.16.1_aisle_clock_late", "v1.16.1_aisle_clock_nosync"]
-)
-def test_real_pairs_join(shared_logs, name):
-    ulog = read_log(shared_logs / "simulated" / f"{name}.ulg")
-    joined = join(ulog, read_log(shared_logs / "mavlink" / f"{name}.tlog"))
-    assert "EKF2 positions differ by 0.001 m" in joined.log.notes[-1]
-    assert {"VISION_POSITION_ESTIMATE", "vehicle_visual_odometry"} <= {
-        t.name for t in joined.positions
-    }

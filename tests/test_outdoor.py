@@ -19,16 +19,15 @@ from px4fuse.analysis import Analysis, explain
 from px4fuse.cli import cli
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.interventions import TURN, cause_of
-from px4fuse.comparison.model import FilterSummary
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.ekf2.model import Model, open_model
-from px4fuse.ekf2.whatif import WhatIf, what_if
+from px4fuse.ekf2.whatif import what_if
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find, source_clock
 from px4fuse.findings.story import story
-from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Truth, Unavailable
+from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_positions import project, unproject
 from px4fuse.simulation import sensors
@@ -72,7 +71,6 @@ def test_fixes_are_the_truth_with_the_stated_noise_at_the_age_that_ekf2_takes(
     track, truth = flight.positions[0], flight.truth
     assert (track.name, track.origin.is_gnss) == ("vehicle_gps_position", True)
     assert track.rate_hz == pytest.approx(5.0, rel=0.01)
-    assert isinstance(truth, Truth)
     assert track.velocity is not None
     for measured, columns, sigma in (
         (track.samples, POSITION_COLUMNS, 0.4),
@@ -91,7 +89,6 @@ def test_fixes_are_the_truth_with_the_stated_noise_at_the_age_that_ekf2_takes(
 def test_a_clean_flight_is_consistent_replayed_and_has_nothing_to_put_right(seed: int) -> None:
     analysis = flown(seed=seed)
     assert roots(analysis) == []
-    assert not isinstance(analysis.aids, Unavailable)
     for name, axes in {"gnss_pos": 2, "gnss_vel": 3}.items():
         aid = analysis.aids[name]
         assert (aid.verdict, len(aid.axes)) == ("consistent", axes)
@@ -100,13 +97,10 @@ def test_a_clean_flight_is_consistent_replayed_and_has_nothing_to_put_right(seed
             low, high = nis_band(axis.samples)
             assert low < axis.nis_mean < 1.05 * high
     model = analysis.ekf2_model
-    assert isinstance(model, Model)
     assert aid_of(analysis).name == model.inputs.aid.name == "gnss_pos"
     assert model.agreement.good
     for owner in ("kf", "ekf2"):
         statement = analysis.axes["north"].filters[owner]
-        assert isinstance(statement, FilterSummary)
-        assert not isinstance(statement.truth, Unavailable)
         assert statement.truth.position_rmse_m < 0.25
         assert 0.5 < (statement.truth.nees_position_mean or 0.0) < 2.5
 
@@ -118,20 +112,14 @@ def test_a_clean_flight_is_consistent_replayed_and_has_nothing_to_put_right(seed
         ("heading=25,40", "ekf2_heading_wrong"),
         ("clock-offset=0.25", "source_clock_offset"),
         ("ekf2-delay=0", "source_clock_offset"),
-        ("jump=3", "source_jumps"),
-        ("nlos=5%", "source_outliers"),
-        ("dropout=15", "source_gap"),
-        ("smoothed=0.5", "source_smoothed"),
         ("r-scale=0.1", "ekf2_variance_understated"),
         ("ekf2-gate=1", "ekf2_gate_small"),
-        ("accel-bias=0.5", "accelerometer_bias"),
         ("slow-error=0.5,30", "errors_larger_than_claimed"),
         ("slow-error=0.8,10", "source_coloured"),
-        ("imu-dropout=2", "imu_gap"),
-        ("no-motion", "no_motion"),
     ],
 )
 def test_the_first_finding_names_the_mistake(mistake: str, root: str) -> None:
+    """Of those in which GNSS takes another path through the findings than indoor positions."""
     assert roots(flown(mistake))[0] == root
 
 
@@ -149,7 +137,6 @@ def test_the_cause_of_ekf2_is_what_was_made_wrong(
 ) -> None:
     analysis = flown(mistake)
     found = cause_of(analysis.causes, "ekf2", "aisle", of)
-    assert found is not None
     assert found.change[name] == pytest.approx(value, abs=within)
     assert found.brings_into_band
     assert "since EKF2" in story(analysis, find(analysis))[0].split("; our filter")[0]
@@ -160,8 +147,6 @@ def test_what_if_predicts_the_flight_with_the_other_delay() -> None:
     assert isinstance(wrong, Model)
     assert isinstance(right, Model)
     asked, other = what_if(wrong, [{"EKF2_GPS_DELAY": 110.0}]), what_if(right, [])
-    assert isinstance(asked, WhatIf)
-    assert isinstance(other, WhatIf)
     (predicted,), true = asked.whatif, other.logged
     assert predicted.nis_mean == pytest.approx(true.nis_mean, rel=0.1)
     for one in (predicted, true, asked.logged):
@@ -180,7 +165,6 @@ def test_the_heading_follows_another_delay_alone(tmp_path: Path) -> None:
     assert isinstance(model, Model)
     changes: list[dict[str, float]] = [{"EKF2_GPS_DELAY": 110.0}, {"EKF2_GPS_P_NOISE": 0.8}]
     asked = what_if(model, changes)
-    assert isinstance(asked, WhatIf)
     summaries = (asked.logged, asked.replayed, *asked.whatif)
     logged, replayed, delayed, noisy = (one.heading_error_mean_deg for one in summaries)
     for error in (logged, replayed, delayed, noisy):

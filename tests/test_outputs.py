@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
 import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from cli_tools import contents, run, run_main
 from click.testing import CliRunner
-from ulog_tools import ev_error, ev_stamps, make_log, position
+from ulog_tools import make_log
 
 from px4fuse.analysis import run_comparison
 from px4fuse.cli import cli
@@ -26,37 +24,11 @@ SECONDS = 20.0
 
 
 @pytest.fixture
-def no_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pages take most of the time, and none of them is looked at here."""
-    monkeypatch.setattr(pdf, "render", lambda document, text: b"%PDF-")
-
-
-@pytest.fixture
 def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a short log, its positions as CSV and notes; the commands run there."""
+    """A folder with a short log; the commands run there."""
     make_log("v1.16", SECONDS).write(tmp_path / "l.ulg")
-    time = ev_stamps(SECONDS) * 1e-6
-    measured = position(time - 5.0) + ev_error(time - 5.0)
-    rows = [f"{t:.6f},{n:.4f},{e:.4f},{d:.4f}" for t, (n, e, d) in zip(time, measured, strict=True)]
-    (tmp_path / "c.csv").write_text("\n".join(["time_s,north,east,down", *rows, ""]))
-    (tmp_path / "n.md").write_text("my own words")
-    (tmp_path / "hard.json").hardlink_to(tmp_path / "l.ulg")
-    (tmp_path / "soft.json").symlink_to(tmp_path / "l.ulg")
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-REFUSED = {
-    "info": "info l.ulg --json l.ulg",
-    "info by soft link": "info l.ulg --json soft.json",
-    "tune by hard link": "tune l.ulg --axis north --json hard.json",
-    "sync": "sync l.ulg --json ./l.ulg",
-    "sync over positions": "sync l.ulg --position c.csv --clock-offset 0 --json c.csv",
-    "compare by hard link": "compare l.ulg -o r.pdf --json hard.json",
-    "compare over positions": "compare l.ulg --position c.csv --clock-offset 0 -o r.pdf "
-    "--json ../{folder}/c.csv",
-    "compare over notes": "compare l.ulg --notes n.md -o r.pdf --json n.md",
-}
 
 
 @pytest.mark.parametrize(("name", "said"), [("王小明", True), ("Ångström", False)])
@@ -92,19 +64,6 @@ def test_what_was_written_is_told_without_acting_on_the_terminal(desk, command: 
     assert any({"\x1b", "\u202e"} & set(path.name) for path in desk.iterdir())
 
 
-@pytest.mark.usefixtures("no_drawing")
-@pytest.mark.parametrize("command", REFUSED.values(), ids=REFUSED)
-def test_no_command_writes_over_what_it_reads(desk, monkeypatch, capsys, command) -> None:
-    before = contents(desk)
-    code, out, err = run_main(monkeypatch, capsys, *command.format(folder=desk.name).split())
-    assert code == 2
-    assert out == ""
-    assert err.startswith("px4fuse: ")
-    assert len(err.splitlines()) == 1
-    assert "not overwritten" in err
-    assert contents(desk) == before  # nor was anything else written
-
-
 def test_extract_keeps_the_tables_of_two_logs_apart(desk, monkeypatch, capsys) -> None:
     make_log("v1.14", SECONDS).write(desk / "other.ulg")
     for _ in range(2):  # the same log again
@@ -121,7 +80,7 @@ def test_extract_keeps_the_tables_of_two_logs_apart(desk, monkeypatch, capsys) -
     assert run_main(monkeypatch, capsys, "extract", "renamed.ulg", "-o", "tables")[0] == 0
 
 
-@pytest.mark.parametrize("command", ["info", "tune", "sync", "extract"])
+@pytest.mark.parametrize("command", ["info", "extract"])
 def test_a_reader_that_leaves_is_no_error(desk, command) -> None:
     """As in px4fuse info LOG | head -1, when head has gone before anything is printed."""
     arguments = [sys.executable, "-m", "px4fuse", command, "l.ulg"]
@@ -131,15 +90,6 @@ def test_a_reader_that_leaves_is_no_error(desk, command) -> None:
     complaint = process.stderr.read()
     process.stderr.close()
     assert (process.wait(), complaint) == (0, b"")
-
-
-def test_a_recording_is_not_joined_with_itself(monkeypatch, capsys, sample_log) -> None:
-    tlog = sample_log.with_suffix(".tlog")
-    code, out, err = run_main(monkeypatch, capsys, "compare", tlog, "--mavlink", tlog)
-    assert code == 2
-    assert out == ""
-    assert "the same recording twice" in err
-    assert len(err.splitlines()) == 1
 
 
 # --- --clock-offset auto ---
@@ -184,86 +134,7 @@ def test_auto_brings_late_stamps_to_the_truth(shared_logs, tmp_path, monkeypatch
     assert rmse["auto"] < 0.1 < rmse["0"]
 
 
-# --- what is said about position files and stamps ---
-
-
-def findings_of(monkeypatch, capsys, out: Path, *arguments: object) -> list[dict[str, str]]:
-    code, _, err = run_main(
-        monkeypatch, capsys, "compare", *arguments, "--axis", "north", "-o", out
-    )
-    assert (code, err) == (0, "")
-    return json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))["findings"]
-
-
-def external(sample_log: Path) -> tuple[str, np.ndarray]:
-    file = sample_log.with_name("aisle_uwb_external.csv")
-    header = file.read_text(encoding="utf-8").splitlines()[0]
-    return header, np.loadtxt(file, delimiter=",", skiprows=1)
-
-
-def write_csv(path: Path, header: str, rows: np.ndarray) -> Path:
-    np.savetxt(path, rows, delimiter=",", header=header, comments="", fmt="%.6f")
-    return path
-
-
-def placement(findings: list[dict[str, str]]) -> list[dict[str, str]]:
-    return [each for each in findings if each["id"] == "position_file_placement"]
-
-
-@pytest.mark.usefixtures("no_drawing")
-def test_position_files_that_do_not_fit_are_said_not_to(
-    tmp_path, monkeypatch, capsys, sample_log, subtests
-) -> None:
-    header, rows = external(sample_log)
-    out = tmp_path / "r.pdf"
-    file = sample_log.with_name("aisle_uwb_external.csv")
-
-    with subtests.test("the file as it is"):
-        found = findings_of(monkeypatch, capsys, out, sample_log, "--position", file)
-        fitted = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
-        assert not placement(found)
-    frame = fitted["source"]["alignment"]["frame"]
-
-    for given in {"ned", "enu", "nwu"} - {frame}:
-        with subtests.test("another frame", given=given):
-            found = findings_of(monkeypatch, capsys, out, sample_log, "--position", file,
-                                "--position-frame", given)  # fmt: skip
-            named = [each for each in placement(found) if each["severity"] == "error"]
-            assert len(named) == 1
-            assert f"as {frame}" in named[0]["message"]
-            assert f"--position-frame {frame}" in named[0]["message"]
-
-    with subtests.test("upside down"):
-        flipped = rows.copy()
-        flipped[:, 3] *= -1.0
-        found = findings_of(monkeypatch, capsys, out, sample_log, "--position",
-                            write_csv(tmp_path / "f.csv", header, flipped),
-                            "--position-frame", frame)  # fmt: skip
-        assert any("height runs against" in each["message"] for each in placement(found))
-
-    with subtests.test("another day"):
-        late = rows.copy()
-        late[:, 0] += 86400.0
-        tlog = sample_log.with_suffix(".tlog")
-        found = findings_of(monkeypatch, capsys, out, tlog, "--position",
-                            write_csv(tmp_path / "d.csv", header, late))  # fmt: skip
-        apart = [each for each in placement(found) if "By their UNIX times" in each["message"]]
-        assert len(apart) == 1
-        assert apart[0]["severity"] == "warning"
-        assert "86" in apart[0]["message"]
-
-
 # ---- places that take no output ------------------------------------------------------------------
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
-@pytest.mark.parametrize("words", ["--version", "lesson kalman"])
-def test_a_full_place_is_one_line(words: str) -> None:
-    command = f"{sys.executable} -m px4fuse {words} >/dev/full"
-    done = subprocess.run(["sh", "-c", command], stderr=subprocess.PIPE, check=False)
-    assert done.returncode == 2
-    assert done.stderr.startswith(b"px4fuse: standard output: cannot be written")
-    assert done.stderr.count(b"\n") == 1
 
 
 @pytest.mark.skipif(os.name != "posix", reason="closes a file descriptor")
@@ -274,25 +145,6 @@ def test_a_closed_standard_output_is_no_error(words: str) -> None:
         stderr=subprocess.PIPE, check=False,
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (0, b"")
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("info {log} --json {long}.json", "File name too long"),
-        ("extract {log} -o ''", "the name is empty"),
-        ("batch '' -o {folder}", "the name of a log is empty"),
-        ("tune {log} --start 126", "no noise could be determined"),
-        ("sync {log} --end 3", "no clock offset could be determined"),
-    ],
-)
-def test_what_is_not_done_is_one_line_and_no_success(
-    words: str, said: str, sample_log: Path, tmp_path: Path
-) -> None:
-    typed = words.format(log=sample_log, long="x" * 300, folder=tmp_path)
-    outcome = CliRunner().invoke(cli, shlex.split(typed), standalone_mode=False)
-    assert said in str(outcome.exception)
-    assert "\n" not in str(outcome.exception)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="named pipes are of POSIX")

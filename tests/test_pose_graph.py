@@ -31,7 +31,7 @@ from px4fuse.trajectory.graph.solver import solve
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "pose_graphs"
 TANGENT = {2: 3, 3: 6}
-SEEDS = 4
+SEEDS = 2
 # Seconds each on one core; torus3D from its own vertices does not converge in 100 steps
 FILES = (
     "SE-Sync_CSAIL", "SE-Sync_MIT", "SE-Sync_intel", "SE-Sync_kitti_00", "SE-Sync_manhattan",
@@ -322,7 +322,7 @@ def test_false_closure_is_set_aside() -> None:
     for seed in range(SEEDS):
         graph, truth, true = laps(seed)
         known = ate(solve(graph.of_edges(true)).poses, truth)
-        for method in ("none", "dcs", "gnc") if seed < 3 else ("dcs", "gnc"):
+        for method in ("none", "dcs", "gnc"):
             solution = solve(graph, robust=method)
             # least squares has no good minimum here to converge to
             assert solution.converged or method == "none"

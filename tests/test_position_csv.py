@@ -42,7 +42,6 @@ TRACK_M = np.column_stack(
     ]
 ).round(4)
 SIGMA_M = RANDOM.uniform(0.05, 0.3, ROWS).round(3)
-QUALITY = RANDOM.integers(40, 100, ROWS)
 
 
 def fixed(values: np.ndarray, decimals: int) -> list[str]:

@@ -22,14 +22,12 @@ from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
 from px4fuse.origin import RECEIVED
-from px4fuse.recording import ClockMap
 from px4fuse.report import clock, fonts, notes
 from px4fuse.report.document import Document
 from px4fuse.report.notes import write
 from px4fuse.report.page import Block, Page, data, printable
 from px4fuse.report.pdf import compiled
 from px4fuse.report.sensitivity import PAIRS, SETTINGS, _settled
-from px4fuse.report.words import clock_words
 from px4fuse.results.model import Student
 
 THAI, HAN, ARABIC = "สมชาย", "王小明", "محمد"
@@ -272,16 +270,3 @@ def test_only_the_ratio_moves_the_gain_and_the_track() -> None:
             run.nis[half, one] * scale**2, run.nis[half, other], rtol=1e-4, atol=1e-9
         )
     assert gains[1] > gains[0] > gains[3]
-
-
-def test_how_a_clock_was_mapped_is_told_by_its_figures_or_by_its_note() -> None:
-    mapped = ClockMap("the sender's clock", "TIMESYNC", 40, 0.25, 3.0, 0.002, "over the link")
-    assert clock_words(mapped) == (
-        "the sender's clock by TIMESYNC: offset +0.2500 s, drift +3 ppm, jitter 2 ms, 40 pairs; "
-        "over the link"
-    )
-    for by_note in (
-        replace(mapped, method="boot clock"), replace(mapped, distinct_stamps=1),
-        replace(mapped, note="over the link, at its own speed"),
-    ):  # fmt: skip
-        assert clock_words(by_note) == f"the sender's clock: {by_note.note}"

@@ -7,7 +7,6 @@ from pathlib import Path
 import jsonschema
 import msgspec
 import pytest
-from conftest import SHARED_LOGS
 from flights import unexplained
 from pypdf import PdfReader
 from results_tools import EXAMPLE, LOOP, changed, decoded
@@ -15,7 +14,7 @@ from results_tools import EXAMPLE, LOOP, changed, decoded
 import px4fuse
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import UnjudgedFilter
-from px4fuse.errors import Px4FuseError, ResultsError
+from px4fuse.errors import ResultsError
 from px4fuse.report.document import Document
 from px4fuse.report.pdf import render
 from px4fuse.request import ComparisonRequest
@@ -201,44 +200,3 @@ def test_what_breaks_the_contract(values, said):
 
 def test_names_are_cleaned_as_texts_are():
     assert list(decoded(changed(tuning={"a\u202eb": NOTHING})).tuning) == ["ab"]
-
-
-@pytest.mark.reallogs
-@pytest.mark.parametrize("log", sorted(SHARED_LOGS.glob("*/*.ulg")), ids=lambda log: log.name)
-def test_every_log_gives_a_valid_report_or_one_clear_line(log):
-    """As a student would type it; GPS flights also with GPS as the source."""
-    made = document_or_refusal(log)
-    if isinstance(made, str):
-        assert log.name in REFUSED
-        assert "\n" not in made
-        assert log.name in made
-        return
-    text = to_json(results(made))
-    assert_valid(text)
-    assert render(made, text).startswith(b"%PDF-")
-
-
-# Logs without a position to compare
-REFUSED = {
-    "Auterion_px4-ulog-rs_hist_15eddfaf_corrupt_format_not_utf8.ulg",
-    "Auterion_px4-ulog-rs_hist_571df892_quadrotor_local.ulg",
-    "JoshAviles_405_hist_1ba09f50_AE405testx.ulg",
-    "PX4_pyulog_hist_fa8acbdc_sample_unordered.ulg",
-    "PX4_pyulog_sample.ulg",
-    "PX4_pyulog_sample_appended_multiple.ulg",
-    "annoybot_yule_log_trig_stats.ulg",
-    "erdemarslan380_px4-system-identification_05_54_37.ulg",
-    "erdemarslan380_px4-system-identification_log100.ulg",
-}
-# One of a kind: motion capture, outliers and a gap, no IMU to speak of, GPS
-EXPLAINED = ("square2", "aisle_nlos", "esc_status", "ekf_failure")
-
-
-def document_or_refusal(log: Path) -> Document | str:
-    try:
-        flight = px4fuse.read_log(log)
-        gps_alone = [track.name for track in flight.positions] == ["vehicle_gps_position"]
-        source = "vehicle_gps_position" if gps_alone else None
-        return document(flight, any(part in log.name for part in EXPLAINED), position_source=source)
-    except Px4FuseError as error:
-        return str(error)

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.comparison.preparation import (
     choose_segment,
-    choose_source,
     shift_clock,
 )
 from px4fuse.comparison.projection import continuous_state
@@ -42,7 +41,7 @@ from px4fuse.flight import (
     Reset,
     Unavailable,
 )
-from px4fuse.origin import GNSS, ORIGINS, RECEIVED
+from px4fuse.origin import RECEIVED
 from px4fuse.recording import LogInfo
 
 GRAVITY = 9.80665
@@ -263,19 +262,6 @@ def test_axes_hold_what_the_source_measures_in_the_segment():
 def straight(first_s, last_s):
     time = np.arange(first_s, last_s + 0.1, 0.2)
     return track_of(time, np.zeros((len(time), 3)))
-
-
-@pytest.mark.parametrize("origin", ORIGINS)
-def test_gps_is_taken_only_when_asked_for(origin):
-    """It is the last in the order of preference."""
-    track = replace(straight(2.0, 18.0), name="source", origin=origin)
-    flight = flight_of(track=track, duration_s=20.0)
-    if origin != GNSS:
-        assert choose_source(flight)[0] is track
-    else:
-        with pytest.raises(MissingDataError, match="`position_source`"):
-            choose_source(flight)
-    assert choose_source(flight, "source") == (track, "chosen with --position-source")
 
 
 @pytest.mark.parametrize(("airborne", "expected"), [

@@ -10,16 +10,14 @@ import pytest
 from exchange import replace
 from flights import unexplained
 
-from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
-from px4fuse.ekf2.model import MODEL_NOTE, Model, open_model
+from px4fuse.ekf2.model import MODEL_NOTE, open_model
 from px4fuse.ekf2.replay import Agreement
-from px4fuse.ekf2.whatif import WhatIf, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.settings import Settings
-from px4fuse.findings import find, source_clock
-from px4fuse.flight import Ekf2, Flight, FusionRecord, Truth, Unavailable
+from px4fuse.findings import find
+from px4fuse.flight import Ekf2, Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_ekf2 import samples_per_step
 from px4fuse.simulation import ekf2, sensors
@@ -43,21 +41,17 @@ def of(flight: Flight) -> Ekf2:
 def fused(flight: Flight, axis: str = "north") -> pd.DataFrame:
     """Innovations while airborne."""
     frame = of(flight).innovations[axis]
-    assert isinstance(frame, pd.DataFrame)
-    assert not isinstance(flight.airborne, Unavailable)
     start, end = flight.airborne[0]
     return frame.loc[start:end]
 
 
 def agreement(flight: Flight) -> Agreement:
     model = open_model(flight)
-    assert isinstance(model, Model), model
     return model.agreement
 
 
 def rmse(flight: Flight, start_s: float, end_s: float, column: str = "north_m") -> float:
     """Of the published position, to the truth."""
-    assert isinstance(flight.truth, Truth)
     track, truth = of(flight).state.loc[start_s:end_s, column], flight.truth.samples[column]
     return float(np.sqrt(np.mean((track - np.interp(track.index, truth.index, truth)) ** 2)))
 
@@ -70,11 +64,6 @@ def named(flight: Flight) -> set[str]:
 @pytest.fixture(scope="module")
 def clean() -> Flight:
     return flown()
-
-
-@pytest.fixture(scope="module")
-def overconfident() -> Flight:
-    return flown("ekf2-noise=0.02")
 
 
 # --- the model, from take-off
@@ -112,7 +101,7 @@ def test_flights_with_mistakes_agree_too(texts: tuple[str, ...], scenario: Scena
 
 def test_clean_flights_are_consistent_and_near_the_truth() -> None:
     values, inside, errors, stated = [], [], [], []
-    for seed in range(20):
+    for seed in range(8):
         flight = flown(scenario=Scenario(passes=2, seed=seed))
         for axis in ("north", "east"):
             frame = fused(flight, axis)
@@ -122,7 +111,6 @@ def test_clean_flights_are_consistent_and_near_the_truth() -> None:
             inside.append(low < values[-1] < high)
             errors.append(rmse(flight, 10.0, 50.0, f"{axis}_m"))
         variance = of(flight).variance
-        assert isinstance(variance, pd.DataFrame)
         stated.append(float(np.sqrt(variance["north_m2"].median())))
     # the heading has an error of 1° that EKF2 takes to be white
     assert np.mean(values) == pytest.approx(1.0, abs=0.08)
@@ -133,9 +121,7 @@ def test_clean_flights_are_consistent_and_near_the_truth() -> None:
 
 def test_the_horizon_state_is_as_good_as_it_says(clean: Flight) -> None:
     """Position and velocity at the horizon, their variances, and the biases that it learns."""
-    assert isinstance(clean.truth, Truth)
     record, truth = of(clean).record, clean.truth.samples
-    assert isinstance(record, FusionRecord)
     later = record.delayed[record.delayed.index > 15.0]
     error = later["north_m_s"] - np.interp(later.index, truth.index, truth["north_m_s"])
     assert 0.5 < np.mean(error**2 / later["north_m2_s2"]) < 2.5
@@ -166,14 +152,12 @@ def test_where_it_stands_still_the_attitude_is_levelled() -> None:
 def test_fusion_needs_ten_hertz_stops_and_resets_as_ekf2_does() -> None:
     slow = flown("decimate=2Hz")
     fusing = of(slow).fusing
-    assert isinstance(fusing, pd.DataFrame)
     assert not fusing["horizontal"].any()
     assert "ekf2_not_fusing" in named(slow)
     # it stays where it is, instead of drifting away on the IMU
     assert of(slow).state[["north_m", "east_m"]].abs().max().max() < 5.0
     gap = flown("dropout=8s,30s")
     fusing = of(gap).fusing
-    assert isinstance(fusing, pd.DataFrame)
     off = fusing[fusing["horizontal"] == 0.0].loc[28.0:39.0]
     assert off.index[0] == pytest.approx(30.4, abs=0.3)
     resets = [reset for reset in of(gap).resets if reset.time_s > 10.0]
@@ -217,31 +201,6 @@ def test_samples_with_older_stamps_than_the_last_are_not_taken() -> None:
 # --- mistakes of EKF2's own
 
 
-def test_overconfident_ekf2_rejects_and_is_named(overconfident: Flight) -> None:
-    assert fused(overconfident)["rejected"].mean() > 0.3
-    assert {"ekf2_rejecting", "ekf2_variance_understated", "ekf2_resets"} <= named(overconfident)
-    model = open_model(overconfident)
-    assert not isinstance(model, Unavailable)
-    assert model.agreement.good
-    answer = what_if(model, [{"EKF2_EVP_NOISE": 0.1}])
-    assert isinstance(answer, WhatIf)
-    (cured,) = answer.whatif
-    assert cured.rejected_share == 0.0
-    assert cured.axes["north"].nis_mean == pytest.approx(1.0, abs=0.3)
-
-
-def test_a_delay_in_force_is_asked_away() -> None:
-    flight = flown("ekf2-delay=175ms", scenario=Scenario(seed=100))
-    # it takes positions for older than they are: its track runs ahead
-    ahead = rmse(flight, 10.0, 110.0)
-    assert ahead > 1.3 * rmse(flown(scenario=Scenario(seed=100)), 10.0, 110.0)
-    analysis = explain(compare(flight, RIGHT, axes=("north", "east")))
-    (finding,) = [f for f in source_clock.detect(analysis) if f.id == "ekf2_ev_delay_wrong"]
-    assert finding.evidence["ekf2_ev_delay_ms"] == 175.0
-    assert finding.evidence["asked_ms"] == pytest.approx(0.0, abs=60.0)
-    assert "EKF2_EV_DELAY" in finding.remedy
-
-
 def test_ekf2_that_is_not_told_to_fuse_only_looks(clean: Flight) -> None:
     flight = flown("ekf2-off")
     assert flight.log.parameters["EKF2_EV_CTRL"] == 0.0
@@ -249,8 +208,6 @@ def test_ekf2_that_is_not_told_to_fuse_only_looks(clean: Flight) -> None:
     assert of(clean).fusing["horizontal"].max() == 1.0
     # as in PX4 samples are compared with the state all the same, and nothing comes of it
     record, plain = of(flight).record, of(clean).record
-    assert isinstance(record, FusionRecord)
-    assert isinstance(plain, FusionRecord)
     assert len(record.vision_age_s) == len(plain.vision_age_s)
     # told nothing for 5 s it stays where it is, while the vehicle flies to and fro over 12 m
     assert rmse(flight, 10.0, 50.0) > 2.0 > 10.0 * rmse(clean, 10.0, 50.0)

@@ -11,7 +11,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from cli_tools import run_main
 from click.testing import CliRunner, Result
 from conftest import page_of
 from exchange import replace
@@ -184,35 +183,6 @@ def test_the_command_of_a_finding_removes_it(desk) -> None:
         for name in ("a.json", "b.json")
     ]
     assert "source_clock_offset" in findings[0] - findings[1]
-
-
-# --- what is typed wrongly ---
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["comapre", "x.ulg"], "Did you mean 'compare'?"),
-        (["l.ulg", "--dt", "0.2"], "px4fuse compare l.ulg --dt 0.2"),
-        (["compare", "l.ulg", "--sigmaz", "1"], "--sigma-z"),
-        (["compare", "l.ulg", "--sigma-z", "10cm"], "give metres, as 0.1"),
-        (["tune", "l.ulg", "--start", "20s"], "give seconds, as 20"),
-        (["sync", "l.ulg", "--clock-offset", "-120ms"], "give seconds, as -0.12, or auto"),
-        (["compare", "l.ulg", "--heading", "-30"], "not between 0 and 360"),
-        (["compare", "l.ulg", "--heading", "north"], "give degrees, as 30"),
-        (["simulate", "-o", "s.ulg", "--heading", "361"], "--heading 361 is out of range"),
-        (["simulate", "-o", "s.ulg", "--speed", "3.6km/h"], "give metres per second, as 1"),
-        (["loop", "l.ulg", "--drift", "1 m"], "give metres, as 1"),
-        (["whatif", "l.ulg", "--set", "EKF2_EV_DELAY=0.1s"], "give milliseconds, as 100"),
-    ],
-)
-def test_slips_are_one_line_that_says_what_to_type(desk, monkeypatch, capsys, words, said) -> None:
-    code, out, err = run_main(monkeypatch, capsys, *words)
-    assert (code, out) == (2, "")
-    assert err.startswith("px4fuse: ")
-    assert len(err.splitlines()) == 1
-    assert said in err
-    assert [path.name for path in desk.iterdir()] == ["l.ulg"]
 
 
 # --- files ---

@@ -96,7 +96,6 @@ def test_every_dialect_gives_the_same_poses(dialect: str, tmp_path: Path) -> Non
     # one unit in the last place of UNIX time
     np.testing.assert_allclose(got.time_s, expected, rtol=0, atol=2.4e-7)
     np.testing.assert_array_equal(got.position_m, POSITION_M)
-    assert got.rotation is not None
     assert (got.rotation.inv() * ROTATION).magnitude().max() < 1e-8
     assert got.kind == ("truth" if dialect == "EuRoC, 17" else "unknown")
     assert (got.name, got.frame, got.unix_offset_s) == ("track.txt", "unknown", 0.0)
@@ -246,8 +245,6 @@ def test_what_is_written_is_read_back_exactly(
     once = read_trajectory(write(tmp_path, tum_text(made)))
     np.testing.assert_array_equal(once.time_s, made.time_s)
     np.testing.assert_array_equal(once.position_m, made.position_m)
-    assert once.rotation is not None
-    assert made.rotation is not None
     np.testing.assert_array_equal(once.rotation.as_quat(), made.rotation.as_quat())
     assert tum_text(once) == tum_text(made)
 
@@ -257,21 +254,3 @@ def test_a_log_is_written_with_unix_time_and_positions_alone_are_not(tmp_path: P
     assert read_trajectory(write(tmp_path, tum_text(made))).time_s[0] == 1.5e9
     with pytest.raises(TrajectoryError, match="needs orientations"):
         tum_text(replace(made, rotation=None))
-
-
-PIECES = [" ", "\n", ",", "#", "\t", "\r", "nan", "1e300", "1e999", "-", "\x00", "1 2 3 0 0 0 1\n"]
-
-
-@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    pieces=st.lists(
-        st.sampled_from(PIECES) | st.floats().map(str) | st.integers().map(str), max_size=60
-    )
-)
-def test_any_text_is_read_or_refused(pieces: list[str], tmp_path: Path) -> None:
-    message, path = "", write(tmp_path, "".join(pieces))
-    try:
-        assert (np.diff(read_trajectory(path).time_s) > 0).all()
-    except TrajectoryError as error:
-        message = str(error)
-    assert "\n" not in message

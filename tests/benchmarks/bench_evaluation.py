@@ -8,27 +8,16 @@ ten-minute flight: 30 Hz of an estimate against 200 Hz of a reference.
 
 from __future__ import annotations
 
-import statistics
 import sys
 import tempfile
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+
+from measured import seconds
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 RUNS = 3
-
-
-def seconds(work: Callable[[], object]) -> float:
-    """Median over some runs."""
-    took = []
-    for _ in range(RUNS):
-        start = time.perf_counter()
-        work()
-        took.append(time.perf_counter() - start)
-    return statistics.median(took)
 
 
 def main() -> None:
@@ -49,7 +38,7 @@ def main() -> None:
         path = Path(folder) / "track.tum"
         path.write_text(tum_text(reference[:20_000]))
         size = path.stat().st_size / 1e6
-        took = seconds(lambda: read_trajectory(path))
+        took = seconds(lambda: read_trajectory(path), RUNS)
         print(f"read 20,000 poses, {size:.1f} MB       {took:7.3f} s")
     x, y, _ = associate(estimate, reference)
     error = np.linalg.norm(x.position_m - y.position_m, axis=1)
@@ -60,7 +49,7 @@ def main() -> None:
         ("all scores", lambda: evaluate(estimate, reference)),
         ("the time offset", lambda: estimate_time_offset(estimate, reference)),
     ):
-        print(f"{words:35} {seconds(work):7.3f} s")
+        print(f"{words:35} {seconds(work, RUNS):7.3f} s")
 
 
 if __name__ == "__main__":

@@ -11,23 +11,16 @@ from __future__ import annotations
 
 import statistics
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from measured import seconds
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 FOLDER = Path(__file__).parents[3] / "shared" / "pose_graphs"
 NAMED = ("SE-Sync_manhattan", "SE-Sync_sphere2500", "SE-Sync_parking-garage")
 SIZES = (100, 300, 1000, 3000, 10_000)
-
-
-def seconds(work: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    work()
-    return time.perf_counter() - start
 
 
 def chain(poses: int):

@@ -9,28 +9,16 @@ A grid of 64 × 64 settings against filterpy replays of single settings, on the 
 
 from __future__ import annotations
 
-import statistics
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from measured import seconds
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 LOG = Path(__file__).parents[2] / "sample_logs" / "aisle_uwb.ulg"
 RUNS = 3
-
-
-def seconds(work: Callable[[], object], runs: int = RUNS) -> float:
-    """Median over some runs."""
-    took = []
-    for _ in range(runs):
-        start = time.perf_counter()
-        work()
-        took.append(time.perf_counter() - start)
-    return statistics.median(took)
 
 
 def main() -> None:
@@ -45,11 +33,11 @@ def main() -> None:
     from px4fuse.readers import read_log
 
     axis = compare(read_log(LOG), axes=("north",)).lines[0]
-    single = seconds(lambda: replay(axis, Settings()))
+    single = seconds(lambda: replay(axis, Settings()), RUNS)
     legs = preintegrate(axis, Settings())
     weight = np.ones(len(legs.measurement_m))
     a, z = np.geomspace(0.05, 5.0, 64)[:, None], np.geomspace(0.01, 1.0, 64)
-    grid = seconds(lambda: total_over_grid([preintegrate(axis, Settings())], a, z, weight))
+    grid = seconds(lambda: total_over_grid([preintegrate(axis, Settings())], a, z, weight), RUNS)
     print(
         f"64 x 64 settings, {len(weight)} measurements: {grid:.2f} s, {4096 / grid:.0f} a second; "
         f"filterpy {single:.2f} s for one; {4096 * single / grid:.0f} times as fast"
@@ -58,9 +46,9 @@ def main() -> None:
     flight, _ = filter_tools.made_flight(1, duration_s=600.0, offset_s=-0.1)
     compared = compare(flight, settings)
     for names in (None, (HORIZONTAL,)):
-        took = seconds(lambda names=names: tune(compared.lines, settings, names, flight=flight), 1)
+        took = seconds(lambda names=names: tune(compared.lines, settings, names, flight=flight))
         print(f"tune, {names[0] if names else 'all axes'}, 600 s: {took:.1f} s (aim 5 s)")
-    took = seconds(lambda: noises_and_clock(compared), 1)
+    took = seconds(lambda: noises_and_clock(compared))
     print(f"horizontal and clock offset, 600 s: {took:.1f} s (aim 2.5 s)")
 
 

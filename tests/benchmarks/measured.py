@@ -1,10 +1,12 @@
-"""Wall time, CPU time and peak memory of a command."""
+"""Wall time, CPU time and peak memory of a command; the time of a call."""
 
 from __future__ import annotations
 
 import os
+import statistics
 import subprocess
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 
@@ -31,3 +33,13 @@ def measured(command: list[str]) -> Measured:
     _, _, used = os.wait4(run.pid, 0)
     wall = time.perf_counter() - start
     return Measured(wall, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024.0)
+
+
+def seconds(work: Callable[[], object], runs: int = 1) -> float:
+    """Median over some runs."""
+    took = []
+    for _ in range(runs):
+        start = time.perf_counter()
+        work()
+        took.append(time.perf_counter() - start)
+    return statistics.median(took)

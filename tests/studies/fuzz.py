@@ -38,6 +38,7 @@ if str(TESTS) not in sys.path:
 import mavlink_tools  # noqa: E402
 import ulog_tools  # noqa: E402
 from class_tools import in_turn  # noqa: E402
+from conftest import page_of  # noqa: E402
 from made_up_fleet import made_up  # noqa: E402
 
 from px4fuse import answers  # noqa: E402
@@ -161,6 +162,12 @@ def _recordings() -> list[bytes]:
     return [sent.tlog(), sent.raw()]
 
 
+def _reports() -> list[bytes]:
+    """The shipped report, and one of its results on an empty page."""
+    report = REPOSITORY / "reports/aisle_uwb.pdf"
+    return [report.read_bytes(), page_of(None, report.with_suffix(".json").read_text())]
+
+
 def _report(path: Path) -> object:
     found = read_report(path.read_bytes(), path.name)
     if isinstance(found, Refused):
@@ -226,10 +233,7 @@ TARGETS = (
         "results", lambda: [(REPOSITORY / "reports/aisle_uwb.json").read_bytes()],
         lambda path: read_results(path.read_bytes()), ".json", True, 100, 2.0,
     ),
-    Target(
-        "report", lambda: [(REPOSITORY / "reports/aisle_uwb.pdf").read_bytes()], _report, ".pdf",
-        False, 15, 0.2,
-    ),
+    Target("report", _reports, _report, ".pdf", False, 120, 0.2),
     Target("rubric", lambda: [rubric_text().encode()], read_rubric, ".toml", True, 900, 8.0),
     Target("overrides", _text(_OVERRIDES), read_overrides, ".csv", True, 900, 6.0),
     Target("roster", _text(_ROSTER, _MOODLE), read_roster, ".csv", True, 900, 6.0),

@@ -1,0 +1,209 @@
+"""What is typed or handed in wrongly: one line that says what to do, and nothing written."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli_tools import contents, run_main
+from conftest import REPOSITORY
+
+pytestmark = pytest.mark.usefixtures("analysed_once")
+
+SAMPLES = REPOSITORY / "sample_logs"
+ROWS = [
+    line
+    for line in (SAMPLES / "loop_slam.tum").read_text().splitlines()
+    if not line.startswith("#")
+]
+
+
+def straight(step_m: float) -> list[str]:
+    return [f"{0.1 * i:.1f} {step_m * i} 0 0 0 0 0 1" for i in range(100)]
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory):
+    """Flights, positions, a trajectory, a pose graph, and everything that is none of these."""
+    folder = tmp_path_factory.mktemp("desk")
+    binary = np.random.default_rng(0).bytes(5000)
+    for name, content in {
+        "a.ulg": (SAMPLES / "aisle_uwb.ulg").read_bytes(),
+        "a.tlog": (SAMPLES / "aisle_uwb.tlog").read_bytes(),
+        "c.csv": (SAMPLES / "aisle_uwb_external.csv").read_bytes(),
+        "l.ulg": (SAMPLES / "loop_vio.ulg").read_bytes(),
+        "empty.ulg": b"",
+        "bad.ulg": b"no log at all",
+        "empty.tum": b"",
+        "junk.bin": binary,
+        "f.pdf": b"%PDF-1.7\n\x00\x01\x02" + binary,
+    }.items():
+        (folder / name).write_bytes(content)
+    for name, rows in {
+        "s.tum": ROWS,
+        "s.pdf": ROWS,
+        "junk.txt": ["hello world", "this is no data"],
+        "nonmono.tum": [*ROWS[:100], ROWS[101], ROWS[100], *ROWS[102:]],
+        "nan.tum": [*ROWS[:50], ROWS[50].replace(ROWS[50].split()[2], "nan"), *ROWS[51:]],
+        "still.tum": straight(0.0),
+        "line.tum": straight(0.1),
+        "g.g2o": [
+            *(f"VERTEX_SE2 {i} {i} 0 0" for i in range(3)),
+            *(f"EDGE_SE2 {i} {i + 1} 1 0 0 1 0 0 1 0 1" for i in range(2)),
+        ],
+        "bad.g2o": ["VERTEX_SE2 0 0 0 0", "EDGE_SE2 0 7 1 0 0 1 0 0 1 0 1"],
+        "n.md": ["my own words"],
+    }.items():
+        (folder / name).write_bytes("".join(row + "\n" for row in rows).encode())
+    (folder / "hard.json").hardlink_to(folder / "a.ulg")
+    (folder / "soft.json").symlink_to(folder / "l.ulg")
+    (folder / "reports").mkdir()
+    (folder / "reports" / "bad.pdf").write_text("an older report")
+    return folder
+
+
+# Command and a part of what it must say
+REFUSED = {
+    # settings
+    "no noise": ("compare a.ulg --sigma-a 0", "--sigma-a 0 is out of range"),
+    "noise of NaN": ("compare a.ulg --sigma-z nan", "--sigma-z"),
+    "endless offset": ("compare a.ulg --clock-offset inf", "--clock-offset"),
+    "heading of NaN": ("compare a.ulg --heading nan", "--heading"),
+    "beyond the flight": ("compare a.ulg --start 500", "empty"),
+    "end before start": ("compare a.ulg --start 50 --end 40", "empty"),
+    "no such source": ("compare a.ulg --position-source nonsense", "no such source"),
+    "no notes": ("compare a.ulg --notes absent.md", "absent.md"),
+    "no report": ("compare a.ulg -o report.txt", "report.txt"),
+    "a file as a folder": ("compare a.ulg -o n.md/r.pdf", "n.md"),
+    "no such axis": ("compare a.ulg --axis up", "up"),
+    "no such option": ("compare a.ulg --no-such-option", "--no-such-option"),
+    # slips, and what to type instead
+    "slip of a command": ("comapre x.ulg", "Did you mean 'compare'?"),
+    "no command": ("l.ulg --dt 0.2", "px4fuse compare l.ulg --dt 0.2"),
+    "slip of an option": ("compare l.ulg --sigmaz 1", "--sigma-z"),
+    "metres with a unit": ("compare l.ulg --sigma-z 10cm", "give metres, as 0.1"),
+    "seconds with a unit": ("tune l.ulg --start 20s", "give seconds, as 20"),
+    "offset with a unit": ("sync l.ulg --clock-offset -120ms", "seconds, as -0.12, or auto"),
+    "negative heading": ("compare l.ulg --heading -30", "not between 0 and 360"),
+    "heading of words": ("compare l.ulg --heading north", "give degrees, as 30"),
+    "heading of a simulation": ("simulate -o s.ulg --heading 361", "--heading 361 is out of range"),
+    "speed with a unit": ("simulate -o s.ulg --speed 3.6km/h", "give metres per second, as 1"),
+    "drift with a unit": ("loop l.ulg --drift '1 m'", "give metres, as 1"),
+    "delay with a unit": ("whatif l.ulg --set EKF2_EV_DELAY=0.1s", "give milliseconds, as 100"),
+    "system of a ULog": ("compare a.ulg --system 1", "--system is for MAVLink"),
+    "a ULog as MAVLink": ("compare a.ulg --mavlink a.ulg", "--mavlink a.ulg: this is a ULog"),
+    "itself again": ("compare a.tlog --mavlink a.tlog", "the same recording twice"),
+    "far time offset": ("evaluate l.ulg:vio s.tum --time-offset 9e5", "give --time-offset auto"),
+    "loop of no drift": ("loop l.ulg --drift 0", "--drift 0 is outside"),
+    # simulations, pages, and what nothing comes of
+    "no such mistake": ("simulate -o flight.ulg --mistake fog", "not a known mistake"),
+    "noise below zero": ("simulate -o flight.ulg --sigma-uwb -1", "--sigma-uwb -1 is out of range"),
+    "simulation as PDF": ("simulate -o flight.pdf", "ends in .ulg"),
+    "log and answer": ("simulate -o x.ulg --answer x.ulg", "name the same file"),
+    "page of nothing": ("explore missing.ulg", "missing.ulg"),
+    "page as PDF": ("explore a.ulg -o page.pdf", "ends in .html"),
+    "page of three": ("explore a.ulg a.ulg a.ulg", "give one, or two"),
+    "page of two and more": ("explore a.ulg a.ulg --mavlink a.tlog", "only one LOG"),
+    "page of no noise": ("explore a.ulg --sigma-a 0", "--sigma-a 0 is out of range"),
+    "too long a name": (f"info a.ulg --json {'x' * 300}.json", "File name too long"),
+    "no name": ("extract a.ulg -o ''", "the name is empty"),
+    "no name of a log": ("batch '' -o out", "the name of a log is empty"),
+    **{
+        f"{name} by {command}": (f"{command} {name}.ulg", f"px4fuse: {name}.ulg: ")
+        for name in ("missing", "empty", "bad")
+        for command in ("compare", "info", "extract -o tables", "tune", "sync")
+    },
+    # trajectories and pose graphs
+    "missing": ("loop absent.ulg", "absent.ulg: cannot be read (No such file or directory)"),
+    "empty trajectory": ("loop empty.tum", "empty.tum: the file is empty"),
+    "text junk": ("loop junk.txt", "junk.txt: not a trajectory file"),
+    "PDF": ("loop f.pdf", "f.pdf: a PDF, not a flight log"),
+    "times that go back": ("loop nonmono.tum", "nonmono.tum, line 102"),
+    "not a number": ("loop nan.tum -o f.pdf", "nan.tum, line 51"),
+    "no motion": ("loop still.tum", "still.tum: the path is 0.00 m long"),
+    "closure outside": ("loop s.tum --closure 10,5000", "within the path"),
+    "closure of one time": ("loop s.tum --closure 10", "'10' is not T1,T2"),
+    "closure of four": ("loop s.tum --closure 1,2,3,4", "is not T1,T2"),
+    "closure backwards": ("loop s.tum --closure 50,10", "within the path"),
+    "closure of no width": ("loop s.tum --closure 10,50,0", "SIGMA 0 is outside"),
+    "closure of NaN": ("loop s.tum --closure 1,nan", "is not T1,T2"),
+    "closure of words": ("loop s.tum --closure a,b", "is not T1,T2"),
+    "closure without end": ("loop s.tum --closure 2,inf", "is not T1,T2"),
+    "landing of words": ("loop s.tum --landed-at junk", "'junk' is not FORWARD,RIGHT"),
+    "landing on the moon": ("loop s.tum --landed-at 1e300,1", "is not FORWARD,RIGHT"),
+    "landing, and open": ("loop s.tum --landed-at 1,2 --open", "exclude each other"),
+    "open, and nothing to correct": ("loop s.tum --open --tum o.tum", "no corrected path"),
+    "from after to": ("loop s.tum --from 50 --to 40", "Change --from or --to"),
+    "no such part": ("loop l.ulg:slam", "'slam' is not a part of a flight"),
+    "part of a trajectory": ("loop s.tum:vio", "s.tum: a trajectory file has no part 'vio'"),
+    "frame of a flight": ("loop l.ulg --frame enu", "--frame enu is for trajectory files"),
+    "no PDF": ("loop s.tum -o r.txt", "r.txt: the report is a PDF"),
+    "path and graph": ("loop s.tum --tum x --g2o x", "two outputs name the same file"),
+    "path to standard output": ("loop s.tum --tum -", "only --json can print"),
+    "reference a graph": ("loop s.tum --reference g.g2o", "g.g2o: a pose graph, not a trajectory"),
+    "graph with a bad edge": ("loop bad.g2o", "bad.g2o, line 2"),
+    "part of a graph": ("loop g.g2o:vio", "a pose graph has no part 'vio'"),
+    "report of a graph": ("loop g.g2o -o r.pdf", "not for a pose graph"),
+    "evaluate junk": ("evaluate s.tum junk.bin", "junk.bin: not a PX4 ULog"),
+    "evaluate apart": ("evaluate s.tum l.ulg --time-offset 0", "no poses match in time"),
+    "evaluate a line": ("evaluate line.tum line.tum", "--alignment yaw"),
+    "offset of words": ("evaluate s.tum s.tum --time-offset abc", "give seconds, as 0.1, or auto"),
+    "RPE over nothing": ("evaluate s.tum s.tum --rpe 0m", "'0m' is not a distance"),
+    "RPE over half a frame": ("evaluate s.tum s.tum --rpe 1.5f", "frames come whole"),
+    "RPE over too many": (f"evaluate s.tum s.tum --rpe {'9' * 26}f", "is not a distance"),
+    "page as text": ("evaluate s.tum s.tum -o page.txt", "ends in .pdf"),
+}
+
+# What a command reads, it does not write over
+SPARED = {
+    "path": "loop s.tum --tum s.tum",
+    "results by soft link of a part": "loop l.ulg:vio --json soft.json",
+    "reference": "loop l.ulg --reference s.tum --tum s.tum",
+    "pose graph": "loop g.g2o --g2o g.g2o",
+    "reference of evaluate": "evaluate s.tum l.ulg:truth --json l.ulg",
+    "estimate by its page": "evaluate s.pdf s.tum -o s.pdf",
+    "info": "info a.ulg --json a.ulg",
+    "info by soft link": "info l.ulg --json soft.json",
+    "tune by hard link": "tune a.ulg --axis north --json hard.json",
+    "sync": "sync a.ulg --json ./a.ulg",
+    "sync over positions": "sync a.ulg --position c.csv --json c.csv",
+    "compare by hard link": "compare a.ulg -o r.pdf --json hard.json",
+    "compare over positions": "compare a.ulg --position c.csv -o r.pdf --json ../{folder}/c.csv",
+    "compare over notes": "compare a.ulg --notes n.md -o r.pdf --json n.md",
+}
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [*REFUSED.values(), *((command, "not overwritten") for command in SPARED.values())],
+    ids=[*REFUSED, *(f"over {name}" for name in SPARED)],
+)
+def test_it_gives_one_line_and_writes_nothing(desk, monkeypatch, capsys, command, said):
+    monkeypatch.chdir(desk)
+    before = contents(desk)
+    typed = shlex.split(command.format(folder=Path(desk).name))
+    code, out, err = run_main(monkeypatch, capsys, *typed)
+    assert (code, out) == (2, ""), err
+    assert err.startswith("px4fuse: ")
+    assert len(err.splitlines()) == 1
+    assert said in err
+    assert "`" not in err  # options, not the arguments of Python
+    assert "1.79525e+09" not in err  # times can be told apart
+    assert contents(desk) == before
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("tune a.ulg --start 126", "no noise could be determined"),
+        ("sync a.ulg --end 3", "no clock offset could be determined"),
+    ],
+)
+def test_what_nothing_comes_of_is_no_success(desk, monkeypatch, capsys, command, said):
+    monkeypatch.chdir(desk)
+    code, _, err = run_main(monkeypatch, capsys, *command.split())
+    assert code == 2
+    assert len(err.splitlines()) == 1
+    assert said in err
