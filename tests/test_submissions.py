@@ -20,6 +20,7 @@ from px4fuse.grading import submissions
 from px4fuse.grading.model import Submission
 from px4fuse.grading.platforms import origin_of, origins_of
 from px4fuse.grading.submissions import collect, read
+from px4fuse.reading import files_by_sha256
 from px4fuse.verification.intake import MAX_BYTES
 from px4fuse.verification.model import Refused
 
@@ -219,7 +220,29 @@ def test_links_do_not_lead_out_of_the_folder(tmp_path):
     os.mkfifo(tmp_path / "in" / "pipe.pdf")
     found, notes = collect([tmp_path / "in"])
     assert [each.name for each in found] == ["a.pdf"]
-    assert notes == ("in: 6 links out of the folder or special files were not followed.",)
+    assert notes == (
+        "in: 6 links out of the folder, special files or folders that cannot be read were not "
+        "followed.",
+    )
+
+
+def test_folders_in_each_other_without_end(tmp_path):
+    """More than functions may call themselves."""
+    folders = [tmp_path / "in" / ("d/" * depth) for depth in range(1_500)]
+    for folder in folders:
+        folder.mkdir()
+    paths = [write(tmp_path / "in" / "a.pdf", PDF), write(folders[-1] / "b.pdf", PDF)]
+    try:
+        found, notes = collect([tmp_path / "in"])
+        known = files_by_sha256([tmp_path / "in"])
+    finally:  # shutil.rmtree, which clears the tests' folders, calls itself
+        for path in paths:
+            path.unlink()
+        for folder in reversed(folders):
+            folder.rmdir()
+    assert [each.file for each in found] == paths
+    assert notes == ()
+    assert [*known.values()] == paths[:1]  # both have the same content
 
 
 # ------------------------------------------------------------------ names

@@ -23,6 +23,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.grading.model import Submission
 from px4fuse.grading.names import distinct
 from px4fuse.grading.platforms import METADATA, ExportOrigin, gradescope_metadata, origins_of
+from px4fuse.reading import files_below
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification.intake import MAX_BYTES
 from px4fuse.verification.model import Refused
@@ -243,9 +244,9 @@ def _files(path: Path, notes: list[str]) -> Iterator[tuple[Path, str]]:
         raise SettingsError(f"{one_line(str(path), MAX_NAME)}: no regular file, and no folder.")
     root = path.resolve()
     outside = 0
-    for whole in sorted(root.rglob("*")):  # symbolic links to folders are not entered
+    for whole in files_below(root):  # symbolic links to folders are not entered
         name = whole.relative_to(root)
-        if any(map(_hidden, name.parts)) or (whole.is_dir() and not whole.is_symlink()):
+        if any(map(_hidden, name.parts)):
             continue
         try:
             resolved = whole.resolve(strict=True)
@@ -258,8 +259,8 @@ def _files(path: Path, notes: list[str]) -> Iterator[tuple[Path, str]]:
         outside += not inside
     if outside:
         notes.append(
-            f"{one_line(path.name, MAX_NAME)}: {outside} links out of the folder or special files "
-            "were not followed."
+            f"{one_line(path.name, MAX_NAME)}: {outside} links out of the folder, special files or "
+            "folders that cannot be read were not followed."
         )
 
 
