@@ -455,6 +455,18 @@ class TestClassFlags:
         assert set(made) == {"1.pdf", "2.pdf"}
         assert "The form has the numbers of" in made["1.pdf"][0]
 
+    def test_a_classmates_numbers_each_changed_a_little(self):
+        claims = Claim("yaw", -20.5), Claim("nlos", 1.23)
+        mine = Answers(log_sha256=SHA, mistakes=claims, quantities=(0.123, None, 0.45))
+        other = (Claim("nlos", 1.24), Claim("yaw", -20.3))
+        theirs = Answers(log_sha256=SHA, mistakes=other, quantities=(0.124, 0.7, None))
+        made = class_flags([of(1, form=mine), of(2, form=theirs)])
+        assert set(made) == {"1.pdf", "2.pdf"}
+        # two may be by chance
+        theirs = replace(theirs, quantities=(0.2, 0.7, 0.45))
+        apart = replace(mine, quantities=(0.123, None, 0.3))
+        assert class_flags([of(1, form=apart), of(2, form=theirs)]) == {}
+
     def test_short_notes_and_a_template_are_not(self):
         assert class_flags([of(1, notes="All is well."), of(2, notes="All is well.")]) == {}
         template = text_of(99, 300)

@@ -14,6 +14,7 @@ from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from decimal import Decimal
 from itertools import combinations
 from operator import attrgetter
+from typing import Any
 
 from px4fuse.assignment.key import folded
 from px4fuse.grading.model import Graded
@@ -22,8 +23,9 @@ from px4fuse.results.contract import LoopResults, Reported, to_plain
 from px4fuse.results.reading import one_line
 from px4fuse.simulation import flights
 
-# Numbers of a form that two students do not have in common by chance
-SAME_NUMBERS = 3
+# Numbers of a form that two students do not have in common by chance, also where one of them has
+# changed each a little
+SAME_NUMBERS, NEARLY = 3, 0.02
 # A hand-picked part of the flight below this share leaves most of it out
 HAND_PICKED = 0.5
 SHOWN = 4
@@ -75,13 +77,27 @@ def own_flags(results: Reported, handed_out: bool = False) -> Iterator[str]:
         yield "The log was made by px4fuse simulate: no vehicle flew."
 
 
-def _form_numbers(one: Graded) -> tuple[float, ...]:
-    """Sizes, values and quantities of a form with digits that nobody types by chance."""
-    form = one.form
-    given = [] if form is None else [n for each in form.mistakes for n in (each.size, each.value)]
-    given += [] if form is None else [n for n in form.quantities if isinstance(n, float)]
-    found = tuple(number for number in given if number is not None and _digits(number) > 1)
-    return found if len(found) >= SAME_NUMBERS else ()
+def _form_numbers(one: Graded) -> dict[tuple[str, str], float]:
+    """Sizes, values and quantities of a form by where they stand."""
+    if one.form is None:
+        return {}
+    given: dict[tuple[str, str], object] = {
+        (each.kind, name): getattr(each, name)
+        for each in one.form.mistakes
+        for name in ("size", "value")
+    }
+    given |= {("", f"q{at}"): number for at, number in enumerate(one.form.quantities)}
+    return {key: float(n) for key, n in given.items() if isinstance(n, float | int)}
+
+
+def _same_numbers(one: Mapping[Any, float], other: Mapping[Any, float]) -> int:
+    """How many numbers nearly agree that nobody types by chance; a value follows from its size."""
+    return sum(
+        _digits(number) > 1
+        and abs(number - other[key]) <= (key[1] != "value") * NEARLY * abs(number)
+        for key, number in one.items()
+        if key in other
+    )
 
 
 def _results_numbers(one: Graded) -> tuple[float, ...]:
@@ -99,7 +115,6 @@ COMMON: tuple[tuple[str, Callable[[Graded], Hashable], Callable[[Graded], str]],
     ("The same file as {}.", attrgetter("sha256"), attrgetter("submission")),
     ("The same student id as in {}.", lambda one: folded(one.student_id), attrgetter("submission")),
     ("The same log as {}.", attrgetter("log_sha256"), _who),
-    ("The form has the numbers of {}.", _form_numbers, _who),
     ("The same numbers to the last digit, from a log of another hash, as {}: a copy of the log.",
      _results_numbers, attrgetter("log_sha256")),
 )  # fmt: skip
@@ -108,7 +123,7 @@ COMMON: tuple[tuple[str, Callable[[Graded], Hashable], Callable[[Graded], str]],
 def class_flags(graded: Sequence[Graded]) -> Mapping[str, Sequence[str]]:
     """What stands out between the reports of a class: sentences, by names of submissions."""
     found: dict[str, list[str]] = defaultdict(list)
-    for name, flag in (*_common(graded), *_copied_notes(graded)):
+    for name, flag in (*_common(graded), *_copied_forms(graded), *_copied_notes(graded)):
         found[name].append(flag)
     return found
 
@@ -127,6 +142,18 @@ def _common(graded: Sequence[Graded]) -> Flags:
                         if other is not one
                     ]
                     yield one.submission, said.format(few_words(others, SHOWN, "; "))
+
+
+def _copied_forms(graded: Sequence[Graded]) -> Flags:
+    """Whose forms have the same numbers, though the flights are others."""
+    found: dict[str, list[str]] = defaultdict(list)
+    numbers = [(one, _form_numbers(one)) for one in graded]
+    for (one, own), (other, theirs) in combinations(numbers, 2):
+        if _same_numbers(own, theirs) >= SAME_NUMBERS and _who(one) != _who(other):
+            found[one.submission].append(_name(other))
+            found[other.submission].append(_name(one))
+    for name, others in found.items():
+        yield name, f"The form has the numbers of {few_words(others, SHOWN, '; ')}."
 
 
 def _copied_notes(graded: Sequence[Graded]) -> Flags:
