@@ -438,6 +438,8 @@ class TestClassFlags:
             lambda words: [p for n, w in enumerate(words) for p in (w, "well")[: 1 + (n % 4 == 3)]],
             lambda words: [w.replace("o", "o\u200b").upper() for w in words],
             lambda words: [w.translate({97 + n: 0x1D41A + n for n in range(26)}) for w in words],
+            lambda words: [w.translate(str.maketrans("aeo", "\u0430\u0435\u043e")) for w in words],
+            lambda words: [w if len(w) > 4 else w[::-1] for w in words],  # other small
         ],
     )
     def test_copies_however_disguised(self, disguise):
