@@ -189,6 +189,30 @@ def test_a_zip_in_a_zip_is_read_and_no_deeper(tmp_path):
     assert notes == ("Files passed over that are not PDFs: 2.",)
 
 
+def test_a_student_hands_in_no_more_than_fifty(tmp_path):
+    many = zipped(
+        {f"{n}.pdf": PDF for n in range(30)}
+        | {"a.zip": zipped({f"{n}.pdf": PDF for n in range(30)})}
+    )
+    one = {
+        "Roe Max_1_assignsubmission_file_/r.pdf": PDF,
+        "Doe_2_assignsubmission_file_/all.zip": many,
+    }
+    write(tmp_path / "unpacked" / "Doe_2_assignsubmission_file_" / "all.zip", many)
+    for name in ("Roe Max_1_assignsubmission_file_/r.pdf", "Zoe_3_assignsubmission_file_/r.pdf"):
+        write(tmp_path / "unpacked" / name, PDF)
+    found, (note,) = collect([tmp_path / "unpacked"])
+    assert len(found) == 2
+    assert "all.zip: passed over: it holds more than 50 PDFs, and is of one student." in note
+    # a zip file in a zip file holds no others that are read
+    one["Doe_2_assignsubmission_file_/all.zip"] = zipped({f"{n}.pdf": PDF for n in range(51)})
+    found, (note,) = collect([write(tmp_path / "export.zip", zipped(one))])
+    assert [each.name for each in found] == ["Roe Max_1_assignsubmission_file_/r.pdf"]
+    # a class has more
+    class_ = {f"N_{n}_assignsubmission_file_/r.pdf": PDF for n in range(80)}
+    assert len(collect([write(tmp_path / "class.zip", zipped(class_))])[0]) == 80
+
+
 def test_nothing_there(tmp_path):
     with pytest.raises(SettingsError, match="no regular file, and no folder"):
         collect([tmp_path / "absent"])
