@@ -55,7 +55,7 @@ MISTAKES: Mapping[str, tuple[str, Mapping[str, float]]] = {
     "vibration": ("the accelerometer is this much noisier", _A),
     "imu-rate": ("the IMU is logged at this rate only", _HZ),
     "no-motion": ("the vehicle hovered where it took off", {}),
-    "open-end": ("the loop ends this far from its start: the closure is false", _M),
+    "open-end": ("the loop ends this far from its start by the odometry: a false closure", _M),
     "vio-drift": ("the odometry drifts by this share of the path, more than usual", {"%": 1.0}),
     "no-vvo": ("the positions that EKF2 was sent are not logged", {}),
     "ekf2-noise": ("EKF2_EVP_NOISE or EKF2_GPS_P_NOISE is this, and the data ask for another", _M),

@@ -184,7 +184,7 @@ def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
     limit = max_log_bytes.get()
     for path in paths:
         if path.is_dir():
-            files = [file for file in sorted(path.rglob("*")) if file.is_file()]
+            files = [file for file in files_below(path) if file.is_file()]
             files = [file for file in files if size_of(file, LogError) <= limit]
         elif (size := size_of(path, LogError)) > limit:
             raise LogError(
@@ -202,6 +202,25 @@ def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
                 raise _unreadable(shown(file), error, LogError) from error
             found.setdefault(sha256, file)
     return found
+
+
+def files_below(folder: Path) -> list[Path]:
+    """All but folders in a folder and its subfolders, however deep, sorted; links as they are.
+
+    A folder that cannot be looked into is among them.
+    """
+    found: list[Path] = []
+    left = [folder]
+    while left:
+        place = left.pop()
+        try:
+            with os.scandir(place) as entries:
+                for entry in entries:
+                    into = left if entry.is_dir(follow_symlinks=False) else found
+                    into.append(Path(entry.path))
+        except OSError:
+            found.append(place)
+    return sorted(found)
 
 
 def _read(path: Path, count: int, refuse: type[Px4FuseError], name: str) -> bytes:

@@ -206,6 +206,7 @@ FILES: dict[str, tuple[Change, str, str]] = {
         put(1e9, "request", "sigma_a_m_s2"), "cannot verify", "Ask how",
     ),
     "a path": (put("../../etc/passwd", "request", "log"), "cannot verify", "Ask how"),
+    "the folder above": (put("..", "request", "log"), "cannot verify", "Ask how"),
     "a step that fails": (put(1e-9, "request", "dt_s"), "cannot verify", "Ask how"),
     "ten thousand lines of notes": (
         put("a\n" * 10_000, "student", "notes"), "cannot verify", "Ask how",
@@ -233,6 +234,7 @@ def test_files(
     assert graded.status != "verified"
     assert not graded.counted
     assert graded.status == status
+    assert not any("Error" in reason for reason in graded.verdict.reasons), graded.verdict.reasons
     assert pending in graded.pending
     assert bool(graded.pending) == bool(pending)
     assert graded.points <= honest.points + 1e-9

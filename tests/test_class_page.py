@@ -25,7 +25,7 @@ from pypdf import PdfReader
 from px4fuse.answers import Answers, Claim
 from px4fuse.grading.anonymous import NAME
 from px4fuse.grading.class_page import html_text
-from px4fuse.grading.model import Entry, Graded, Item, Override
+from px4fuse.grading.model import INSTRUCTOR, Entry, Graded, Item, Override
 from px4fuse.verification.model import Mismatch, Verdict
 from px4fuse.webpage.safe import MAX_CHARACTERS
 
@@ -235,11 +235,17 @@ def test_an_anonymous_class_names_nobody() -> None:
 
 
 def test_short_ids_leave_the_numbers_of_a_text() -> None:
-    one = replace(CLASS[0].counting, notes="Two of 12 m, said Ada.")
-    entry = Entry("Ada", "12", one, pseudonym="Student 001", flags=("Like 12.",))
+    item = Item("Text", 3.0, 12.0, f"It names 12. {INSTRUCTOR}3 of 12, Ada.", by_hand=True)
+    one = replace(CLASS[0].counting, notes="Two of 12 m, said Ada.", items=(item,))
+    entry = Entry(
+        "Ada", "12", one, pseudonym="Student 001", flags=("Like 12.",), comment="12 m, Ada."
+    )
     text = html_text([entry], "Class", "px4fuse 1")
     assert "Two of 12 m, said Student 001." in text
     assert "Like Student 001." in text
+    # what the instructor writes of an item, and of all
+    assert "It names Student 001. Your instructor: 3 of 12, Student 001." in text
+    assert '"12 m, Student 001."' in text
 
 
 def test_a_minute_late_is_not_nothing() -> None:

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 from exchange import replace
-from form_guesses import at_random
+from form_guesses import at_random, constants
 from scipy.stats import spearmanr
 
 from px4fuse.answers import CURES, MISTAKES, PANELS, Answers, Claim
+from px4fuse.assignment.drawing import draw
 from px4fuse.assignment.truth import FormTruth, VerdictTruth, Wrong, truth_of
 from px4fuse.grading.form_points import PARTS, SHOWS, cures, form_points, panels
 from px4fuse.simulation import flights
@@ -140,6 +141,34 @@ def test_a_cure_that_needs_no_measurement_counts_with_the_size_alone() -> None:
     assert parts(guess, truth) == [30.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     measured = replace(guess, mistakes=(replace(claim, size=5.1, unit="m"),))
     assert parts(measured, truth)[:4] == [30.0, 15.0, 10.0, 15.0]
+
+
+def test_a_constant_form_does_not_pay_on_loops() -> None:
+    """Of 300 that are drawn, with the closure errors and verdicts that they have."""
+    rng = np.random.default_rng(7)
+    truths = []
+    for number in range(300):
+        drawn = draw(b"constant forms", f"s{number}", "loop")
+        sizes = [float(typed.partition("=")[2].rstrip("m")) for typed in drawn.typed]
+        measured = [size + rng.normal(0.0, 0.4) for size in sizes]
+        wrong = [Wrong("open-end", size, size - 0.3, size + 0.3, 65.0) for size in measured]
+        verdicts = VerdictTruth("overstated", 7.0), VerdictTruth("understated", 1.1)
+        truths.append(
+            FormTruth(tuple(wrong), 0.01, *verdicts, ("nothing unusual",), (), (0.5, 0.1, 0.2))
+        )
+    for kind in ("open-end", "none"):
+        for form in constants(truths, kind):
+            assert np.mean([form_points(form, one).share for one in truths]) <= 0.35
+
+
+def test_the_size_of_an_open_end_is_what_the_odometry_measures() -> None:
+    """The drift in it is nothing that a student could know of."""
+    scenario = Scenario(kind="loop", passes=1, vio_drift=0.02, seed=4, truth=False)
+    (wrong,) = truth_of(flights.simulate(scenario, parse(("open-end=5m",))), SHA256).mistakes
+    assert wrong.size is not None
+    assert wrong.low is not None
+    assert 0.1 < abs(wrong.size - 5.0) < 1.5
+    assert wrong.low == pytest.approx(wrong.size - 0.3)
 
 
 # ------------------------------------------------------------------ forms with points by hand

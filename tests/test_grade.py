@@ -25,7 +25,9 @@ from px4fuse.grading.model import Entry, Graded
 from px4fuse.grading.names import file_names
 from px4fuse.grading.rubric import read_rubric
 from px4fuse.reading import files_by_sha256
+from px4fuse.verification import pages
 from px4fuse.verification.model import Verdict
+from px4fuse.verification.workers import Failed
 
 pytestmark = pytest.mark.usefixtures("analysed_once")
 
@@ -83,6 +85,20 @@ def test_everything_that_was_handed_in_stands_in_the_table(handed_in, tmp_path) 
     assert "<img src=x" not in page
     assert "<title>Lab: fusion and loop closure</title>" in page  # the rubric's
     assert len(list((output / "feedback").glob("*.txt"))) == 6
+
+
+@pytest.mark.usefixtures("at_once", "drawn_once")
+def test_pages_that_cannot_be_drawn_hide_in_no_verified_row(tmp_path, monkeypatch) -> None:
+    """As where they take more time or memory than there is for them."""
+    folder = tmp_path / "in"
+    folder.mkdir()
+    (folder / "a.pdf").write_bytes(
+        forged(REPORT.read_bytes(), lambda writer: writer.remove_page(7))
+    )
+    monkeypatch.setattr(pages, "bounded", lambda *_: Failed("it took longer than 10 s."))
+    (only,) = grade([folder], [LOG.parent], read_rubric(None), tmp_path / "class").graded
+    assert only.status == "verified"
+    assert any("could not be drawn: do not open them" in flag for flag in only.flags)
 
 
 @pytest.mark.usefixtures("at_once", "drawn_once")

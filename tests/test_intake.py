@@ -197,8 +197,23 @@ TEXT = TextStringObject("x")
 
 
 OPENS = dictionary(S=NameObject("/URI"), URI=TextStringObject("http://x"))
+
+
+def by_itself_and_by_a_click(writer: PdfWriter) -> None:
+    """One action, of a link and of a page that is opened."""
+    opens = writer._add_object(OPENS)
+    annotation(Subtype=NameObject("/Link"), A=opens)(writer)
+    turned = dictionary(O=opens)
+    writer.pages[0][NameObject("/AA")] = writer._add_object(turned)
+
+
 ACTS = {
     "opens an address": on_root("/OpenAction", OPENS),
+    "that opens an address": on_root("/OpenAction", dictionary(S=NameObject("/GoTo"), Next=OPENS)),
+    "an action that opens": on_root(
+        "/OpenAction", dictionary(S=NameObject("/GoTo"), Next=ArrayObject([OPENS]))
+    ),
+    "an action that": by_itself_and_by_a_click,
     "JavaScript": on_root("/Open#41ction", action("JavaScript", JS=TEXT)),
     "contains JavaScript": on_root("/Names", dictionary(JavaScript=dictionary())),
     "contains JS, JavaScript": on_root("/AA", dictionary(WC=action("JavaScript", JS=TEXT))),

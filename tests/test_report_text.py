@@ -165,6 +165,16 @@ def test_long_notes_run_over_pages_and_lose_nothing() -> None:
     assert not list(notes.draw(document(Student("", "", " \n <!-- nothing --> \n"))))
 
 
+def test_words_without_end_are_broken() -> None:
+    """PDF/A takes no string of 32,768 characters, and a page no line of them."""
+    endless = "a" * 33_000
+    code = '{"x": 1, ' * 4_000
+    student = Student("", "", f"{endless}\n\n| {endless} |\n|---|\n\n```\n{code}\n```\n")
+    text = "".join(set_by_typst(*notes.draw(document(student))))
+    assert text.count("a") >= 66_000
+    assert text.count("{") == 4_000
+
+
 def test_what_a_student_writes_is_never_evaluated() -> None:
     hostile = '#read("/etc/passwd") #sys.inputs $x$ = y *b* @ref <label> // c'
     page = Page("Notes")

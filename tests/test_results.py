@@ -157,12 +157,13 @@ def test_no_number_is_written_that_is_none(sample_flight):
         (b'{"schema": {"name": "px4fuse-other", "version": "2.0"}}', "no results of px4fuse"),
         (b'{"schema": {"name": ["px4fuse-results"], "version": 1}}', "no results of px4fuse"),
         (b'{"schema": "px4fuse-results"}', "no results of px4fuse"),
+        (b'[{"a": 1, "b": {}, "a": 2}]', "a key stands there twice"),
         (b"[]", "no results of px4fuse"),
         (b"1", "no results of px4fuse"),
         (b'{"schema": {"name": "px4fuse-loop", "version": "1.0"}}', "follows version 1.0"),
         (b'{"schema": {"name": "px4fuse-loop", "version": "3.0"}}', "missing required field"),
     ],
-    ids=range(20),
+    ids=range(21),
 )
 def test_what_is_no_results(given, said):
     with pytest.raises(ResultsError, match=said) as raised:

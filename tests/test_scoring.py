@@ -438,6 +438,8 @@ class TestClassFlags:
             lambda words: [p for n, w in enumerate(words) for p in (w, "well")[: 1 + (n % 4 == 3)]],
             lambda words: [w.replace("o", "o\u200b").upper() for w in words],
             lambda words: [w.translate({97 + n: 0x1D41A + n for n in range(26)}) for w in words],
+            lambda words: [w.translate(str.maketrans("aeo", "\u0430\u0435\u043e")) for w in words],
+            lambda words: [w if len(w) > 4 else w[::-1] for w in words],  # other small
         ],
     )
     def test_copies_however_disguised(self, disguise):
@@ -454,6 +456,18 @@ class TestClassFlags:
         made = class_flags([of(1, form=same), of(2, form=same), of(3)])
         assert set(made) == {"1.pdf", "2.pdf"}
         assert "The form has the numbers of" in made["1.pdf"][0]
+
+    def test_a_classmates_numbers_each_changed_a_little(self):
+        claims = Claim("yaw", -20.5), Claim("nlos", 1.23)
+        mine = Answers(log_sha256=SHA, mistakes=claims, quantities=(0.123, None, 0.45))
+        other = (Claim("nlos", 1.24), Claim("yaw", -20.3))
+        theirs = Answers(log_sha256=SHA, mistakes=other, quantities=(0.124, 0.7, None))
+        made = class_flags([of(1, form=mine), of(2, form=theirs)])
+        assert set(made) == {"1.pdf", "2.pdf"}
+        # two may be by chance
+        theirs = replace(theirs, quantities=(0.2, 0.7, 0.45))
+        apart = replace(mine, quantities=(0.123, None, 0.3))
+        assert class_flags([of(1, form=apart), of(2, form=theirs)]) == {}
 
     def test_short_notes_and_a_template_are_not(self):
         assert class_flags([of(1, notes="All is well."), of(2, notes="All is well.")]) == {}

@@ -20,6 +20,7 @@ from px4fuse.grading import submissions
 from px4fuse.grading.model import Submission
 from px4fuse.grading.platforms import origin_of, origins_of
 from px4fuse.grading.submissions import collect, read
+from px4fuse.reading import files_by_sha256
 from px4fuse.verification.intake import MAX_BYTES
 from px4fuse.verification.model import Refused
 
@@ -188,6 +189,30 @@ def test_a_zip_in_a_zip_is_read_and_no_deeper(tmp_path):
     assert notes == ("Files passed over that are not PDFs: 2.",)
 
 
+def test_a_student_hands_in_no_more_than_fifty(tmp_path):
+    many = zipped(
+        {f"{n}.pdf": PDF for n in range(30)}
+        | {"a.zip": zipped({f"{n}.pdf": PDF for n in range(30)})}
+    )
+    one = {
+        "Roe Max_1_assignsubmission_file_/r.pdf": PDF,
+        "Doe_2_assignsubmission_file_/all.zip": many,
+    }
+    write(tmp_path / "unpacked" / "Doe_2_assignsubmission_file_" / "all.zip", many)
+    for name in ("Roe Max_1_assignsubmission_file_/r.pdf", "Zoe_3_assignsubmission_file_/r.pdf"):
+        write(tmp_path / "unpacked" / name, PDF)
+    found, (note,) = collect([tmp_path / "unpacked"])
+    assert len(found) == 2
+    assert "all.zip: passed over: it holds more than 50 PDFs, and is of one student." in note
+    # a zip file in a zip file holds no others that are read
+    one["Doe_2_assignsubmission_file_/all.zip"] = zipped({f"{n}.pdf": PDF for n in range(51)})
+    found, (note,) = collect([write(tmp_path / "export.zip", zipped(one))])
+    assert [each.name for each in found] == ["Roe Max_1_assignsubmission_file_/r.pdf"]
+    # a class has more
+    class_ = {f"N_{n}_assignsubmission_file_/r.pdf": PDF for n in range(80)}
+    assert len(collect([write(tmp_path / "class.zip", zipped(class_))])[0]) == 80
+
+
 def test_nothing_there(tmp_path):
     with pytest.raises(SettingsError, match="no regular file, and no folder"):
         collect([tmp_path / "absent"])
@@ -219,7 +244,29 @@ def test_links_do_not_lead_out_of_the_folder(tmp_path):
     os.mkfifo(tmp_path / "in" / "pipe.pdf")
     found, notes = collect([tmp_path / "in"])
     assert [each.name for each in found] == ["a.pdf"]
-    assert notes == ("in: 6 links out of the folder or special files were not followed.",)
+    assert notes == (
+        "in: 6 links out of the folder, special files or folders that cannot be read were not "
+        "followed.",
+    )
+
+
+def test_folders_in_each_other_without_end(tmp_path):
+    """More than functions may call themselves."""
+    folders = [tmp_path / "in" / ("d/" * depth) for depth in range(1_500)]
+    for folder in folders:
+        folder.mkdir()
+    paths = [write(tmp_path / "in" / "a.pdf", PDF), write(folders[-1] / "b.pdf", PDF)]
+    try:
+        found, notes = collect([tmp_path / "in"])
+        known = files_by_sha256([tmp_path / "in"])
+    finally:  # shutil.rmtree, which clears the tests' folders, calls itself
+        for path in paths:
+            path.unlink()
+        for folder in reversed(folders):
+            folder.rmdir()
+    assert [each.file for each in found] == paths
+    assert notes == ()
+    assert [*known.values()] == paths[:1]  # both have the same content
 
 
 # ------------------------------------------------------------------ names

@@ -45,7 +45,7 @@ class Sheet:
     path: Path
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
-    numbers: tuple[int, ...]
+    numbers: tuple[int, ...] = ()
     mark: bytes = b""
     encoding: str = "utf-8"
     separator: str = ","
@@ -62,8 +62,9 @@ class Sheet:
         place = self.column(titles)
         return "" if place is None else row[place].strip()
 
-    def content(self) -> bytes:
-        """The file again, in its own encoding, separator, quotes and line ends."""
+    @property
+    def text(self) -> str:
+        """The table with its own separator, quotes and line ends."""
         out = io.StringIO()
         writer = csv.writer(
             out,
@@ -72,11 +73,14 @@ class Sheet:
             quoting=csv.QUOTE_ALL if self.quoted else csv.QUOTE_MINIMAL,
         )
         writer.writerows((self.head, *self.rows))
-        text = out.getvalue()
+        return out.getvalue()
+
+    def content(self) -> bytes:
+        """The file again, in its own encoding."""
         try:
-            return self.mark + text.encode(self.encoding)
+            return self.mark + self.text.encode(self.encoding)
         except UnicodeEncodeError:  # feedback holds more signs than a Windows code page
-            return codecs.BOM_UTF8 + text.encode()
+            return codecs.BOM_UTF8 + self.text.encode()
 
 
 def bare(title: str) -> str:

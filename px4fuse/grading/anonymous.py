@@ -7,7 +7,7 @@ import unicodedata
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from px4fuse.grading.model import Entry, Graded
+from px4fuse.grading.model import INSTRUCTOR, Entry, Graded
 from px4fuse.webpage.frame import Part
 
 # Shorter words are in every text
@@ -39,7 +39,7 @@ class Veil:
         )
 
     def hide(self, text: str, *, own_words: bool = False) -> str:
-        """A text without names; ``own_words`` are a student's, in which short ids are numbers."""
+        """A text without names; ``own_words`` are a person's, in which short ids are numbers."""
         if not self._instead:
             return text
         composed = unicodedata.normalize("NFC", text)
@@ -58,7 +58,9 @@ class Veil:
 
     def _hidden(self, value: Any) -> Any:
         if isinstance(value, str):
-            return value if POINTS.fullmatch(value) else self.hide(value)
+            rules, mark, said = value.partition(INSTRUCTOR)
+            rules = rules if POINTS.fullmatch(rules) else self.hide(rules)
+            return f"{rules}{mark}{self.hide(said, own_words=True)}"
         return [*map(self._hidden, value)] if isinstance(value, list | tuple) else value
 
 

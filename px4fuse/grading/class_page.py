@@ -168,7 +168,7 @@ def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str], veil: Veil)
 
 
 def _comment(entry: Entry) -> Part:
-    return frame.listed("Your comment", [entry.comment] if entry.comment else [])
+    return frame.prose("Your comment", entry.comment)
 
 
 def _details(entry: Entry, one: Graded) -> Iterator[Part]:

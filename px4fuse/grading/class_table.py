@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
+from px4fuse.assignment.sheet import Sheet
 from px4fuse.grading.model import Entry, columns
 from px4fuse.spreadsheet import neutral, neutral_id
 
@@ -30,9 +30,8 @@ def csv_text(entries: Sequence[Entry]) -> str:
         without translating line ends.
     """
     items, numbers = columns(entries)
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\r\n")
-    writer.writerow(neutral(title) for title in (*FIRST, *items, *numbers, *LAST))
+    head = tuple(map(neutral, (*FIRST, *items, *numbers, *LAST)))
+    rows = []
     for entry in entries:
         one = entry.counting
         points = {item.title: item.points for item in one.items} if one else {}
@@ -49,8 +48,8 @@ def csv_text(entries: Sequence[Entry]) -> str:
         ]  # fmt: skip
         cells = [neutral(part) if isinstance(part, str) else number(part) for part in row]
         cells[FIRST.index("id")] = neutral_id(entry.student_id)
-        writer.writerow(cells)
-    return "\ufeff" + out.getvalue()
+        rows.append(tuple(cells))
+    return "\ufeff" + Sheet(Path(), head, tuple(rows)).text
 
 
 def number(value: float | None) -> str:

@@ -13,7 +13,7 @@ from px4fuse.assignment.sheet import Sheet
 from px4fuse.grading.class_table import number
 from px4fuse.grading.flags import class_flags
 from px4fuse.grading.lateness import LateRule, in_zone_of
-from px4fuse.grading.model import Entry, Graded, Item, Override, Submission
+from px4fuse.grading.model import INSTRUCTOR, Entry, Graded, Item, Override, Submission
 from px4fuse.grading.overrides import TOTAL, Overrides, matched
 from px4fuse.grading.roster import Register
 from px4fuse.results.reading import one_line
@@ -248,7 +248,7 @@ def _overruled(item: Item, said: Override | None) -> Item:
     """An item with the instructor's points and comment in place of, or behind, the rules'."""
     if said is None:
         return item
-    comment = f"{item.comment} Your instructor: {said.comment}" if said.comment else item.comment
+    comment = f"{item.comment} {INSTRUCTOR}{said.comment}" if said.comment else item.comment
     if said.points is None:
         return replace(item, comment=comment)
     if said.points != item.points:

@@ -10,10 +10,11 @@ import json
 import re
 import unicodedata
 from collections import Counter, defaultdict
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from decimal import Decimal
 from itertools import combinations
 from operator import attrgetter
+from typing import Any
 
 from px4fuse.assignment.key import folded
 from px4fuse.grading.model import Graded
@@ -22,17 +23,21 @@ from px4fuse.results.contract import LoopResults, Reported, to_plain
 from px4fuse.results.reading import one_line
 from px4fuse.simulation import flights
 
-# Numbers of a form that two students do not have in common by chance
-SAME_NUMBERS = 3
+# Numbers of a form that two students do not have in common by chance, also where one of them has
+# changed each a little
+SAME_NUMBERS, NEARLY = 3, 0.02
 # A hand-picked part of the flight below this share leaves most of it out
 HAND_PICKED = 0.5
 SHOWN = 4
 # Words in a row by which two texts are compared: of two written apart a few per cent are the same,
 # of a copy with an error in every fifth word two in five
-RUN = 3
+RUN, SMALL = 3, 4
 COPIED = 0.25
 # Shorter texts are the same by chance
-MIN_RUNS = 25
+MIN_RUNS = 36
+# Letters of other alphabets that look like Latin ones
+LOOK_ALIKE = str.maketrans("\u0430\u0435\u043e\u0440\u0441\u0443\u0445\u0456\u03bf\u03b1\u03bd",
+                           "aeopcyxioav")  # fmt: skip
 # Of longer texts only the beginning is compared
 MAX_CHARACTERS = 36_000
 # What more than half of the class has is the instructor's template, from a class of this size on
@@ -46,8 +51,8 @@ TO_A_GRADER = re.compile(
     re.IGNORECASE,
 )
 
-# By the name of a submission
-Flags = Iterator[tuple[str, str]]
+# Two reports that have something in common, and how much where that is not all of it
+Pairs = Iterator[tuple[Graded, Graded, str]]
 
 
 def own_flags(results: Reported, handed_out: bool = False) -> Iterator[str]:
@@ -75,13 +80,27 @@ def own_flags(results: Reported, handed_out: bool = False) -> Iterator[str]:
         yield "The log was made by px4fuse simulate: no vehicle flew."
 
 
-def _form_numbers(one: Graded) -> tuple[float, ...]:
-    """Sizes, values and quantities of a form with digits that nobody types by chance."""
-    form = one.form
-    given = [] if form is None else [n for each in form.mistakes for n in (each.size, each.value)]
-    given += [] if form is None else [n for n in form.quantities if isinstance(n, float)]
-    found = tuple(number for number in given if number is not None and _digits(number) > 1)
-    return found if len(found) >= SAME_NUMBERS else ()
+def _form_numbers(one: Graded) -> dict[tuple[str, str], float]:
+    """Sizes, values and quantities of a form by where they stand."""
+    if one.form is None:
+        return {}
+    given: dict[tuple[str, str], object] = {
+        (each.kind, name): getattr(each, name)
+        for each in one.form.mistakes
+        for name in ("size", "value")
+    }
+    given |= {("", f"q{at}"): number for at, number in enumerate(one.form.quantities)}
+    return {key: float(n) for key, n in given.items() if isinstance(n, float | int)}
+
+
+def _same_numbers(one: Mapping[Any, float], other: Mapping[Any, float]) -> int:
+    """How many numbers nearly agree that nobody types by chance; a value follows from its size."""
+    return sum(
+        _digits(number) > 1
+        and abs(number - other[key]) <= (key[1] != "value") * NEARLY * abs(number)
+        for key, number in one.items()
+        if key in other
+    )
 
 
 def _results_numbers(one: Graded) -> tuple[float, ...]:
@@ -95,11 +114,10 @@ def _who(one: Graded) -> str:
 
 # What no two reports should have in common: the sentence, what it is (empty for nothing to
 # compare), and whose it has to be to count: two reports of one student may be on one log
-COMMON: tuple[tuple[str, Callable[[Graded], Hashable], Callable[[Graded], str]], ...] = (
+COMMON: tuple[tuple[str, Callable[[Graded], object], Callable[[Graded], str]], ...] = (
     ("The same file as {}.", attrgetter("sha256"), attrgetter("submission")),
     ("The same student id as in {}.", lambda one: folded(one.student_id), attrgetter("submission")),
     ("The same log as {}.", attrgetter("log_sha256"), _who),
-    ("The form has the numbers of {}.", _form_numbers, _who),
     ("The same numbers to the last digit, from a log of another hash, as {}: a copy of the log.",
      _results_numbers, attrgetter("log_sha256")),
 )  # fmt: skip
@@ -108,45 +126,54 @@ COMMON: tuple[tuple[str, Callable[[Graded], Hashable], Callable[[Graded], str]],
 def class_flags(graded: Sequence[Graded]) -> Mapping[str, Sequence[str]]:
     """What stands out between the reports of a class: sentences, by names of submissions."""
     found: dict[str, list[str]] = defaultdict(list)
-    for name, flag in (*_common(graded), *_copied_notes(graded)):
-        found[name].append(flag)
+    for said, pairs in (
+        *((said, _same(graded, what, whose)) for said, what, whose in COMMON),
+        ("The form has the numbers of {}.", _copied_forms(graded)),
+        ("The text shares whole passages with those of {}.", _copied_notes(graded)),
+    ):
+        others: dict[str, list[str]] = defaultdict(list)
+        for pair in pairs:
+            for one, other in (pair[:2], pair[1::-1]):
+                how = pair[2] or _line(other.submission)
+                others[one.submission].append(f"{_name(other)} ({how})")
+        for name, named in others.items():
+            found[name].append(said.format(few_words(named, SHOWN, "; ")))
     return found
 
 
-def _common(graded: Sequence[Graded]) -> Flags:
-    for said, what, whose in COMMON:
-        where: dict[Hashable, list[Graded]] = defaultdict(list)
-        for one in graded:
-            where[what(one)].append(one)
-        for value, members in where.items():
-            if value and len(set(map(whose, members))) > 1:
-                for one in members:
-                    others = [
-                        f"{_name(other)} ({_line(other.submission)})"
-                        for other in members
-                        if other is not one
-                    ]
-                    yield one.submission, said.format(few_words(others, SHOWN, "; "))
+def _same(
+    graded: Sequence[Graded], what: Callable[[Graded], object], whose: Callable[[Graded], str]
+) -> Pairs:
+    known = [(one, what(one), whose(one)) for one in graded]
+    for (one, mine, me), (other, theirs, they) in combinations(known, 2):
+        if mine and mine == theirs and me != they:
+            yield one, other, ""
 
 
-def _copied_notes(graded: Sequence[Graded]) -> Flags:
+def _copied_forms(graded: Sequence[Graded]) -> Pairs:
+    """Whose forms have the same numbers, though the flights are others."""
+    numbers = [(one, _form_numbers(one)) for one in graded]
+    for (one, own), (other, theirs) in combinations(numbers, 2):
+        if _same_numbers(own, theirs) >= SAME_NUMBERS and _who(one) != _who(other):
+            yield one, other, ""
+
+
+def _copied_notes(graded: Sequence[Graded]) -> Pairs:
     """Whose texts share passages: with the share of the shorter one, the most alike first."""
     each = [runs(words_of(one.notes[:MAX_CHARACTERS])) for one in graded]
     if len(each) >= TEMPLATE_CLASS:
         counted = Counter(part for parts in each for part in parts)
         common = {part for part, count in counted.items() if count > TEMPLATE_SHARE * len(each)}
         each = [parts - common for parts in each]
-    found: dict[str, list[tuple[float, Graded]]] = defaultdict(list)
     long = [(one, own) for one, own in zip(graded, each, strict=True) if len(own) >= MIN_RUNS]
-    for (first, own), (second, other) in combinations(long, 2):
-        share = len(own & other) / min(len(own), len(other))
-        if share >= COPIED and _who(first) != _who(second):
-            found[first.submission].append((share, second))
-            found[second.submission].append((share, first))
-    for name, others in found.items():
-        others.sort(key=lambda pair: -pair[0])
-        named = [f"{_name(other)} ({share:.0%} of the shorter)" for share, other in others]
-        yield name, f"The text shares whole passages with those of {few_words(named, SHOWN)}."
+    shares = [
+        (len(own & other) / min(len(own), len(other)), first, second)
+        for (first, own), (second, other) in combinations(long, 2)
+        if _who(first) != _who(second)
+    ]
+    for share, first, second in sorted(shares, key=lambda one: -one[0]):
+        if share >= COPIED:
+            yield first, second, f"{share:.0%} of the shorter"
 
 
 def _name(one: Graded) -> str:
@@ -173,14 +200,17 @@ def words_of(text: str) -> list[str]:
     >>> words_of("Naïve, ｎaïve: SIGMA_Z")
     ['naive', 'naive', 'sigma', 'z']
     """
-    plain = unicodedata.normalize("NFKD", text).casefold()
+    plain = unicodedata.normalize("NFKD", text).casefold().translate(LOOK_ALIKE)
     seen = "".join(part for part in plain if unicodedata.category(part) not in ("Mn", "Cf"))
     return re.findall(r"[^\W_]+", seen)
 
 
 def runs(words: Sequence[str]) -> frozenset[tuple[str, ...]]:
-    """Every few words in a row."""
-    return frozenset(tuple(words[at : at + RUN]) for at in range(len(words) - RUN + 1))
+    """Every few words in a row, of all words and of the longer ones: "the" is quickly a "this"."""
+    long = [word for word in words if len(word) > SMALL]
+    return frozenset(
+        tuple(each[at : at + RUN]) for each in (words, long) for at in range(len(each) - RUN + 1)
+    )
 
 
 def text_flags(results: Reported, min_words: int, common_words: Sequence[str]) -> Iterator[str]:

@@ -52,7 +52,8 @@ SHOWS: Mapping[str, tuple[str, ...]] = {
                        "accel-bias", "ekf2-delay"),
     "loop": ("jump", "open-end"),
 }  # fmt: skip
-# What needs no measurement, so that it counts only as far as the size is right
+# What needs no measurement: it counts only where the size is right, and close is not enough, since
+# the sizes that are drawn lie close to each other
 GUESSABLE = frozenset(("open-end",))
 ANY = (-math.inf, math.inf)
 CLOSE_S, CLOSE_SHARE = 2.0, 0.05
@@ -182,7 +183,7 @@ def size_share(wrong: Wrong, claim: Claim) -> float:
     if claim.kind != wrong.kind:
         same_unit = [*MISTAKES[claim.kind][1]][:1] == [*MISTAKES[wrong.kind][1]][:1]
         return 1.0 / 3.0 if wrong.low <= size <= wrong.high and same_unit else 0.0
-    close = abs(size - wrong.size) <= HALF_SIZE * abs(wrong.size)
+    close = wrong.kind not in GUESSABLE and abs(size - wrong.size) <= HALF_SIZE * abs(wrong.size)
     return _value_share(size, wrong.low, wrong.high, 0.5 if close else 0.0)
 
 

@@ -27,6 +27,9 @@ from px4fuse.reading import files_by_sha256, max_log_bytes
 from px4fuse.verification.model import Refused, Verdict
 from px4fuse.verification.workers import Failed, run_bounded
 
+UNSEEN = (
+    "The pages that were handed in could not be drawn: do not open them, read the redrawn report."
+)
 FAILED = "Do not open it: ask for the report as px4fuse wrote it."
 
 
@@ -201,7 +204,8 @@ def grade_one(
 
 def _page_flags(verdict: Verdict) -> tuple[str, ...]:
     if not verdict.pages:
-        return ()
+        unseen = verdict.with_log and verdict.page_status == "not compared"
+        return (UNSEEN,) if unseen else ()
     first, *others = verdict.pages
     more = f" Also: page {', '.join(str(one.page) for one in others)}." if others else ""
     return (

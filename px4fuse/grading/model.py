@@ -11,6 +11,9 @@ from px4fuse.answers import Answers
 from px4fuse.grading.platforms import NOBODY, ExportOrigin
 from px4fuse.verification.model import Verdict
 
+# Before the instructor's own words behind a comment of the rules
+INSTRUCTOR = "Your instructor: "
+
 
 @dataclass(frozen=True)
 class Submission:

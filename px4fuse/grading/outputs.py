@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 import random
 from collections.abc import Sequence
@@ -11,7 +9,7 @@ from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 
-from px4fuse.assignment.sheet import read_sheet
+from px4fuse.assignment.sheet import Sheet, read_sheet
 from px4fuse.grading import exports
 from px4fuse.grading.anonymous import hidden_words
 from px4fuse.grading.class_page import html_text
@@ -146,10 +144,7 @@ def _pseudonyms(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]
     new = {who: entry.student for entry in entries if (who := _identity(entry)) not in kept}
     for who in random.SystemRandom().sample(list(new), len(new)):
         kept[who] = next(free), new[who]
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\r\n")
-    writer.writerow(NAMES_HEAD)
-    for who, (name, student) in sorted(kept.items(), key=lambda pair: pair[1]):
-        writer.writerow((name, neutral_id(who), neutral(student)))
+    ordered = sorted(kept.items(), key=lambda pair: pair[1])
+    rows = ((name, neutral_id(who), neutral(student)) for who, (name, student) in ordered)
     made = [replace(entry, pseudonym=kept[_identity(entry)][0]) for entry in entries]
-    return made, "\ufeff" + out.getvalue()
+    return made, "\ufeff" + Sheet(path, NAMES_HEAD, tuple(rows)).text

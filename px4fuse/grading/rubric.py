@@ -6,6 +6,7 @@ A TOML file of items, each with a title, points, the name of a check and its par
 
 from __future__ import annotations
 
+import re
 import tomllib
 from importlib.resources import files
 from pathlib import Path
@@ -23,6 +24,13 @@ from px4fuse.results.reading import one_line
 DEFAULT = "rubric.toml"
 MAX_RUBRIC_BYTES = 1_000_000
 HELP = "px4fuse grade --write-rubric FILE.toml writes one that explains itself."
+# Checks of earlier rubrics, and what to write instead
+GONE = {
+    "sections": "it is gone; delete the item (a verified report has its pages), or write check = "
+    '"number" with the path of what must be there',
+    "flight": 'it is gone; write check = "number" with the path "axes.*.updates.count" or '
+    '"loop.path_length_m"',
+}
 
 if TYPE_CHECKING:
     AnyItem = RubricItem
@@ -96,4 +104,11 @@ def parse_rubric(text: str, where: str) -> Rubric:
         return msgspec.convert(tomllib.loads(text.replace("\r\n", "\n")), Rubric)
     # ValueError: not TOML, or an integer of a million digits
     except (msgspec.ValidationError, ValueError, RecursionError) as error:
-        raise SettingsError(f"{where}: {one_line(str(error), 300)}", HELP) from error
+        said = re.sub(r"`\$\.item\[(\d+)\]\.?([^`]*)`", _place, str(error))
+        gone = next((f": {new}" for old, new in GONE.items() if f"value {old!r}" in said), "")
+        raise SettingsError(f"{where}: {one_line(said, 300)}{gone}", HELP) from error
+
+
+def _place(path: re.Match[str]) -> str:
+    """Which item and what of it, as a person counts."""
+    return f"item {int(path[1]) + 1}{f', {path[2]}' * bool(path[2])}"

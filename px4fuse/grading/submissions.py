@@ -22,7 +22,14 @@ from typing import IO
 from px4fuse.errors import SettingsError
 from px4fuse.grading.model import Submission
 from px4fuse.grading.names import distinct
-from px4fuse.grading.platforms import METADATA, ExportOrigin, gradescope_metadata, origins_of
+from px4fuse.grading.platforms import (
+    METADATA,
+    ExportOrigin,
+    gradescope_metadata,
+    origin_of,
+    origins_of,
+)
+from px4fuse.reading import files_below
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification.intake import MAX_BYTES
 from px4fuse.verification.model import Refused
@@ -33,6 +40,8 @@ MAX_DIRECTORY_BYTES = 4_000_000
 # Of all that is in one zip file, whose entries may share their bytes; and of the zip files in it
 MAX_TOTAL_BYTES = 4_000_000_000
 MAX_INNER_BYTES = 500_000_000
+# Of a zip file that a student handed in
+MAX_PDFS = 50
 # PDFs are compressed inside; what still shrinks a hundred times is empty
 MAX_RATIO = 100
 MAX_NAME = 200
@@ -124,7 +133,7 @@ class _Search:
                     f"{_shown(place.name)}: {len(entries) - len(last)} entries have the name of "
                     "another one; only the last of each name was read."
                 )
-            left = MAX_INNER_BYTES
+            left, before = MAX_INNER_BYTES, len(self.found)
             for name, one in last.items():
                 label = _label(one)
                 if any(map(_hidden, label.split("/"))):
@@ -136,6 +145,10 @@ class _Search:
                 if place.depth:  # a student set the clock of what is in a zip file in another one
                     inner = replace(inner, entry=f"{place.entry}{_INSIDE}{name}", time=place.time)
                 self.take(inner, partial(_unpacked, archive, name))
+        students = place.depth or origin_of(place.name).platform
+        if students and len(self.found) - before > MAX_PDFS:  # the class would wait for them
+            self.found = dict([*self.found.items()][:before])
+            raise _EntryError(f"it holds more than {MAX_PDFS} PDFs, and is of one student.")
 
 
 def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, ...]]:
@@ -243,9 +256,9 @@ def _files(path: Path, notes: list[str]) -> Iterator[tuple[Path, str]]:
         raise SettingsError(f"{one_line(str(path), MAX_NAME)}: no regular file, and no folder.")
     root = path.resolve()
     outside = 0
-    for whole in sorted(root.rglob("*")):  # symbolic links to folders are not entered
+    for whole in files_below(root):  # symbolic links to folders are not entered
         name = whole.relative_to(root)
-        if any(map(_hidden, name.parts)) or (whole.is_dir() and not whole.is_symlink()):
+        if any(map(_hidden, name.parts)):
             continue
         try:
             resolved = whole.resolve(strict=True)
@@ -258,8 +271,8 @@ def _files(path: Path, notes: list[str]) -> Iterator[tuple[Path, str]]:
         outside += not inside
     if outside:
         notes.append(
-            f"{one_line(path.name, MAX_NAME)}: {outside} links out of the folder or special files "
-            "were not followed."
+            f"{one_line(path.name, MAX_NAME)}: {outside} links out of the folder, special files or "
+            "folders that cannot be read were not followed."
         )
 
 

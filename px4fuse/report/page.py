@@ -7,6 +7,7 @@ terminal. Text from outside (names, notes) is data too, and is never read as mar
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,8 @@ WIDTH, AXIS_LEFT, LABEL = 512.0, 26.0, 52.0
 # Points below an axes for its numbers, and for its label
 TICKS, AXIS_LABEL, BARE = 12.0, 11.0, 3.0
 KEPT = "\n\N{NO-BREAK SPACE}"  # though not printable by themselves
+# What has no place to break a line: PDF/A takes no string of 32,768 characters, and no page a line
+ENDLESS = re.compile(r"[^ \n]{100}(?=[^ \n]{400})")
 Block = dict[str, Any]
 Cell = str | tuple[str, str]
 
@@ -169,12 +172,12 @@ def legend_above(axes: Axes, columns: int = 9, **options: Any) -> None:
 
 
 def printable(text: str) -> str:
-    """Text without control characters, and a white square for what no font here can draw."""
+    """Text without control characters or endless words, a white square for what no font draws."""
     from px4fuse.report import fonts  # noqa: PLC0415 - as in :meth:`Page.panel`
 
     return "".join(
         character if character in KEPT or fonts.font_of(character) else fonts.NO_GLYPH
-        for character in text.expandtabs(4)
+        for character in ENDLESS.sub(r"\g<0>\n", text.expandtabs(4))
         if character in KEPT or character.isprintable()
     )
 

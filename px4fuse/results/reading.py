@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import unicodedata
 from functools import cache
 from typing import Any
@@ -41,6 +42,7 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
         raise ResultsError(f"{name} is larger than {MAX_BYTES // 1_000_000} MB.")
     try:
         value = _all_cleaned(msgspec.json.decode(data))
+        json.loads(data, object_pairs_hook=_each_once)
     except RecursionError as error:
         raise ResultsError(f"{name} is nested too deeply.") from error
     except (msgspec.DecodeError, ValueError) as error:
@@ -62,6 +64,12 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
             f"{name} does not follow the schema: {one_line(str(error), 300)}."
         ) from error
     return found
+
+
+def _each_once(pairs: list[tuple[str, Any]]) -> None:
+    """Refuse what one program reads from its first place and another one from its last."""
+    if len(dict(pairs)) < len(pairs):
+        raise ValueError("a key stands there twice")
 
 
 def _all_cleaned(value: Any) -> Any:

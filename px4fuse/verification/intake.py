@@ -202,18 +202,18 @@ def _inflated_bytes(pdf: bytes, start: int, limit: int) -> int:
 def _walk(reader: pypdf.PdfReader) -> _Contents:
     """Look at everything that a viewer can reach, each object once, without decoding it."""
     contents = _Contents()
-    seen: set[tuple[int, int]] = set()
+    seen: set[tuple[IndirectObject, bool]] = set()
     missing = values = 0
-    left: list[Any] = [reader.trailer]
+    # with whether a viewer comes there by a click alone: the action of a link or of an outline
+    left: list[tuple[Any, bool]] = [(reader.trailer, False)]
     while left:
-        value = left.pop()
+        value, clicked = left.pop()
         values += 1
         if isinstance(value, IndirectObject):
-            key = (value.idnum, value.generation)
-            if key in seen:
+            if (value, clicked) in seen:
                 continue
-            seen.add(key)
-            listed = _is_listed(reader, *key)
+            seen.add((value, clicked))
+            listed = _is_listed(reader, value.idnum, value.generation)
             missing += not listed
             if len(seen) > MAX_OBJECTS or missing > MAX_MISSING:
                 raise ResultsError(_COSTLY)
@@ -223,9 +223,11 @@ def _walk(reader: pypdf.PdfReader) -> _Contents:
             raise ResultsError(_COSTLY)
         if isinstance(value, DictionaryObject):
             _look_at(value, contents)
-            left.extend(value.raw_get(key) for key in value)
+            if not clicked and _name(value.get("/S")) == "/URI":
+                contents.found.add("an action that opens an address")
+            left.extend((value.raw_get(key), key == "/A") for key in value)
         elif isinstance(value, ArrayObject):
-            left.extend(list.__iter__(value))
+            left.extend((each, False) for each in list.__iter__(value))
     return contents
 
 
@@ -242,10 +244,6 @@ def _look_at(value: DictionaryObject, contents: _Contents) -> None:
     action = _name(value.get("/S")) or ""
     if _ACTIONS.fullmatch(action):
         contents.found.add(action[1:])
-    for key in ("/OpenAction", "/AA"):
-        opened = _resolved(value.get(key))
-        if isinstance(opened, DictionaryObject) and "/URI" in str(opened):
-            contents.found.add("an action that opens an address")
     if "/EF" in value:
         contents.files.append(value)
         versions = _resolved(value.get("/EF"))

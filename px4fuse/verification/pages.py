@@ -56,7 +56,7 @@ DISTANCE = 0.07
 SIZE_PX = 2
 MAX_PAGE_TEXT = 1_000_000
 # For the pages of a PDF that was handed in; libraries take 0.6 GB of the address space
-TIMEOUT_S, MEMORY_BYTES = 10.0, 1_100_000_000
+TIMEOUT_S, MEMORY_BYTES = 10.0, 1_000_000_000
 # Less where a page is very long, or its picture does not fit into MAX_PICTURE_BYTES
 WIDTH_PX = 700
 # Enough to keep our blue, EKF2's orange and the severities apart, with smooth letters

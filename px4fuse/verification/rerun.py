@@ -111,7 +111,7 @@ def _place(
         asked = f"none of the files given has the SHA-256 of {what}"
         raise FileMissingError(asked, one_line(recorded, 80) or "its file")
     name = recorded
-    plain = name == Path(name).name and "\\" not in name and name.isprintable()
+    plain = name == Path(name).name != ".." and "\\" not in name and name.isprintable()
     if not plain:
         raise ResultsError(f"{NOT_OURS}: a file name in it is not a plain name", ASK)
     # each in a folder of its own: two may have one name

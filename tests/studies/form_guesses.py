@@ -11,11 +11,12 @@ from __future__ import annotations
 import argparse
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from statistics import fmean
 
 import numpy as np
+from msgspec.structs import replace
 
 from px4fuse.answers import CURES, EKF2_DID, MISTAKES, PANELS, VERDICTS, Answers, Claim
 from px4fuse.assignment.assignment import fly
@@ -58,28 +59,33 @@ def at_random(rng: np.random.Generator) -> Answers:
     )
 
 
-def constant(truths: Sequence[FormTruth], kind: str) -> Answers:
-    """The same for everybody: a mistake, and the commonest of everything else."""
+def constants(truths: Sequence[FormTruth], kind: str) -> Iterator[Answers]:
+    """The same for everybody: a mistake of the likeliest sizes, and the commonest of all else."""
 
     def common(values: list[str]) -> str:
         return Counter(values).most_common(1)[0][0]
 
-    of_kind = [wrong for one in truths for wrong in one.mistakes if wrong.kind == kind]
-    size = float(np.median([wrong.size for wrong in of_kind if wrong.size is not None] or [0.0]))
-    cure = ""
-    if kind != "none":
-        cure = cures(Wrong(kind, size, size, size), truths[0])[0][0]
-    claim = Claim(
-        kind, size if kind != "none" else None, when="whole flight" if kind != "none" else "",
-        parameter=cure, panel=panels(kind)[0] if kind != "none" else "",
-    )  # fmt: skip
-    return Answers(
+    blank = Answers(
         log_sha256=SHA256,
-        mistakes=(claim,),
+        mistakes=(Claim("none"),),
         verdict_ours=common([one.ours.verdict for one in truths]),  # type: ignore[arg-type]
         verdict_ekf2=common([one.ekf2.verdict for one in truths]),  # type: ignore[arg-type]
         ekf2_did=(common([said for one in truths for said in one.ekf2_did]),),
     )
+    if kind == "none":
+        yield blank
+        return
+    of_kind = [wrong for one in truths for wrong in one.mistakes if wrong.kind == kind]
+    sizes = [wrong.size for wrong in of_kind if wrong.size is not None] or [0.0]
+    begins = [wrong.from_s for wrong in of_kind if wrong.from_s is not None] or [0.0]
+    for size in np.quantile(sizes, np.arange(0.05, 1.0, 0.1)):
+        cure = cures(Wrong(kind, size, size, size), truths[0])[0][0]
+        for from_s in (None, float(np.median(begins))):
+            claim = Claim(
+                kind, float(size), when="whole flight" if from_s is None else "", from_s=from_s,
+                parameter=cure, panel=panels(kind)[0],
+            )  # fmt: skip
+            yield replace(blank, mistakes=(claim,))
 
 
 def right(one: FormTruth) -> Answers:
@@ -125,7 +131,8 @@ def main() -> None:
     print(f"{len(aisles)} aisles, {len(loops)} loops")
     for name, group in (("all", truths), ("aisles", aisles), ("loops", loops)):
         kinds = {wrong.kind for one in group for wrong in one.mistakes} | {"none"}
-        best = {kind: fmean(form_points(constant(group, kind), one).share for one in group)
+        best = {kind: max(fmean(form_points(form, one).share for one in group)
+                          for form in constants(group, kind))
                 for kind in kinds}  # fmt: skip
         kind = max(best, key=lambda each: best[each])
         random = fmean(
