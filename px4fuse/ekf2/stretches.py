@@ -27,7 +27,7 @@ from px4fuse.flight import (
     FusionRecord,
     Unavailable,
 )
-from px4fuse.readers.px4_ekf2 import samples_per_step
+from px4fuse.readers.px4_ekf2 import same_stamps, samples_per_step
 from px4fuse.trajectory.rotation import (
     conjugate,
     from_vector,
@@ -199,7 +199,7 @@ def _stretch(
     rows = slice(first_row, int(np.searchsorted(time, end_s, side="right")))
     time, imu = time[rows], imu.iloc[rows]
     interval = np.diff(time)
-    known = np.flatnonzero(np.isin(np.rint(time * 1e6), np.rint(record.delayed.index * 1e6)))
+    known = same_stamps(time, record.delayed.index)
     ends = step_ends(interval, known, predict_s(record))
     bias = np.asarray(start[ACCELEROMETER_BIAS_COLUMNS])
     rate = imu[ANGULAR_RATE_COLUMNS].to_numpy()[1:] - np.asarray(start[GYRO_BIAS_COLUMNS])
@@ -272,7 +272,7 @@ def step_ends(interval_s: Array, known: IntArray, target_s: float) -> IntArray:
     ndarray of int
         The last is at most n.
     """
-    needed = samples_per_step(target_s, float(np.median(interval_s)))
+    needed = samples_per_step(target_s, float(np.median(interval_s)), known)
     shown = set(known.tolist())
     ends, count, total = [], 0, 0.0
     for at, interval in enumerate(interval_s.tolist(), start=1):
