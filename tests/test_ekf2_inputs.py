@@ -105,7 +105,9 @@ def test_a_sweep_has_2_to_200_values() -> None:
 def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     """What is prepared of a flight of which only the parameters matter."""
     monkeypatch.setattr(inputs_module, "read_vision", lambda *_: made(Received, stamp_s=None))
-    monkeypatch.setattr(inputs_module, "find_stretches", lambda *_: (made(Stretch),))
+    monkeypatch.setattr(
+        inputs_module, "find_stretches", lambda *_, **_more: (made(Stretch, field=None),)
+    )
 
     def prepared(
         interval_s: float = 0.008, horizon_s: Any = 0.1, firmware: str = "PX4 v1.16.1",

@@ -15,8 +15,6 @@ import pytest
 from exchange import replace
 from findings_tools import analysis as stand_in
 from findings_tools import late, made
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 from ulog_tools import Log, gnss_log, position, seconds_of, stamps, topic
 
@@ -26,7 +24,6 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.preparation import choose_source, prepare
 from px4fuse.ekf2.inputs import Received, _rules, read_gnss
 from px4fuse.ekf2.model import Model
-from px4fuse.ekf2.stretches import Compass
 from px4fuse.ekf2.walk import ATTITUDE, GATE, NOISE, SPEED, STAMPS, Why
 from px4fuse.ekf2.whatif import WhatIf, what_if
 from px4fuse.errors import SettingsError
@@ -390,8 +387,8 @@ def test_what_other_settings_of_gnss_would_have_done(models: dict[str, Model]) -
 
 
 @pytest.mark.reallogs
-def test_another_delay_turns_the_heading_back(models: dict[str, Model]) -> None:
-    """As a replay with the magnetometer itself has it, 4.7° to 1.5°; other settings leave it."""
+def test_the_magnetometer_is_replayed_so_that_the_heading_follows(models: dict[str, Model]) -> None:
+    """As an independent replay with a magnetometer has it, 4.7° to 1.5°."""
 
     def turned_deg(name: str, **settings: float) -> tuple[float, float]:
         found = what_if(models[name], [settings])
@@ -399,30 +396,20 @@ def test_another_delay_turns_the_heading_back(models: dict[str, Model]) -> None:
         after, logged = found.whatif[0].heading_error_mean_deg, found.logged.heading_error_mean_deg
         assert isinstance(after, float)
         assert isinstance(logged, float)
-        assert found.replayed.heading_error_mean_deg == pytest.approx(logged, abs=0.15)
+        assert found.replayed.heading_error_mean_deg == pytest.approx(logged, abs=0.4)
         return logged, after
 
+    for model in models.values():
+        assert {stretch.field is None for stretch in model.inputs.stretches} == {False}
+        assert model.agreement.heading_rms_difference_deg is not None
+        assert model.agreement.heading_rms_difference_deg < 0.55
     assert turned_deg("delay0", EKF2_GPS_DELAY=200.0) == pytest.approx((4.7, 1.5), abs=0.3)
     # 110 ms of error turn it in proportion, 200 ms were 4.7°
     logged, after = turned_deg("nominal", EKF2_GPS_DELAY=0.0)
-    assert after - logged == pytest.approx(4.7 * 110.0 / 200.0, abs=0.5)
-
-
-@given(
-    st.lists(st.floats(-0.01, 0.01), min_size=3, max_size=30),
-    st.lists(st.floats(0.0, 2.0), min_size=30, max_size=30),
-)
-def test_what_a_compass_tells_adds_up_whatever_the_steps(
-    told: list[float], pull: list[float]
-) -> None:
-    times = np.arange(len(told) + 1, dtype=float)
-    sums = [np.concatenate([[0.0], np.cumsum(each[: len(told)])]) for each in (told, pull)]
-    compass = Compass(times, *sums)
-    fine, coarse = np.linspace(0.0, times[-1], 50)[1:, None], times[-1:, None]
-    steps, gains = compass.between(fine)
-    whole, gain = compass.between(coarse)
-    assert steps.sum() == pytest.approx(whole[0, 0], abs=1e-9)
-    assert np.prod(1.0 - gains) == pytest.approx(1.0 - gain[0, 0], abs=1e-9)
+    assert after - logged == pytest.approx(4.7 * 110.0 / 200.0, abs=0.6)
+    # against a magnetometer that counts for little, the wrong delay turns it further
+    logged, after = turned_deg("delay0", EKF2_MAG_NOISE=0.5)
+    assert after > logged + 0.2
 
 
 @pytest.mark.reallogs

@@ -2,9 +2,9 @@
 
 The model is the part of EKF2 that horizontal positions move: 15 error states about the published
 attitude, started from the log's own ``estimator_states`` and fed with IMU and positions as logged,
-of GNSS with their velocities.
-It is not EKF2: what else EKF2 fuses (height, heading) is taken from its own output. How far it can
-be believed is measured on each log, see :mod:`px4fuse.ekf2.replay`.
+of GNSS with their velocities, and with the magnetometer (21 states) where the log holds it.
+It is not EKF2: what else EKF2 fuses (height, else the heading) is taken from its own output. How
+far it can be believed is measured on each log, see :mod:`px4fuse.ekf2.replay`.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from px4fuse.ekf2.intervals import (
     make_intervals,
 )
 from px4fuse.ekf2.output_predictor import follow_attitude, later, publish
-from px4fuse.ekf2.recursion import HEADING, LEVEL, Run, Variant, run, with_compass, with_correlation
+from px4fuse.ekf2.recursion import HEADING, LEVEL, Run, Variant, run, with_correlation
 from px4fuse.ekf2.replay import (
     REJECTING_SHARE,
     UPDATE_COLUMNS,
@@ -42,7 +42,7 @@ from px4fuse.ekf2.replay import (
     agreement_with_log,
     with_obedient,
 )
-from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS, check
+from px4fuse.ekf2_parameters import FIELD_NOISES, GNSS_POS, MAG, PARAMETERS, check
 from px4fuse.errors import SettingsError
 from px4fuse.flight import STATE_COLUMNS, Ekf2, Flight, Unavailable
 from px4fuse.readers.px4_innovations import with_gnss
@@ -110,8 +110,6 @@ def open_model(flight: Flight) -> Model | Unavailable:
         obeyed = agreement_with_log(flight, _assemble(inputs, again, 0, {}))
         if isinstance(obeyed, Agreement):
             agreement = with_obedient(agreement, obeyed)
-    if inputs.aid == GNSS_POS:
-        inputs = replace(inputs, stretches=tuple(map(with_compass, runs)))
     replay = structs.replace(replay, agreement=agreement)
     return Model(flight, inputs, intervals, replay, agreement)
 
@@ -137,6 +135,9 @@ def replay_settings(
     changes, inputs = [check(change) for change in settings], model.inputs
     of_others = PARAMETERS.keys() - inputs.settings.keys()
     idle = dict.fromkeys(of_others, f"EKF2 fused {inputs.aid.label} in this log")
+    if inputs.aid == GNSS_POS:
+        no_field = "the log does not hold what EKF2 fused of a magnetometer"
+        idle |= dict.fromkeys(of_others & {*MAG.own, *FIELD_NOISES}, no_field)
     if inputs.rules.horizon_by_delay:
         firmware = model.flight.log.firmware
         idle["EKF2_DELAY_MAX"] = f"in {firmware} the longest delay makes the horizon"

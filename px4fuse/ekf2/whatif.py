@@ -44,8 +44,12 @@ NO_TRUTH = Unavailable(
 )
 # Of a flight on GNSS
 HEADING_FOLLOWS = (
-    "with another delay of GNSS the heading follows, against a magnetometer whose pull is known "
-    "roughly (to about half a degree); else heading and height are EKF2's own as flown"
+    "the heading follows, with the magnetometer as EKF2 fused it (as flown it is {:.1f}° off the "
+    "log, RMS); the height is EKF2's own as flown"
+)
+HEADING_STAYS = (
+    "heading and height are EKF2's own as flown, whatever is changed: the log does not hold what "
+    "EKF2 fused of a magnetometer, all axes throughout"
 )
 OWN_HEADING = Unavailable(
     "heading error", "on external vision the heading is EKF2's own as flown", "Read it in the log."
@@ -185,6 +189,7 @@ def what_if(model: Model, settings: Sequence[Mapping[str, float]]) -> WhatIf | U
         return model.agreement.doubted(WHAT)
     replays = replay_settings(model, settings)
     flight, judged = model.flight, model.flown.judged_s
+    gnss = model.inputs.aid == GNSS_POS
     return WhatIf(
         agreement=model.agreement,
         logged=_of_log(flight, model.flown, judged),
@@ -192,10 +197,15 @@ def what_if(model: Model, settings: Sequence[Mapping[str, float]]) -> WhatIf | U
         whatif=_steadied(model, [_of_replay(flight, r, judged) for r in replays], judged),
         judged=judged,
         notes=(
-            *((HEADING_FOLLOWS,) if replays and model.inputs.aid == GNSS_POS else ()),
+            *((_of_heading(model.agreement),) if replays and gnss else ()),
             *(note for replay in replays for note in _notes(model, replay)),
         ),
     )
+
+
+def _of_heading(agreement: Agreement) -> str:
+    off_deg = agreement.heading_rms_difference_deg
+    return HEADING_STAYS if off_deg is None else HEADING_FOLLOWS.format(off_deg)
 
 
 def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) -> list[float]:

@@ -33,16 +33,19 @@ from px4fuse.flight import (
     FusionRecord,
     Reset,
     Unavailable,
+    at_times,
 )
 from px4fuse.readers import px4_topics as px4
-from px4fuse.readers.layouts import Layout
+from px4fuse.readers.layouts import Layout, elements
 from px4fuse.readers.px4_aid_sources import STATUS, STATUS_FLAGS
 from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S, intentions, read_aids
 from px4fuse.readers.px4_innovations import innovations_of
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 
 VISION = "vehicle_visual_odometry"
-STATES = 16  # attitude, velocity, position and both biases; the rest does not concern position
+STATES = 22  # attitude, velocity, position, biases, magnetic fields; the rest is wind and terrain
+MAG_3D_BIT = 5  # filter_control_status_u, common.h
+FIELD_COLUMNS = ("forward_gauss", "right_gauss", "down_gauss")
 # So near to a half, IMU samples per step may be rounded either way
 HALF = 0.05
 # Horizontal aiding besides vision position
@@ -332,7 +335,28 @@ def _read_record(
             if name in meant and meant[name].any()
         ),
         vision_age_s=age[~age.index.duplicated()],
+        field_gauss=_read_field(topics),
     )
+
+
+def _read_field(topics: Topics) -> pd.DataFrame:
+    """What the magnetometer measured, of the two topics that have it the one with more rows."""
+    found = []
+    step_s = _step_s(topics)
+    for topic, name in px4.MAGNETOMETER:
+        layout = Layout(topic, elements(list(FIELD_COLUMNS), name))
+        if topics.find((layout,)) is not None:
+            frame = topics.of_primary(layout).dropna()
+            if name == "observation":  # by the time that EKF2 takes it to be of
+                delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3
+                frame = frame.set_axis(frame.index + delay_s + 0.5 * step_s)
+            found.append(frame)
+    bits = topics.read((Layout(STATUS, {"bits": "control_mode_flags"}),), step=True)
+    if not found or bits is None:
+        return pd.DataFrame()
+    used = max(found, key=len)
+    flags = at_times(bits["bits"].dropna(), used.index).astype(np.int64)
+    return used.assign(fused_3d=(flags >> MAG_3D_BIT & 1).astype(float))
 
 
 def _attitude_variance(quaternion: Array, variance: Array) -> Array:
