@@ -25,7 +25,7 @@ from px4fuse.comparison.preparation import choose_source, prepare
 from px4fuse.ekf2.inputs import Received, _rules, read_gnss
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.walk import ATTITUDE, GATE, NOISE, SPEED, STAMPS, Why
-from px4fuse.ekf2.whatif import WhatIf, what_if
+from px4fuse.ekf2.whatif import Summary, WhatIf, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.findings import find, noises
 from px4fuse.flight import (
@@ -410,6 +410,32 @@ def test_the_magnetometer_is_replayed_so_that_the_heading_follows(models: dict[s
     # against a magnetometer that counts for little, the wrong delay turns it further
     logged, after = turned_deg("delay0", EKF2_MAG_NOISE=0.5)
     assert after > logged + 0.2
+
+
+@pytest.mark.reallogs
+def test_how_a_flight_would_have_gone_without_an_aid(models: dict[str, Model]) -> None:
+    """93 s of it: what the error becomes is what the filter says of it, and no more."""
+
+    def without(*names: str) -> tuple[Summary, float]:
+        found = what_if(models["nominal"], [{}], dict.fromkeys(names, 60.0))
+        assert isinstance(found, WhatIf)
+        assert found.judged[0][0] == 60.0
+        (after,) = found.whatif
+        error = after.position_rmse_to_truth_m
+        assert isinstance(error, float)
+        return after, error
+
+    # 0.3 m/s of noise ten times a second add up to 0.9 m
+    velocity_alone, error = without("gnss_pos")
+    assert 0.4 < error < 1.5
+    assert 0.2 < velocity_alone.nis_mean < 2.0
+    assert without("gnss_vel")[1] == pytest.approx(0.2, abs=0.05)
+    inertial, error = without("gnss_pos", "gnss_vel")
+    assert error > 10.0
+    assert inertial.nis_mean < 2.0
+    no_field, error = without("mag")
+    assert error == pytest.approx(0.155, abs=0.02)
+    assert no_field.heading_error_mean_deg == pytest.approx(0.0, abs=1.0)
 
 
 @pytest.mark.reallogs

@@ -7,8 +7,8 @@ and ``EKF/vel_pos_fusion.cpp`` (gate, fusion), ``ev_pos_control.cpp`` (noise, re
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -79,6 +79,8 @@ class Variant:
     as_logged : bool
         Whether samples are rejected and the position is reset where EKF2 itself did, as far as the
         log shows.
+    without : mapping from PX4's name of an aid to float
+        From when on (s) it is not fused.
     stamp_offset_s : float or None
         What is added to the stamps; None: samples count when EKF2 takes them to have been measured.
     """
@@ -90,6 +92,7 @@ class Variant:
     reported: bool = True
     gated: bool = True
     as_logged: bool = False
+    without: Mapping[str, float] = field(default_factory=dict)
     stamp_offset_s: float | None = None
 
     def timing(self, inputs: Inputs) -> Timing:
@@ -168,6 +171,10 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     action = np.where(gated, event["action"], np.where(event["usable"], FUSE, IDLE))
     end, active = event["end"], action > IDLE
     now_s, sampled = stretch.time_s[end], np.any(active, axis=1)
+    off_s = {aid.name: np.array([v.without.get(aid.name, np.inf) for v in variants])
+             for aid in (inputs.aid, GNSS_VEL, MAG)}  # fmt: skip
+    on = now_s < off_s[inputs.aid.name]
+    with_velocity = (action == FUSE) & (now_s < off_s[GNSS_VEL.name]) & fuses_velocity
     sample = np.maximum(intervals[0].events.sample, 0)
     measured, noise = _measurements(inputs, stretch, sample, end, knob, reported)
     in_turn = inputs.received.velocity_m_s is not None
@@ -181,6 +188,7 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     if stretch.field is not None:
         each = [gather(stretch.field, stretch.rotation, one.events.end) for one in distinct]
         seen = FieldSamples(*(np.stack(part, axis=1)[:, pick] for part in zip(*each, strict=True)))
+        seen = seen._replace(number=np.where(now_s < off_s[MAG.name], seen.number, 0.0))
     gyro2 = np.where(attitude, knob["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
     force2 = (knob["EKF2_ACC_NOISE"] ** 2)[:, None, None]
     drift, drift_limit = _drift(inputs, stretch, knob, biases, attitude)
@@ -188,7 +196,7 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     floor = inputs.rules.bias_floor
     x, P = _start(stretch, biases, attitude)
     logged = inputs.received.rejected[sample], inputs.received.reset[sample]
-    usable = action, event["startable"], now_s, gated, as_logged, *logged
+    usable = np.where(on, action, IDLE), event["startable"] & on, now_s, gated, as_logged, *logged
     fusion = _Fusion(inputs.rules, stretch.time_s[0], *usable)
     innovations, variances = np.full((2, events, size, 6), np.nan)
     rejected, fused, reset = np.zeros((3, events, size), bool)
@@ -225,7 +233,7 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
             S = spread[:, TOLD] + noise[e]
             innovations[e], variances[e] = np.where(active[e, :, None], (nu, S), np.nan)
             outside = nu * nu > gate2 * S
-            moving = fuses_velocity & ~(outside[:, SPEED].any(axis=1) & gated)
+            moving = with_velocity[e] & ~(outside[:, SPEED].any(axis=1) & gated)
             outside = outside[:, LEVEL].any(axis=1)
             rejected[e], fused[e], reset[e], moving = fusion.decide(e, outside, moving)
             if in_turn:
@@ -342,12 +350,11 @@ class _Fusion:
     ) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
         """Whose sample is rejected, fused, reset to, and whose velocity is fused.
 
-        ``outside`` is outside the gate, ``moving`` has a velocity within its own.
+        ``outside`` is outside the gate, ``moving`` has a velocity that is fused, within its own.
         """
         rules, now_s, action = self.rules, self.time_s[e], self.action[e]
         gated, obeys = self.gated, self.as_logged
         fusing, told = action == FUSE, math.isfinite(self.rejected[e])
-        moving = moving & fusing
         self.velocity_s = np.where(moving, now_s, self.velocity_s)
         if self.usual[e] and not (outside.any() or self.stopped.any()):
             self.last_s = now_s
