@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -390,6 +390,8 @@ class Counterfactual:
         Empty where only a sweep was asked for.
     asked : bool
         Whether the changes are what the data ask for.
+    without : mapping from PX4's name of an aid to float
+        From when on (s) it is not fused.
     why : mapping from axis name to Why or Unavailable
         Why EKF2 as flown differs from our filter at its defaults; empty where they cannot be
         compared.
@@ -400,8 +402,14 @@ class Counterfactual:
     changes: Mapping[str, float]
     asked: bool
     why: Mapping[str, Why | Unavailable]
+    without: Mapping[str, float] = field(default_factory=dict)
 
     __repr__ = brief
+
+    @property
+    def first(self) -> int:
+        """Where the values of the sweep begin: after the changes, where there are any."""
+        return int(bool(self.changes or self.without))
 
 
 def run_what_if(
@@ -427,7 +435,7 @@ def run_what_if(
     model = open_model(flight)
     if isinstance(model, Unavailable):
         raise MissingDataError(f"{flight.log.name}: {model.what}: {model.reason}", model.remedy)
-    asked = not changes and swept is None
+    asked = not changes and swept is None and not request.without
     why: Mapping[str, Why | Unavailable] = {}
     compared = None
     try:
@@ -443,13 +451,13 @@ def run_what_if(
             changes = asked_of_ekf2(compared, model, tuning, clock)
             if not changes:
                 raise MissingDataError(_nothing_asked(compared, model))
-    settings = [changes] if changes else []
+    settings = [changes] if changes or request.without else []
     settings += [{**changes, swept.parameter: value} for value in values] if swept else []
     progress("replaying with other parameters")
-    found = what_if(model, settings)
+    found = what_if(model, settings, request.without)
     if isinstance(found, Unavailable):
         raise MissingDataError(f"{flight.log.name}: {found.what}: {found.reason}", found.remedy)
-    return Counterfactual(flight, found, changes, asked, why)
+    return Counterfactual(flight, found, changes, asked, why, request.without)
 
 
 def _nothing_asked(compared: Comparison, model: Model) -> str:

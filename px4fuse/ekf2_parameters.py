@@ -96,6 +96,8 @@ BAROMETER = Aid(
     label="barometer", reported="EKF2_BARO_NOISE and the variance of its bias",
 )  # fmt: skip
 GNSS_VEL = _gnss("gnss_vel", "GNSS velocity", "EKF2_GPS_V_NOISE", "EKF2_GPS_V_GATE", "m/s")
+MAG = Aid("mag", "EKF2_MAG_TYPE", "EKF2_MAG_NOISE", "EKF2_MAG_GATE", "EKF2_MAG_DELAY",
+          label="magnetometer", unit="gauss", default_gate=3.0)  # fmt: skip
 # What EKF2 can fuse, in the order in which it is told. gate, noise and what else forms R: PX4's
 # EKF/aid_sources of v1.13 to main
 AIDS: Mapping[str, Aid] = {
@@ -116,8 +118,7 @@ AIDS: Mapping[str, Aid] = {
         Aid("optical_flow", "EKF2_OF_CTRL", "EKF2_OF_N_MIN", "EKF2_OF_GATE", "EKF2_OF_DELAY",
             label="optical flow", unit="rad/s", default_gate=3.0,
             reported="EKF2_OF_N_MIN to EKF2_OF_N_MAX, by quality"),
-        Aid("mag", "EKF2_MAG_TYPE", "EKF2_MAG_NOISE", "EKF2_MAG_GATE", "EKF2_MAG_DELAY",
-            label="magnetometer", unit="gauss", default_gate=3.0),
+        MAG,
         Aid("mag_heading", "EKF2_MAG_TYPE", "EKF2_HEAD_NOISE", "EKF2_HDG_GATE", "EKF2_MAG_DELAY",
             label="magnetic heading", unit="rad", default_gate=2.6),
         Aid("airspeed", "EKF2_ARSP_THR", "EKF2_EAS_NOISE", "EKF2_TAS_GATE", "EKF2_ASP_DELAY",
@@ -155,6 +156,10 @@ class Parameter:
     maximum: float
 
 
+FIELD_NOISES = {
+    "EKF2_MAG_E_NOISE": Parameter("gauss/s", 0.001, 0.0, 0.1),
+    "EKF2_MAG_B_NOISE": Parameter("gauss/s", 0.0001, 0.0, 0.1),
+}
 PARAMETERS: Mapping[str, Parameter] = {
     EV_POS.noise: Parameter("m", 0.1, 0.01, 1e3),
     EV_POS.noise_mode: Parameter("", 0.0, 0.0, 1.0),
@@ -166,6 +171,9 @@ PARAMETERS: Mapping[str, Parameter] = {
     GNSS_VEL.noise: Parameter("m/s", 0.3, 0.01, 5.0),
     GNSS_VEL.gate: Parameter("SD", 5.0, 1.0, 1e3),
     BAROMETER.noise: Parameter("m", 3.5, 0.01, 15.0),
+    MAG.noise: Parameter("gauss", 0.05, 0.001, 1.0),
+    MAG.gate: Parameter("SD", 3.0, 1.0, 1e3),
+    **FIELD_NOISES,
     "EKF2_DELAY_MAX": Parameter("ms", 200.0, 0.0, 1e3),
     **dict.fromkeys((*EV_POS.place, *GNSS_POS.place), Parameter("m", 0.0, -math.inf, math.inf)),
     "EKF2_ACC_NOISE": Parameter("m/s^2", 0.35, 0.01, 1.0),
@@ -187,21 +195,24 @@ REPORTED = (
 )  # fmt: skip
 
 
-def settings_in_force(logged: Mapping[str, float], aid: Aid = EV_POS) -> dict[str, float]:
+def settings_in_force(
+    logged: Mapping[str, float], aid: Aid = EV_POS, *others: Aid
+) -> dict[str, float]:
     """The model's parameters as the log has them, PX4's defaults where it has none.
 
     Parameters
     ----------
     logged : mapping
         Parameters of the log, by PX4 name.
-    aid : Aid
+    aid, *others : Aid
         What EKF2 fused: those of other aids are left out.
     """
+    used = {one.switch for one in (aid, *others)}
     of_others = {
         name
-        for other in (EV_POS, GNSS_POS, GNSS_VEL, BAROMETER)
-        if other.switch != aid.switch
-        for name in (*other.own, *other.place)
+        for other in (EV_POS, GNSS_POS, GNSS_VEL, MAG, BAROMETER)
+        if other.switch not in used
+        for name in (*other.own, *other.place, *(FIELD_NOISES if other == MAG else ()))
     }
     defaults = {
         name: parameter.default for name, parameter in PARAMETERS.items() if name not in of_others

@@ -47,9 +47,11 @@ GYRO_BIAS_COLUMNS = [f"gyro_bias_{axis}_rad_s" for axis in ("forward", "right", 
 ACCELEROMETER_BIAS_COLUMNS = [
     f"accelerometer_bias_{axis}_m_s2" for axis in ("forward", "right", "down")
 ]
+EARTH_FIELD_COLUMNS = [f"earth_field_{axis}_gauss" for axis in AXIS_NAMES]
+BODY_FIELD_COLUMNS = [f"body_field_{axis}_gauss" for axis in ("forward", "right", "down")]
 DELAYED_STATE_COLUMNS = [
     *QUATERNION_COLUMNS, *VELOCITY_COLUMNS, *POSITION_COLUMNS, *GYRO_BIAS_COLUMNS,
-    *ACCELEROMETER_BIAS_COLUMNS,
+    *ACCELEROMETER_BIAS_COLUMNS, *EARTH_FIELD_COLUMNS, *BODY_FIELD_COLUMNS,
 ]  # fmt: skip
 DELAYED_VARIANCE_COLUMNS = [
     *(f"attitude_{axis}_rad2" for axis in AXIS_NAMES),
@@ -57,6 +59,7 @@ DELAYED_VARIANCE_COLUMNS = [
     *POSITION_VARIANCE_COLUMNS,
     *(f"{name.removesuffix('_rad_s')}_rad2_s2" for name in GYRO_BIAS_COLUMNS),
     *(f"{name.removesuffix('_m_s2')}_m2_s4" for name in ACCELEROMETER_BIAS_COLUMNS),
+    *(f"{name}2" for name in (*EARTH_FIELD_COLUMNS, *BODY_FIELD_COLUMNS)),
 ]  # fmt: skip
 
 
@@ -241,11 +244,12 @@ class FusionRecord:
     ----------
     parameters : mapping
         Every EKF2_ parameter in the log, by PX4 name, in PX4's units, as at the log's start.
-    delayed : DataFrame, shape (n, 31)
+    delayed : DataFrame, shape (n, 43)
         State and variances at the fusion horizon. ``w, x, y, z`` turns body FRD into NED; velocity
         and position NED (horizontal position NaN where PX4 keeps it as latitude and longitude);
-        biases of gyro (rad/s) and accelerometer (m/s²), body FRD; then the variances of attitude
-        error about north, east and down, of velocity, position and the biases.
+        biases of gyro (rad/s) and accelerometer (m/s²), body FRD; magnetic field of the earth
+        (NED) and of the body (FRD), in gauss; then the variances of attitude error about north,
+        east and down, of velocity, position, the biases and both fields.
     per_step_biases : bool
         Whether this release keeps the biases as increments per prediction (up to v1.14).
     other_aiding : tuple of str
@@ -253,6 +257,9 @@ class FusionRecord:
     vision_age_s : Series
         How long after its measurement stamp each external vision sample was published (s), by that
         stamp; empty where not logged.
+    field_gauss : DataFrame, shape (m, 4)
+        Magnetic field that was measured, body FRD, by time of measurement, and ``fused_3d``: 1
+        where EKF2 fused all of it, 0 where only its heading; empty where not logged.
     """
 
     parameters: Mapping[str, float]
@@ -260,6 +267,7 @@ class FusionRecord:
     per_step_biases: bool
     other_aiding: tuple[str, ...]
     vision_age_s: pd.Series
+    field_gauss: pd.DataFrame = field(default_factory=pd.DataFrame)
 
     __repr__ = brief
 

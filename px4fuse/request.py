@@ -210,6 +210,8 @@ class WhatIfRequest(_Asked, frozen=True, kw_only=True, tag_field="command", tag=
         In PX4's units. Empty without a sweep: what the data ask for.
     sweep : Sweep or None
         One parameter over several values, the others changed as said.
+    without : mapping from PX4's name of an aid to float
+        From when on (s) it is not fused, besides.
     """
 
     log: str
@@ -217,6 +219,7 @@ class WhatIfRequest(_Asked, frozen=True, kw_only=True, tag_field="command", tag=
     system: System | None = None
     changes: dict[str, float] = {}
     sweep: Sweep | None = None
+    without: dict[str, float] = {}
 
 
 class EvaluationRequest(_Asked, frozen=True, kw_only=True):
@@ -454,6 +457,10 @@ def command_line(
         if (swept := given.sweep) is not None:
             ends = f"{_typed(swept.low)}:{_typed(swept.high)}:{swept.count}"
             words += ["--sweep", f"{swept.parameter}={ends}"]
+        for name in given.without:
+            words += ["--without", name]
+        for since in {*given.without.values()} - {0.0}:
+            words += ["--from", _typed(since)]
     join = subprocess.list2cmdline if typed and os.name == "nt" else shlex.join
     return join(["px4fuse", *words])
 

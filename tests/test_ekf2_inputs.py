@@ -105,7 +105,9 @@ def test_a_sweep_has_2_to_200_values() -> None:
 def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     """What is prepared of a flight of which only the parameters matter."""
     monkeypatch.setattr(inputs_module, "read_vision", lambda *_: made(Received, stamp_s=None))
-    monkeypatch.setattr(inputs_module, "find_stretches", lambda *_: (made(Stretch),))
+    monkeypatch.setattr(
+        inputs_module, "find_stretches", lambda *_, **_more: (made(Stretch, field=None),)
+    )
 
     def prepared(
         interval_s: float = 0.008, horizon_s: Any = 0.1, firmware: str = "PX4 v1.16.1",
@@ -249,6 +251,7 @@ def test_what_ekf2_did_with_a_sample_is_found_by_its_time() -> None:
         ([4] * 9, [3], [2, 3, 5, 7, 9]),  # a known end sets the count again
         ([10] * 3, [], [1, 2, 3]),
         ([2.75] * 7, [0, 6], [3, 6]),
+        ([3.2] * 9, [0, 2, 6], [2, 4, 6, 8]),  # of two and a half, as the log shows it
     ],
 )
 def test_a_step_ends_after_its_samples_or_when_it_is_long(

@@ -10,8 +10,10 @@ from ulog_tools import GENERATIONS, covariances, make_log, stamps, topic
 from px4fuse.alignment.joining import later
 from px4fuse.flight import (
     ACCELEROMETER_BIAS_COLUMNS,
+    BODY_FIELD_COLUMNS,
     DELAYED_STATE_COLUMNS,
     DELAYED_VARIANCE_COLUMNS,
+    EARTH_FIELD_COLUMNS,
     GYRO_BIAS_COLUMNS,
     QUATERNION_COLUMNS,
     Ekf2,
@@ -21,7 +23,8 @@ from px4fuse.readers import read_log
 
 QUATERNION = Rotation.from_euler("ZYX", [40.0, 10.0, -5.0], degrees=True).as_quat(scalar_first=True)
 BIAS = np.array([0.15, -0.10, 0.08])
-STATES = [*QUATERNION, 0.5, -0.2, 0.1, 3.0, 4.0, -1.5, 1e-4, 2e-4, 3e-4, 1e-3, 2e-3, 3e-3]
+STATES = [*QUATERNION, 0.5, -0.2, 0.1, 3.0, 4.0, -1.5, 1e-4, 2e-4, 3e-4, 1e-3, 2e-3, 3e-3,
+          0.21, 0.01, 0.43, 0.02, -0.03, 0.04]  # fmt: skip
 
 
 @pytest.fixture
@@ -39,7 +42,7 @@ def record_of(tmp_path):
 def made_log(generation, position=True):
     log = make_log(generation)
     states = log["estimator_states"]["states"]
-    states[:, :16] = STATES
+    states[:, :22] = STATES
     if not position:
         states[:, 7:9] = 0.0
     log.parameters |= {"EKF2_EVP_NOISE": 0.2, "EKF2_TAU_POS": 0.3, "EKF2_EV_DELAY": 12}
@@ -69,7 +72,12 @@ def test_states_and_variances_have_one_layout(record_of, generation):
         assert row["north_m"] == pytest.approx(3.0)
     logged = covariances(16)[4 if old else 3 :]
     assert row[DELAYED_VARIANCE_COLUMNS[3:9]].to_numpy() == pytest.approx(logged[:6])
-    assert row[DELAYED_VARIANCE_COLUMNS[9:]].to_numpy() == pytest.approx(logged[6:12] / per**2)
+    assert row[DELAYED_VARIANCE_COLUMNS[9:15]].to_numpy() == pytest.approx(logged[6:12] / per**2)
+    # the fields of a magnetometer
+    fields = [*EARTH_FIELD_COLUMNS, *BODY_FIELD_COLUMNS]
+    assert row[fields].to_numpy() == pytest.approx(STATES[16:])
+    of_fields = covariances(22 if old else 21)[-6:]
+    assert row[DELAYED_VARIANCE_COLUMNS[15:]].to_numpy() == pytest.approx(of_fields)
 
 
 def test_attitude_variance_of_a_quaternion_is_that_of_many_draws(record_of):

@@ -257,10 +257,42 @@ def test_a_reset_to_a_fix_takes_its_velocity_too() -> None:
     np.testing.assert_allclose(done.variance[at + 1, 0, 3:5], 0.09)
 
 
+def test_from_when_on_an_aid_is_lost_it_moves_nothing_more() -> None:
+    """Ten fixes at the origin, then ten 1 m north that say 0.5 m/s; 11.05 s lies between."""
+    fixes, speeds = [0.0] * 10 + [1.0] * 10, [0.0] * 10 + [0.5] * 10
+    done = {name: on_gnss(fixes, speeds, without=dict.fromkeys(name.split(), 11.05))
+            for name in ("", "gnss_pos", "gnss_vel", "gnss_pos gnss_vel")}  # fmt: skip
+    whole = done[""]
+    for name, one in done.items():
+        np.testing.assert_array_equal(one.state[:10], whole.state[:10])
+        assert one.fused[:10].all()
+        # what it would have innovated is still told
+        assert np.isfinite(one.innovation[10:, 0, 3:5]).all()
+        assert one.fused[10:].any() == ("gnss_pos" not in name)
+        assert not (one.rejected | one.reset).any()
+    north, speed = ({name: one.state[-1, 0, row] for name, one in done.items()} for row in (6, 3))
+    assert north["gnss_pos gnss_vel"] == pytest.approx(0.0, abs=1e-9)
+    assert speed["gnss_pos gnss_vel"] == pytest.approx(0.0, abs=1e-9)
+    assert north["gnss_vel"] > 0.05
+    # what is left of the two is surer than nothing
+    spread = {name: one.variance[-1, 0, 6] for name, one in done.items()}
+    for name in ("gnss_vel", "gnss_pos"):
+        assert spread[""] < spread[name] < spread["gnss_pos gnss_vel"]
+    assert speed["gnss_pos"] == pytest.approx(0.5, abs=0.05)
+    assert 0.0 < north["gnss_pos"] < north[""]
+
+
+def test_vision_that_is_lost_leaves_the_vehicle_to_the_imu() -> None:
+    done = at_rest([0.0] * 10 + [1.0] * 10, without={"ev_pos": 11.05})
+    np.testing.assert_allclose(done.state[..., 6], 0.0, atol=1e-9)
+    assert not done.fused[10:].any()
+    assert (np.diff(done.variance[11:, 0, 6]) > 0.0).all()
+
+
 def at_rest(
     measured_m: list[float], logged: float = np.nan, down_m: float = 0.0, aid: Aid = EV_POS,
     rules: Rules = RULES, speed_m_s: Any = None, velocity: bool = True,
-    tilt_rad2: float = np.inf, **settings: float,
+    tilt_rad2: float = np.inf, without: Any = None, **settings: float,
 ) -> Run:  # fmt: skip
     """A level vehicle that stands still at the origin, seen at 10 Hz at these places north.
 
@@ -294,7 +326,7 @@ def at_rest(
         vision_height=False, imu_offset_m=np.zeros(3), aid=aid,
     )  # fmt: skip
     intervals = make_intervals(inputs, stretch, Timing(0.0, 0.1))
-    variant = Variant(inputs.settings, velocity=velocity, as_logged=True)
+    variant = Variant(inputs.settings, velocity=velocity, as_logged=True, without=without or {})
     return run(inputs, stretch, [variant], [intervals])
 
 

@@ -276,7 +276,7 @@ def test_a_prediction_that_a_little_noise_changes_is_not_steady(
 
     def judged(changed: Summary) -> bool:
         monkeypatch.setattr(whatif, "disturbed", disturbed)
-        monkeypatch.setattr(whatif, "replay_settings", lambda _, changes: changes)
+        monkeypatch.setattr(whatif, "replay_settings", lambda _, changes, **_more: changes)
         monkeypatch.setattr(whatif, "_of_replay", lambda *_: changed)
         (found,) = whatif._steadied(model, [base], ((0.0, 1.0),))
         return found.steady

@@ -186,6 +186,17 @@ def test_a_step_is_the_nearest_number_of_samples() -> None:
     assert samples_per_step(0.01, 0.004 + 1e-12) == samples_per_step(0.01, 0.004 - 1e-12) == 3
 
 
+def test_a_half_is_rounded_as_the_log_shows_it() -> None:
+    """EKF2 rounds a mean that it measures: two and a half samples are two, or three."""
+    by_two, by_three = 2 * np.arange(0, 60, 7), 3 * np.arange(0, 60, 7)
+    ends = by_two, by_three, [5], [0, 25, 50]
+    assert [samples_per_step(0.01, 0.004, each) for each in ends] == [2, 3, 3, 3]
+    # steps that an IMU with dropouts makes differ now and then
+    assert samples_per_step(0.01, 0.004, np.append(3 * np.arange(30), [91])) == 3
+    # far from a half the log is not asked
+    assert samples_per_step(0.01, 0.00375, by_two) == 3
+
+
 def test_samples_with_older_stamps_than_the_last_are_not_taken() -> None:
     simulation = simulate(Scenario(passes=4, seed=5), parse(["clock-jump=400ms"]))
     topics = {topic.name: topic.fields for topic in simulation.topics}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import numpy as np
@@ -53,6 +54,42 @@ def test_results_have_the_three_side_by_side(sample_log: Path, tmp_path: Path) -
         for axis in ("north", "east"):
             assert 0.04 < said[key][axis]["position_rmse_to_truth_m"] < 0.09
     assert said["whatif"]["north"]["nis_mean"] < 0.3 * said["replayed"]["north"]["nis_mean"]
+
+
+def test_without_an_aid_from_a_time_on(sample_log: Path) -> None:
+    done = run(sample_log, "--without", "ev_pos", "--from", "100", "--json", "-")
+    assert done.exit_code == 0, done.output
+    said = json.loads(done.output)
+    jsonschema.validate(said, schema())
+    assert said["whatif"]["without"] == {"ev_pos": 100.0}
+    assert said["judged_s"][0][0] == 100.0
+    assert said["provenance"]["command"].endswith("aisle_uwb.ulg --without ev_pos --from 100")
+    assert said["replayed"]["without"] == {}
+    # half a minute of inertial navigation at 0.35 m/s² of noise, as far off as it says that it is
+    for axis in ("north", "east"):
+        assert said["replayed"][axis]["position_rmse_to_truth_m"] < 0.1
+        assert 0.02 < said["whatif"][axis]["nis_mean"] < 4.0
+    assert error_of(said["whatif"]) > 1.0
+    (note,) = [one for one in said["notes"] if one.startswith("without ev_pos from 100 s on")]
+    assert "EKF2 itself gives its position up" in note
+
+
+def error_of(summary: dict[str, Any]) -> float:
+    return float(
+        np.hypot(*(summary[axis]["position_rmse_to_truth_m"] for axis in ("north", "east")))
+    )
+
+
+def test_an_aid_that_the_model_lacks_and_a_time_after_the_flight_are_refused(
+    sample_log: Path,
+) -> None:
+    for words, said in (
+        (["--without", "baro_hgt"], "baro_hgt: of this log the model fuses ev_pos."),
+        (["--without", "ev_pos", "--from", "500"], "500 s: less than 5 s of the flight"),
+    ):
+        refused = run(sample_log, *words)
+        assert isinstance(refused.exception, SettingsError)
+        assert said in str(refused.exception)
 
 
 def test_without_set_it_is_what_the_data_ask_for(asked: Counterfactual) -> None:
@@ -108,6 +145,7 @@ def test_the_request_is_written_as_it_was_typed() -> None:
             ["--set", "EKF2_EVP_NOISE=0.1", "--sweep", "EKF2_EVP_NOISE=0.1:0.2"],
             "set and swept",
         ),
+        (["--from", "60"], "--from says when --without begins"),
         (["-o", "page.txt"], "ends in .pdf"),
     ],
 )

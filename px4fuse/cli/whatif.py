@@ -9,6 +9,7 @@ import click
 
 from px4fuse.cli.inputs import Named, flight_options, json_option, open_option, path_option
 from px4fuse.cli.outputs import finish, progress, report_paths, result_files
+from px4fuse.cli.quantity import TypedQuantity
 from px4fuse.errors import SettingsError
 from px4fuse.units import NAMES, in_unit
 from px4fuse.writing import STANDARD_OUTPUT
@@ -29,6 +30,19 @@ if TYPE_CHECKING:
 @click.option(
     "--sweep", metavar="NAME=LOW:HIGH[:COUNT]", help="Parameter to change over several values."
 )
+@click.option(
+    "--without",
+    multiple=True,
+    metavar="AID",
+    help="Aid that is no longer fused, as gnss_pos, gnss_vel, mag or ev_pos; may be repeated.",
+)
+@click.option(
+    "--from",
+    "since",
+    type=TypedQuantity("s", 60.0),
+    metavar="SECONDS",
+    help="When the aids of --without are lost.  [default: from the start]",
+)
 @flight_options
 @path_option("-o", "--output", metavar="FILE.pdf", help="A page, and its results beside it.")
 @json_option
@@ -37,6 +51,8 @@ def whatif(
     log: Path,
     changes: tuple[str, ...],
     sweep: str | None,
+    without: tuple[str, ...],
+    since: float | None,
     output: Path | None,
     json_path: Path | None,
     **given: Any,
@@ -44,8 +60,9 @@ def whatif(
     """Replay EKF2 from LOG as flown and with other parameters, side by side.
 
     By a model of EKF2 that is started from the log, and believed only where it reproduces what EKF2
-    logged. For example, px4fuse whatif log.ulg --set EKF2_EVP_NOISE=0.1. Without --set and --sweep,
-    with the measurement noise and the delay that the data ask for (see tune and sync).
+    logged. For example, px4fuse whatif log.ulg --set EKF2_EVP_NOISE=0.1. Without
+    --set, --sweep and --without, with the measurement noise and the delay that the data ask for
+    (see tune and sync). --without gnss_pos --from 60 goes on from there without that aid.
     """
     from px4fuse.analysis import run_what_if
     from px4fuse.report.document import WhatIfDocument
@@ -55,10 +72,13 @@ def whatif(
 
     if output is not None:
         report_paths(output, json_path)  # before the work, not after it
+    if since is not None and not without:
+        raise SettingsError("--from says when --without begins: give that too.")
     request = WhatIfRequest(
         log=str(log),
         changes=_changes(changes),
         sweep=None if sweep is None else _sweep(sweep),
+        without=dict.fromkeys(without, since or 0.0),
         **given,
     )
     with progress(json_path == STANDARD_OUTPUT) as step:

@@ -20,6 +20,7 @@ from px4fuse.ekf2_parameters import (
     GNSS_MODE,
     GNSS_POS,
     GNSS_VEL,
+    MAG,
     Aid,
     fuses_by_mask,
     settings_in_force,
@@ -219,7 +220,7 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
         if not flight.log.firmware.startswith(STAMPED_AT_HORIZON):
             return Unavailable(WHAT, horizon_s.reason, horizon_s.remedy)
         horizon_s = 0.0  # a buffer of one step: EKF2_EV_DELAY is at most EKF2_PREDICT_US
-    stretches = find_stretches(flight, imu, attitude, ekf2, record, read.stamp_s)
+    stretches = find_stretches(flight, imu, attitude, ekf2, record, read.stamp_s, magnetic=gnss)
     if not stretches:
         return Unavailable(
             WHAT,
@@ -228,8 +229,9 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
             "Record without dropouts (a faster SD card, fewer topics), with steady positions.",
         )
     fusing = ekf2.fusing
+    magnetic = [MAG] if any(stretch.field for stretch in stretches) else []
     return Inputs(
-        settings=settings_in_force(record.parameters, aid) | place,
+        settings=settings_in_force(record.parameters, aid, *magnetic) | place,
         stretches=stretches,
         received=read,
         rules=_rules(record, ekf2.step_s, gnss=gnss),

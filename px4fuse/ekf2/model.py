@@ -2,9 +2,9 @@
 
 The model is the part of EKF2 that horizontal positions move: 15 error states about the published
 attitude, started from the log's own ``estimator_states`` and fed with IMU and positions as logged,
-of GNSS with their velocities.
-It is not EKF2: what else EKF2 fuses (height, heading) is taken from its own output. How far it can
-be believed is measured on each log, see :mod:`px4fuse.ekf2.replay`.
+of GNSS with their velocities, and with the magnetometer (21 states) where the log holds it.
+It is not EKF2: what else EKF2 fuses (height, else the heading) is taken from its own output. How
+far it can be believed is measured on each log, see :mod:`px4fuse.ekf2.replay`.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from px4fuse.ekf2.intervals import (
     make_intervals,
 )
 from px4fuse.ekf2.output_predictor import follow_attitude, later, publish
-from px4fuse.ekf2.recursion import HEADING, LEVEL, Run, Variant, run, with_compass, with_correlation
+from px4fuse.ekf2.recursion import HEADING, LEVEL, Run, Variant, run, with_correlation
 from px4fuse.ekf2.replay import (
     REJECTING_SHARE,
     UPDATE_COLUMNS,
@@ -42,7 +42,15 @@ from px4fuse.ekf2.replay import (
     agreement_with_log,
     with_obedient,
 )
-from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS, check
+from px4fuse.ekf2_parameters import (
+    BAROMETER,
+    FIELD_NOISES,
+    GNSS_POS,
+    GNSS_VEL,
+    MAG,
+    PARAMETERS,
+    check,
+)
 from px4fuse.errors import SettingsError
 from px4fuse.flight import STATE_COLUMNS, Ekf2, Flight, Unavailable
 from px4fuse.readers.px4_innovations import with_gnss
@@ -110,14 +118,15 @@ def open_model(flight: Flight) -> Model | Unavailable:
         obeyed = agreement_with_log(flight, _assemble(inputs, again, 0, {}))
         if isinstance(obeyed, Agreement):
             agreement = with_obedient(agreement, obeyed)
-    if inputs.aid == GNSS_POS:
-        inputs = replace(inputs, stretches=tuple(map(with_compass, runs)))
     replay = structs.replace(replay, agreement=agreement)
     return Model(flight, inputs, intervals, replay, agreement)
 
 
 def replay_settings(
-    model: Model, settings: Sequence[Mapping[str, float]], left_out_s: Array | None = None
+    model: Model,
+    settings: Sequence[Mapping[str, float]],
+    left_out_s: Array | None = None,
+    without: Mapping[str, float] | None = None,
 ) -> tuple[Ekf2Replay, ...]:
     """Replay with several settings at once, each a change of what was flown.
 
@@ -128,16 +137,21 @@ def replay_settings(
         What each changes, by PX4 name and in PX4's units.
     left_out_s : ndarray, optional
         Stamps of samples that are not fused, and not among the updates.
+    without : mapping from PX4's name of an aid to float, optional
+        From when on (s) it is not fused.
 
     Raises
     ------
     SettingsError
-        A parameter that the model does not have, or a value outside PX4's range.
+        A parameter or an aid that the model does not have, or a value outside PX4's range.
     """
     changes, inputs = [check(change) for change in settings], model.inputs
     of_others = PARAMETERS.keys() - inputs.settings.keys()
     idle = dict.fromkeys(of_others, f"EKF2 fused {inputs.aid.label} in this log")
     idle[BAROMETER.noise] = "the model takes height from EKF2 itself"
+    if inputs.aid == GNSS_POS:
+        no_field = "the log does not hold what EKF2 fused of a magnetometer"
+        idle |= dict.fromkeys(of_others & {*MAG.own, *FIELD_NOISES}, no_field)
     if inputs.rules.horizon_by_delay:
         firmware = model.flight.log.firmware
         idle["EKF2_DELAY_MAX"] = f"in {firmware} the longest delay makes the horizon"
@@ -145,6 +159,9 @@ def replay_settings(
         idle[GNSS_POS.delay] = "EKF2 takes the receiver driver's own times"
     for name in [name for change in changes for name in change if name in idle]:
         raise SettingsError(f"{name} changes nothing here: {idle[name]}.")
+    without = without or {}
+    for name in without.keys() - (known := aids_of(inputs)):
+        raise SettingsError(f"{name}: of this log the model fuses {', '.join(known)}.")
     if not changes:
         return ()
     obeys = left_out_s is not None
@@ -155,12 +172,21 @@ def replay_settings(
         never = np.zeros(len(rejected), dtype=bool)
         inputs = replace(inputs, received=replace(inputs.received, rejected=rejected, reset=never))
         model = replace(model, inputs=inputs)
-    variants = [Variant({**inputs.settings, **change}, as_logged=obeys) for change in changes]
+    variants = [
+        Variant({**inputs.settings, **change}, as_logged=obeys, without=without)
+        for change in changes
+    ]
     runs = _run_model(model, variants)
     replays = [_assemble(inputs, runs, at, change) for at, change in enumerate(changes)]
     if left_out_s is not None:
         replays = [_without(inputs, each, left_out_s) for each in replays]
     return tuple(structs.replace(each, agreement=model.agreement) for each in replays)
+
+
+def aids_of(inputs: Inputs) -> list[str]:
+    """PX4's names of the aids that the model fuses."""
+    velocity = [GNSS_VEL.name] if inputs.received.velocity_m_s is not None else []
+    return [inputs.aid.name, *velocity, *([MAG.name] if MAG.noise in inputs.settings else [])]
 
 
 def _without(inputs: Inputs, replay: Ekf2Replay, left_out_s: Array) -> Ekf2Replay:

@@ -7,8 +7,8 @@ and ``EKF/vel_pos_fusion.cpp`` (gate, fusion), ``ev_pos_control.cpp`` (noise, re
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -30,17 +30,13 @@ from px4fuse.ekf2.intervals import (
     Intervals,
     Timing,
 )
-from px4fuse.ekf2.stretches import Compass, Stretch
-from px4fuse.ekf2_parameters import GNSS_VEL
+from px4fuse.ekf2.magnetometer import FieldSamples, fuse_field, gather
+from px4fuse.ekf2.stretches import Stretch
+from px4fuse.ekf2_parameters import GNSS_VEL, MAG
 
 # How long the first pass runs that gives the correlations at the start
 CORRELATING_S = 8.0
 LEAST_VARIANCE = 1e-30
-# Of the heading, in one step: it comes back at once
-MOST_GAIN = 0.999
-# The magnetometer's field is a state of EKF2 too, and gives way where the heading stays turned: on
-# a flight that GNSS turned by 5° it pulled with this share of what the variance tells
-GIVING = 0.4
 # Events whose intervals are stacked at once
 TOGETHER = 64
 # Variance by which a sample is not taken at all
@@ -83,6 +79,8 @@ class Variant:
     as_logged : bool
         Whether samples are rejected and the position is reset where EKF2 itself did, as far as the
         log shows.
+    without : mapping from PX4's name of an aid to float
+        From when on (s) it is not fused.
     stamp_offset_s : float or None
         What is added to the stamps; None: samples count when EKF2 takes them to have been measured.
     """
@@ -94,6 +92,7 @@ class Variant:
     reported: bool = True
     gated: bool = True
     as_logged: bool = False
+    without: Mapping[str, float] = field(default_factory=dict)
     stamp_offset_s: float | None = None
 
     def timing(self, inputs: Inputs) -> Timing:
@@ -131,11 +130,9 @@ class Run:
     noise : ndarray, shape (E, S, 6)
         R.
     rejected, fused, reset : ndarray of bool, shape (E, S)
-    told_rad, heading_gain : ndarray, shape (E, S)
-        By how much EKF2's own heading turned that of the model, and its gain as a measurement.
-    state, variance : ndarray, shape (E + 1, S, 15)
-        At the start and after each event.
-    covariance : ndarray, shape (S, 15, 15)
+    state, variance : ndarray, shape (E + 1, S, n)
+        At the start and after each event; n is 15, or 21 where the magnetic fields are states.
+    covariance : ndarray, shape (S, n, n)
         At the end.
     """
 
@@ -148,14 +145,12 @@ class Run:
     rejected: BoolArray
     fused: BoolArray
     reset: BoolArray
-    told_rad: Array
-    heading_gain: Array
     state: Array
     variance: Array
     covariance: Array
 
 
-def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
+def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     inputs: Inputs, stretch: Stretch, variants: Sequence[Variant], intervals: Sequence[Intervals]
 ) -> Run:
     """Run the variants through one stretch, each with its intervals."""
@@ -176,6 +171,10 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
     action = np.where(gated, event["action"], np.where(event["usable"], FUSE, IDLE))
     end, active = event["end"], action > IDLE
     now_s, sampled = stretch.time_s[end], np.any(active, axis=1)
+    off_s = {aid.name: np.array([v.without.get(aid.name, np.inf) for v in variants])
+             for aid in (inputs.aid, GNSS_VEL, MAG)}  # fmt: skip
+    on = now_s < off_s[inputs.aid.name]
+    with_velocity = (action == FUSE) & (now_s < off_s[GNSS_VEL.name]) & fuses_velocity
     sample = np.maximum(intervals[0].events.sample, 0)
     measured, noise = _measurements(inputs, stretch, sample, end, knob, reported)
     in_turn = inputs.received.velocity_m_s is not None
@@ -185,22 +184,23 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
     own = np.stack([stretch.attitude_error_rad[end, HEADING], stretch.down_m[end]], axis=-1)
     own_attitude = stretch.attitude_variance_rad2[end]
     own_variance = np.stack([own_attitude[:, :, HEADING], stretch.down_variance_m2[end]], axis=-1)
-    told_rad, heading_gain = np.zeros((2, events, size))
-    # a delay turns the heading; what other settings do to it is less than what is known of it
-    follows = knob[inputs.aid.delay] != inputs.settings[inputs.aid.delay]
-    turned = None if stretch.compass is None else stretch.compass.between(now_s)
+    seen = None
+    if stretch.field is not None:
+        each = [gather(stretch.field, stretch.rotation, one.events.end) for one in distinct]
+        seen = FieldSamples(*(np.stack(part, axis=1)[:, pick] for part in zip(*each, strict=True)))
+        seen = seen._replace(number=np.where(now_s < off_s[MAG.name], seen.number, 0.0))
     gyro2 = np.where(attitude, knob["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
     force2 = (knob["EKF2_ACC_NOISE"] ** 2)[:, None, None]
-    drift, drift_limit = _drift(inputs, knob, biases, attitude)
+    drift, drift_limit = _drift(inputs, stretch, knob, biases, attitude)
     steps = np.diff(end, axis=0, prepend=0)[:, :, None]
     floor = inputs.rules.bias_floor
     x, P = _start(stretch, biases, attitude)
     logged = inputs.received.rejected[sample], inputs.received.reset[sample]
-    usable = action, event["startable"], now_s, gated, as_logged, *logged
+    usable = np.where(on, action, IDLE), event["startable"] & on, now_s, gated, as_logged, *logged
     fusion = _Fusion(inputs.rules, stretch.time_s[0], *usable)
     innovations, variances = np.full((2, events, size, 6), np.nan)
     rejected, fused, reset = np.zeros((3, events, size), bool)
-    states, spreads = np.empty((2, events + 1, size, STATES))
+    states, spreads = np.empty((2, events + 1, size, x.shape[1]))
     states[0], spreads[0] = x, _diagonal(P)
     innovation, R = np.empty((2, size, 4))
     for e in range(events):
@@ -214,25 +214,31 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
             drifted = drift * steps[some]
         phi = transition[within]
         # x = Φx + u, P = ΦPΦ' + Q
-        x = (phi @ x[:, :, None])[:, :, 0] + pushed[within]
-        P = phi @ P @ np.swapaxes(phi, 1, 2)
+        x[:, :STATES] = (phi @ x[:, :STATES, None])[:, :, 0] + pushed[within]
+        P[:, :STATES] = phi @ P[:, :STATES]
+        P[:, :, :STATES] = P[:, :, :STATES] @ np.swapaxes(phi, 1, 2)
         P[:, :MOVED, :MOVED] += added[within]
         spread = _diagonal(P)
-        biased = spread[:, BIASES]
+        biased = spread[:, BIASES.start :]
         biased += (biased < drift_limit) * drifted[within]
         if floor is not None:
             _limit_bias(P, floor, biases)
         innovation[:, 2:], R[:, 2:] = 0.0, NOT_TAKEN
+        if seen is not None and seen.number[e].any():
+            told = FieldSamples(*(part[e] for part in seen))
+            x, P = fuse_field(x, P, told, knob[MAG.noise], knob[MAG.gate])
+            spread = _diagonal(P)
         if sampled[e]:
             nu = measured[e] - x[:, TOLD]
             S = spread[:, TOLD] + noise[e]
             innovations[e], variances[e] = np.where(active[e, :, None], (nu, S), np.nan)
             outside = nu * nu > gate2 * S
-            moving = fuses_velocity & ~(outside[:, SPEED].any(axis=1) & gated)
+            moving = with_velocity[e] & ~(outside[:, SPEED].any(axis=1) & gated)
             outside = outside[:, LEVEL].any(axis=1)
             rejected[e], fused[e], reset[e], moving = fusion.decide(e, outside, moving)
             if in_turn:
-                P = _surer(P, own_attitude[e, :, :HEADING])
+                if seen is None:
+                    P = _surer(P, own_attitude[e, :, :HEADING])
                 x, P = _in_turn(x, P, nu, S, noise[e], SPEED, moving)
                 x, P = _in_turn(x, P, nu, S, noise[e], LEVEL, fused[e])
                 spread = _diagonal(P)
@@ -241,11 +247,8 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
                 R[fused[e], 2:] = noise[e, fused[e], LEVEL]
         np.subtract(own[e], x[:, OWN], out=innovation[:, :2])
         R[:, :2] = _down_to(spread[:, OWN], own_variance[e])
-        heading_gain[e] = spread[:, HEADING] / (spread[:, HEADING] + R[:, 0])
-        if turned is not None:
-            told, gain = turned[0][e], np.where(follows, turned[1][e], 1.0)
-            innovation[:, 0] = told + gain * (innovation[:, 0] - told)
-        told_rad[e] = innovation[:, 0]
+        if seen is not None:
+            innovation[:, 0], R[:, 0] = 0.0, NOT_TAKEN
         heading = np.where(attitude, x[:, HEADING] + innovation[:, 0], 0.0)
         if inputs.vision_height:
             R[:, 1] = NOT_TAKEN
@@ -258,7 +261,8 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
         HPH.reshape(size, -1)[:, :: len(MEASURED) + 1] += R
         K = np.swapaxes(HP, 1, 2) @ np.linalg.inv(HPH)
         x = x + (K @ innovation[:, :, None])[:, :, 0]
-        x[:, HEADING] = heading
+        if seen is None:
+            x[:, HEADING] = heading
         P = P - K @ HP
         P = 0.5 * (P + np.swapaxes(P, 1, 2))
         if reset[e].any():
@@ -269,7 +273,7 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
         states[e + 1], spreads[e + 1] = x, _diagonal(P)
     return Run(
         stretch, tuple(variants), tuple(each.events for each in intervals), innovations, variances,
-        noise, rejected, fused, reset, told_rad, heading_gain, states, spreads, P,
+        noise, rejected, fused, reset, states, spreads, P,
     )  # fmt: skip
 
 
@@ -346,12 +350,11 @@ class _Fusion:
     ) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
         """Whose sample is rejected, fused, reset to, and whose velocity is fused.
 
-        ``outside`` is outside the gate, ``moving`` has a velocity within its own.
+        ``outside`` is outside the gate, ``moving`` has a velocity that is fused, within its own.
         """
         rules, now_s, action = self.rules, self.time_s[e], self.action[e]
         gated, obeys = self.gated, self.as_logged
         fusing, told = action == FUSE, math.isfinite(self.rejected[e])
-        moving = moving & fusing
         self.velocity_s = np.where(moving, now_s, self.velocity_s)
         if self.usual[e] and not (outside.any() or self.stopped.any()):
             self.last_s = now_s
@@ -378,23 +381,15 @@ class _Fusion:
 
 
 def _drift(
-    inputs: Inputs, knob: dict[str, Array], biases: BoolArray, attitude: BoolArray
+    inputs: Inputs, stretch: Stretch, knob: dict[str, Array], biases: BoolArray, attitude: BoolArray
 ) -> tuple[Array, Array]:
-    """Variance that the biases gain per step, and the variance at which they stop gaining."""
-    gyro = attitude * (knob["EKF2_GYR_B_NOISE"] * inputs.step_s) ** 2
-    force = biases * (knob["EKF2_ACC_B_NOISE"] * inputs.step_s) ** 2
-    limit = np.stack([knob["EKF2_GYR_NOISE"] ** 2, knob["EKF2_ACC_NOISE"] ** 2], axis=-1)
-    return np.repeat(np.stack([gyro, force], axis=-1), 3, axis=-1), np.repeat(limit, 3, axis=-1)
-
-
-def with_compass(done: Run) -> Stretch:
-    """The same stretch, with what the magnetometer did to the heading of the first variant."""
-    gain = np.minimum(GIVING * done.heading_gain[:, 0], MOST_GAIN)
-    sums = (np.concatenate([[0.0], np.cumsum(each)])
-            for each in (done.told_rad[:, 0], -np.log1p(-gain)))  # fmt: skip
-    stretch = done.stretch
-    times = np.concatenate([stretch.time_s[:1], stretch.time_s[done.events[0].end]])
-    return replace(stretch, compass=Compass(times, *sums))
+    """Variance that biases and fields gain per step, and at which variance they stop gaining."""
+    of_field = ("MAG_E", "MAG_B") if stretch.field is not None else ()
+    gained = np.stack([knob[f"EKF2_{of}_NOISE"] for of in ("GYR_B", "ACC_B", *of_field)], axis=-1)
+    gained[:, :2] *= np.stack([attitude, biases], axis=-1)
+    limit = np.stack([knob[f"EKF2_{of}_NOISE"] for of in ("GYR", "ACC", *["MAG"] * len(of_field))],
+                     axis=-1)  # fmt: skip
+    return np.repeat((gained * inputs.step_s) ** 2, 3, axis=-1), np.repeat(limit**2, 3, axis=-1)
 
 
 def with_correlation(inputs: Inputs, stretch: Stretch, intervals: Intervals) -> Stretch:
@@ -409,12 +404,18 @@ def with_correlation(inputs: Inputs, stretch: Stretch, intervals: Intervals) -> 
     (covariance,) = run(inputs, stretch, [Variant(inputs.settings)], [first]).covariance
     # a bias that EKF2 does not learn has no variance
     deviation = np.sqrt(np.maximum(np.diagonal(covariance), LEAST_VARIANCE))
-    return replace(stretch, correlation=covariance / deviation[:, None] / deviation)
+    correlation = covariance / deviation[:, None] / deviation
+    if stretch.field is not None:
+        # EKF2 has just reset heading and fields, which parts them from all other states
+        alone = np.array([HEADING, *range(STATES, len(correlation))])
+        correlation[alone], correlation[:, alone] = 0.0, 0.0
+        correlation[alone, alone] = 1.0
+    return replace(stretch, correlation=correlation)
 
 
 def _diagonal(P: Array) -> Array:
     """Its variances: a view, not a copy."""
-    return P.reshape(len(P), -1)[:, :: STATES + 1]
+    return P.reshape(len(P), -1)[:, :: P.shape[1] + 1]
 
 
 def _start(stretch: Stretch, biases: BoolArray, attitude: BoolArray) -> tuple[Array, Array]:

@@ -13,8 +13,9 @@ from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
 from px4fuse.ekf2.inputs import aid_source, replayed_aid, same_sample
 from px4fuse.ekf2.stretches import SETTLING_S
-from px4fuse.ekf2_parameters import GNSS_POS
+from px4fuse.ekf2_parameters import GNSS_POS, MAG
 from px4fuse.filter import signals
+from px4fuse.filter.heading import heading_rad
 from px4fuse.flight import (
     POSITION_COLUMNS,
     VELOCITY_COLUMNS,
@@ -103,6 +104,8 @@ class Agreement(Record, frozen=True, kw_only=True):
         Share of those that both reject or both do not.
     published_rms_difference_m : float
         Of the horizontal position that is published, replay minus log.
+    heading_rms_difference_deg : float or None
+        Of the filter's heading; None where the replay takes it from the log.
     good : bool
         Whether anything may be concluded from a replay of this log.
     reason : str
@@ -121,6 +124,7 @@ class Agreement(Record, frozen=True, kw_only=True):
     published_rms_difference_m: NotNegative
     good: bool
     reason: str
+    heading_rms_difference_deg: NotNegative | None = None
 
     @property
     def axes(self) -> Mapping[str, AxisAgreement]:
@@ -242,7 +246,19 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
         published_rms_difference_m=float(apart_m),
         good=good,
         reason=reason,
+        heading_rms_difference_deg=_heading_off_deg(ekf2, replay),
     )
+
+
+def _heading_off_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
+    """Of a replay that fuses the magnetometer."""
+    if MAG.noise not in replay.settings or isinstance(ekf2.record, Unavailable):
+        return None
+    logged = ekf2.record.delayed
+    logged = logged[settled(logged.index, replay.judged_s)]
+    ours = replay.delayed["heading_rad"]
+    off = np.interp(logged.index, ours.index, np.unwrap(ours)) - heading_rad(logged)
+    return float(np.degrees(rms(np.angle(np.exp(1j * off)))))
 
 
 def _velocity(ekf2: Ekf2, replay: Ekf2Replay) -> dict[str, AxisAgreement]:

@@ -5,7 +5,7 @@ Sources: PX4-Autopilot ``EKF/imu_down_sampler/imu_down_sampler.cpp``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -16,7 +16,9 @@ from px4fuse.display import brief
 from px4fuse.flight import (
     ACCELEROMETER_BIAS_COLUMNS,
     ANGULAR_RATE_COLUMNS,
+    BODY_FIELD_COLUMNS,
     DELAYED_VARIANCE_COLUMNS,
+    EARTH_FIELD_COLUMNS,
     GYRO_BIAS_COLUMNS,
     POSITION_COLUMNS,
     QUATERNION_COLUMNS,
@@ -27,7 +29,7 @@ from px4fuse.flight import (
     FusionRecord,
     Unavailable,
 )
-from px4fuse.readers.px4_ekf2 import samples_per_step
+from px4fuse.readers.px4_ekf2 import same_stamps, samples_per_step
 from px4fuse.trajectory.rotation import (
     conjugate,
     from_vector,
@@ -49,35 +51,33 @@ START_AFTER_S = 1.0
 # settles what is tilt and what is accelerometer bias
 AIRBORNE_S = 4.0
 SETTLING_S = 5.0
+# EKF2 resets heading and fields when the vehicle has taken off; what the log has is of after that
+FIELD_AFTER_S = 1.0
+# EKF2 fuses 14 samples of the field a second (SENS_MAG_RATE is 15): one of fewer that are in the
+# log stands for several, down to this rate
+FIELD_HZ, LEAST_FIELD_HZ = 14.0, 1.5
 MIN_STRETCH_S = 10.0
 
 
 @dataclass(frozen=True)
-class Compass:
-    """What the magnetometer told EKF2 of its heading as flown, summed from the start.
-
-    What EKF2 knows of the magnetometer is not in the log, or thinly. What is left of its heading
-    when the gyro and the positions are accounted for is what the magnetometer did to it.
+class Field:
+    """What the magnetometer measured in one stretch.
 
     Attributes
     ----------
-    time_s : ndarray, shape (n,)
-    told_rad : ndarray, shape (n,)
-        By how much it turned the heading.
-    pull : ndarray, shape (n,)
-        -ln(1 - gain): another heading would have come back by this.
+    step : ndarray of int, shape (m,)
+        At the end of which prediction step EKF2 takes each sample.
+    gauss : ndarray, shape (m, 3)
+        Body FRD.
+    weight : float
+        Samples that EKF2 had for each one in the log.
     """
 
-    time_s: Array
-    told_rad: Array
-    pull: Array
+    step: IntArray
+    gauss: Array
+    weight: float
 
-    def between(self, times: Array) -> tuple[Array, Array]:
-        """Turn and gain from one time to the next, along the first axis."""
-        at_start = np.full((1, *times.shape[1:]), self.time_s[0])
-        times = np.concatenate([at_start, times])
-        told, pull = (np.interp(times, self.time_s, each) for each in (self.told_rad, self.pull))
-        return np.diff(told, axis=0), -np.expm1(-np.diff(pull, axis=0))
+    __repr__ = brief
 
 
 @dataclass(frozen=True)
@@ -100,9 +100,9 @@ class Stretch:
         Specific force of the body in each step, nominal bias removed, in the frame at its end.
     accelerometer_bias_m_s2 : ndarray, shape (3,)
         Nominal bias: the log's at the start.
-    state : ndarray, shape (15,)
-        At the start: attitude error, velocity, position, errors of both biases.
-    variance : ndarray, shape (15,)
+    state : ndarray, shape (15,) or (21,)
+        At the start: attitude error, velocity, position, errors of both biases, magnetic fields.
+    variance : ndarray, shape (15,) or (21,)
         At the start, in the same order.
     down_m : ndarray, shape (n + 1,)
         Published height.
@@ -111,13 +111,13 @@ class Stretch:
         As the log has them.
     attitude_error_rad : ndarray, shape (n + 1, 3)
         Of EKF2's own filter at its horizon, against the nominal attitude.
-    correlation : ndarray, shape (15, 15)
+    correlation : ndarray, shape (n, n)
         Of the state at the start; the log has variances only.
     fusing : bool
         Whether EKF2 fuses the source when it begins.
-    compass : Compass or None
-        What else than positions and velocities told EKF2 of its heading; None: the heading is
-        EKF2's own as flown, whatever is changed.
+    field : Field or None
+        What the magnetometer measured: then the magnetic fields are states too, and there are 21;
+        None: the heading is EKF2's own as flown, whatever is changed.
     """
 
     time_s: Array
@@ -134,7 +134,7 @@ class Stretch:
     attitude_error_rad: Array
     correlation: Array
     fusing: bool = True
-    compass: Compass | None = None
+    field: Field | None = None
 
     __repr__ = brief
 
@@ -146,6 +146,8 @@ def find_stretches(
     ekf2: Ekf2,
     record: FusionRecord,
     source_s: Array,
+    *,
+    magnetic: bool = False,
 ) -> tuple[Stretch, ...]:
     """Parts of a flight without gaps in IMU and positions, from when EKF2 has fused for a while.
 
@@ -158,6 +160,8 @@ def find_stretches(
     record : FusionRecord
     source_s : ndarray
         Stamps of the positions that EKF2 fused.
+    magnetic : bool
+        Whether the magnetic fields are to be states, where the log allows it.
     """
     innovations = ekf2.innovations["north"]
     assert isinstance(innovations, pd.DataFrame)
@@ -170,18 +174,24 @@ def find_stretches(
     first = max(attitude.index[0], source_s[0])
     last = min(attitude.index[-1], source_s[-1] + 1.0)
     airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
+    of_field = _field_s(record) if magnetic else None
+    cuts += of_field[1:] if of_field else ()
     found = []
     for low, high in pairwise(np.unique(np.clip(cuts, first, last))):
         inside = fused[(fused >= low) & (fused <= high)]
         if not len(inside):
             continue
-        offs = [off + AIRBORNE_S for off, _ in airborne if off < high]
-        at = int(np.searchsorted(states, max([inside[0] + START_AFTER_S, *offs[:1]])))
+        starts = [off + AIRBORNE_S for off, _ in airborne if off < high][:1]
+        if of_field and low <= of_field[0] < high:
+            starts.append(of_field[0])
+        at = int(np.searchsorted(states, max([inside[0] + START_AFTER_S, *starts])))
         if at == len(states) or high - states[at] < MIN_STRETCH_S:
             continue
         covered = (time[1:] > states[at]) & (time[:-1] < high)
         if np.all(np.diff(time)[covered] <= IMU_GAP_S):
-            found.append(_stretch(imu, attitude, ekf2, record, at, high))
+            made = _stretch(imu, attitude, ekf2, record, at, high)
+            within = of_field and of_field[0] <= states[at] and high <= of_field[1]
+            found.append(_with_field(made, record, at, ekf2.step_s) if within else made)
     return tuple(found)
 
 
@@ -199,7 +209,7 @@ def _stretch(
     rows = slice(first_row, int(np.searchsorted(time, end_s, side="right")))
     time, imu = time[rows], imu.iloc[rows]
     interval = np.diff(time)
-    known = np.flatnonzero(np.isin(np.rint(time * 1e6), np.rint(record.delayed.index * 1e6)))
+    known = same_stamps(time, record.delayed.index)
     ends = step_ends(interval, known, predict_s(record))
     bias = np.asarray(start[ACCELEROMETER_BIAS_COLUMNS])
     rate = imu[ANGULAR_RATE_COLUMNS].to_numpy()[1:] - np.asarray(start[GYRO_BIAS_COLUMNS])
@@ -232,7 +242,7 @@ def _stretch(
         force_m_s2=gain / step[:, None],
         accelerometer_bias_m_s2=bias,
         state=np.concatenate([error[0], start[VELOCITY_COLUMNS], position, np.zeros(6)]),
-        variance=np.asarray(start[DELAYED_VARIANCE_COLUMNS]),
+        variance=np.asarray(start[DELAYED_VARIANCE_COLUMNS[:15]]),
         down_m=_at(ekf2.state["down_m"], times),
         attitude_variance_rad2=np.column_stack(
             [_at(record.delayed[name], times) for name in DELAYED_VARIANCE_COLUMNS[:3]]
@@ -240,6 +250,37 @@ def _stretch(
         down_variance_m2=_at(record.delayed["down_m2"], times),
         attitude_error_rad=np.column_stack([np.interp(times, states, part) for part in error.T]),
         correlation=np.eye(15),
+    )
+
+
+def _field_s(record: FusionRecord) -> tuple[float, float] | None:
+    """From when to when EKF2 fused all of the field, without a break, once it was settled."""
+    fused = record.field_gauss["fused_3d"] if len(record.field_gauss) else pd.Series(dtype=float)
+    times, on = fused.index.to_numpy(), fused.to_numpy() > 0.0
+    if not on.any() or 1.0 / np.median(np.diff(times)) < LEAST_FIELD_HZ:
+        return None
+    first, last = np.flatnonzero(on)[[0, -1]]
+    if not on[first:last].all():
+        return None
+    return float(times[first]) + FIELD_AFTER_S, float(times[last])
+
+
+def _with_field(stretch: Stretch, record: FusionRecord, at: int, step_s: float) -> Stretch:
+    """The same stretch with the magnetic fields among its states."""
+    start, frame = record.delayed.iloc[at], record.field_gauss
+    stamps = frame.index.to_numpy()
+    age_s = record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
+    step = np.searchsorted(stretch.time_s, stamps - age_s - 1e-9)
+    inside = (step > 0) & (step < len(stretch.time_s))
+    fields = [*EARTH_FIELD_COLUMNS, *BODY_FIELD_COLUMNS]
+    weight = max(FIELD_HZ * float(np.median(np.diff(stamps))), 1.0)
+    gauss = frame.drop(columns="fused_3d").to_numpy()
+    return replace(
+        stretch,
+        state=np.concatenate([stretch.state, start[fields]]),
+        variance=np.concatenate([stretch.variance, start[DELAYED_VARIANCE_COLUMNS[-6:]]]),
+        correlation=np.eye(len(stretch.state) + len(fields)),
+        field=Field(step[inside], gauss[inside], weight),
     )
 
 
@@ -272,7 +313,7 @@ def step_ends(interval_s: Array, known: IntArray, target_s: float) -> IntArray:
     ndarray of int
         The last is at most n.
     """
-    needed = samples_per_step(target_s, float(np.median(interval_s)))
+    needed = samples_per_step(target_s, float(np.median(interval_s)), known)
     shown = set(known.tolist())
     ends, count, total = [], 0, 0.0
     for at, interval in enumerate(interval_s.tolist(), start=1):

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from px4fuse.arrays import Array
 from px4fuse.display import Shown
 from px4fuse.ekf2.inputs import horizontal_resets_s
-from px4fuse.ekf2.model import Model, disturbed, replay_settings
+from px4fuse.ekf2.model import Model, aids_of, disturbed, replay_settings
 from px4fuse.ekf2.replay import (
     HORIZONTAL,
     Agreement,
@@ -27,7 +27,7 @@ from px4fuse.ekf2.replay import (
     rms_to_truth,
     settled,
 )
-from px4fuse.ekf2_parameters import GNSS_POS, check
+from px4fuse.ekf2_parameters import GNSS_POS, MAG, check
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.heading import heading_rad
@@ -44,12 +44,18 @@ NO_TRUTH = Unavailable(
 )
 # Of a flight on GNSS
 HEADING_FOLLOWS = (
-    "with another delay of GNSS the heading follows, against a magnetometer whose pull is known "
-    "roughly (to about half a degree); else heading and height are EKF2's own as flown"
+    "the heading follows, with the magnetometer as EKF2 fused it (as flown it is {:.1f}° off the "
+    "log, RMS); the height is EKF2's own as flown"
+)
+HEADING_STAYS = (
+    "heading and height are EKF2's own as flown, whatever is changed: the log does not hold what "
+    "EKF2 fused of a magnetometer, all axes throughout"
 )
 OWN_HEADING = Unavailable(
     "heading error", "on external vision the heading is EKF2's own as flown", "Read it in the log."
 )
+# What must be left to judge once an aid is taken away
+JUDGED_S = 5.0
 SWEEP_VALUES = 9
 MAX_SWEEP_VALUES = 200
 # Each rejection decides the next: a prediction is steady where millimetres of noise on positions
@@ -89,6 +95,8 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     ----------
     changed : mapping
         Parameters that differ from those flown.
+    without : mapping from PX4's name of an aid to float
+        From when on (s) it is not fused.
     north, east : AxisSummary
     samples : int
     rejected_share : float
@@ -114,6 +122,7 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     late: Count = 0
     lost: Count = 0
     steady: bool = True
+    without: Mapping[str, float] = {}
 
     @property
     def axes(self) -> dict[str, AxisSummary]:
@@ -162,7 +171,11 @@ class WhatIf(Shown):
     notes: tuple[str, ...]
 
 
-def what_if(model: Model, settings: Sequence[Mapping[str, float]]) -> WhatIf | Unavailable:
+def what_if(
+    model: Model,
+    settings: Sequence[Mapping[str, float]],
+    without: Mapping[str, float] | None = None,
+) -> WhatIf | Unavailable:
     """What EKF2 would have done with other parameters.
 
     Parameters
@@ -170,6 +183,8 @@ def what_if(model: Model, settings: Sequence[Mapping[str, float]]) -> WhatIf | U
     model : Model
     settings : sequence of mapping
         What each changes, by PX4 name and in PX4's units.
+    without : mapping from PX4's name of an aid to float, optional
+        From when on (s) it is not fused, besides; all are judged from then on.
 
     Returns
     -------
@@ -179,23 +194,47 @@ def what_if(model: Model, settings: Sequence[Mapping[str, float]]) -> WhatIf | U
     Raises
     ------
     SettingsError
-        A parameter that the model does not have, or a value outside PX4's range.
+        A parameter or an aid that the model does not have, a value outside PX4's range, or a time
+        after which nothing is left to judge.
     """
     if not model.agreement.good:
         return model.agreement.doubted(WHAT)
-    replays = replay_settings(model, settings)
+    without = without or {}
+    replays = replay_settings(model, settings, without=without)
     flight, judged = model.flight, model.flown.judged_s
+    if without:
+        since = min(without.values())
+        # each further stretch starts anew from the log, which had the aid
+        left = [(max(start, since), end) for start, end in judged if end - since > JUDGED_S]
+        judged = tuple(left[:1])
+        if not judged:
+            raise SettingsError(
+                f"{since:g} s: less than {JUDGED_S:g} s of the flight that is replayed are left "
+                f"then; it ends at {model.flown.judged_s[-1][1]:.0f} s."
+            )
+    gnss = model.inputs.aid == GNSS_POS
     return WhatIf(
         agreement=model.agreement,
         logged=_of_log(flight, model.flown, judged),
         replayed=_of_replay(flight, model.flown, judged),
-        whatif=_steadied(model, [_of_replay(flight, r, judged) for r in replays], judged),
+        whatif=tuple(
+            replace(one, without=without)
+            for one in _steadied(
+                model, [_of_replay(flight, r, judged) for r in replays], judged, without
+            )
+        ),
         judged=judged,
         notes=(
-            *((HEADING_FOLLOWS,) if replays and model.inputs.aid == GNSS_POS else ()),
+            *((_of_heading(model.agreement),) if replays and gnss else ()),
             *(note for replay in replays for note in _notes(model, replay)),
+            *(_carried(model, replay, without, judged) for replay in replays if without),
         ),
     )
+
+
+def _of_heading(agreement: Agreement) -> str:
+    off_deg = agreement.heading_rms_difference_deg
+    return HEADING_STAYS if off_deg is None else HEADING_FOLLOWS.format(off_deg)
 
 
 def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) -> list[float]:
@@ -224,7 +263,12 @@ def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) 
     return [float(value) for value in values]
 
 
-def _steadied(model: Model, found: Sequence[Summary], judged: Spans) -> tuple[Summary, ...]:
+def _steadied(
+    model: Model,
+    found: Sequence[Summary],
+    judged: Spans,
+    without: Mapping[str, float] | None = None,
+) -> tuple[Summary, ...]:
     """Predictions, with whether each stays where it is when the positions are disturbed."""
     runs = [[one] for one in found]
     tried = [
@@ -233,7 +277,7 @@ def _steadied(model: Model, found: Sequence[Summary], judged: Spans) -> tuple[Su
     ]  # fmt: skip
     for seed in range(DISTURBED_RUNS if tried else 0):
         other = disturbed(model, DISTURBED_M, seed)
-        again = replay_settings(other, [same[0].changed for same in tried])
+        again = replay_settings(other, [same[0].changed for same in tried], without=without)
         for same, replay in zip(tried, again, strict=True):
             same.append(_of_replay(model.flight, replay, judged))
     return tuple(
@@ -362,6 +406,26 @@ def _longest(fused_s: Array, judged: Spans) -> float:
     """Longest time between two fusions, the ends of what is judged included."""
     ends = [judged[0][0], judged[-1][1]]
     return float(np.max(np.diff(np.sort(np.concatenate([fused_s, ends])))))
+
+
+def _carried(model: Model, replay: Ekf2Replay, without: Mapping[str, float], judged: Spans) -> str:
+    """How far from the replay as flown EKF2 comes without some aids."""
+    flown, found = (
+        one.published.loc[settled(one.published.index, judged), POSITION_COLUMNS[:2]]
+        for one in (model.flown, replay)
+    )
+    apart = np.hypot(*(found - flown).to_numpy().T)
+    lost = ", ".join(f"{name} from {since:g} s on" for name, since in without.items())
+    position = {*aids_of(model.inputs)} - {MAG.name}
+    given_up = (
+        "; with no horizontal aid EKF2 itself gives its position up after EKF2_NOAID_TOUT (5 s), "
+        "while the model dead-reckons on"
+    )
+    return (
+        f"without {lost}, what is published is {apart.max():.3g} m from the replay as flown at "
+        f"most (at {found.index[apart.argmax()]:.1f} s), {apart[-1]:.3g} m at the end"
+        + (given_up if position <= without.keys() else "")
+    )
 
 
 def _notes(model: Model, replay: Ekf2Replay) -> list[str]:

@@ -306,6 +306,7 @@ def _request(analysis: Analysis) -> ComparisonRequest:
 def what_if(
     log: Pathlike | Flight | Model,
     changes: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
+    without: Mapping[str, float] | None = None,
 ) -> WhatIf:
     """What EKF2 would have done with other parameters.
 
@@ -316,22 +317,26 @@ def what_if(
     changes : mapping or sequence of mappings, optional
         Values by PX4 name, in PX4's units; by default the noise and the delay that the data ask
         for.
+    without : mapping from PX4's name of an aid to float, optional
+        From when on (s) EKF2 does not fuse it, as ``{"gnss_pos": 60.0}``.
 
     Raises
     ------
     LogError, MissingDataError, SettingsError
         The log cannot be read, EKF2 cannot be replayed from it or the replay does not agree with
-        the log, or a parameter is unknown or out of PX4's range.
+        the log, or a parameter or an aid is unknown or a value out of range.
     """
     flight = log.flight if isinstance(log, Model) else log
     if not isinstance(flight, Flight):
         flight = read_log(flight)
-    if changes is None:
+    if changes is None and not without:
         return run_what_if(WhatIfRequest(log=flight.log.name), flight=flight).whatif
     model = log if isinstance(log, Model) else open_model(flight)
     if isinstance(model, Unavailable):
         raise MissingDataError(f"{model.what}: {model.reason}", model.remedy)
-    found = whatif.what_if(model, [changes] if isinstance(changes, Mapping) else changes)
+    changes = {} if changes is None else changes
+    settings = [changes] if isinstance(changes, Mapping) else changes
+    found = whatif.what_if(model, settings, without)
     if isinstance(found, Unavailable):
         raise MissingDataError(f"{found.what}: {found.reason}", found.remedy)
     return found

@@ -11,8 +11,9 @@ from typing import Literal
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 
-from px4fuse.arrays import Array
+from px4fuse.arrays import Array, IntArray
 from px4fuse.ekf2_parameters import AIDS, EV_POS, settings_in_force
 from px4fuse.flight import (
     ACCELEROMETER_BIAS_COLUMNS,
@@ -32,16 +33,21 @@ from px4fuse.flight import (
     FusionRecord,
     Reset,
     Unavailable,
+    at_times,
 )
 from px4fuse.readers import px4_topics as px4
-from px4fuse.readers.layouts import Layout
+from px4fuse.readers.layouts import Layout, elements
 from px4fuse.readers.px4_aid_sources import STATUS, STATUS_FLAGS
 from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S, intentions, read_aids
 from px4fuse.readers.px4_innovations import innovations_of
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 
 VISION = "vehicle_visual_odometry"
-STATES = 16  # attitude, velocity, position and both biases; the rest does not concern position
+STATES = 22  # attitude, velocity, position, biases, magnetic fields; the rest is wind and terrain
+MAG_3D_BIT = 5  # filter_control_status_u, common.h
+FIELD_COLUMNS = ("forward_gauss", "right_gauss", "down_gauss")
+# So near to a half, IMU samples per step may be rounded either way
+HALF = 0.05
 # Horizontal aiding besides vision position
 OTHER_AIDING = ("gnss_pos", "gnss_vel", "optical_flow", "ev_vel", "aux_global_position", "airspeed")
 VARIANCES_NOT_LOGGED = Unavailable(
@@ -190,18 +196,41 @@ def _step_s(topics: Topics) -> float:
     imu = topics.read(px4.IMU)
     if imu is None or len(imu) < 2:
         return target
-    interval = float(np.median(np.diff(imu.index.to_numpy())))
-    return samples_per_step(target, interval) * interval if interval < target else target
+    time = imu.index.to_numpy()
+    interval = float(np.median(np.diff(time)))
+    if interval >= target:
+        return target
+    known = pd.Index([])
+    if topic := _state_vector(topics)[0]:
+        known = topics.of_primary(Layout(topic, {"states[0]": "states[0]"})).index
+    return samples_per_step(target, interval, same_stamps(time, known)) * interval
 
 
-def samples_per_step(target_s: float, interval_s: float) -> int:
-    """IMU samples that EKF2 gathers for a prediction: the nearest whole number, halves up.
+def same_stamps(times_s: Array, known_s: ArrayLike) -> IntArray:
+    """Rows of the times that are among the known ones, to a microsecond."""
+    wanted = np.rint(np.asarray(known_s, dtype=float) * 1e6)
+    return np.flatnonzero(np.isin(np.rint(times_s * 1e6), wanted))
+
+
+def samples_per_step(target_s: float, interval_s: float, ends: ArrayLike = ()) -> int:
+    """IMU samples that EKF2 gathers for a prediction: the nearest whole number.
+
+    EKF2 rounds a mean of the measured intervals, so that a half goes either way: up, unless ends
+    of steps that the log shows (as numbers of IMU samples) tell otherwise.
 
     >>> samples_per_step(0.010, 0.00375), samples_per_step(0.010, 0.004)
     (3, 3)
+    >>> samples_per_step(0.010, 0.004, [0, 4, 6, 14])
+    2
     """
+    exact = target_s / interval_s + 0.5
     # stamps in µs: an interval of 4 ms must not fall to either side by rounding
-    return max(int(target_s / interval_s + 0.5 + 1e-6), 1)
+    samples = max(int(exact + 1e-6), 1)
+    gaps = np.diff(np.asarray(ends, dtype=float))
+    if samples > 1 and abs(exact - samples) < HALF and len(gaps):
+        fits, fewer = (np.mean(gaps % count == 0.0) > 0.9 for count in (samples, samples - 1))
+        return samples - int(fewer and not fits)
+    return samples
 
 
 def _accelerometer_bias(
@@ -306,7 +335,28 @@ def _read_record(
             if name in meant and meant[name].any()
         ),
         vision_age_s=age[~age.index.duplicated()],
+        field_gauss=_read_field(topics),
     )
+
+
+def _read_field(topics: Topics) -> pd.DataFrame:
+    """What the magnetometer measured, of the two topics that have it the one with more rows."""
+    found = []
+    step_s = _step_s(topics)
+    for topic, name in px4.MAGNETOMETER:
+        layout = Layout(topic, elements(list(FIELD_COLUMNS), name))
+        if topics.find((layout,)) is not None:
+            frame = topics.of_primary(layout).dropna()
+            if name == "observation":  # by the time that EKF2 takes it to be of
+                delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3
+                frame = frame.set_axis(frame.index + delay_s + 0.5 * step_s)
+            found.append(frame)
+    bits = topics.read((Layout(STATUS, {"bits": "control_mode_flags"}),), step=True)
+    if not found or bits is None:
+        return pd.DataFrame()
+    used = max(found, key=len)
+    flags = at_times(bits["bits"].dropna(), used.index).astype(np.int64)
+    return used.assign(fused_3d=(flags >> MAG_3D_BIT & 1).astype(float))
 
 
 def _attitude_variance(quaternion: Array, variance: Array) -> Array:

@@ -58,6 +58,10 @@ DEFAULT_PROFILE = "Record with SDLOG_PROFILE bit 0 (default)."
 
 # Topics with EKF2's state vector and its variances, best first
 ESTIMATOR_STATES = ("estimator_states", "estimator_status")  # since v1.12, v1.8 to v1.11
+# The magnetic field: what was measured, and what EKF2 has kept of it (from v1.14)
+MAGNETOMETER = (
+    ("vehicle_magnetometer", "magnetometer_ga"), ("estimator_aid_src_mag", "observation"),
+)  # fmt: skip
 # (number of states, number of variances) -> how many variances attitude has; velocity and position
 # follow it. 4: of the quaternion filter, whose biases are increments per prediction; 3: of the
 # error-state filter (EKF/python/ekf_derivation/generated/state.h at v1.15.4 and v1.16)
@@ -279,4 +283,4 @@ def topics() -> list[str]:
         AID_OBSERVATION_VERTICAL, *(track.layouts for track in _TRACKS),
     )  # fmt: skip
     named = {layout.topic for group in groups for layout in group}
-    return sorted(named | UNUSED.keys() | {*ESTIMATOR_STATES})
+    return sorted(named | UNUSED.keys() | {*ESTIMATOR_STATES, MAGNETOMETER[0][0]})

@@ -48,10 +48,12 @@ def _named(name: str) -> str:
 
 def heads(made_of: Counterfactual) -> list[str]:
     """Heads of the columns of :func:`rows`."""
-    changed = ", ".join(
+    parts = [
         f"{name} {number_words(value)} {PARAMETERS[name].unit}".rstrip()
         for name, value in made_of.changes.items()
-    )
+    ]
+    parts += [f"without {name} from {since:g} s" for name, since in made_of.without.items()]
+    changed = ", ".join(parts)
     asked = " (what the data ask for)" if made_of.asked else ""
     return ["as logged", "replayed", *([f"what if {changed}{asked}"] if changed else [])]
 
@@ -59,7 +61,7 @@ def heads(made_of: Counterfactual) -> list[str]:
 def rows(made_of: Counterfactual) -> list[list[str]]:
     """Label and one cell per EKF2: as logged, as replayed, and with the changes."""
     found = made_of.whatif
-    every = [found.logged, found.replayed, *(found.whatif[:1] if made_of.changes else ())]
+    every = [found.logged, found.replayed, *found.whatif[: made_of.first]]
     made = [
         [label.format(axis), *(cell(s, axis) if s.steady else CHAOTIC for s in every)]
         for axis in HORIZONTAL
@@ -103,7 +105,7 @@ def _sweep_cells(summary: Summary) -> list[str]:
 
 def sweep_of(made_of: Counterfactual) -> tuple[Summary, ...]:
     """What the values of the sweep gave."""
-    return made_of.whatif.whatif[1 if made_of.changes else 0 :]
+    return made_of.whatif.whatif[made_of.first :]
 
 
 def swept(made_of: Counterfactual) -> str:

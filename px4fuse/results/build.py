@@ -104,7 +104,7 @@ def sync_results(
 def whatif_results(request: WhatIfRequest, made_of: Counterfactual, command: str) -> WhatIfResults:
     """What ``px4fuse whatif`` found."""
     found = made_of.whatif
-    first = 1 if made_of.changes else 0
+    first = made_of.first
     return WhatIfResults(
         schema=schema_of(WHATIF),
         request=request.recorded(),

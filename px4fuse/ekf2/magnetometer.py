@@ -1,0 +1,72 @@
+"""The magnetometer as EKF2 fuses it: all three axes, with the fields of earth and body as states.
+
+Samples between two events are fused together at the later one, as their mean: the attitude error
+hardly changes in between. So they make no intervals of their own.
+
+Sources: PX4-Autopilot ``EKF/aid_sources/magnetometer`` (``mag_fusion.cpp``: fuseMag;
+``mag_control.cpp``: R and its floor), ``EKF/covariance.cpp`` (process noise of the fields).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from px4fuse.arrays import Array, IntArray
+from px4fuse.ekf2.intervals import BODY_FIELD, EARTH_FIELD, FIELD_STATES, THETA
+from px4fuse.ekf2.stretches import Field
+from px4fuse.trajectory.rotation import skew
+
+MIN_SD_GAUSS = 0.01
+EYE = np.eye(3)
+CROSS = skew(EYE).reshape(3, 9)  # v @ CROSS is [v]×
+
+
+class FieldSamples(NamedTuple):
+    """Field samples of the interval before each event; shape (E, ...), or (E, S, ...).
+
+    ``gauss`` is their mean (body FRD), ``turn`` the mean rotation from NED into the body, and
+    ``number`` how many EKF2 had.
+    """
+
+    gauss: Array
+    turn: Array
+    number: Array
+
+
+def gather(field: Field, rotation: Array, end: IntArray) -> FieldSamples:
+    """Samples by the event at which they are fused; ``end`` is the step of each event."""
+    event = np.searchsorted(end, field.step)
+    inside = event < len(end)
+    event, step = event[inside], field.step[inside]
+    count = np.bincount(event, minlength=len(end))
+    each = np.concatenate([field.gauss[inside][:, None], rotation[step].transpose(0, 2, 1)], axis=1)
+    total = np.zeros((len(end), 4, 3))
+    np.add.at(total, event, each)
+    mean = total / np.maximum(count, 1)[:, None, None]
+    return FieldSamples(mean[:, 0], mean[:, 1:], np.asarray(count * field.weight))
+
+
+def fuse_field(
+    x: Array, P: Array, told: FieldSamples, noise_gauss: Array, gate: Array
+) -> tuple[Array, Array]:
+    """State and covariance of S variants after the field samples of one event."""
+    earth = x[:, EARTH_FIELD]
+    of_earth, of_turn = ((each @ CROSS).reshape(-1, 3, 3) for each in (earth, x[:, THETA]))
+    H = np.zeros((len(x), 3, FIELD_STATES))
+    H[:, :, THETA] = told.turn @ of_earth
+    H[:, :, EARTH_FIELD] = told.turn @ (EYE - of_turn)
+    H[:, :, BODY_FIELD] = EYE
+    seen = (H[:, :, EARTH_FIELD] @ earth[:, :, None])[:, :, 0] + x[:, BODY_FIELD]
+    nu = told.gauss - seen
+    R = np.maximum(noise_gauss, MIN_SD_GAUSS) ** 2
+    HP = H @ P
+    S = HP @ H.transpose(0, 2, 1)
+    limit = gate[:, None] ** 2 * (np.einsum("nii->ni", S) + R[:, None])
+    taken = (told.number > 0.0) & (nu * nu <= limit).all(axis=1)
+    S += (R / np.maximum(told.number, 1.0))[:, None, None] * EYE
+    K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * taken[:, None, None]
+    x = x + (K @ nu[:, :, None])[:, :, 0]
+    P = P - K @ HP
+    return x, 0.5 * (P + P.transpose(0, 2, 1))
