@@ -36,14 +36,17 @@ NUMBER = re.compile(r"-?\d+\.\d+(?:e[-+]?\d+)?")
 LAST_DIGITS = re.compile(r"\b[0-9a-f]{64}\b|\b[0-9a-f]{12,32}…|(?<=iterations )\d+")
 
 
-def agrees(name: str, lines: list[str]) -> None:
+def agrees(name: str, lines: list[str], paragraph: int | None = None) -> None:
     """Compare with what is kept, numbers with a fraction to one in their last digit."""
-    path = GOLDEN / f"{name}.txt"
-    text = "\n".join(lines) + "\n"
+    path, kept, found = GOLDEN / f"{name}.txt", [""], "\n".join(lines)
+    if paragraph is not None:
+        kept = path.read_text(encoding="utf-8").rstrip().split("\n\n")
     if os.environ.get("PX4FUSE_GOLDEN") == "write":
-        path.write_text(text, encoding="utf-8")
-    kept = path.read_text(encoding="utf-8").splitlines()
-    found = text.splitlines()
+        at = paragraph or 0
+        kept[at : at + 1] = [found]
+        path.write_text("\n\n".join(kept) + "\n", encoding="utf-8")
+    text = path.read_text(encoding="utf-8") if paragraph is None else kept[paragraph]
+    kept, found = text.splitlines(), f"{found}\n".splitlines()
     if len(kept) == len(found):
         pairs = zip(kept, found, strict=True)
         found = [one if is_alike(one, other) else other for one, other in pairs]

@@ -3,7 +3,7 @@
 Each file in ``tests/golden`` holds what one command prints, every block of its pages with what is
 drawn, and the numbers of its results in four digits. After a change that is meant::
 
-    PX4FUSE_GOLDEN=write python -m pytest tests/test_golden.py
+    PX4FUSE_GOLDEN=write python -m pytest -n 0 tests/test_golden.py tests/test_findings.py
 
 writes them anew; look at the difference, and at the pages, before it is committed.
 """
@@ -20,20 +20,16 @@ import numpy as np
 import pytest
 from cli_tools import run
 from conftest import REPOSITORY, page_of
-from flights import unexplained, with_noises
-from golden_tools import agrees, numbers, of_blocks, of_values, rounded, value, written
+from golden_tools import agrees, numbers, of_blocks, of_values, rounded, written
 from made_up_fleet import made_up
 from scipy.spatial.transform import Rotation
-from test_findings import FAULTS
 from ulog_tools import gnss_log
 
 import px4fuse
 from px4fuse.cli import COMMANDS as CLI_COMMANDS
-from px4fuse.comparison.comparison import compare
 from px4fuse.explore.data import flight_data
 from px4fuse.explore.figures import document_json
 from px4fuse.explore.packing import Packer
-from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
 from px4fuse.fleet.page import html_text
 from px4fuse.plain import plain
@@ -193,18 +189,6 @@ def test_help_says_what_it_said() -> None:
             *run(*command.split(), "--help").output.splitlines(),
         ]
     agrees("help", lines)
-
-
-def test_findings_say_what_they_said() -> None:
-    """Each fault's finding with its sentence, remedy and evidence."""
-    lines = []
-    for fault in FAULTS:
-        comparison = compare(fault.fly(), Settings(**fault.settings))
-        asked = "sigma_z_asked_m" in fault.evidence
-        found = find(with_noises(comparison) if asked else unexplained(comparison))
-        one = next(each for each in found if each.id == fault.id)
-        lines += [f"{one.id} {one.severity} {value(one.evidence)}", one.message, one.remedy, ""]
-    agrees("findings", [rounded(line) for line in lines])
 
 
 def test_a_flight_on_gnss_shows_its_aids(tmp_path: Path, kept_pages: list[Any]) -> None:
