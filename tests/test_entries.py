@@ -222,6 +222,16 @@ def test_the_instructors_word_is_the_last(tmp_path) -> None:
     )
 
 
+def test_more_points_than_there_are_are_told_and_not_given(tmp_path) -> None:
+    rows = said(tmp_path, "1,A,95,A slip.", "1,total,200,")
+    (ada, _), notes = laid_out(TWO, overrides=rows)
+    assert ada.total == 10.0
+    assert notes == (
+        "overrides.csv: 1 cannot have more than 10 points of 'A'.",
+        "overrides.csv: 1 cannot have more than 20 points of 'total'.",
+    )
+
+
 def test_pending_points_do_not_count_until_the_instructor_says_so(tmp_path) -> None:
     files = {"1.pdf": graded("", 4.0, student_id="1", pending="Run 0.1.1.")}
     (ada, _), _ = laid_out(files, overrides=said(tmp_path, "1,A,9,"))
