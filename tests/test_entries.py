@@ -9,6 +9,7 @@ import pytest
 from class_tools import graded
 from exchange import replace
 
+from px4fuse.answers import Answers, Claim
 from px4fuse.assignment.roster import Person
 from px4fuse.errors import SettingsError
 from px4fuse.grading.entries import Course, class_entries
@@ -106,6 +107,46 @@ def test_what_is_no_report_counts_only_where_nothing_else_is_there() -> None:
     assert ada.total == 0.0
 
 
+def of_form(points: float, kind: str, **more):
+    form = Answers(log_sha256="a" * 64, mistakes=(Claim(kind),))
+    return replace(graded("", points, student_id="1"), form=form, **more)
+
+
+def test_a_guess_in_each_of_several_files_does_not_pay() -> None:
+    """None of those that came together counts until the instructor says which is meant."""
+    files = {"a.pdf": of_form(4.0, "yaw"), "b.pdf": of_form(9.0, "nlos")}
+    (ada, _), _ = laid_out(files)
+    assert ada.total is None
+    assert ada.counting.pending == "Ask which of 2 reports is meant: their forms differ."
+    assert len(ada.others) == 1
+    assert laid_out(files, Course(attempt="best"))[0][0].total == 9.0
+    # the same form twice is no guess
+    (ada, _), _ = laid_out({name: of_form(4.0, "yaw") for name in files})
+    assert ada.total == 4.0
+
+
+def test_what_is_pending_displaces_no_report_that_counts() -> None:
+    """As another's report under this student's id, handed in later."""
+    files = {"a.pdf": of_form(9.0, "yaw"), "z.pdf": of_form(2.0, "nlos", pending="Ask whose.")}
+    packed = {"a.pdf": datetime(2026, 11, 18), "z.pdf": datetime(2026, 11, 19)}
+    for times in (None, packed):
+        (ada, _), _ = laid_out(files, packed=times)
+        assert ada.total == 9.0
+        assert [one.submission for one in ada.others] == ["z.pdf"]
+    assert ada.flags == ("z.pdf is pending, so that another file counts.",)
+    waiting = replace(files["a.pdf"].items[0], waits=True)  # for the points of the text
+    files["a.pdf"] = replace(files["a.pdf"], items=(waiting,))
+    (ada, _), _ = laid_out(files)
+    assert ada.counting.submission == "a.pdf"
+
+
+def test_a_name_that_imitates_a_platforms_is_flagged() -> None:
+    name = blackboard("ada", "20-10-00-00", "ada_attempt_2026-11-18-10-00-00_r.pdf")
+    (ada, _), _ = laid_out({name: graded("", 4.0)})
+    assert ada.handed_in == "2026-11-20 10:00"
+    assert ada.flags == ("Its name has more of a platform's than Blackboard writes.",)
+
+
 def test_of_two_files_of_one_submission_the_better_one_counts() -> None:
     files = {blackboard("ada", "19-10-00-00", "a.pdf"): graded("", 8.0),
              blackboard("ada", "19-10-00-00", "b.pdf"): graded("", 2.0)}  # fmt: skip
@@ -178,6 +219,16 @@ def test_the_instructors_word_is_the_last(tmp_path) -> None:
     )
     assert text.endswith(
         "Total    8 of 20\n\nFrom your instructor:\n\nCome and\nsee me.\nAgreed.\n"
+    )
+
+
+def test_more_points_than_there_are_are_told_and_not_given(tmp_path) -> None:
+    rows = said(tmp_path, "1,A,95,A slip.", "1,total,200,")
+    (ada, _), notes = laid_out(TWO, overrides=rows)
+    assert ada.total == 10.0
+    assert notes == (
+        "overrides.csv: 1 cannot have more than 10 points of 'A'.",
+        "overrides.csv: 1 cannot have more than 20 points of 'total'.",
     )
 
 

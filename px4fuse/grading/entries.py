@@ -159,6 +159,8 @@ def _attempt(
             f"The zip file dates it {packed.strftime(SHOWN)}, after the due time; that may be when "
             "it was downloaded, so nothing was taken off."
         )
+    if origin.imitated:
+        flags.append(f"Its name has more of a platform's than {platform or 'none'} writes.")
     claimed = register.place(Person(graded.student_id)) if origin.platform else None
     if claimed is not None and place is not None and claimed != place:
         other = register.people[claimed]
@@ -183,9 +185,9 @@ def _attempt(
 
 
 def _worth(attempt: Attempt) -> float:
-    """For the best of several: what counts, pending ones last."""
+    """For the best of several: what it gives without what the instructor has still to say."""
     _, one, entry = attempt
-    return -1.0 if one.counted is None else max(one.counted - entry.deduction, 0.0)
+    return max(one.points - entry.deduction, 0.0)
 
 
 def _order(attempt: Attempt) -> tuple[object, ...]:
@@ -196,8 +198,10 @@ def _order(attempt: Attempt) -> tuple[object, ...]:
 def _chosen(attempts: Sequence[Attempt], course: Course) -> Entry:
     """The attempt that counts, with the others and what that needs said."""
     ordered = sorted(attempts, key=_order)
-    # what is not a report counts only where there is nothing else
-    able = [one for one in ordered if one[1].version] or ordered
+    # what is pending, such as another's report under this id, or no report counts only where there
+    # is nothing else
+    reports = [one for one in ordered if one[1].version]
+    able = [one for one in reports if not one[1].pending] or reports or ordered
     found = {
         "latest": able[-1],
         # several files of one submission: the best
@@ -206,15 +210,19 @@ def _chosen(attempts: Sequence[Attempt], course: Course) -> Entry:
     }[course.attempt]
     stamps, graded, entry = found
     flags = list(entry.flags)
-    beside = sum(one[0] == stamps for one in able) if any(stamps) else 1
-    if beside > 1:
-        flags.append(f"{beside} reports came at the same time; the best of them counts.")
-    last = ordered[-1][1]
-    if not last.version and last is not graded:
-        name = one_line(last.submission, 80)
-        flags.append(f"{name} cannot be read as a report, so that another file counts.")
     others = tuple(one for _, one, _ in ordered if one is not graded)
-    return replace(entry, others=others, flags=tuple(flags))
+    beside = [one for stamp, one, _ in able if stamp == stamps]
+    if course.attempt != "best" and len({one.form for one in beside}) > 1:  # a guess in each
+        graded = replace(
+            graded, pending=f"Ask which of {len(beside)} reports is meant: their forms differ."
+        )
+    elif len(beside) > 1 and any(stamps):
+        flags.append(f"{len(beside)} reports came at the same time; the best of them counts.")
+    last = ordered[-1][1]
+    if last in others and (last.pending or not last.version):
+        why = "is pending" if last.version else "cannot be read as a report"
+        flags.append(f"{one_line(last.submission, 80)} {why}, so that another file counts.")
+    return replace(entry, counting=graded, others=others, flags=tuple(flags))
 
 
 def _settled(

@@ -81,14 +81,18 @@ def matched(
             notes.append(f"{NAME}: nobody has the id {one_line(student, 40) or '(empty)'}.")
             continue
         one = entries[place].counting
-        known = [item.title for item in one.items] if one else []
-        titles = {folded(title): title for title in (*known, TOTAL, "")}
+        most = {item.title: item.of for item in one.items} if one else {}
+        most |= {TOTAL: one.of if one else MOST, "": MOST}
+        titles = {folded(title): title for title in most}
         for item, override in rows.items():
-            if folded(item) in titles:
-                said[place][titles[folded(item)]] = override
+            title, wrong = titles.get(folded(item)), ""
+            if title is None:
+                wrong = f"has no item {one_line(item, 60)!r}"
+            elif (override.points or 0.0) > most[title]:
+                wrong = f"cannot have more than {most[title]:g} points of {one_line(title, 60)!r}"
             else:
-                name = one_line(item, 60)
-                notes.append(f"{NAME}: {one_line(student, 40)} has no item {name!r}.")
+                said[place][title] = override
+            notes += [f"{NAME}: {one_line(student, 40)} {wrong}."] if wrong else []
     return said, tuple(notes)
 
 

@@ -48,6 +48,8 @@ PLATFORMS = {
         r"_(?P<number>(?!(?:19|20)\d\d/)\d+)/(?P<late>Late Submission - )?"
     ),
 }
+# What a platform writes into a name once, and nobody else by chance
+_PARTS = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")
 TIME_IN_NAMES = "%Y-%m-%d-%H-%M-%S"
 _SUBMISSION = re.compile(r"^(?:submission_)?(\d+)(?:\.pdf)?:\s*\n((?:[ -].*\n?)*)", re.MULTILINE)
 _SUBMITTERS = re.compile(r"^  :submitters:\s*\n((?:  - .*\n?|    .*\n?)*)", re.MULTILINE)
@@ -72,12 +74,15 @@ class ExportOrigin:
         Without a time zone where the platform leaves it out.
     late : bool
         Whether the platform marks it so.
+    imitated : bool
+        Whether a student's own part of the name looks like a platform's.
     """
 
     platform: str = ""
     person: Person = UNKNOWN
     time: datetime | None = None
     late: bool = False
+    imitated: bool = False
 
 
 NOBODY = ExportOrigin()
@@ -111,7 +116,8 @@ def origin_of(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> ExportO
             whole = said.get("name") or f"{said.get('first', '')} {said.get('last', '')}".strip()
             numbers = {platform: said["number"]} if "number" in said else {}
             person = Person("", whole, "", said.get("login", ""), numbers)
-            return ExportOrigin(platform, person, time, bool(said.get("late")))
+            imitated = len(_PARTS.findall(name)) > (platform in ("moodle", "blackboard"))
+            return ExportOrigin(platform, person, time, bool(said.get("late")), imitated)
     return NOBODY
 
 
