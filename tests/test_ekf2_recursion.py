@@ -38,8 +38,8 @@ from px4fuse.ekf2.recursion import (
     run,
 )
 from px4fuse.ekf2.recursion import _measurements as measurements
-from px4fuse.ekf2.stretches import Stretch
-from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, Aid, settings_in_force
+from px4fuse.ekf2.stretches import Field, Stretch
+from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, MAG, Aid, settings_in_force
 from px4fuse.errors import SettingsError
 from px4fuse.trajectory.rotation import skew
 
@@ -289,10 +289,31 @@ def test_vision_that_is_lost_leaves_the_vehicle_to_the_imu() -> None:
     assert (np.diff(done.variance[11:, 0, 6]) > 0.0).all()
 
 
+@pytest.mark.parametrize("speed_m_s", [None, np.zeros((20, 3))])
+def test_with_a_magnetometer_the_heading_is_told_by_it_and_the_height_is_ekf2s_own(
+    speed_m_s: Any,
+) -> None:
+    """The filter begins 0.05 rad off, and what the log has of the heading is not taken."""
+    done = at_rest([0.0] * 5 + [1.0] * 15, aid=GNSS_POS, rules=GNSS_RULES, speed_m_s=speed_m_s,
+                   heading_rad=0.05, down_m=-3.0, field_gauss=(0.21, 0.0, 0.43))  # fmt: skip
+    assert done.state.shape == (len(done.innovation) + 1, 1, 21)
+    heading = done.state[:, 0, 2]
+    assert 0.02 < heading[1] < 0.05
+    assert heading[-1] == pytest.approx(0.0, abs=0.01)
+    # 28 samples of 0.21 gauss, each 0.05 exact; the gyro adds a little
+    told = 1.0 / (0.01**-1 + 28 * (0.21 / 0.05) ** 2)
+    assert told < done.variance[-1, 0, 2] < 1.4 * told
+    np.testing.assert_array_equal(done.state[1:, 0, 8], -3.0)
+    np.testing.assert_allclose(done.variance[10:, 0, 8], 4e-4, rtol=1e-3)
+    assert done.fused.all()
+    assert done.state[-1, 0, 6] > 0.02
+
+
 def at_rest(
     measured_m: list[float], logged: float = np.nan, down_m: float = 0.0, aid: Aid = EV_POS,
     rules: Rules = RULES, speed_m_s: Any = None, velocity: bool = True,
-    tilt_rad2: float = np.inf, without: Any = None, **settings: float,
+    tilt_rad2: float = np.inf, without: Any = None, heading_rad: float = 0.0,
+    field_gauss: Any = None, **settings: float,
 ) -> Run:  # fmt: skip
     """A level vehicle that stands still at the origin, seen at 10 Hz at these places north.
 
@@ -310,6 +331,14 @@ def at_rest(
         down_variance_m2=np.full(count + 1, 4e-4), attitude_error_rad=np.zeros((count + 1, 3)),
         correlation=np.eye(15),
     )  # fmt: skip
+    stretch.state[2] = heading_rad
+    if field_gauss is not None:
+        stretch = replace(
+            stretch, state=np.concatenate([stretch.state, field_gauss, np.zeros(3)]),
+            variance=np.concatenate([stretch.variance, np.full(6, 1e-8)]), correlation=np.eye(21),
+            field=Field(np.arange(7, count, 7), np.tile(field_gauss, ((count - 1) // 7, 1)), 1.0),
+        )  # fmt: skip
+        stretch.variance[2] = 0.01
     stamp = 10.105 + 0.1 * np.arange(len(measured_m))
     north = np.array(measured_m)
     vision = Received(
@@ -322,7 +351,8 @@ def at_rest(
             vision, velocity_m_s=speed_m_s, velocity_variance_m2_s2=np.zeros_like(speed_m_s)
         )
     inputs = Inputs(
-        settings_in_force(settings, aid), (stretch,), vision, rules, 0.01, 0.1, 0.01,
+        settings_in_force(settings, aid, *([MAG] if stretch.field else [])), (stretch,), vision,
+        rules, 0.01, 0.1, 0.01,
         vision_height=False, imu_offset_m=np.zeros(3), aid=aid,
     )  # fmt: skip
     intervals = make_intervals(inputs, stretch, Timing(0.0, 0.1))

@@ -32,7 +32,7 @@ from px4fuse.ekf2.intervals import (
 )
 from px4fuse.ekf2.magnetometer import FieldSamples, fuse_field, gather
 from px4fuse.ekf2.stretches import Stretch
-from px4fuse.ekf2_parameters import GNSS_VEL, MAG
+from px4fuse.ekf2_parameters import GNSS_POS, GNSS_VEL, MAG
 
 # How long the first pass runs that gives the correlations at the start
 CORRELATING_S = 8.0
@@ -177,10 +177,10 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     with_velocity = (action == FUSE) & (now_s < off_s[GNSS_VEL.name]) & fuses_velocity
     sample = np.maximum(intervals[0].events.sample, 0)
     measured, noise = _measurements(inputs, stretch, sample, end, knob, reported)
-    in_turn = inputs.received.velocity_m_s is not None
+    in_turn, has_speed = inputs.aid == GNSS_POS, inputs.received.velocity_m_s is not None
     gates = [knob.get(GNSS_VEL.gate, np.ones(size)), knob[inputs.aid.gate]]
     gate2 = np.maximum(np.repeat(np.stack(gates, axis=1), 3, axis=1), MIN_GATE) ** 2
-    # height and heading are measured by EKF2's own
+    # height, and without a magnetometer the heading, are measured by EKF2's own
     own = np.stack([stretch.attitude_error_rad[end, HEADING], stretch.down_m[end]], axis=-1)
     own_attitude = stretch.attitude_variance_rad2[end]
     own_variance = np.stack([own_attitude[:, :, HEADING], stretch.down_variance_m2[end]], axis=-1)
@@ -238,37 +238,41 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
             rejected[e], fused[e], reset[e], moving = fusion.decide(e, outside, moving)
             if in_turn:
                 if seen is None:
-                    P = _surer(P, own_attitude[e, :, :HEADING])
-                x, P = _in_turn(x, P, nu, S, noise[e], SPEED, moving)
+                    for row in range(HEADING):
+                        _, P = _surer(P, row, own_attitude[e, :, row])
+                if has_speed:
+                    x, P = _in_turn(x, P, nu, S, noise[e], SPEED, moving)
                 x, P = _in_turn(x, P, nu, S, noise[e], LEVEL, fused[e])
                 spread = _diagonal(P)
             else:
                 innovation[:, 2:] = nu[:, LEVEL]
                 R[fused[e], 2:] = noise[e, fused[e], LEVEL]
-        np.subtract(own[e], x[:, OWN], out=innovation[:, :2])
-        R[:, :2] = _down_to(spread[:, OWN], own_variance[e])
-        if seen is not None:
-            innovation[:, 0], R[:, 0] = 0.0, NOT_TAKEN
-        heading = np.where(attitude, x[:, HEADING] + innovation[:, 0], 0.0)
-        if inputs.vision_height:
-            R[:, 1] = NOT_TAKEN
-            if sampled[e]:
-                innovation[:, 1] = nu[:, 5]
-                R[:, 1] = np.where(active[e], noise[e, :, 5], NOT_TAKEN)
-        # K = PH'(HPH' + R)⁻¹, x = x + Kν, P = P - KHP
-        HP = np.take(P, MEASURED, axis=1)
-        HPH = np.take(HP, MEASURED, axis=2)
-        HPH.reshape(size, -1)[:, :: len(MEASURED) + 1] += R
-        K = np.swapaxes(HP, 1, 2) @ np.linalg.inv(HPH)
-        x = x + (K @ innovation[:, :, None])[:, :, 0]
-        if seen is None:
+        if seen is not None:  # only the height is EKF2's own, and held
+            K, P = _surer(P, DOWN, own_variance[e, :, 1])
+            x = x + K * (own[e, :, 1] - x[:, DOWN])[:, None]
+            x[:, DOWN] = own[e, :, 1]
+        else:
+            np.subtract(own[e], x[:, OWN], out=innovation[:, :2])
+            R[:, :2] = _down_to(spread[:, OWN], own_variance[e])
+            heading = np.where(attitude, x[:, HEADING] + innovation[:, 0], 0.0)
+            if inputs.vision_height:
+                R[:, 1] = NOT_TAKEN
+                if sampled[e]:
+                    innovation[:, 1] = nu[:, 5]
+                    R[:, 1] = np.where(active[e], noise[e, :, 5], NOT_TAKEN)
+            # K = PH'(HPH' + R)⁻¹, x = x + Kν, P = P - KHP
+            HP = np.take(P, MEASURED, axis=1)
+            HPH = np.take(HP, MEASURED, axis=2)
+            HPH.reshape(size, -1)[:, :: len(MEASURED) + 1] += R
+            K = np.swapaxes(HP, 1, 2) @ np.linalg.inv(HPH)
+            x = x + (K @ innovation[:, :, None])[:, :, 0]
             x[:, HEADING] = heading
-        P = P - K @ HP
-        P = 0.5 * (P + np.swapaxes(P, 1, 2))
+            P = P - K @ HP
+            P = 0.5 * (P + np.swapaxes(P, 1, 2))
         if reset[e].any():
             after = inputs.rules.reset_scale * noise[e, :, LEVEL]
             _set(x, P, reset[e], HORIZONTAL, measured[e, :, LEVEL], after)
-            if in_turn and inputs.rules.with_velocity:
+            if has_speed and inputs.rules.with_velocity:
                 _set(x, P, reset[e], VELOCITY, measured[e, :, SPEED], noise[e, :, SPEED])
         states[e + 1], spreads[e + 1] = x, _diagonal(P)
     return Run(
@@ -285,18 +289,16 @@ def _set(x: Array, P: Array, which: BoolArray, rows: slice, value: Array, varian
     P[which, rows, rows] = np.eye(value.shape[1]) * variance[which][:, :, None]
 
 
-def _surer(P: Array, target: Array) -> Array:
-    """Bring the variances of the tilt down to the logged ones, and with them all that they bear on.
+def _surer(P: Array, row: int, target: Array) -> tuple[Array, Array]:
+    """Bring one variance down to the logged one, and with it all that it bears on; and the gain.
 
-    The magnetometer tells EKF2 of the tilt too. What it tells is not in the log, so that the tilt
-    itself stays as it is.
+    The magnetometer tells EKF2 of the tilt too. What it tells is not always in the log, so that the
+    tilt itself stays as it is.
     """
-    for row in range(target.shape[-1]):
-        spread = P[:, row, row]
-        R = _down_to(spread, target[:, row])
-        K = P[:, :, row] / (spread + R)[:, None]
-        P = P - K[:, :, None] * P[:, None, row]
-    return P
+    spread = P[:, row, row]
+    R = _down_to(spread, target)
+    K = P[:, :, row] / (spread + R)[:, None]
+    return K, P - K[:, :, None] * P[:, None, row]
 
 
 def _in_turn(
