@@ -309,14 +309,16 @@ def _in_turn(
     As fuseDirectStateMeasurement (``ekf_helper.cpp``), in Joseph's form, which bears a gain that is
     not the optimal one.
     """
+    weight = taken[:, None] / S
     for j in range(part.start, part.stop):
         row = TOLD.start + j
-        K = np.where(taken[:, None], P[:, :, row] / S[:, j, None], 0.0)
+        column = P[:, :, row]
+        K = column * weight[:, j, None]
         x = x + K * nu[:, j, None]
-        A = P - K[:, :, None] * P[:, None, row]
-        left = A[:, :, row] - R[:, j, None] * K
-        P = A - left[:, :, None] * K[:, None]
-        P = 0.5 * (P + np.swapaxes(P, 1, 2))
+        # P - KHP - (KHP)' + K(HPH' + R)K': one product and what it is turned, symmetric as P is
+        half = column - (0.5 * (column[:, row] + R[:, j]))[:, None] * K
+        taken_off = K[:, :, None] * half[:, None]
+        P = P - (taken_off + np.swapaxes(taken_off, 1, 2))
     return x, P
 
 
