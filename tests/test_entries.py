@@ -133,7 +133,7 @@ def test_what_is_pending_displaces_no_report_that_counts() -> None:
         (ada, _), _ = laid_out(files, packed=times)
         assert ada.total == 9.0
         assert [one.submission for one in ada.others] == ["z.pdf"]
-    assert ada.flags == ("z.pdf is pending, so that another file counts.",)
+        assert ada.flags == ("z.pdf is pending, so that another file counts.",)
     waiting = replace(files["a.pdf"].items[0], waits=True)  # for the points of the text
     files["a.pdf"] = replace(files["a.pdf"], items=(waiting,))
     (ada, _), _ = laid_out(files)

@@ -218,10 +218,10 @@ def _chosen(attempts: Sequence[Attempt], course: Course) -> Entry:
         )
     elif len(beside) > 1 and any(stamps):
         flags.append(f"{len(beside)} reports came at the same time; the best of them counts.")
-    last = ordered[-1][1]
-    if last in others and (last.pending or not last.version):
-        why = "is pending" if last.version else "cannot be read as a report"
-        flags.append(f"{one_line(last.submission, 80)} {why}, so that another file counts.")
+    for stamp, one, _ in ordered:
+        if one in others and stamp >= stamps and (one.pending or not one.version):
+            why = "is pending" if one.version else "cannot be read as a report"
+            flags.append(f"{one_line(one.submission, 80)} {why}, so that another file counts.")
     return replace(entry, counting=graded, others=others, flags=tuple(flags))
 
 
