@@ -16,7 +16,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import noises_and_clock
 from px4fuse.filter.causes import Explained, explained, fit
-from px4fuse.filter.coloured import Smoothing, smoothing
+from px4fuse.filter.coloured import Smoothing
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings
@@ -173,11 +173,11 @@ def test_other_mistakes_are_no_smoothing(mistake) -> None:
 
 def test_a_shift_of_the_stamps_that_explains_as_much_is_no_smoothing() -> None:
     late = flown("clock-offset=250ms")
-    axes = tuple(result.axis for result in late.axes.values())
-    given = {"sigma_a_m_s2": 0.27, "sigma_z_m": 0.10, "outlier_time_s": np.array([])}
-    told = smoothing(axes, RIGHT, **given, clock_offset_s=-0.25)
-    assert isinstance(told, Smoothing)
-    assert told.gain_nats == 0.0
+    assert isinstance(late.smoothing, Smoothing)
+    assert late.smoothing.gain_nats == 0.0
+    unknown = replace(late, clock=unavailable("clock offset")).smoothing
+    assert isinstance(unknown, Smoothing)
+    assert unknown.gain_nats > 3.0
 
 
 # ------------------------------------------------------------------ stamps of arrival
