@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import compare, compare_prepared
 from px4fuse.comparison.estimates import (
     Progress,
@@ -39,7 +38,7 @@ from px4fuse.ekf2_parameters import check
 from px4fuse.errors import LogError, MissingDataError, SettingsError
 from px4fuse.filter.causes import AFTER_STEP_S, Explained, explained
 from px4fuse.filter.clock import ClockOffset
-from px4fuse.filter.coloured import Coloured, Smoothing, coloured, smoothing
+from px4fuse.filter.coloured import Coloured, Smoothing, hanging_together
 from px4fuse.filter.heading import HeadingError
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Axis
@@ -54,8 +53,6 @@ if TYPE_CHECKING:
 
 # Noises that the report states: those of a source once. Each axis by itself is for `px4fuse tune`
 REPORTED = (HORIZONTAL, "down")
-# Gain of a low pass below which no slow error is looked for; clean flights have 0 to 2
-WORTH_A_LOOK_NATS = 5.0
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -108,56 +105,61 @@ class Analysis(Comparison):
         found = self._horizontally()
         if isinstance(found, Unavailable):
             return found
-        axes, left_out, noises = found
-        return explained(self.flight, axes, self.settings, outlier_time_s=left_out, **noises)
+        axes, tuned, offset_s = found
+        return explained(
+            self.flight,
+            axes,
+            self.settings,
+            sigma_a_m_s2=size(tuned.filter_sigma_a, self.settings.sigma_a_m_s2),
+            sigma_z_m=size(tuned.sigma_z, self.settings.sigma_z_m),
+            outlier_time_s=tuned.outlier_time_s,
+            clock_offset_s=offset_s,
+        )
 
     @cached_property
-    def smoothing(self) -> Smoothing | Unavailable:
-        """A low pass in the source."""
+    def hanging_together(self) -> tuple[Smoothing, Coloured | Unavailable] | Unavailable:
+        """A low pass and a slow error of the source, jumps taken out."""
         found = self._horizontally()
         if isinstance(found, Unavailable):
             return found
-        axes, left_out, noises = found
-        # the filter comes to a jump as slowly as a low pass would
-        time_s = axes[0].measurement_time_s
-        for jump in self.explained.jumps if isinstance(self.explained, Explained) else ():
+        axes, tuned, offset_s = found
+        jumps = self.explained.jumps if isinstance(self.explained, Explained) else ()
+        # when exactly a jump was is not known
+        time_s, left_out = axes[0].measurement_time_s, tuned.outlier_time_s
+        for jump in jumps:
             near = (time_s >= jump.time_s) & (time_s < jump.time_s + AFTER_STEP_S)
             left_out = np.union1d(left_out, time_s[near])
-        return smoothing(axes, self.settings, outlier_time_s=left_out, **noises)
+        return hanging_together(
+            self.flight, axes, self.settings, tuned.noises, outlier_time_s=left_out,
+            clock_offset_s=offset_s, jumps=jumps,
+        )  # fmt: skip
 
-    @cached_property
+    @property
+    def smoothing(self) -> Smoothing | Unavailable:
+        """A low pass in the source."""
+        found = self.hanging_together
+        return found if isinstance(found, Unavailable) else found[0]
+
+    @property
     def coloured(self) -> Coloured | Unavailable:
         """A slow error of the source, where something makes successive errors hang together."""
-        found, smooth = self._horizontally(), self.smoothing
-        if isinstance(found, Unavailable):
-            return found
-        if isinstance(smooth, Unavailable):
-            return smooth
-        if smooth.gain_nats < WORTH_A_LOOK_NATS:
-            return Unavailable("slow errors of the source", "its errors do not hang together", "")
-        axes, left_out, noises = found
-        del noises["clock_offset_s"]
-        return coloured(axes, self.settings, outlier_time_s=left_out, lag_s=smooth.lag_s, **noises)
+        found = self.hanging_together
+        return found if isinstance(found, Unavailable) else found[1]
 
     @cached_property
     def aids(self) -> Mapping[str, AidResult] | Unavailable:
         """Every aid that EKF2 can fuse, judged by its own innovations."""
         return judge_aids(self.flight)
 
-    def _horizontally(self) -> tuple[tuple[Axis, ...], Array, dict[str, float]] | Unavailable:
-        """The horizontal axes, times of outliers, noises and a clock offset beyond doubt."""
-        clock, offset_s, settings = self.clock, 0.0, self.settings
+    def _horizontally(self) -> tuple[tuple[Axis, ...], AxisTuning, float] | Unavailable:
+        """The horizontal axes, their noises and outliers, and a clock offset beyond doubt."""
+        clock, offset_s = self.clock, 0.0
         if isinstance(clock, ClockOffset) and clock.determinable:
             offset_s = clock.remaining_s if abs(clock.remaining_s) > clock.chance_s else 0.0
         for name, group in ((HORIZONTAL, ("north", "east")), (AISLE, (AISLE,))):
             tuned = self.tuning.get(name)
             if isinstance(tuned, AxisTuning) and self.axes.keys() >= set(group):
-                noises = {
-                    "sigma_a_m_s2": size(tuned.filter_sigma_a, settings.sigma_a_m_s2),
-                    "sigma_z_m": size(tuned.sigma_z, settings.sigma_z_m),
-                    "clock_offset_s": offset_s,
-                }
-                return tuple(self.axes[each].axis for each in group), tuned.outlier_time_s, noises
+                return tuple(self.axes[each].axis for each in group), tuned, offset_s
         return Unavailable(
             "causes beyond noise",
             "the noises of the horizontal axes are not known",

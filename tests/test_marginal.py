@@ -128,7 +128,16 @@ WEAK = np.array([1e-6, 1e-4])  # of position and velocity where a stretch starts
 WEIGHT = np.random.default_rng(2).uniform(0.1, 1.0, COUNT)
 SOME_NOISES = [
     Noises(*each)
-    for each in ((0.5, 0.1), (0.05, 0.1), (2.0, 0.1), (0.5, 0.02), (0.5, 1.0), (0.5, 0.1, 0.3))
+    for each in (
+        (0.5, 0.1),
+        (0.05, 0.1),
+        (2.0, 0.1),
+        (0.5, 0.02),
+        (0.5, 1.0),
+        (0.5, 0.1, 0.3),
+        (0.5, 0.1, 0.0, 0.3, 0.7),
+        (0.5, 0.1, 0.3, 0.05, 3.0),
+    )
 ]
 
 
@@ -163,6 +172,8 @@ def arguments(
     positions: Positions, noises: Noises, weight: Array
 ) -> tuple[Positions, float, Array]:
     """What :func:`fit` takes."""
+    if noises.slow_m:
+        positions = replace(positions, slow=(noises.slow_m, noises.tau_s))
     scaled, variance = positions.over(1.0, noises.walk_m, weight / noises.sigma_z_m**2)
     return scaled, noises.sigma_a_m_s2, variance
 
@@ -192,6 +203,10 @@ def stretch_normal(
     signals = np.array([-means[k][0] for k in used]).reshape(-1, 4)
     signals[:, 0] += part.measurement_m[kept, axis]
     covariance = np.array([cross[k, j][0, 0] for k in used for j in used])
+    if noises.slow_m:
+        time = np.concatenate([[0.0], np.cumsum(part.length_s)])[kept]
+        slow = noises.slow_m**2 * np.exp(-np.abs(time[:, None] - time) / noises.tau_s)
+        covariance = covariance + slow.ravel()
     return kept, signals, covariance.reshape(len(used), len(used)) + np.diag(variance[kept])
 
 
@@ -206,7 +221,7 @@ def joint_normal(
 
 
 def test_marginal_constants_are_a_covariance() -> None:
-    """At all offsets and noises, weights and a walk, but for one number that is always the same."""
+    """At all offsets and noises, but for one number that is always the same."""
     part = with_constants()
 
     def dense(noises: Noises, at: int) -> float:

@@ -10,15 +10,12 @@ import numpy as np
 import pytest
 import source_errors as errors
 from exchange import replace
-from filterpy.kalman import KalmanFilter
 from scipy.interpolate import CubicSpline
 
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.comparison import compare
-from px4fuse.filter import coloured as colours
-from px4fuse.filter.coloured import Coloured
-from px4fuse.filter.likelihood import preintegrate
-from px4fuse.filter.model import INITIAL_COVARIANCE
+from px4fuse.filter.coloured import Coloured, hanging_together
+from px4fuse.filter.fitting import Noises
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding, find
 from px4fuse.findings.causes import SETTINGS
@@ -28,6 +25,7 @@ from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.scenario import Scenario
 
 RIGHT = Settings(0.27, 0.10)
+NONE = np.zeros(0)
 NEW = {"source_coloured", "source_repeats", "source_axes_unequal", "source_noise_changes"}
 
 
@@ -65,7 +63,7 @@ def test_white_noise_is_no_other(seed: int) -> None:
     analysis = judged(errors.white, seed=seed)
     assert told(analysis) == {}
     assert list(detect(analysis)) == []
-    assert isinstance(analysis.coloured, Unavailable)  # not even looked for
+    assert isinstance(analysis.coloured, Unavailable)
 
 
 @pytest.mark.parametrize(
@@ -112,7 +110,7 @@ def test_a_slow_error_is_no_low_pass_and_a_low_pass_no_slow_error(seed: int) -> 
         found = analysis.coloured
         assert isinstance(found, Coloured)
         assert found.gain_nats > 30.0
-        assert (found.lag_nats > 4.0) == lags
+        assert (found.lag_nats > 1.0) == lags
         assert 0.5 < found.share <= 1.0
 
 
@@ -127,43 +125,47 @@ def test_outliers_and_a_jump_are_none_of_them() -> None:
         assert not NEW & set(found)
 
 
-def test_the_likelihood_is_that_of_a_filter_of_three_states() -> None:
-    """Against filterpy, measurement by measurement."""
-    axis = judged(MIXED).axes["north"].axis
-    axis = replace(axis, measurement_time_s=axis.measurement_time_s[:60],
-                   measurement_m=axis.measurement_m[:60])  # fmt: skip
-    legs = preintegrate(axis, RIGHT)
-    skip = np.zeros(60, bool)
-    skip[[20, 21, 40]] = True
-    sigma_a, white, slow, tau = 0.3, 0.06, 0.09, 0.7
-    ours = colours._slow_score([legs], skip, *(np.array([x]) for x in (sigma_a, white, slow, tau)))
-    kf = KalmanFilter(dim_x=3, dim_z=1, dim_u=2)
-    a, b, d = INITIAL_COVARIANCE
-    kf.x = np.array([[legs.initial.position_m], [legs.initial.velocity_m_s], [0.0]])
-    kf.P = np.array([[a, b, 0.0], [b, d, 0.0], [0.0, 0.0, slow**2]])
-    kf.H, kf.R = np.array([[1.0, 0.0, 1.0]]), np.array([[white**2]])
-    kf.B = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
-    total = 0.0
-    for k in range(len(legs.length_s)):
-        dt, rho = legs.length_s[k], np.exp(-legs.length_s[k] / tau)
-        kf.F = np.array([[1.0, dt, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, rho]])
-        q00, q01, q11 = sigma_a**2 * legs.noise_unit[k] + legs.noise_fixed[k]
-        slow_q = slow**2 * (1.0 - rho**2)
-        kf.Q = np.array([[q00, q01, 0.0], [q01, q11, 0.0], [0.0, 0.0, slow_q]])
-        kf.predict(np.array([[legs.delta_position_m[k]], [legs.delta_velocity_m_s[k]]]))
-        if not skip[-len(legs.length_s) :][k]:
-            kf.update(legs.measurement_m[k])
-            total += 0.5 * float(np.log(kf.S[0, 0]) + kf.y[0, 0] ** 2 / kf.S[0, 0])
-    assert ours == pytest.approx([total], abs=1e-8)
-
-
 def test_too_few_and_no_imu_are_said() -> None:
-    axis: Any = judged(MIXED).axes["north"].axis
-    given = {"sigma_a_m_s2": 0.3, "sigma_z_m": 0.1, "outlier_time_s": np.array([]), "lag_s": 0.2}
+    analysis = judged(MIXED)
+    axis, given = analysis.axes["north"].axis, {"outlier_time_s": NONE, "clock_offset_s": 0.0}
     few = replace(axis, measurement_time_s=axis.measurement_time_s[:99],
                   measurement_m=axis.measurement_m[:99])  # fmt: skip
-    found = colours.coloured((few,), RIGHT, **given)
+    found = hanging_together(analysis.flight, (few,), RIGHT, Noises(0.3, 0.1), **given)
     assert isinstance(found, Unavailable)
     assert "99" in found.reason
-    blind = replace(axis, acceleration=Unavailable("acceleration", "no IMU", ""))
-    assert colours.coloured((blind,), RIGHT, **given) == blind.acceleration
+    blind = replace(analysis.flight, imu=Unavailable("IMU", "no IMU", ""))
+    assert hanging_together(blind, (axis,), RIGHT, Noises(0.3, 0.1), **given) == blind.imu
+
+
+def test_a_slow_error_shows_beside_a_jump_and_outliers() -> None:
+    """Both are taken out first, and named besides."""
+    assert {"source_jumps", "source_coloured"} <= set(told(judged(partial(both, jump_m=2.0))))
+    found = told(judged(partial(both, outliers=0.03)))
+    assert {"source_outliers", "source_coloured"} <= set(found)
+    assert "source_jumps" not in found
+
+
+def both(rng: Any, time: Any, true: Any, jump_m: float = 0.0, outliers: float = 0.0) -> Any:
+    return SLOW(rng, time, true)[0] + errors.jumped(rng, time, true, jump_m)[0] * bool(jump_m) + (
+        errors.with_outliers(rng, time, true, outliers)[0] * bool(outliers)
+    ), 0.0
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_jump_among_outliers_is_one_with_its_size_and_time(seed: int) -> None:
+    """Real outliers in the seconds after it used to make it one of them."""
+    kept: dict[str, float] = {}
+
+    def model(rng: Any, time: Any, true: Any) -> Any:
+        at = 2 * len(time) // 3
+        kept["at_s"] = time[at]
+        error, _ = errors.with_outliers(rng, time, true, 0.08)
+        error[at:, 0] += 1.0
+        return error, 0.0
+
+    found = told(judged(model, seed=seed))
+    assert {"source_jumps", "source_outliers"} == set(found)
+    evidence = found["source_jumps"].evidence
+    assert evidence["count"] == 1
+    assert evidence["size_m"] == pytest.approx(1.0, abs=4.0 * evidence["sigma_m"])
+    assert evidence["at_s"] == pytest.approx(kept["at_s"], abs=0.2)

@@ -63,8 +63,8 @@ BURST_S = 1.0
 AFTER_STEP_S = 6.0
 # Chance that a flight without a step shows one anywhere
 STEP_FALSE_ALARM = 1e-3
-# Mean NIS of what follows a step that is one: of outliers that end, it stays far above 1
-STEP_NIS = 2.5
+# Chance that a measurement that is no outlier beside a step is taken for one; places of it tried
+AGREES, PLACES = 1e-3, 6
 MAX_JUMPS = 3
 BIAS_M_S2 = 0.2  # half of EKF2's own limit, EKF2_ABL_LIM
 BIAS_SIGMAS = 4.0  # 6e-5 of clean flights lie beyond
@@ -174,10 +174,8 @@ def explained(
         return too_few(CAUSES, count, MIN_MEASUREMENTS)
     levels = sigma_a_m_s2 * SIGMA_A_FACTORS
     sigma_a, found = _fit_noise(model, levels, skip)
-    jumps = _jumps(model, sigma_a, skip)
+    jumps, skip = _jumps(model, sigma_a, skip)
     if jumps:
-        for jump in jumps:
-            skip = skip & ~_from(model.time_s, jump.time_s, AFTER_STEP_S)
         model = replace(model, steps=steps(model.time_s, [jump.time_s for jump in jumps]))
         sigma_a, found = _fit_noise(model, levels, skip)
     return Explained(
@@ -223,43 +221,52 @@ def _scale(model: Hypotheses, sigma_a: float, skip: BoolArray) -> Estimate:
     return Estimate(float(found * turned - 1.0), float(sigma))
 
 
-def _jumps(model: Hypotheses, sigma_a: float, skip: BoolArray) -> tuple[Jump, ...]:
-    """Steps of the source that stay, the largest first found, in order of time.
+def _jumps(
+    model: Hypotheses, sigma_a: float, skip: BoolArray
+) -> tuple[tuple[Jump, ...], BoolArray]:
+    """Steps of the source that stay, in order of time, and what is an outlier beside them.
 
     Times are proposed by a scan over all, and by where runs of outliers begin: a step begins with
-    one. Each is then judged without what follows within a second, by what the vehicle's own
-    reading makes of the rest, so that a burst of outliers is none.
+    one. Each is then judged without what follows within a second, so that a burst of outliers is
+    none. Where exactly it is, which its size depends on, is found last.
     """
     jumps: list[Jump] = []
-    found = skip
     for _ in range(MAX_JUMPS):
         model = replace(model, steps=steps(model.time_s, [jump.time_s for jump in jumps]))
-        starts = np.flatnonzero(found & ~np.concatenate([[False], found[:-1]]))
-        proposed = [float(model.time_s[at]) for at in starts]
-        proposed += _scan(model, sigma_a, found)
-        chance = STEP_FALSE_ALARM / max(len(proposed), 1)
-        judged = [_judge(model, sigma_a, found, time_s, chance) for time_s in proposed]
+        starts = model.time_s[np.flatnonzero(skip & ~np.concatenate([[False], skip[:-1]]))]
+        proposed = [*_scan(model, sigma_a, skip, starts), *_scan(model, sigma_a, skip)[:1]]
+        chance = STEP_FALSE_ALARM / max(len(starts), 1)
+        judged = [_judge(model, sigma_a, skip, time_s, chance) for time_s in proposed]
         named = [jump for jump in judged if jump is not None]
         if not named:
             break
-        best = max(named, key=lambda jump: jump.chi_square)
+        best, skip = _placed(model, sigma_a, skip, max(named, key=lambda jump: jump.chi_square))
         jumps.append(best)
-        found = found & ~_from(model.time_s, best.time_s, AFTER_STEP_S)
-    return tuple(sorted(jumps, key=lambda jump: jump.time_s))
+    return tuple(sorted(jumps, key=lambda jump: jump.time_s)), skip
 
 
 def _from(time_s: Array, start_s: float, length_s: float) -> BoolArray:
     return np.asarray((time_s >= start_s) & (time_s < start_s + length_s))
 
 
-def _scan(model: Hypotheses, sigma_a: float, skip: BoolArray) -> list[float]:
-    """The time at which a step would explain most, where that is more than chance would."""
-    base = model.fit(sigma_a, skip)
-    times = model.time_s[EDGE:-EDGE]
-    times = times[:: max(1, -(-len(times) // MAX_STEPS))]
+def _scan(
+    model: Hypotheses, sigma_a: float, skip: BoolArray, times: Array | None = None
+) -> list[float]:
+    """The times at which a step would explain more than chance, by default of all; most first."""
+    if times is None:
+        times = model.time_s[EDGE:-EDGE]
+        times = times[:: max(1, -(-len(times) // MAX_STEPS))]
     if not len(times):
         return []
-    # what a step at each time takes away of the squares, summed over the axes
+    chi_square = _step_squares(model, sigma_a, skip, times)
+    least = chdtri(len(model.legs), STEP_FALSE_ALARM / len(model.time_s))
+    order = np.argsort(-chi_square)
+    return [float(times[at]) for at in order if chi_square[at] >= least]
+
+
+def _step_squares(model: Hypotheses, sigma_a: float, skip: BoolArray, times: Array) -> Array:
+    """χ² of a step at each time: what it takes away of the squares, summed over the axes."""
+    base = model.fit(sigma_a, skip)
     chi_square = np.zeros(len(times))
     for axis in range(len(model.legs)):
         rows = base.axis == axis
@@ -267,26 +274,42 @@ def _scan(model: Hypotheses, sigma_a: float, skip: BoolArray) -> list[float]:
         for few in np.array_split(np.arange(len(times)), -(-len(times) // STEPS_AT_ONCE)):
             added = steps(model.time_s, times[few])
             alone = _with_signals(model.legs[axis], 0.0 * added, 0.0 * added, added)
-            response, _ = model.whitened(alone, sigma_a, skip)
+            response = model.whitened(alone, sigma_a, skip)[0][~skip]
             mixed = columns.T @ response
             size = np.sum(response**2, axis=0) - np.sum(mixed * (base.covariance @ mixed), axis=0)
             chi_square[few] += (rest @ response) ** 2 / np.maximum(size, 1e-9)
-    chi_square /= max(base.spread, 1.0) ** 2
-    best = int(np.argmax(chi_square))
-    if chi_square[best] < chdtri(len(model.legs), STEP_FALSE_ALARM / len(model.time_s)):
-        return []
-    return [float(times[best])]
+    return np.asarray(chi_square / max(base.spread, 1.0) ** 2)
+
+
+def _placed(
+    model: Hypotheses, sigma_a: float, skip: BoolArray, jump: Jump
+) -> tuple[Jump, BoolArray]:
+    """A jump at the most likely time near its own, with its size, and what is an outlier then."""
+    near = np.abs(model.time_s - jump.time_s) <= BURST_S
+    # with the step in the middle of what is not known, what follows is no outlier where it agrees
+    square = model.with_step(jump.time_s)[0].squares(sigma_a, skip | near)
+    after = near | _from(model.time_s, jump.time_s, AFTER_STEP_S)
+    skip = np.where(after & ~near, square > chdtri(len(model.legs), AGREES), skip)
+    times = model.time_s[near]
+    likely = np.argsort(-_step_squares(model, sigma_a, skip & ~near, times))[:PLACES]
+    placed = []
+    for at in times[likely].tolist():
+        square = model.with_step(at)[0].squares(sigma_a, skip | near)
+        placed.append((at, np.where(near, square > chdtri(len(model.legs), AGREES), skip)))
+    # an outlier beside a step looks like one: fewest are left where it is
+    time_s, skip = min(placed, key=lambda each: np.count_nonzero(each[1]))
+    stepped, columns = model.with_step(time_s)
+    found = stepped.fit(sigma_a, skip)
+    step_m = tuple(found.estimate(int(column)) for column in columns)
+    return replace(jump, time_s=time_s, step_m=step_m), skip
 
 
 def _judge(
     model: Hypotheses, sigma_a: float, skip: BoolArray, time_s: float, chance: float
 ) -> Jump | None:
     """A step at a time, where what comes later still asks for it; None where that is chance."""
-    after = _from(model.time_s, time_s, AFTER_STEP_S)
-    burst = _from(model.time_s, time_s, BURST_S)
-    model = replace(model, steps=np.hstack([model.steps, steps(model.time_s, [time_s])]))
-    columns = len(model.prior) + model.steps.shape[1] * (1 + np.arange(len(model.legs))) - 1
-    later = (skip & ~after) | burst
+    later = skip | _from(model.time_s, time_s, BURST_S)
+    model, columns = model.with_step(time_s)
     before = np.count_nonzero(~later & (model.time_s < time_s))
     if min(before, np.count_nonzero(~later & (model.time_s >= time_s))) < EDGE:
         return None
@@ -295,12 +318,7 @@ def _judge(
     chi_square = float(size @ np.linalg.solve(covariance, size)) / max(found.spread, 1.0) ** 2
     if chi_square < chdtri(len(columns), chance):
         return None
-    near = np.tile(after[~later], len(model.legs))
-    if np.mean(found.rest[near] ** 2) > STEP_NIS * max(found.spread, 1.0) ** 2:
-        return None
-    # its size from all, now that it is known to be one
-    whole = model.fit(sigma_a, skip & ~after)
-    return Jump(time_s, tuple(whole.estimate(int(at)) for at in columns), chi_square)
+    return Jump(time_s, tuple(found.estimate(int(at)) for at in columns), chi_square)
 
 
 @dataclass(frozen=True)
@@ -399,10 +417,16 @@ class Hypotheses:
     sigma_z_m: float
     steps: Array
 
+    def with_step(self, time_s: float) -> tuple[Hypotheses, IntArray]:
+        """The same with one more step, and its column of each axis."""
+        model = replace(self, steps=np.hstack([self.steps, steps(self.time_s, [time_s])]))
+        width, count = len(self.prior), model.steps.shape[1]
+        return model, width + count * (1 + np.arange(len(self.legs))) - 1
+
     def whitened(self, legs: Preintegrated, sigma_a: float, skip: BoolArray) -> tuple[Array, float]:
-        """Innovations over √S of the signals of one axis, shape (m, k), and Σ ln S."""
+        """Innovations over √S of the signals of one axis, (m, k), and Σ ln S of those used."""
         nu, s = innovations(legs, sigma_a, self.sigma_z_m, skip)
-        return (nu / np.sqrt(s)[:, None])[~skip], float(np.sum(np.log(s[~skip])))
+        return nu / np.sqrt(s)[:, None], float(np.sum(np.log(s[~skip])))
 
     def fit(self, sigma_a: float, skip: BoolArray, scale: float = 1.0) -> HypothesisFit:
         """Fit all columns, with the acceleration (and its noise) scaled.
@@ -414,11 +438,27 @@ class Hypotheses:
             Measurements that are neither fused nor fitted.
         scale : float
         """
+        data, columns, log_s = self._laid_out(sigma_a, skip, scale)
+        axes, kept = len(data), np.count_nonzero(~skip)
+        prior = np.append(self.prior, np.full(axes * self.steps.shape[1], np.inf))
+        rows = columns[:, ~skip].reshape(axes * kept, -1)
+        return fit(data[:, ~skip].ravel(), rows, np.repeat(np.arange(axes), kept), prior, log_s)
+
+    def squares(self, sigma_a: float, skip: BoolArray) -> Array:
+        """What a fit leaves of every measurement, over its σ: squares summed over the axes."""
+        found = self.fit(sigma_a, skip)
+        data, columns, _ = self._laid_out(sigma_a, skip)
+        rest = data - columns @ found.coefficients
+        return np.asarray(np.sum(rest**2, axis=0)) / max(found.spread, 1.0) ** 2
+
+    def _laid_out(
+        self, sigma_a: float, skip: BoolArray, scale: float = 1.0
+    ) -> tuple[Array, Array, float]:
+        """Whitened innovations (a, m) of all axes and their columns (a, m, k), and Σ ln S."""
         hats, steps, axes = self.hats[0].shape[1], self.steps.shape[1], len(self.legs)
         width = len(self.prior)
-        kept = np.count_nonzero(~skip)
-        data = np.empty((axes, kept))
-        columns = np.zeros((axes, kept, width + axes * steps))
+        data = np.empty((axes, len(skip)))
+        columns = np.zeros((axes, len(skip), width + axes * steps))
         log_s = 0.0
         for at, legs in enumerate(self.legs):
             # acceleration in the source's own length: of what was measured, and of a turn of it
@@ -437,9 +477,7 @@ class Hypotheses:
             first, step = CONSTANTS + hats * at, width + steps * at
             which = np.r_[:CONSTANTS, first : first + hats, step : step + steps]
             columns[at][:, which] = normalised[:, 1:]
-        prior = np.append(self.prior, np.full(axes * steps, np.inf))
-        axis = np.repeat(np.arange(axes), kept)
-        return fit(data.ravel(), columns.reshape(axes * kept, -1), axis, prior, log_s)
+        return data, columns, log_s
 
 
 def _with_signals(legs: Preintegrated, dp: Array, dv: Array, measured_m: Array) -> Preintegrated:

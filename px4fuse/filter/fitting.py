@@ -26,6 +26,7 @@ SIGMA_A_SEARCH_M_S2 = (1e-3, 30.0)
 # From what no positioning system resolves
 SIGMA_Z_SEARCH_M = (1e-3, 10.0)
 WALK_SEARCH_M = (1e-4, 1.0)
+SLOW_SEARCH_M, SLOW_SEARCH_S = (1e-3, 10.0), (0.05, 60.0)
 MAX_PASSES = 12
 # Of the maximisation, in the end and while the outliers still change
 MAX_STEPS, ROUGH_STEPS = 50, 3
@@ -54,11 +55,21 @@ class Noises:
     walk_m : float
         Random walk of the source itself, m per square root of a second; 0 for one that does not
         drift.
+    slow_m, tau_s : float
+        Standard deviation and time constant of a slow error of the source; 0 for none.
     """
 
     sigma_a_m_s2: float
     sigma_z_m: float
     walk_m: float = 0.0
+    slow_m: float = 0.0
+    tau_s: float = 0.0
+
+
+SEARCHES = {
+    "sigma_a_m_s2": SIGMA_A_SEARCH_M_S2, "sigma_z_m": SIGMA_Z_SEARCH_M, "walk_m": WALK_SEARCH_M,
+    "slow_m": SLOW_SEARCH_M, "tau_s": SLOW_SEARCH_S,
+}  # fmt: skip
 
 
 class Likelihood:
@@ -107,7 +118,7 @@ class Likelihood:
 
     def __call__(self, noises: Noises) -> float:
         """-ln p with some noises."""
-        if noises.walk_m or not self.tabulated:
+        if noises.walk_m or noises.slow_m or not self.tabulated:
             return negative_log_likelihood(self.parts, noises, self.weight)
         ln_z = log(noises.sigma_z_m) / self.step
         ln_ratio = log(noises.sigma_a_m_s2) / self.step - ln_z
@@ -165,6 +176,8 @@ def fitted(blocks: Iterable[Positions], noises: Noises, weight: Array) -> Fitted
     """Fit with some noises and weights."""
     sigma = noises.sigma_z_m
     ratio, walk = noises.sigma_a_m_s2 / sigma, noises.walk_m / sigma
+    if noises.slow_m:
+        blocks = (replace(each, slow=(noises.slow_m, noises.tau_s)) for each in blocks)
     return of_ratios(blocks, [ratio], walk, weight, sigma)[0].scaled(sigma)
 
 
@@ -233,7 +246,7 @@ def most_likely(
     parts : sequence of Positions
         With the same measurements.
     start : Noises
-        To start with. A walk is fitted where this one is not zero.
+        To start with. A walk and a slow error are fitted where they are not zero.
     weight : ndarray, shape (m,)
         Of each measurement to start with.
     outliers : bool
@@ -321,19 +334,22 @@ def widened_by_outliers(square: Array, count: Array, outlier: Array, width: floa
 
 
 def _maximise(likelihood: Likelihood, start: Noises, steps: int = MAX_STEPS) -> Noises:
-    values = [start.sigma_a_m_s2, start.sigma_z_m, *([start.walk_m] if start.walk_m else [])]
-    bounds = np.log([SIGMA_A_SEARCH_M_S2, SIGMA_Z_SEARCH_M, WALK_SEARCH_M][: len(values)])
+    values = {name: value for name, value in vars(start).items() if value}
+    bounds = np.log([SEARCHES[name] for name in values])
     count = len(likelihood.weight)
 
     def score(logs: Array) -> float:
         # of each measurement: the first step is as long as the slope, at most 1
-        return likelihood(Noises(*np.exp(logs).tolist())) / count
+        return likelihood(made(logs)) / count
+
+    def made(logs: Array) -> Noises:
+        return Noises(**dict(zip(values, np.exp(logs).tolist(), strict=True)))
 
     found = minimize(
         score,
-        np.clip(np.log(values), *bounds.T),
+        np.clip(np.log([*values.values()]), *bounds.T),
         method="L-BFGS-B",
         bounds=bounds.tolist(),
         options={"eps": SLOPE_STEP, "ftol": 1e-10, "gtol": 1e-8, "maxiter": steps},
     )
-    return Noises(*np.exp(found.x).tolist())
+    return made(found.x)

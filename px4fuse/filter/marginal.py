@@ -7,7 +7,8 @@ millisecond; the marginal likelihood of the measurements, which is that of the f
 (Schweppe 1965), follows from log|A| and the squares that remain at the minimum. Signals that enter
 linearly (data, or what a bias would add to them) are columns: the factorisation does not depend on
 them. Biases and the like have a prior, and are marginalised by the Schur complement of their
-products.
+products. A slow error of the source is a third state, c_{k+1} = ρ c_k + noise, that the measurement
+sees: z - p - c; it begins anew in each stretch.
 """
 
 from __future__ import annotations
@@ -56,6 +57,8 @@ class Positions:
     delta_position_m, delta_velocity_m_s : ndarray, shape (a, T, 1 + c, m - 1)
         What the acceleration adds on each leg, and what each constant adds to that, for T clock
         offsets; any value where a stretch begins.
+    slow : (float, float) or None
+        Standard deviation (m) and time constant (s) of a slow error of the source.
     """
 
     measurement_m: Array
@@ -67,6 +70,7 @@ class Positions:
     constant_sigma: Array
     delta_position_m: Array
     delta_velocity_m_s: Array
+    slow: tuple[float, float] | None = None
 
     @cached_property
     def stretches(self) -> list[tuple[int, int]]:
@@ -92,7 +96,8 @@ class Positions:
         fixed = self.noise_fixed / sigma_z_m**2
         fixed[0] += self.length_s * walk**2
         extra = np.ones(len(self.measurement_m) - len(weight))
-        scaled = replace(self, noise_fixed=fixed, initial=self.initial * sigma_z_m**2)
+        slow = self.slow and (self.slow[0] / sigma_z_m, self.slow[1])
+        scaled = replace(self, noise_fixed=fixed, initial=self.initial * sigma_z_m**2, slow=slow)
         return scaled, 1.0 / np.concatenate([extra, weight])
 
     def systems(
@@ -116,7 +121,7 @@ class Positions:
             precision[:, 0] += np.where(used, 1.0 / variance_m2, 0.0)
             precision[self.start[few]] += 1.0
             said = (precision > 0.0) & ((precision > self.initial) | (self.initial > HELD))
-            system = factorise(self.length_s, noise, self.joined, precision)
+            system = factorise(self.length_s, noise, self.joined, precision, self.slow)
             # where the start is as good as unknown, what is known of it does not count
             vague = float(np.sum(np.log(precision[(precision > 0.0) & ~said])))
             system = replace(system, log_determinant=system.log_determinant + vague)
@@ -207,11 +212,9 @@ def fit(
         parts = (np.sqrt(system.precision[:, 0]) * data, *system.whiten(data, dp[axes], dv[axes]))
         for at, (begin, end) in enumerate(positions.stretches):
             rows = slice(2 * begin, 2 * end - 2)
+            states = slice(system.states * begin, system.states * end)
             for sign, part, here in zip(
-                (1.0, 1.0, -1.0),
-                parts,
-                (slice(begin, end), rows, slice(2 * begin, 2 * end)),
-                strict=True,
+                (1.0, 1.0, -1.0), parts, (slice(begin, end), rows, states), strict=True
             ):
                 signal = part[..., here]
                 gram[at] += sign * (signal @ np.swapaxes(signal, -1, -2)).sum(axis=0)
@@ -335,7 +338,7 @@ class BandedSystem:
         Q⁻¹ by elements 00, 01, 11; zero where a stretch begins.
     root : ndarray, shape (m - 1,)
         1/√Q₁₁, as Q⁻¹ has it but for rounding; zero where a stretch begins.
-    bands, lower : ndarray, shape (4, 2m)
+    bands, lower : ndarray, shape (2 + states, states · m)
         Bands of A and of its Cholesky factor.
     log_determinant : float
         ln|A| + Σ ln|Q| - Σ ln precision: twice the part of -ln p that no signal enters.
@@ -348,6 +351,11 @@ class BandedSystem:
     bands: Array
     lower: Array
     log_determinant: float
+
+    @property
+    def states(self) -> int:
+        """Of each time: position, velocity, and a slow error of the source where there is one."""
+        return len(self.bands) - 2
 
     def whiten(self, measured_m: Array, dp: Array, dv: Array) -> tuple[Array, Array]:
         """Signals such that the products under the inverse covariance are a difference of two.
@@ -365,7 +373,7 @@ class BandedSystem:
         -------
         rows : ndarray, shape (..., 2m - 2)
             Legs over their covariance's root, two for each, zero where a stretch begins.
-        explained : ndarray, shape (..., 2m)
+        explained : ndarray, shape (..., states · m)
         """
         i00, i01, _ = self.inverse
         # Q⁻¹ = UᵀU; where a stretch begins it is zero
@@ -379,22 +387,23 @@ class BandedSystem:
         return rows.reshape(*dp.shape[:-1], -1), explained.T.reshape(*dp.shape[:-1], -1)
 
     def solve(self, measured_m: Array, dp: Array, dv: Array) -> Array:
-        """Most likely states: position and velocity, shape (..., m, 2); arguments of `whiten`."""
+        """Most likely states: position and velocity first, shape (..., m, states); as `whiten`."""
         right = self._right(measured_m, dp, dv)
         state, _ = lapack.dpbtrs(self.lower, right.T, lower=1, overwrite_b=1)
-        return np.asarray(state.T.reshape(*dp.shape[:-1], -1, 2))
+        return np.asarray(state.T.reshape(*dp.shape[:-1], -1, self.states))
 
     def _right(self, measured_m: Array, dp: Array, dv: Array) -> Array:
-        """The right side of the normal equations, shape (columns, 2m)."""
+        """The right side of the normal equations, shape (columns, states · m)."""
         i00, i01, i11 = self.inverse
-        right = np.zeros((*dp.shape[:-1], len(self.precision), 2))
+        right = np.zeros((*dp.shape[:-1], len(self.precision), self.states))
         right[..., 0] = self.precision[:, 0] * measured_m
+        right[..., 2:] = right[..., :1]
         g0, g1 = i00 * dp + i01 * dv, i01 * dp + i11 * dv
         right[..., 1:, 0] += g0
         right[..., 1:, 1] += g1
         right[..., :-1, 0] -= g0
         right[..., :-1, 1] -= g1 + g0 * self.length_s
-        return right.reshape(-1, 2 * len(self.precision))
+        return right.reshape(-1, self.states * len(self.precision))
 
     def position_variance(self) -> Array:
         """Variance of each state's position given all data (m²), shape (m,).
@@ -416,7 +425,13 @@ class BandedSystem:
         return np.asarray(p11 / (p00 * p11 - p01**2))
 
 
-def factorise(length_s: Array, noise: Array, joined: BoolArray, precision: Array) -> BandedSystem:
+def factorise(
+    length_s: Array,
+    noise: Array,
+    joined: BoolArray,
+    precision: Array,
+    slow: tuple[float, float] | None = None,
+) -> BandedSystem:
     """Factorise the normal equations of the states at the measurements.
 
     Parameters
@@ -430,6 +445,8 @@ def factorise(length_s: Array, noise: Array, joined: BoolArray, precision: Array
     precision : ndarray, shape (m, 2)
         Of the measured positions, 1/m², 0 for one that is not used, and of the velocities around
         zero.
+    slow : (float, float), optional
+        As :class:`Positions` has it; what is known of positions must then be measurements.
 
     Raises
     ------
@@ -448,7 +465,8 @@ def factorise(length_s: Array, noise: Array, joined: BoolArray, precision: Array
     slope = i00 * length_s
     cross = slope + i01
     # A = Σ precision + [-F I]ᵀ Q⁻¹ [-F I]; by columns, as LAPACK keeps bands
-    columns = np.zeros((len(precision), 2, 4))
+    states = 2 if slow is None else 3
+    columns = np.zeros((len(precision), states, states + 2))
     position, velocity = columns[:, 0], columns[:, 1]
     position[:, 0], velocity[:, 0] = precision.T
     position[1:, 0] += i00
@@ -457,16 +475,25 @@ def factorise(length_s: Array, noise: Array, joined: BoolArray, precision: Array
     position[:-1, 0] += i00
     position[:-1, 1] += cross
     velocity[:-1, 0] += (cross + i01) * length_s + i11
-    position[:-1, 2], position[:-1, 3] = -i00, -i01
-    velocity[:-1, 1], velocity[:-1, 2] = -cross, -(i01 * length_s + i11)
-    bands = columns.reshape(-1, 4).T
+    position[:-1, states], position[:-1, states + 1] = -i00, -i01
+    velocity[:-1, states - 1], velocity[:-1, states] = -cross, -(i01 * length_s + i11)
+    log_noise = np.sum(np.log(determinant[joined]))
+    if slow is not None:
+        sigma, tau_s = slow
+        kept = np.where(joined, np.exp(-length_s / tau_s), 0.0)
+        variance = sigma**2 * np.append(1.0, 1.0 - kept**2)  # of what is new in each state
+        error = columns[:, 2]
+        position[:, 2] = measured
+        error[:, 0] = measured + 1.0 / variance
+        error[:-1, 0] += kept**2 / variance[1:]
+        error[:-1, states] = -kept / variance[1:]
+        log_noise += np.sum(np.log(variance))
+    bands = columns.reshape(-1, states + 2).T
     lower, broken = lapack.dpbtrf(bands, lower=1)
     if broken:
         raise np.linalg.LinAlgError("a stretch has too few measurements")
     log_determinant = (
-        2.0 * np.sum(np.log(lower[0]))
-        + np.sum(np.log(determinant[joined]))
-        - np.sum(np.log(precision[precision > 0.0]))
+        2.0 * np.sum(np.log(lower[0])) + log_noise - np.sum(np.log(precision[precision > 0.0]))
     )
     root = np.where(joined, 1.0 / np.sqrt(q11), 0.0)
     return BandedSystem(precision, length_s, inverse, root, bands, lower, float(log_determinant))

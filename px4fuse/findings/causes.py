@@ -131,7 +131,9 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
     # R describes none of these three
     "source_coloured": (*_FITTED, "source_variance_wrong", "errors_larger_than_claimed"),
     "source_axes_unequal": (*_OURS, "source_outliers", "source_variance_wrong"),
-    "source_noise_changes": (*_OURS, "source_outliers", "source_variance_wrong"),
+    "source_noise_changes": (
+        *_OURS, "source_outliers", "source_variance_wrong", "source_coloured",
+    ),
     "ekf2_heading_wrong": (
         f"errors_larger_than_claimed:{FRAME}", f"kf_variance_understated:{FRAME}",
         f"errors_larger_than_claimed:{ELSEWHERE}", "sigma_a_small", f"aid_understated:{SENSOR}",
@@ -149,8 +151,8 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
     ),
     # a step of the stamps moves positions of a vehicle that moves
     "source_clock_changes": (
-        "source_jumps", "source_scale_wrong", "source_smoothed", "ekf2_ev_delay_wrong",
-        "errors_larger_than_claimed",
+        "source_jumps", "source_scale_wrong", "source_smoothed", "source_coloured",
+        "ekf2_ev_delay_wrong", "errors_larger_than_claimed",
     ),
     "source_stamps_of_arrival": ("source_clock_changes",),
     "source_clock_offset": (

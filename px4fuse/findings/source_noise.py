@@ -19,7 +19,7 @@ from px4fuse.findings.model import Found, error, info, warning
 from px4fuse.findings.source_positions import LAG_NATS, hardly_moved
 from px4fuse.flight import POSITION_COLUMNS, Unavailable
 
-COLOURED_NATS = 8.0  # a likelihood ratio of 3,000 for two more numbers; clean flights have 0
+COLOURED_NATS = 5.0  # a likelihood ratio of 150 for two more numbers; 1 of 400 clean flights
 REPEATS = 0.05  # of the positions
 REPEATS_ERROR = 0.3  # of the positions: no longer the rate that it seems
 MIN_REPEATS = 10

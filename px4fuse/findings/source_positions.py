@@ -14,7 +14,7 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
-from px4fuse.filter.causes import AFTER_STEP_S, Explained
+from px4fuse.filter.causes import AFTER_STEP_S, BURST_S, Explained
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.coloured import Coloured, Smoothing
 from px4fuse.filter.signals import within
@@ -29,7 +29,7 @@ MOTION_RANGE_M = 0.5  # 5 to 95 %; a hovering drone with 0.1 m UWB stays below
 NOISE_RANGE = 1.25 * 3.29  # of white noise's σ from 5 to 95 %, with a quarter for chance
 SECOND_DIFFERENCE = 6.0**0.5 / 1.4826  # their median size over σ
 GAIN_NATS = 12.0  # a likelihood ratio of 160,000; clean flights have 0 to 2
-LAG_NATS = 4.0  # earlier stamps e⁴ times as likely; slow errors that do not lag have 0 to 0.1
+LAG_NATS = 1.0  # a low pass e times as likely as a slow error, which has one number more
 LAG_S = 0.05  # at 1 m/s half of a good UWB's noise
 LAG_ERROR_S = 0.10  # at 1 m/s a good UWB's noise
 JUMP_M = 0.2  # twice a good UWB's noise
@@ -135,7 +135,10 @@ def _steady(analysis: Analysis) -> str:
 def scale(analysis: Analysis) -> Found:
     """Distances are too long or too short, by an IMU that misses no motion."""
     imu, found = analysis.flight.imu, analysis.explained
+    # GNSS measures in metres: what looks like a scale is something else
     if not isinstance(imu, pd.DataFrame) or too_slow(imu, MIN_IMU_RATE_HZ):
+        return
+    if analysis.source.origin.is_gnss:
         return
     # a low pass takes from the motion as well, and a slow error moves with it by chance
     if not isinstance(found, Explained) or low_pass(analysis) is not None:
@@ -151,12 +154,8 @@ def scale(analysis: Analysis) -> Found:
             f"{'long' if off > 0 else 'short'} (± {1.96 * sigma:.0%}) against the motion that the "
             "IMU measures",
             ": neither filter's innovations show it, since both follow the positions.",
-            "Measure a known distance with the source"
-            + (
-                "."
-                if analysis.source.origin.is_gnss
-                else "; survey the anchors again, and check its unit and its calibration."
-            ),
+            "Measure a known distance with the source; survey the anchors again, and check its "
+            "unit and its calibration.",
             {"scale": 1.0 + off, "sigma": sigma},
         )
 
@@ -171,7 +170,7 @@ def outliers(analysis: Analysis) -> Found:
     times_s = [
         time
         for time in tuned.outlier_time_s.tolist()
-        if not any(at <= time < at + AFTER_STEP_S for at in steps)
+        if not any(at - BURST_S <= time < at + AFTER_STEP_S for at in steps)
     ]
     count, share = len(times_s), len(times_s) / tuned.count
     if share < OUTLIERS or count < MIN_OUTLIERS:
