@@ -95,6 +95,7 @@ BAROMETER = Aid(
     "baro_hgt", "EKF2_BARO_CTRL", "EKF2_BARO_NOISE", "EKF2_BARO_GATE", "EKF2_BARO_DELAY",
     label="barometer", reported="EKF2_BARO_NOISE and the variance of its bias",
 )  # fmt: skip
+BAROMETER_NOISE_M = 3.5  # PX4's default of EKF2_BARO_NOISE
 GNSS_VEL = _gnss("gnss_vel", "GNSS velocity", "EKF2_GPS_V_NOISE", "EKF2_GPS_V_GATE", "m/s")
 MAG = Aid("mag", "EKF2_MAG_TYPE", "EKF2_MAG_NOISE", "EKF2_MAG_GATE", "EKF2_MAG_DELAY",
           label="magnetometer", unit="gauss", default_gate=3.0)  # fmt: skip
@@ -170,7 +171,6 @@ PARAMETERS: Mapping[str, Parameter] = {
     GNSS_POS.delay: Parameter("ms", 110.0, 0.0, 300.0),
     GNSS_VEL.noise: Parameter("m/s", 0.3, 0.01, 5.0),
     GNSS_VEL.gate: Parameter("SD", 5.0, 1.0, 1e3),
-    BAROMETER.noise: Parameter("m", 3.5, 0.01, 15.0),
     MAG.noise: Parameter("gauss", 0.05, 0.001, 1.0),
     MAG.gate: Parameter("SD", 3.0, 1.0, 1e3),
     **FIELD_NOISES,
@@ -210,7 +210,7 @@ def settings_in_force(
     used = {one.switch for one in (aid, *others)}
     of_others = {
         name
-        for other in (EV_POS, GNSS_POS, GNSS_VEL, MAG, BAROMETER)
+        for other in (EV_POS, GNSS_POS, GNSS_VEL, MAG)
         if other.switch not in used
         for name in (*other.own, *other.place, *(FIELD_NOISES if other == MAG else ()))
     }

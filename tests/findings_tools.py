@@ -83,7 +83,8 @@ def source(**parts: Any) -> Any:
         "frame": "NED",
         "clock_map": None, "alignment": None, "rate_hz": 5.0, "age_s": 0.0,
     }  # fmt: skip
-    return SimpleNamespace(**{**usual, **parts})
+    made = {**usual, **parts}
+    return SimpleNamespace(aid=lambda axis: made["origin"].aid, **made)
 
 
 def positions(time_s: Any, north_m: Any = 0.0, variance_m2: float = np.nan) -> pd.DataFrame:

@@ -350,7 +350,9 @@ def test_the_range_of_the_motion_leaves_out_a_twentieth_at_either_end() -> None:
 
 
 def test_what_is_poorly_known_of_a_files_place_is_told_with_its_option() -> None:
-    placed = SimpleNamespace(warnings=("as good as ned: give --position-frame ned.", "it is weak."))
+    placed = SimpleNamespace(
+        misplaced=("as good as ned: give --position-frame ned.",), warnings=("it is weak.",)
+    )
     frame, yaw = source_frame.placement(analysis(source=source(alignment=placed)))
     assert (frame.severity, yaw.severity) == ("error", "warning")
     assert frame.message == "uwb: As good as ned: give --position-frame ned."

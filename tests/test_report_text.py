@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import typst
 from exchange import replace
+from findings_tools import source
 from flights import random_walk
 from hypothesis import given
 from hypothesis import strategies as st
@@ -21,7 +22,6 @@ from px4fuse.filter.likelihood import preintegrate, states
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
-from px4fuse.origin import RECEIVED
 from px4fuse.report import clock, fonts, notes
 from px4fuse.report.document import Document
 from px4fuse.report.notes import write
@@ -217,7 +217,7 @@ def with_clock(found: ClockOffset | Unavailable, *findings: str, delay_ms: float
         clock=found,
         settings=SimpleNamespace(clock_offset_s=0.0),
         flight=SimpleNamespace(log=log),
-        source=SimpleNamespace(origin=RECEIVED, age_s=0.0, alignment=None),
+        source=source(),
     )
     named = tuple(Finding(name, "error", "", "") for name in findings)
     return Document(analysis, named, Student(), "")  # type: ignore[arg-type]

@@ -43,7 +43,6 @@ from px4fuse.ekf2.replay import (
     with_obedient,
 )
 from px4fuse.ekf2_parameters import (
-    BAROMETER,
     FIELD_NOISES,
     GNSS_POS,
     GNSS_VEL,
@@ -148,7 +147,6 @@ def replay_settings(
     changes, inputs = [check(change) for change in settings], model.inputs
     of_others = PARAMETERS.keys() - inputs.settings.keys()
     idle = dict.fromkeys(of_others, f"EKF2 fused {inputs.aid.label} in this log")
-    idle[BAROMETER.noise] = "the model takes height from EKF2 itself"
     if inputs.aid == GNSS_POS:
         no_field = "the log does not hold what EKF2 fused of a magnetometer"
         idle |= dict.fromkeys(of_others & {*MAG.own, *FIELD_NOISES}, no_field)

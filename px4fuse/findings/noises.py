@@ -35,7 +35,7 @@ from px4fuse.comparison.remedy import (
     remedy_words,
     settings_words,
 )
-from px4fuse.ekf2_parameters import BAROMETER, PARAMETERS
+from px4fuse.ekf2_parameters import BAROMETER, BAROMETER_NOISE_M, PARAMETERS
 from px4fuse.filter.consistency import SIGMA_OFF, Consistency
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import within
@@ -324,8 +324,10 @@ def _is_default(analysis: Analysis, owner: FilterName, result: AxisComparison) -
     if owner == "kf":
         chosen, own = analysis.settings, Settings()
         return (chosen.sigma_z_m, chosen.sigma_a_m_s2) == (own.sigma_z_m, own.sigma_a_m_s2)
-    name = aid_of(analysis, result.axis.name).noise
-    default = PARAMETERS[name].default
+    aid = aid_of(analysis, result.axis.name)
+    name, default = aid.noise, BAROMETER_NOISE_M
+    if aid != BAROMETER:
+        default = PARAMETERS[name].default
     untouched = analysis.flight.log.parameters.get(name, default) == default
     # a sender that reports a larger variance has chosen it
     return untouched and not abs(np.log(_ekf2_noise_m(result) / default)) > np.log(NOISE_FITS)
