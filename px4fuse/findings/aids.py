@@ -57,8 +57,8 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
                 "aid_changed",
                 f"Innovations of {aid.label} change in flight: from about {time_s:.0f} s on their "
                 f"mean is {abs(moved):.1f} √S from where it was ({axis})",
-                ": the sensor and what else EKF2 fuses contradict each other since, and EKF2 is "
-                "pulled until its own states have taken it in.",
+                ": the sensor and what else EKF2 fuses contradict each other from then on, and "
+                "EKF2 is pulled until its own states have taken it in.",
                 "See what was switched, moved or passed near the sensor then (current, metal, "
                 "wash, heat).",
                 {"aid": name, "axis": axis, "time_s": time_s, "moved": moved},
