@@ -126,7 +126,10 @@ def examples() -> dict[str, Example]:
     flight = aisle_flight(duration_s=60.0)
     silent = aid_log(meant=steps((0.0, 1.0)))
     silent = replace(silent, samples=outage_free(silent, 20.0, 41.0))
-    aids = {"gnss_pos": silent, "baro_hgt": aid_log(sigma=1.5), "mag": aid_log(mean=-0.4)}
+    changed = aid_log()
+    changed.samples.loc[35.0:, "innovation_east"] -= 0.7
+    aids = {"gnss_pos": silent, "baro_hgt": aid_log(sigma=1.5), "mag": aid_log(mean=-0.4),
+            "mag_heading": changed}  # fmt: skip
     judged = judge_aids(replace(flight, ekf2=replace(flight.ekf2, aids=aids)))
     keep(find_aids(judged), "innovations that were made up")
     for fault in FAULTS:
