@@ -18,7 +18,7 @@ from scipy.optimize import brentq
 from scipy.special import chdtri
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.filter.model import INITIAL_COVARIANCE, Symmetric, move, noise, spread
+from px4fuse.filter.model import INITIAL_COVARIANCE, Symmetric, move, noise, spread, update
 from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.filter.steps import Timeline, timeline
@@ -223,14 +223,10 @@ def recursion(
         p00 = p00 + q * unit[0] + fixed[0]
         p01 = p01 + q * unit[1] + fixed[1]
         p11 = p11 + q * unit[2] + fixed[2]
-        # ν = z - Hx, S = HPHᵀ + R, K = PHᵀS⁻¹
-        nu, s = z - p, p00 + r
-        k0, k1 = p00 / s, p01 / s
-        if not skipped:
-            # x = x + Kν, P = (I - KH)P
-            p, v = p + k0 * nu, v + k1 * nu
-            p00, p01, p11 = r * k0, r * k1, p11 - k1 * p01
         covariance = p00, p01, p11
+        (nu, s, k0, _), after = update(p, v, covariance, z, r)
+        if not skipped:
+            p, v, covariance = after
         yield nu, s, k0, p, v, covariance
 
 

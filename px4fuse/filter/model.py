@@ -75,3 +75,20 @@ def spread(covariance: Symmetric[T], dt_s: T) -> Symmetric[T]:
     """FPFᵀ, by element: the covariance after ``dt_s``, before Q is added."""
     p00, p01, p11 = covariance
     return p00 + 2.0 * dt_s * p01 + dt_s**2 * p11, p01 + dt_s * p11, p11
+
+
+def update(
+    position: T, velocity: T, covariance: Symmetric[T], measured: T, variance: T
+) -> tuple[tuple[T, T, T, T], tuple[T, T, Symmetric[T]]]:
+    """ν = z - Hx, S = HPHᵀ + R, K = PHᵀS⁻¹; x = x + Kν, P = (I - KH)P.
+
+    Returns
+    -------
+    tuple
+        ν (m), S (m²) and both gains; then position, velocity and covariance after it.
+    """
+    p00, p01, p11 = covariance
+    nu, s = measured - position, p00 + variance
+    k0, k1 = p00 / s, p01 / s
+    after = variance * k0, variance * k1, p11 - k1 * p01
+    return (nu, s, k0, k1), (position + k0 * nu, velocity + k1 * nu, after)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from px4fuse.filter.kalman import Replay, as_replay
-from px4fuse.filter.model import INITIAL_COVARIANCE, move, noise, spread
+from px4fuse.filter.model import INITIAL_COVARIANCE, move, noise, spread, update
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.filter.steps import timeline
@@ -38,13 +38,11 @@ def quick_replay(axis: Axis, settings: Settings) -> Replay:
         # x = Fx + Bu, P = FPFᵀ + Q
         p, v = move(p, v, a, dt)
         (p00, p01, p11), (q00, q01, q11) = spread(covariance, dt), noise(dt)
-        p00, p01, p11 = p00 + q * q00, p01 + q * q01, p11 + q * q11
+        covariance = p00, _, p11 = p00 + q * q00, p01 + q * q01, p11 + q * q11
         if measurement >= 0:
-            # y = z - Hx, S = HPHᵀ + R, K = PHᵀS⁻¹, x = x + Ky, P = (I - KH)P
-            z, s = measured_m[measurement], p00 + r
-            y, k0, k1 = z - p, p00 / s, p01 / s
-            updates.append((z, y, s, k0, k1, p, p00, p11))
-            p, v, p00, p01, p11 = p + k0 * y, v + k1 * y, r * k0, r * k1, p11 - k1 * p01
-        covariance = p00, p01, p11
+            z = measured_m[measurement]
+            told, after = update(p, v, covariance, z, r)
+            updates.append((z, *told, p, p00, p11))
+            p, v, covariance = after
         states.append((p, v, *covariance))
     return as_replay(axis, settings, line, states, updates)

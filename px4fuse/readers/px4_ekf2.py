@@ -114,7 +114,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         accelerometer_bias=_accelerometer_bias(topics, delayed),
         step_s=step_s,
         horizon_s=_horizon_s(topics, step_s),
-        record=_read_record(topics, delayed, local, meant),
+        record=_read_record(topics, delayed, local, meant, step_s),
         aids=aids,
     )
 
@@ -309,6 +309,7 @@ def _read_record(
     delayed: pd.DataFrame | Unavailable,
     local: pd.DataFrame,
     meant: Mapping[str, pd.Series[float]],
+    step_s: float,
 ) -> FusionRecord | Unavailable:
     """What the log tells of the inside of EKF2's filter; ``local`` is the published position."""
     topic, attitude = _state_vector(topics)
@@ -335,14 +336,13 @@ def _read_record(
             if name in meant and meant[name].any()
         ),
         vision_age_s=age[~age.index.duplicated()],
-        field_gauss=_read_field(topics),
+        field_gauss=_read_field(topics, step_s),
     )
 
 
-def _read_field(topics: Topics) -> pd.DataFrame:
+def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
     """What the magnetometer measured, of the two topics that have it the one with more rows."""
     found = []
-    step_s = _step_s(topics)
     for topic, name in px4.MAGNETOMETER:
         layout = Layout(topic, elements(list(FIELD_COLUMNS), name))
         if topics.find((layout,)) is not None:
