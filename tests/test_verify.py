@@ -49,7 +49,6 @@ from pypdf.generic import (
 )
 
 from px4fuse.cli import cli
-from px4fuse.cli.verify import verify as verify_command
 from px4fuse.report.seal import sealed
 from px4fuse.results.contract import to_json, to_plain
 from px4fuse.verification import pages, rerun, verification
@@ -569,7 +568,7 @@ def test_a_joined_recording_is_found_by_its_content(tmp_path: Path) -> None:
 
 
 def run(*words: str) -> tuple[int, str]:
-    outcome = CliRunner().invoke(verify_command, list(words))
+    outcome = CliRunner().invoke(cli, ["verify", *words])
     return outcome.exit_code, outcome.output
 
 
