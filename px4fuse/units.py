@@ -7,7 +7,7 @@ import re
 NAMES = {
     "m": "metres", "m/s": "metres per second", "m/s²": "metres per second squared",
     "s": "seconds", "ms": "milliseconds", "°": "degrees", "Hz": "hertz",
-    "%": "percent", "ppm": "parts per million", "": "a number",
+    "gauss": "gauss", "%": "percent", "ppm": "parts per million", "": "a number",
 }  # fmt: skip
 _LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "dm": 0.1, "km": 1e3, "in": 0.0254, "ft": 0.3048}
 _TIMES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
@@ -21,6 +21,7 @@ _UNITS: dict[str, dict[str, float]] = {
     "ms": {unit: 1e3 * seconds for unit, seconds in _TIMES.items()},
     "°": {"°": 1.0, "deg": 1.0, "degrees": 1.0, "rad": 57.29577951308232},
     "Hz": {"hz": 1.0, "khz": 1e3},
+    "gauss": {"gauss": 1.0, "ga": 1.0, "ut": 0.01, "µt": 0.01},
     "%": {"%": 1.0},
     "ppm": {"ppm": 1.0},
     "": {"": 1.0},

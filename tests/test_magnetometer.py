@@ -44,7 +44,11 @@ def test_a_heading_error_is_put_right_and_its_variance_is_the_kalman_filters() -
     seen = FieldSamples(told(true, body).gauss, told(nominal, body).turn, np.ones(1))
     x, P = knowing()
     for _ in range(400):
-        x, P = fuse_field(x, P, seen, np.array([0.02]), np.array([3.0]))
+        x, P, told_of = fuse_field(x, P, seen, np.array([0.02]), np.array([3.0]))
+    # what is left between measured and expected, and its variance: HPH' + R
+    np.testing.assert_allclose(told_of[0, 0], 0.0, atol=5e-4)
+    np.testing.assert_allclose(told_of[1, 0], 0.02**2, rtol=0.01)
+    assert told_of[2].all()
     assert x[0, 2] == pytest.approx(0.05, abs=0.002)
     # 1/P = 1/P₀ + n·|horizontal field|²/R
     information = 0.1**-2 + 400 * np.hypot(*EARTH[:2]) ** 2 / 0.02**2
@@ -61,7 +65,7 @@ def test_the_fields_of_earth_and_body_are_told_apart_where_the_vehicle_turns() -
     x[0, 15:18] += [0.03, -0.02, 0.01]
     for heading in np.linspace(0.0, 6.0, 200):
         seen = told(Rotation.from_euler("ZYX", [heading, 0.3 * np.sin(heading), 0.0]), body)
-        x, P = fuse_field(x, P, seen, np.array([0.01]), np.array([100.0]))
+        x, P, _ = fuse_field(x, P, seen, np.array([0.01]), np.array([100.0]))
     np.testing.assert_allclose(x[0, 18:], body, atol=1e-3)
     np.testing.assert_allclose(x[0, 15:18], EARTH, atol=1e-3)
 
@@ -72,7 +76,7 @@ def test_one_sample_that_stands_for_several_counts_as_often() -> None:
     x, P = knowing()
     once = fuse_field(x, P, seen._replace(number=np.full(1, 5.0)), noise, gate)
     for _ in range(5):
-        x, P = fuse_field(x, P, seen, noise, gate)
+        x, P, _ = fuse_field(x, P, seen, noise, gate)
     np.testing.assert_allclose(once[0], x, atol=1e-9)
     np.testing.assert_allclose(once[1], P, atol=1e-9)
 
@@ -82,14 +86,17 @@ def test_each_variant_has_its_own_noise_and_gate_and_takes_what_it_was_sent() ->
     seen = told(Rotation.identity(), np.array([0.3, 0.0, 0.0]), size=4)
     seen = seen._replace(number=np.array([1.0, 1.0, 0.0, 1.0]))
     noise, gate = np.array([0.05, 0.2, 0.2, 0.0]), np.array([3.0, 3.0, 3.0, 100.0])
-    after, left = fuse_field(x, P, seen, noise, gate)
+    after, left, told_of = fuse_field(x, P, seen, noise, gate)
     # 0.3 gauss off: 6 standard deviations of the first; the third was sent nothing
     moved = np.abs(after - x).max(axis=1) > 0.0
     assert moved.tolist() == [False, True, False, True]
     np.testing.assert_array_equal(left[0], P[0])
+    assert told_of[2, [0, 1, 3], 0].tolist() == [0.0, 1.0, 1.0]
+    np.testing.assert_allclose(told_of[0, [0, 1, 3], 0], 0.3)
+    assert np.isnan(told_of[:, 2]).all()
     # 0.01 gauss of noise at least, as mag_control.cpp has it
-    least, _ = fuse_field(x[:1], P[:1], FieldSamples(*(each[:1] for each in seen)),
-                          np.array([0.01]), np.array([100.0]))  # fmt: skip
+    least, *_ = fuse_field(x[:1], P[:1], FieldSamples(*(each[:1] for each in seen)),
+                           np.array([0.01]), np.array([100.0]))  # fmt: skip
     np.testing.assert_allclose(after[3], least[0])
 
 

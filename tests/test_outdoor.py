@@ -27,13 +27,14 @@ from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find, source_clock
 from px4fuse.findings.story import story
-from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Unavailable
+from px4fuse.flight import POSITION_COLUMNS, QUATERNION_COLUMNS, VELOCITY_COLUMNS, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_positions import project, unproject
 from px4fuse.simulation import sensors
 from px4fuse.simulation.flights import simulate, simulate_flight, to_ulog
 from px4fuse.simulation.mistakes import Mistakes, parse
 from px4fuse.simulation.scenario import Scenario, scenario_of
+from px4fuse.trajectory.rotation import interpolate, matrix
 
 OUTDOOR = scenario_of("outdoor", seed=5)
 
@@ -85,6 +86,33 @@ def test_fixes_are_the_truth_with_the_stated_noise_at_the_age_that_ekf2_takes(
     assert stated.to_numpy() == pytest.approx([0.16, 0.16, 0.36], rel=1e-5)
 
 
+def test_field_and_height_are_the_truth_with_their_noise(tmp_path: Path) -> None:
+    """Also what EKF2 makes of them, which is vehicle_attitude and height of the log."""
+    log = tmp_path / "outdoor.ulg"
+    log.write_bytes(to_ulog(simulate(OUTDOOR, parse(["mag=0.3,60"]))))
+    flight = read_log(log)
+    truth, record = flight.truth.samples, flight.ekf2.record
+    down = flight.barometer["down_m"] + sensors.HOME[2]
+    error = down.to_numpy() - np.interp(down.index, truth.index, truth["down_m"])
+    assert error.std() == pytest.approx(0.4, rel=0.1)
+    assert abs(error.mean()) < 4 * 0.4 / len(error) ** 0.5
+    measured = record.field_gauss
+    true = interpolate(
+        measured.index.to_numpy(), flight.truth.attitude.index.to_numpy(),
+        flight.truth.attitude[QUATERNION_COLUMNS].to_numpy(),
+    )  # fmt: skip
+    expected = np.einsum("nji,j->ni", matrix(true), sensors.EARTH_FIELD_GAUSS)
+    off = measured.drop(columns="fused_3d").to_numpy() - expected
+    before = measured.index < 60.0
+    np.testing.assert_allclose(off[before].mean(axis=0), 0.0, atol=0.008)
+    np.testing.assert_allclose(off[~before].mean(axis=0), [0.0, 0.3, 0.0], atol=0.008)
+    np.testing.assert_allclose(off[before].std(axis=0), 0.02, rtol=0.2)
+    height = record.delayed["down_m"].to_numpy()
+    error = height - np.interp(record.delayed.index, truth.index, truth["down_m"])
+    claimed = float(np.sqrt(record.delayed["down_m2"].iloc[20:].mean()))
+    assert error[20:].std() == pytest.approx(claimed, rel=0.3)
+
+
 @pytest.mark.parametrize("seed", [5, 8])
 def test_a_clean_flight_is_consistent_replayed_and_has_nothing_to_put_right(seed: int) -> None:
     analysis = flown(seed=seed)
@@ -96,9 +124,16 @@ def test_a_clean_flight_is_consistent_replayed_and_has_nothing_to_put_right(seed
             # what the model lacks costs GNSS velocity a little
             low, high = nis_band(axis.samples)
             assert low < axis.nis_mean < 1.05 * high
+    height = analysis.aids["baro_hgt"]
+    assert (height.verdict, height.rejected_share) == ("consistent", 0.0)
+    # 0.02 gauss are measured, EKF2_MAG_NOISE is 0.05
+    field = analysis.aids["mag"].axes
+    assert [axis.nis_mean for axis in field.values()] == pytest.approx([0.16] * 3, abs=0.05)
     model = analysis.ekf2_model
     assert aid_of(analysis).name == model.inputs.aid.name == "gnss_pos"
     assert model.agreement.good
+    assert model.agreement.heading_rms_difference_deg < 0.5
+    assert max(axis.position_rms_difference_m for axis in model.agreement.axes.values()) < 0.03
     for owner in ("kf", "ekf2"):
         statement = analysis.axes["north"].filters[owner]
         assert statement.truth.position_rmse_m < 0.25
@@ -114,6 +149,7 @@ def test_a_clean_flight_is_consistent_replayed_and_has_nothing_to_put_right(seed
         ("ekf2-delay=0", "source_clock_offset"),
         ("r-scale=0.1", "ekf2_variance_understated"),
         ("ekf2-gate=1", "ekf2_gate_small"),
+        ("mag=0.2", "aid_changed"),
         ("slow-error=0.5,30", "errors_larger_than_claimed"),
         ("slow-error=0.8,10", "source_coloured"),
     ],
@@ -159,7 +195,8 @@ def test_what_if_predicts_the_flight_with_the_other_delay() -> None:
 
 def test_without_a_magnetometer_the_heading_is_as_flown_and_that_is_told(tmp_path: Path) -> None:
     log = tmp_path / "a.ulg"  # which holds the true attitude, as a flight in memory does not
-    log.write_bytes(to_ulog(simulate(OUTDOOR, parse(["ekf2-delay=0"]))))
+    # a heading that is wrong is one that EKF2 takes from the field alone
+    log.write_bytes(to_ulog(simulate(OUTDOOR, parse(["ekf2-delay=0", "heading=3"]))))
     model = open_model(read_log(log))
     assert isinstance(model, Model)
     asked = what_if(model, [{"EKF2_GPS_DELAY": 110.0}])
@@ -180,6 +217,22 @@ def test_the_delay_that_is_asked_for_is_that_of_the_receiver_where_it_has_one() 
     said = next(source_clock.detect(changed)).remedy
     (asked,) = re.findall(r"110 ms old \(SENS_GPS0_DELAY\), that would be (\d+) ms", said)
     assert int(asked) == pytest.approx(110 + 250, abs=60)
+
+
+def test_a_magnetometer_that_is_rejected_from_a_change_on_is_told_once() -> None:
+    changed, starved = [one for one in find(flown("mag=0.2")) if one.id.startswith("aid_")]
+    assert (changed.id, starved.id) == ("aid_changed", "aid_starved")
+    assert starved.caused_by == "aid_changed"
+    assert "Innovations of the magnetometer change" in changed.message
+    # the middle of the flight
+    assert changed.evidence["time_s"] == pytest.approx(67.0, abs=10.0)
+
+
+def test_a_noise_that_ekf2_does_not_take_is_no_mistake() -> None:
+    with pytest.raises(SettingsError, match=r"the larger of EKF2_GPS_P_NOISE .*0\.4 m"):
+        simulate(OUTDOOR, parse(["ekf2-noise=0.05"]))
+    parameters = simulate(OUTDOOR, parse(["ekf2-noise=0.8"])).parameters
+    assert parameters["EKF2_GPS_P_NOISE"] == 0.8
 
 
 def test_a_slow_error_has_its_size_and_its_time() -> None:

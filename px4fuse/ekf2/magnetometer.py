@@ -50,8 +50,12 @@ def gather(field: Field, rotation: Array, end: IntArray) -> FieldSamples:
 
 def fuse_field(
     x: Array, P: Array, told: FieldSamples, noise_gauss: Array, gate: Array
-) -> tuple[Array, Array]:
-    """State and covariance of S variants after the field samples of one event."""
+) -> tuple[Array, Array, Array]:
+    """State and covariance of S variants after the field samples of one event.
+
+    And innovation (gauss), its variance for a single sample and whether it was fused, of shape
+    (3, S, 3); NaN where there was no sample.
+    """
     earth = x[:, EARTH_FIELD]
     of_earth, of_turn = ((each @ CROSS).reshape(-1, 3, 3) for each in (earth, x[:, THETA]))
     H = np.zeros((len(x), 3, FIELD_STATES))
@@ -63,10 +67,13 @@ def fuse_field(
     R = np.maximum(noise_gauss, MIN_SD_GAUSS) ** 2
     HP = H @ P
     S = HP @ H.transpose(0, 2, 1)
-    limit = gate[:, None] ** 2 * (np.einsum("nii->ni", S) + R[:, None])
-    taken = (told.number > 0.0) & (nu * nu <= limit).all(axis=1)
+    single = np.einsum("nii->ni", S) + R[:, None]
+    seen_at_all = told.number > 0.0
+    taken = seen_at_all & (nu * nu <= gate[:, None] ** 2 * single).all(axis=1)
+    fused = np.broadcast_to(taken[:, None], nu.shape)
     S += (R / np.maximum(told.number, 1.0))[:, None, None] * EYE
     K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * taken[:, None, None]
     x = x + (K @ nu[:, :, None])[:, :, 0]
     P = P - K @ HP
-    return x, 0.5 * (P + P.transpose(0, 2, 1))
+    told_of = np.where(seen_at_all[:, None], (nu, single, fused), np.nan)
+    return x, 0.5 * (P + P.transpose(0, 2, 1)), told_of

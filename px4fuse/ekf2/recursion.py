@@ -134,6 +134,9 @@ class Run:
         At the start and after each event; n is 15, or 21 where the magnetic fields are states.
     covariance : ndarray, shape (S, n, n)
         At the end.
+    field : ndarray, shape (E, 3, S, 3)
+        Of the magnetometer (body FRD): innovation (gauss), its variance for one sample, and whether
+        it was fused; NaN where there was none.
     """
 
     stretch: Stretch
@@ -148,6 +151,7 @@ class Run:
     state: Array
     variance: Array
     covariance: Array
+    field: Array
 
 
 def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
@@ -199,6 +203,7 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     usable = np.where(on, action, IDLE), event["startable"] & on, now_s, gated, as_logged, *logged
     fusion = _Fusion(inputs.rules, stretch.time_s[0], *usable)
     innovations, variances = np.full((2, events, size, 6), np.nan)
+    of_field = np.full((events, 3, size, 3), np.nan)
     rejected, fused, reset = np.zeros((3, events, size), bool)
     states, spreads = np.empty((2, events + 1, size, x.shape[1]))
     states[0], spreads[0] = x, _diagonal(P)
@@ -226,7 +231,7 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
         innovation[:, 2:], R[:, 2:] = 0.0, NOT_TAKEN
         if seen is not None and seen.number[e].any():
             told = FieldSamples(*(part[e] for part in seen))
-            x, P = fuse_field(x, P, told, knob[MAG.noise], knob[MAG.gate])
+            x, P, of_field[e] = fuse_field(x, P, told, knob[MAG.noise], knob[MAG.gate])
             spread = _diagonal(P)
         if sampled[e]:
             nu = measured[e] - x[:, TOLD]
@@ -277,7 +282,7 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
         states[e + 1], spreads[e + 1] = x, _diagonal(P)
     return Run(
         stretch, tuple(variants), tuple(each.events for each in intervals), innovations, variances,
-        noise, rejected, fused, reset, states, spreads, P,
+        noise, rejected, fused, reset, states, spreads, P, of_field,
     )  # fmt: skip
 
 

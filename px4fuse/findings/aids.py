@@ -9,8 +9,8 @@ from collections.abc import Mapping
 
 from px4fuse.analysis import Analysis
 from px4fuse.ekf2.aids import STARVED_S, WINDOW_S, AidResult
-from px4fuse.ekf2_parameters import AIDS
-from px4fuse.findings.causes import CAUSE, SENSOR
+from px4fuse.ekf2_parameters import AIDS, BAROMETER, MAG
+from px4fuse.findings.causes import CAUSE, CHANGE, SENSOR
 from px4fuse.findings.model import Found, info, warning
 from px4fuse.flight import Unavailable
 from px4fuse.plain import factor_words, number_words
@@ -37,7 +37,9 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
             starved.setdefault(AIDS[name].switch or name, []).append(aid)
     for switch, together in starved.items():
         longest = max(together, key=lambda aid: aid.longest_without)
-        labels = ", ".join(aid.label for aid in together)
+        labels = ", ".join(_named(aid) for aid in together)
+        changed = any(axis.change for aid in together for axis in aid.axes.values())
+        cause = CHANGE if changed else _sensor(switch, source)
         yield warning(
             "aid_starved",
             f"EKF2 had {longest.longest_without:.0f} s without {labels} that it meant to fuse",
@@ -46,7 +48,7 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
             "See what the sensor lacked then (reception, range, light), or whether EKF2 rejected "
             "it; what carried EKF2 meanwhile is in the table.",
             {"aid": labels, "longest_without_s": longest.longest_without,
-             "rejected_share": longest.rejected_share, CAUSE: _sensor(switch, source)},
+             "rejected_share": longest.rejected_share, CAUSE: cause},
             (longest.longest_without_s,),
         )  # fmt: skip
     for name, aid in judged.items():
@@ -55,8 +57,8 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
             axis, (time_s, moved) = max(changes.items(), key=lambda item: abs(item[1][1]))
             yield warning(
                 "aid_changed",
-                f"Innovations of {aid.label} change in flight: from about {time_s:.0f} s on their "
-                f"mean is {abs(moved):.1f} √S from where it was ({axis})",
+                f"Innovations of {_named(aid)} change in flight: from about {time_s:.0f} s on "
+                f"their mean is {abs(moved):.1f} √S from where it was ({axis})",
                 ": the sensor and what else EKF2 fuses contradict each other from then on, and "
                 "EKF2 is pulled until its own states have taken it in.",
                 "See what was switched, moved or passed near the sensor then (current, metal, "
@@ -69,7 +71,7 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
             raised = f"raise {noise}" if noise else "its reported accuracy is too small"
             yield warning(
                 "aid_understated",
-                f"EKF2 is {factor_words(factor)} times too sure of {aid.label}",
+                f"EKF2 is {factor_words(factor)} times too sure of {_named(aid)}",
                 f" (mean NIS {number_words(aid.nis_mean)}, 1 is consistent; "
                 f"{aid.rejected_share:.1%} rejected): its errors are larger than R"
                 f"{_noise_words(aid)} says, or another aid pulls against it.",
@@ -87,7 +89,7 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
             axis, worst = max(aid.axes.items(), key=lambda item: abs(item[1].pull))
             yield info(
                 "aid_biased",
-                f"Innovations of {aid.label} are not zero in the mean",
+                f"Innovations of {_named(aid)} are not zero in the mean",
                 f" ({number_words(worst.innovation_mean)} {aid.unit}, {axis}; √S is "
                 f"{number_words(worst.s_sqrt_median)}): it and another aid contradict each other, "
                 "and EKF2 stands between them.",
@@ -96,6 +98,10 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
                 {"aid": name, "axis": axis, "innovation_mean": worst.innovation_mean,
                  "s_sqrt_median": worst.s_sqrt_median},
             )  # fmt: skip
+
+
+def _named(aid: AidResult) -> str:
+    return f"the {aid.label}" if aid.label in (BAROMETER.label, MAG.label) else aid.label
 
 
 def _sensor(switch: str, source: str) -> str:

@@ -89,8 +89,8 @@ NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
     "measurement noise", "process noise", "outliers", "clock", "frame", "gate", "accelerometer",
     "elsewhere",
 )  # fmt: skip
-# Likewise of an aid: it is of the sensor that the positions are of
-SENSOR = "the source's sensor"
+# Likewise of an aid: it is of the sensor that the positions are of, or changed in flight
+SENSOR, CHANGE = "the source's sensor", "change"
 
 _OVERSTATED = ("kf_variance_overstated", "ekf2_variance_overstated")
 _OURS = ("kf_variance_overstated", "kf_variance_understated")
@@ -171,6 +171,8 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
         "errors_larger_than_claimed",
     ),
     "source_not_logged": ("source_decimated",),
+    # what contradicts EKF2 from then on is rejected
+    "aid_changed": (f"aid_starved:{CHANGE}",),
     "source_gap": ("ekf2_fusion_interrupted", f"errors_larger_than_claimed:{ELSEWHERE}"),
     "logger_dropouts": ("imu_gap",),
 }  # fmt: skip

@@ -1,18 +1,20 @@
 """What EKF2 makes of a simulated flight, by px4fuse's own model of it, as PX4 v1.16 logs it.
 
 The model is :mod:`px4fuse.ekf2`, run forward from its own beginning instead of from a log: PX4's
-initial variances, levelled at rest, then IMU and vision as simulated. Height and heading are not
-part of that model; a slow error about the truth stands in for barometer and magnetometer. The
-model is linear about an attitude, here the true one: what the gyro measures beyond it enters as a
-turn, so that nothing of the truth reaches the estimate. The log's vehicle_attitude is not made by
-it, so that what a student's filter is fed with does not depend on EKF2's parameters; the model's
-own attitude is in estimator_states.
+initial variances, levelled at rest, then IMU and positions as simulated. The model is linear about
+an attitude, here the true one: what the gyro measures beyond it enters as a turn, so that nothing
+of the truth reaches the estimate.
+
+Outdoors EKF2 fuses the magnetometer, and vehicle_attitude is its own. Its height is of the
+barometer and the IMU, by a filter of two states. Indoors a slow error about the truth stands in
+for both sensors, and vehicle_attitude is not made by the model, so that what a student's filter is
+fed with does not depend on EKF2's parameters; the model's own attitude is in estimator_states.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +22,7 @@ from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.ekf2.inputs import NO_LIMIT, Inputs, Received, Rules
 from px4fuse.ekf2.intervals import (
     ACCELEROMETER_BIAS,
+    FIELD_STATES,
     GRAVITY_M_S2,
     GYRO_BIAS,
     POSITION,
@@ -30,12 +33,13 @@ from px4fuse.ekf2.intervals import (
 from px4fuse.ekf2.model import delayed_states, run_variants
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.recursion import EAST, HEADING, LEVEL, NORTH, Run, Variant
-from px4fuse.ekf2.stretches import Stretch, down_sampled, step_ends
-from px4fuse.ekf2_parameters import GNSS_POS, GNSS_VEL, settings_in_force
+from px4fuse.ekf2.stretches import Field, Stretch, down_sampled, step_ends
+from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, settings_in_force
+from px4fuse.filter.model import move, noise, spread, update
 from px4fuse.simulation import sensors
-from px4fuse.simulation.ekf2_topics import TopicTrack, ekf2_topics
+from px4fuse.simulation.ekf2_topics import Height, TopicTrack, ekf2_topics
 from px4fuse.simulation.mistakes import Mistakes
-from px4fuse.simulation.motion import Motion, Sines, attitude
+from px4fuse.simulation.motion import Motion, attitude
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.simulation.ulog_writer import Topic
 from px4fuse.trajectory.rotation import (
@@ -48,6 +52,9 @@ from px4fuse.trajectory.rotation import (
 )
 
 PREDICT_US = 10_000  # EKF2_PREDICT_US
+STANDING_SD_M_S = 0.01
+# Of each axis of both fields, when the magnetometer has been aligned on the ground
+FIELD_SD_GAUSS = 0.03
 # v1.14 to main: EV_MAX_INTERVAL (ev_control.cpp), reset_timeout_max (common.h)
 RULES = Rules(0.2, 0.4, 1.0, 5, None, horizon_by_delay=False)
 # v1.16: gps_control.cpp, and no_aid_timeout_max (common.h)
@@ -62,17 +69,30 @@ REST_S = 10.0
 REST_SD = np.repeat([0.05, 0.0005, 0.06], 3)
 # Of heading and height as v1.16 logs them in flight, and of what stands in for the barometer
 HEADING_SD_RAD, HEIGHT_SD_M = 0.03, 0.15
-HEIGHT_ERROR_M = 0.03
 # Fine enough that variances are logged between the samples of a UWB too
 MAX_INTERVAL_S = 0.1
+
+
+@dataclass(frozen=True)
+class Others:
+    """The complete topics of what else EKF2 takes outdoors, whatever of them is logged."""
+
+    magnetometer: Topic
+    barometer: Topic
 
 
 def parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]:
     """EKF2's parameters as flown: all that its model has, by PX4 name."""
     aid = scenario.aid
-    known = settings_in_force({}, aid)
+    gnss = aid == GNSS_POS
+    known = settings_in_force({}, aid, *([MAG] if gnss else []))
     delay_ms = known[aid.delay] if mistakes.ekf2_delay_s is None else 1e3 * mistakes.ekf2_delay_s
-    of_aid = {GNSS_VEL.noise: scenario.sigma_gnss_m_s} if aid == GNSS_POS else {aid.noise_mode: 1}
+    of_aid: dict[str, float] = {aid.noise_mode: 1}
+    if gnss:
+        # of the magnetic heading alone (1), or of all its axes where it should be right (0)
+        only_heading = int(bool(mistakes.heading_deg))
+        of_aid = {GNSS_VEL.noise: scenario.sigma_gnss_m_s, MAG.switch: only_heading}
+        of_aid |= {BAROMETER.noise: sensors.SIGMA_BAROMETER_M, BAROMETER.gate: 5.0}
     return (
         known
         | of_aid
@@ -93,6 +113,7 @@ def fly(
     motion: Motion,
     imu: Topic,
     source: sensors.SensedPositions,
+    others: Others | None,
     flown: Mapping[str, int | float],
     at_rest: tuple[Array, Array],
     aid_source_hz: float = 0.0,
@@ -101,7 +122,7 @@ def fly(
 
     Parameters
     ----------
-    imu, source : Topic, SensedPositions
+    imu, source, others : Topic, SensedPositions, Others or None
         As EKF2 received them, whatever of them is logged.
     flown : mapping
         Parameters of the log.
@@ -112,7 +133,14 @@ def fly(
     """
     aid = scenario.aid
     stretch, time_us, nominal = _stretch(scenario, mistakes, motion, imu, at_rest)
-    settings = settings_in_force({name: float(np.float32(v)) for name, v in flown.items()}, aid)
+    known = {name: float(np.float32(v)) for name, v in flown.items()}
+    height = None
+    if others is not None:
+        height = _height(scenario, mistakes, stretch, others.barometer, known)
+        stretch = replace(stretch, down_m=height.down_m, down_variance_m2=height.variance_m2)
+        if not known[MAG.switch]:
+            stretch = _with_field(stretch, others.magnetometer)
+    settings = settings_in_force(known, aid, MAG)
     rules = GNSS_RULES if aid == GNSS_POS else RULES
     step_s = float(np.median(stretch.step_s))
     length = int(np.ceil(settings["EKF2_DELAY_MAX"] * 1e3 / PREDICT_US))
@@ -132,7 +160,7 @@ def fly(
     )
     done = run_variants(inputs, [Variant(settings)], {})[0]
     track = _track(inputs, done, time_us, nominal)
-    return ekf2_topics(inputs, done, track, aid_source_hz)
+    return ekf2_topics(inputs, done, track, height, scenario.attitude_rate_hz, aid_source_hz)
 
 
 def _stretch(
@@ -157,10 +185,6 @@ def _stretch(
     nominal = sensors.quaternions(rotation)
     gyro = running_product(np.concatenate([nominal[:1], from_vector(turn)]))
     beyond = multiply(nominal, conjugate(gyro))
-    rng = sensors.stream(scenario, sensors.Stream.HEIGHT)
-    height = Sines.draw(
-        rng, np.array([HEIGHT_ERROR_M]), sensors.ATTITUDE_PERIODS_S, sensors.ATTITUDE_SINES
-    )
     error = np.zeros((len(time), 3))
     error[:, HEADING] = sensors.attitude_error(scenario, mistakes, time).as_rotvec()[:, HEADING]
     state, covariance = _standing(rotation[0], *at_rest, float(error[0, HEADING]))
@@ -176,7 +200,7 @@ def _stretch(
             accelerometer_bias_m_s2=np.zeros(3),
             state=state,
             variance=variance,
-            down_m=motion.at(time).position_m[:, 2] + height.at(time)[0][:, 0],
+            down_m=motion.at(time).position_m[:, 2] + sensors.height_error(scenario, time),
             # nothing tells of the tilt but the positions
             attitude_variance_rad2=np.tile([np.inf, np.inf, HEADING_SD_RAD**2], (len(time), 1)),
             down_variance_m2=np.full(len(time), HEIGHT_SD_M**2),
@@ -187,6 +211,53 @@ def _stretch(
         step_us,
         nominal,
     )
+
+
+def _with_field(stretch: Stretch, magnetometer: Topic) -> Stretch:
+    """The same stretch with the magnetic fields among its states, aligned on the ground."""
+    stamp_s = sensors.time_s(magnetometer)
+    step = np.searchsorted(stretch.time_s, stamp_s - 0.5 * float(np.median(stretch.step_s)))
+    inside = (step > 0) & (step < len(stretch.time_s))
+    gauss = magnetometer.fields["magnetometer_ga"].astype(np.float64)
+    correlation = np.eye(FIELD_STATES)
+    correlation[:STATES, :STATES] = stretch.correlation
+    return replace(
+        stretch,
+        state=np.concatenate([stretch.state, sensors.EARTH_FIELD_GAUSS, np.zeros(3)]),
+        variance=np.concatenate([stretch.variance, np.full(6, FIELD_SD_GAUSS**2)]),
+        correlation=correlation,
+        field=Field(step[inside], gauss[inside], 1.0),
+    )
+
+
+def _height(
+    scenario: Scenario,
+    mistakes: Mistakes,
+    stretch: Stretch,
+    barometer: Topic,
+    flown: Mapping[str, float],
+) -> Height:
+    """Height by the barometer, EKF2's only one here, and the IMU with its bias known."""
+    bias, _ = sensors.biases(scenario, mistakes)
+    force = np.einsum("nij,nj->ni", stretch.rotation[1:], stretch.force_m_s2 - bias)
+    down_m = sensors.HOME[2] - barometer.fields["baro_alt_meter"].astype(np.float64)
+    due = np.searchsorted(stretch.time_s, sensors.time_s(barometer)).tolist()
+    samples = dict(zip(due, down_m.tolist(), strict=True))
+    r, q = flown[BAROMETER.noise] ** 2, flown["EKF2_ACC_NOISE"] ** 2
+    p, v, covariance = down_m[0], 0.0, (r, 0.0, STANDING_SD_M_S**2)
+    found, rows = [(p, r)], []
+    steps, gained = stretch.step_s.tolist(), (force[:, 2] + GRAVITY_M_S2[2]).tolist()
+    for at, (dt, a) in enumerate(zip(steps, gained, strict=True), start=1):
+        p, v = move(p, v, a, dt)
+        more = (q * dt * each for each in noise(dt))
+        p00, p01, p11 = (old + new for old, new in zip(spread(covariance, dt), more, strict=True))
+        covariance = p00, p01, p11
+        if at in samples:
+            told, (p, v, covariance) = update(p, v, covariance, samples[at], r)
+            rows.append((at, samples[at], *told[:2]))
+        found.append((p, covariance[0]))
+    down, variance = np.array(found).T
+    return Height(down, variance, np.array(rows))
 
 
 def _standing(
@@ -277,6 +348,7 @@ def _track(inputs: Inputs, done: Run, time_us: IntArray, nominal: Array) -> Topi
         delayed=state[:, 3:],
         velocity_m_s=velocity,
         position_m=position,
+        attitude=multiply(from_vector(ours), nominal),
         resets=tuple((step + lag, jump) for step, jump in resets),
         aided=aided,
     )

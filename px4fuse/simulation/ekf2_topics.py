@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.intervals import POSITION, STATES
+from px4fuse.ekf2.intervals import POSITION
 from px4fuse.ekf2.recursion import EAST, LEVEL, NORTH, Run
-from px4fuse.ekf2_parameters import GNSS_POS, GNSS_VEL, Aid
+from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid
+from px4fuse.readers.px4_ekf2 import MAG_3D_BIT
 from px4fuse.readers.px4_positions import unproject
 from px4fuse.simulation import sensors
 from px4fuse.simulation.ulog_writer import Topic
@@ -22,7 +23,25 @@ from px4fuse.simulation.ulog_writer import Topic
 # full rate, a vehicle only at this one
 VEHICLE_AID_SOURCE_HZ = 2.0
 STATES_HZ, LOCAL_POSITION_HZ, FLAGS_HZ = 2.0, 10.0, 1.0
+MAGNETOMETER_HZ, BAROMETER_HZ, OTHER_AIDS_HZ = 2.0, 5.0, 2.0
 PUBLISHED_LATER_US = 100
+
+
+@dataclass(frozen=True)
+class Height:
+    """Height by the barometer, down (m), at the end of each prediction step, shape (n + 1,).
+
+    Attributes
+    ----------
+    down_m, variance_m2 : ndarray
+    samples : ndarray, shape (m, 4)
+        Of each sample of the barometer the step that fused it, what it measured, its innovation
+        and the variance of that.
+    """
+
+    down_m: Array
+    variance_m2: Array
+    samples: Array
 
 
 @dataclass(frozen=True)
@@ -38,7 +57,7 @@ class TopicTrack:
     delayed_attitude, delayed : ndarray
         Quaternions, and velocity, position and both biases at the horizon, by the time that they
         are of.
-    velocity_m_s, position_m : ndarray
+    velocity_m_s, position_m, attitude : ndarray
         Published.
     resets : tuple of (int, ndarray)
         Step in which the published position jumped, and by how much (m, north and east).
@@ -52,12 +71,18 @@ class TopicTrack:
     delayed: Array
     velocity_m_s: Array
     position_m: Array
+    attitude: Array
     resets: tuple[tuple[int, Array], ...]
     aided: BoolArray
 
 
 def ekf2_topics(
-    inputs: Inputs, done: Run, track: TopicTrack, aid_source_hz: float
+    inputs: Inputs,
+    done: Run,
+    track: TopicTrack,
+    height: Height | None,
+    attitude_hz: float,
+    aid_source_hz: float,
 ) -> tuple[Topic, ...]:
     """The topics that EKF2 had anything to say in.
 
@@ -65,13 +90,19 @@ def ekf2_topics(
     ----------
     done : Run
         The model's run, of one variant in one stretch.
+    height : Height or None
+        Where a barometer was fused.
+    attitude_hz : float
+        Of vehicle_attitude, which is EKF2's where it fuses a magnetometer.
     aid_source_hz : float
         To what estimator_aid_src_ev_pos is thinned; 0 leaves it.
     """
     topics = (
         _local_position(track, gnss=inputs.aid == GNSS_POS),
-        _states(done, track),
+        _states(done, track, gnss=inputs.aid == GNSS_POS),
         *_aid_sources(inputs, done, track, aid_source_hz),
+        *([] if height is None else [_barometer(track, height)]),
+        *([] if done.stretch.field is None else _of_field(inputs, done, track, attitude_hz)),
         _flags(inputs, done, track),
     )
     return tuple(topic for topic in topics if len(topic.fields["timestamp"]))
@@ -103,7 +134,7 @@ def _local_position(track: TopicTrack, *, gnss: bool) -> Topic:
     return Topic("vehicle_local_position", fields)
 
 
-def _states(done: Run, track: TopicTrack) -> Topic:
+def _states(done: Run, track: TopicTrack, *, gnss: bool) -> Topic:
     """estimator_states of v1.16: 25 states with 24 covariances, positions as 0."""
     end = done.events[0].end
     events = np.flatnonzero(np.diff(end, prepend=0) > 0)
@@ -112,10 +143,12 @@ def _states(done: Run, track: TopicTrack) -> Topic:
     rows = end[events]
     states = np.zeros((len(rows), 25), np.float32)
     states[:, 0:4] = track.delayed_attitude[rows]
-    states[:, 4:16] = track.delayed[rows]
+    states[:, 4 : 4 + track.delayed.shape[1]] = track.delayed[rows]
     states[:, 7:9] = 0.0  # horizontally kept as latitude and longitude
+    if gnss:
+        states[:, 9] -= sensors.HOME[2]  # and downwards as altitude, where there is an origin
     covariances = np.zeros((len(rows), 24), np.float32)
-    covariances[:, :STATES] = done.variance[events + 1, 0]
+    covariances[:, : done.variance.shape[2]] = done.variance[events + 1, 0]
     return Topic(
         "estimator_states",
         {
@@ -171,6 +204,56 @@ def _aid_sources(inputs: Inputs, done: Run, track: TopicTrack, rate_hz: float) -
     )
 
 
+def _barometer(track: TopicTrack, height: Height) -> Topic:
+    step = height.samples[:, 0].astype(np.intp)
+    seen = step < len(track.time_us) - track.lag
+    seen &= sensors.thinned(sensors.seconds(track.time_us[step]), OTHER_AIDS_HZ)
+    rows, (measured, innovation, variance) = step[seen], height.samples[seen, 1:].T
+    outside = innovation**2 > BAROMETER.default_gate**2 * variance
+    return _aid_source(
+        BAROMETER,
+        {BAROMETER.gate: BAROMETER.default_gate},
+        sensors.stamps(track.time_us[rows], _horizon_us(track, rows)),
+        (measured - sensors.HOME[2]).astype(np.float32),
+        (innovation, variance, variance - height.variance_m2[rows]),
+        (outside, ~outside),
+    )
+
+
+def _of_field(inputs: Inputs, done: Run, track: TopicTrack, attitude_hz: float) -> list[Topic]:
+    """What a magnetometer has EKF2 say: vehicle_attitude, its innovations, and that it is fused."""
+    field, settings, end = done.stretch.field, inputs.settings, done.events[0].end
+    assert field is not None
+    seen = np.flatnonzero(
+        np.isfinite(done.field[:, 2, 0, 0]) & (end < len(track.time_us) - track.lag)
+    )
+    seen = seen[sensors.thinned(sensors.seconds(track.time_us[end[seen]]), OTHER_AIDS_HZ)]
+    rows, (innovation, variance, fused) = end[seen], np.moveaxis(done.field[seen, :, 0], 1, 0)
+    last = field.gauss[np.searchsorted(field.step, rows, side="right") - 1]
+    stamps = sensors.stamps(track.time_us[rows], _horizon_us(track, rows))
+    noise = np.full(innovation.shape, settings[MAG.noise] ** 2)
+    taken = fused[:, 0] > 0.0
+    published = np.flatnonzero(sensors.thinned(sensors.seconds(track.time_us), attitude_hz))
+    told = np.flatnonzero(sensors.thinned(sensors.seconds(track.time_us[: -track.lag]), FLAGS_HZ))
+    return [
+        sensors.attitude_topic(
+            "vehicle_attitude", track.time_us[published], PUBLISHED_LATER_US,
+            track.attitude[published],
+        ),
+        _aid_source(
+            MAG, settings, stamps, last.astype(np.float32), (innovation, variance, noise),
+            (~taken, taken),
+        ),
+        Topic(
+            "estimator_status",
+            {
+                **sensors.stamps(track.time_us[told], _horizon_us(track, told)),
+                "control_mode_flags": np.full(len(told), 1 << MAG_3D_BIT, np.uint64),
+            },
+        ),
+    ]  # fmt: skip
+
+
 def _aid_source(
     aid: Aid,
     settings: Mapping[str, float],
@@ -220,7 +303,7 @@ def _flags(inputs: Inputs, done: Run, track: TopicTrack) -> Topic:
             "cs_yaw_align": always,
             "cs_gnss_pos": on[rows] & gnss,
             "cs_opt_flow": never,
-            "cs_mag_hdg": always,
+            **({"cs_mag_hdg": always} if done.stretch.field is None else {"cs_mag_3d": always}),
             "cs_baro_hgt": always,
             "cs_ev_pos": on[rows] & ~gnss,
             "cs_ev_yaw": never,

@@ -19,7 +19,7 @@ from px4fuse.readers.px4_topics import IMU
 from px4fuse.readers.ulog_topics import NOTE_KEY, Topics
 from px4fuse.recording import LogInfo
 from px4fuse.simulation import ekf2, sensors
-from px4fuse.simulation.ekf2_topics import VEHICLE_AID_SOURCE_HZ
+from px4fuse.simulation.ekf2_topics import BAROMETER_HZ, MAGNETOMETER_HZ, VEHICLE_AID_SOURCE_HZ
 from px4fuse.simulation.mistakes import MISTAKES, Mistakes, as_typed, made
 from px4fuse.simulation.motion import Motion, plan
 from px4fuse.simulation.scenario import Scenario
@@ -72,6 +72,13 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
             raise SettingsError(f"--mistake {name} requires --kind {' or '.join(kinds)}.")
         if MISTAKES[name].of_ekf2 and not scenario.ekf2:
             raise SettingsError(f"--mistake {name} is one of EKF2's: leave out --no-ekf2.")
+    if scenario.aid == GNSS_POS and 0.0 < mistakes.ekf2_noise_m < (
+        stated_m := sensors.reported_sigma_m(scenario, mistakes)
+    ):
+        raise SettingsError(
+            f"--mistake ekf2-noise={mistakes.ekf2_noise_m:g} changes nothing outdoors: EKF2 takes "
+            f"the larger of {GNSS_POS.noise} and the receiver's accuracy, {stated_m:g} m."
+        )
     motion = plan(scenario, mistakes, sensors.stream(scenario, sensors.Stream.WANDER))
     positions = sensors.positions(scenario, mistakes, motion)
     imu = sensors.imu(scenario, mistakes, motion)
@@ -83,6 +90,13 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
     ]
     if not mistakes.no_vvo:
         topics.append(positions.topic)
+    others = None
+    if scenario.aid == GNSS_POS:
+        others = ekf2.Others(
+            sensors.magnetometer(scenario, mistakes, motion), sensors.barometer(scenario, motion)
+        )
+        topics.append(sensors.at_rate(others.magnetometer, MAGNETOMETER_HZ))
+        topics.append(sensors.at_rate(others.barometer, BAROMETER_HZ))
     if scenario.truth:
         topics.append(sensors.ground_truth(scenario, motion))
     for topic in topics:
@@ -91,9 +105,11 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
     if scenario.ekf2:
         standing = sensors.at_rest(scenario, mistakes, motion, ekf2.REST_S)
         aid_source_hz = VEHICLE_AID_SOURCE_HZ if mistakes.no_vvo else 0.0
-        topics += ekf2.fly(
-            scenario, mistakes, motion, imu, positions, parameters, standing, aid_source_hz
+        made_by_ekf2 = ekf2.fly(
+            scenario, mistakes, motion, imu, positions, others, parameters, standing, aid_source_hz
         )
+        names = {topic.name for topic in made_by_ekf2}
+        topics = [*(topic for topic in topics if topic.name not in names), *made_by_ekf2]
     return Simulation(scenario, mistakes, motion, positions, tuple(topics), parameters)
 
 

@@ -48,6 +48,8 @@ class Mistakes:
     slow_error_s: float = number(30.0, 0.1, 1e4, "s", "TIME")
     heading_deg: float = number(0.0, -180.0, 180.0, "°", "DEG")
     heading_at_s: float | None = number(None, 0.0, 1e4, "s", "AT")
+    mag_gauss: float = number(0.0, -1.0, 1.0, "gauss", "GAUSS")
+    mag_at_s: float | None = number(None, 0.0, 1e4, "s", "AT")
     accel_bias_m_s2: float = number(0.0, -5.0, 5.0, "m/s²", "M/S2")
     vibration_m_s2: float = number(0.0, 0.0, 20.0, "m/s²", "M/S2")
     imu_rate_hz: float = number(0.0, 1.0, 1000.0, "Hz", "HZ")
@@ -184,9 +186,17 @@ MISTAKES: Mapping[str, Mistake] = MappingProxyType({
     ),
     "heading": Mistake(
         ("heading_deg", "heading_at_s"), 20.0,
-        "EKF2's heading is too large by this, from AT on (the start): a disturbed compass.",
+        "EKF2's heading is too large by this, from AT on (the start): a disturbed compass, and "
+        "outdoors an EKF2 that takes the heading from it as it is (EKF2_MAG_TYPE 1).",
         "Innovations grow at every start, stop and corner; the positions are turned against the "
         "attitude.",
+    ),
+    "mag": Mistake(
+        ("mag_gauss", "mag_at_s"), 0.2,
+        "A current beside the magnetometer adds this to its right axis from AT on (the middle).",
+        "The magnetometer's innovations change then, and EKF2's heading with them; away from "
+        "cables, or calibrate it with the motors running.",
+        kinds=("outdoor",),
     ),
     "accel-bias": Mistake(
         ("accel_bias_m_s2",), 0.5,
@@ -223,7 +233,7 @@ MISTAKES: Mapping[str, Mistake] = MappingProxyType({
     ),
     "ekf2-noise": Mistake(
         ("ekf2_noise_m",), 0.02,
-        "EKF2_EVP_NOISE (outdoors EKF2_GPS_P_NOISE) is this.",
+        "EKF2_EVP_NOISE is this (outdoors EKF2_GPS_P_NOISE, which matters above 0.4 m).",
         "Below the source's noise EKF2's NIS is far above 1 and it rejects good samples; above it "
         "NIS is far below 1.",
         of_ekf2=True,

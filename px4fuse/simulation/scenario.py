@@ -104,7 +104,7 @@ class Scenario:
         Of a single sample.
     tilt_error_deg, yaw_error_deg : float
         Root mean square of the slow error (periods of 20 to 60 s) of the logged attitude, whose
-        heading EKF2 is given too.
+        heading EKF2 is given too, where it fuses no magnetometer.
     imu_rate_hz, attitude_rate_hz, truth_rate_hz : float
     truth : bool
         Whether the log holds the ground truth.

@@ -37,6 +37,12 @@ HOME = (47.397742, 8.545594, 488.0)
 # Of a fix when it is stamped; GNSS is less exact downwards
 FIX_AGE_S = 1e-3 * PARAMETERS[GNSS_POS.delay].default
 OF_GNSS = np.array([1.0, 1.0, 1.5])
+# The magnetic field there (NED) and noise of its samples; noise of the barometer
+EARTH_FIELD_GAUSS = np.array([0.217, 0.013, 0.430])
+SIGMA_FIELD_GAUSS, SIGMA_BAROMETER_M = 0.02, 0.4
+FIELD_RATE_HZ, BAROMETER_RATE_HZ = 14.0, 10.0
+# Root mean square of what height does beside the truth, slowly: weather and wind
+HEIGHT_ERROR_M = 0.03
 # A compass that is disturbed in flight pulls EKF2's heading along with this time constant
 HEADING_FOLLOWS_S = 3.0
 ATTITUDE_PERIODS_S = (20.0, 60.0)
@@ -49,7 +55,8 @@ POSE_FRAME_NED = 1  # msg/VehicleOdometry.msg
 # Streams of random numbers: a mistake in one sensor leaves the others' noise as it was
 Stream = IntEnum(
     "Stream",
-    "WANDER BIAS IMU ATTITUDE TIMING SOURCE DRIFT NLOS VIBRATION HEIGHT REST SLOW FIX_VELOCITY",
+    "WANDER BIAS IMU ATTITUDE TIMING SOURCE DRIFT NLOS VIBRATION HEIGHT REST SLOW FIX_VELOCITY "
+    "FIELD BAROMETER",
     start=0,
 )
 
@@ -129,13 +136,60 @@ def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
     )
 
 
+def magnetometer(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
+    """vehicle_magnetometer, complete."""
+    time_us = _grid_us(motion.duration_s, FIELD_RATE_HZ)
+    rotation = attitude(motion.at(seconds(time_us))).body_to_ned
+    if mistakes.heading_deg:  # the heading that EKF2 takes from it
+        rotation = attitude_error(scenario, mistakes, seconds(time_us)).as_matrix() @ rotation
+    field = np.einsum("nji,j->ni", rotation, EARTH_FIELD_GAUSS)
+    field += SIGMA_FIELD_GAUSS * stream(scenario, Stream.FIELD).standard_normal(field.shape)
+    at_s = motion.duration_s / 2.0 if mistakes.mag_at_s is None else mistakes.mag_at_s
+    field[seconds(time_us) >= at_s, 1] += mistakes.mag_gauss
+    return Topic(
+        "vehicle_magnetometer", stamps(time_us) | {"magnetometer_ga": field.astype(np.float32)}
+    )
+
+
+def barometer(scenario: Scenario, motion: Motion) -> Topic:
+    """vehicle_air_data, complete."""
+    time_us = _grid_us(motion.duration_s, BAROMETER_RATE_HZ)
+    height_m = HOME[2] - motion.at(seconds(time_us)).position_m[:, 2]
+    height_m -= height_error(scenario, seconds(time_us))
+    noise = stream(scenario, Stream.BAROMETER).standard_normal(len(time_us))
+    height_m += SIGMA_BAROMETER_M * noise
+    return Topic(
+        "vehicle_air_data", stamps(time_us) | {"baro_alt_meter": height_m.astype(np.float32)}
+    )
+
+
+def height_error(scenario: Scenario, time_s: Array) -> Array:
+    """How far below the truth the height is, slowly (m)."""
+    rng, rms = stream(scenario, Stream.HEIGHT), np.array([HEIGHT_ERROR_M])
+    return Sines.draw(rng, rms, ATTITUDE_PERIODS_S, ATTITUDE_SINES).at(time_s)[0][:, 0]
+
+
+def at_rate(complete: Topic, rate_hz: float) -> Topic:
+    """A topic as a logger keeps it that passes on at most this rate; 0 keeps all."""
+    return _some(complete, thinned(time_s(complete), rate_hz))
+
+
 def logged_imu(complete: Topic, mistakes: Mistakes, motion: Motion) -> Topic:
     """sensor_combined as the logger keeps it."""
-    time_s = seconds(complete.fields["timestamp"].astype(np.int64) - START_US)
+    stamps_s = time_s(complete)
     keep = _outside_gap(
-        time_s, mistakes.imu_dropout_s, mistakes.imu_dropout_at_s, motion.duration_s
-    ) & thinned(time_s, mistakes.imu_rate_hz)
-    return Topic(complete.name, {name: values[keep] for name, values in complete.fields.items()})
+        stamps_s, mistakes.imu_dropout_s, mistakes.imu_dropout_at_s, motion.duration_s
+    )
+    return _some(complete, keep & thinned(stamps_s, mistakes.imu_rate_hz))
+
+
+def time_s(topic: Topic) -> Array:
+    """When each message was published, seconds from the first data."""
+    return seconds(topic.fields["timestamp"].astype(np.int64) - START_US)
+
+
+def _some(topic: Topic, keep: BoolArray) -> Topic:
+    return Topic(topic.name, {name: values[keep] for name, values in topic.fields.items()})
 
 
 def at_rest(
@@ -157,14 +211,15 @@ def logged_attitude(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> T
     time_us = _grid_us(motion.duration_s, scenario.attitude_rate_hz)
     truth = attitude(motion.at(seconds(time_us))).body_to_ned
     error = attitude_error(scenario, mistakes, seconds(time_us)).as_matrix()
-    return _attitude_topic("vehicle_attitude", time_us, ATTITUDE_LATENCY_US, error @ truth)
+    turned = quaternions(error @ truth)
+    return attitude_topic("vehicle_attitude", time_us, ATTITUDE_LATENCY_US, turned)
 
 
 def true_attitude(scenario: Scenario, motion: Motion) -> Topic:
     """vehicle_attitude_groundtruth."""
     time_us = _grid_us(motion.duration_s, scenario.truth_rate_hz)
     truth = attitude(motion.at(seconds(time_us))).body_to_ned
-    return _attitude_topic("vehicle_attitude_groundtruth", time_us, 0, truth)
+    return attitude_topic("vehicle_attitude_groundtruth", time_us, 0, quaternions(truth))
 
 
 def quaternions(body_to_ned: Array) -> Array:
@@ -172,12 +227,9 @@ def quaternions(body_to_ned: Array) -> Array:
     return np.asarray(Rotation.from_matrix(body_to_ned).as_quat(scalar_first=True))
 
 
-def _attitude_topic(
-    name: str, time_us: NDArray[np.int64], late_us: int, body_to_ned: Array
-) -> Topic:
+def attitude_topic(name: str, time_us: NDArray[np.int64], late_us: int, quaternion: Array) -> Topic:
     """An attitude, published so much later."""
-    quaternion = quaternions(body_to_ned).astype(np.float32)
-    return Topic(name, stamps(time_us, late_us) | {"q": quaternion})
+    return Topic(name, stamps(time_us, late_us) | {"q": quaternion.astype(np.float32)})
 
 
 def attitude_error(scenario: Scenario, mistakes: Mistakes, time_s: Array) -> Rotation:
