@@ -111,7 +111,7 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
 
     def prepared(
         interval_s: float = 0.008, horizon_s: Any = 0.1, firmware: str = "PX4 v1.16.1",
-        fusing: Any = NONE, per_step_biases: bool = False, **parameters: float,
+        fusing: Any = NONE, per_step_biases: bool = False, without: Any = (), **parameters: float,
     ) -> Any:  # fmt: skip
         record = made(
             FusionRecord, parameters=parameters, other_aiding=(), per_step_biases=per_step_biases
@@ -120,7 +120,7 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
             Ekf2, record=record, innovations={"north": pd.DataFrame()}, horizon_s=horizon_s,
             step_s=0.01, fusing=fusing, aids={},
         )  # fmt: skip
-        imu = pd.DataFrame(index=interval_s * np.arange(2))
+        imu = pd.DataFrame(index=np.delete(interval_s * np.arange(1000), without))
         return prepare(made(Flight, imu=imu, attitude=imu, ekf2=ekf2, log=log(firmware=firmware)))
 
     return prepared
@@ -139,13 +139,18 @@ def test_rules_of_the_releases(flown: Callable[..., Any]) -> None:
 
 
 def test_what_a_log_must_hold(flown: Callable[..., Any]) -> None:
-    assert isinstance(flown(0.012), Inputs)
+    assert isinstance(flown(0.0119), Inputs)
     assert "logged at 80 Hz" in flown(0.0125).reason
     assert isinstance(flown(horizon_s=NONE), Unavailable)
     assert flown(horizon_s=NONE, firmware="PX4 v1.13.3").horizon_s == 0.0
     for vertical, there in (([1.0, 0.0], False), ([1.0, 1.0, 0.0], True)):
         assert flown(fusing=pd.DataFrame({"vertical": vertical})).vision_height is there
     assert flown(fusing=NONE).vision_height is False
+    every = np.arange(2, 998)
+    assert "11% of the IMU's samples are missing" in flown(without=every[::10]).reason
+    # fewer, and a gap, at which a stretch ends
+    assert isinstance(flown(without=every[::12]), Inputs)
+    assert isinstance(flown(without=np.arange(400, 600)), Inputs)
 
 
 def track(name: str, origin: Origin, interval_s: float = 0.1, **parts: Any) -> PositionTrack:

@@ -13,7 +13,7 @@ import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
-from px4fuse.ekf2.stretches import MIN_STRETCH_S, Stretch, find_stretches, predict_s
+from px4fuse.ekf2.stretches import IMU_GAP_S, MIN_STRETCH_S, Stretch, find_stretches, predict_s
 from px4fuse.ekf2_parameters import (
     AID_MASK,
     EV_POS,
@@ -55,6 +55,8 @@ OF_GNSS = (GNSS_POS.label, GNSS_VEL.label)
 RESET_SHOWS_S = 0.2
 # Predictions of more than this lose turns and vibration inside a step; EKF2's own are 8 to 13 ms
 MAX_IMU_INTERVAL_S = 0.012
+# Of the IMU's samples, outside gaps: EKF2 had them
+MAX_LOST_SHARE = 0.1
 # The first release that stamps estimator_states with the time of the horizon
 STAMPED_AT_HORIZON = "PX4 v1.13"
 NO_LIMIT = 1_000_000
@@ -203,13 +205,8 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
         said = f"EKF2 fused more than {fused} horizontally ({', '.join(others)})"
         more = "" if gnss else f", {GNSS_POS.switch} 0 and without bit 2 of {EV_POS.switch}"
         return Unavailable(WHAT, said, f"Fly with EKF2_OF_CTRL 0{more}.")
-    interval = float(np.median(np.diff(imu.index.to_numpy())))
-    if interval > MAX_IMU_INTERVAL_S:
-        return Unavailable(
-            WHAT,
-            f"the IMU is logged at {1 / interval:.0f} Hz, slower than EKF2 predicts",
-            "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate.",
-        )
+    if lacking := _imu_lacks(imu.index.to_numpy()):
+        return lacking
     read = read_gnss(flight, ekf2, record) if gnss else read_vision(flight, ekf2, record, attitude)
     if isinstance(read, Unavailable):
         return read
@@ -243,6 +240,28 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
         and bool(fusing["vertical"].mean() > 0.5),
         imu_offset_m=np.array([record.parameters.get(f"EKF2_IMU_POS_{x}", 0.0) for x in "XYZ"]),
         aid=aid,
+    )
+
+
+def _imu_lacks(time_s: Array) -> Unavailable | None:
+    """Why IMU samples at these times are too few for predictions; None where they are not."""
+    intervals = np.diff(time_s)
+    interval = float(np.median(intervals))
+    if interval > MAX_IMU_INTERVAL_S:
+        return Unavailable(
+            WHAT,
+            f"the IMU is logged at {1 / interval:.0f} Hz, slower than EKF2 predicts",
+            "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate.",
+        )
+    within = intervals[intervals <= IMU_GAP_S]
+    lost = float((np.rint(within / interval) - 1.0).clip(0.0).sum() / len(time_s))
+    if lost <= MAX_LOST_SHARE:
+        return None
+    return Unavailable(
+        WHAT,
+        f"{lost:.0%} of the IMU's samples are missing from the log, one here and there, and with "
+        "them how the vehicle moved",
+        "Use a faster SD card, or log less (SDLOG_PROFILE).",
     )
 
 

@@ -44,11 +44,11 @@ NO_TRUTH = Unavailable(
 )
 # Of a flight on GNSS
 HEADING_FOLLOWS = (
-    "the heading follows, with the magnetometer as EKF2 fused it (as flown it is {:.1f}° off the "
+    "The heading follows, with the magnetometer as EKF2 fused it (as flown it is {:.1f}° off the "
     "log, RMS); the height is EKF2's own as flown"
 )
 HEADING_STAYS = (
-    "heading and height are EKF2's own as flown, whatever is changed: the log does not hold what "
+    "Heading and height are EKF2's own as flown, whatever is changed: the log does not hold what "
     "EKF2 fused of a magnetometer, all axes throughout"
 )
 OWN_HEADING = Unavailable(
@@ -422,7 +422,7 @@ def _carried(model: Model, replay: Ekf2Replay, without: Mapping[str, float], jud
         "while the model dead-reckons on"
     )
     return (
-        f"without {lost}, what is published is {apart.max():.3g} m from the replay as flown at "
+        f"Without {lost}, what is published is {apart.max():.3g} m from the replay as flown at "
         f"most (at {found.index[apart.argmax()]:.1f} s), {apart[-1]:.3g} m at the end"
         + (given_up if position <= without.keys() else "")
     )
@@ -434,7 +434,7 @@ def _notes(model: Model, replay: Ekf2Replay) -> list[str]:
     remedy = "" if model.inputs.rules.horizon_by_delay else ": raise EKF2_DELAY_MAX"
     change = ", ".join(f"{name}={value:g}" for name, value in replay.changed.items())
     return [
-        f"{change or 'as flown'}: {replay.late + replay.lost} of "
+        f"{change or 'As flown'}: {replay.late + replay.lost} of "
         f"{len(replay.updates) + replay.lost} samples would reach EKF2 after its fusion horizon "
         f"has passed them ({replay.lost} would never be fused){remedy}"
     ]
