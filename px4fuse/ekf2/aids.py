@@ -28,7 +28,7 @@ AidVerdict = Literal[
 BIASED, FELT = 0.5, 0.2
 # A change in flight: in windows of so many seconds the mean moves by half of √S, and by six times
 # what those before scatter
-WINDOW_S, IN_WINDOW, WINDOWS_BEFORE, CHANGED, CHANGED_SIGMAS = 10.0, 5, 3, 0.5, 6.0
+WINDOW_S, IN_WINDOW, WINDOWS_BEFORE, CHANGED, CHANGED_SIGMAS = 10.0, 5, 2, 0.5, 6.0
 # Longest time (s) without a sample fused while EKF2 means to fuse it. EKF2 itself resets to an aid
 # after 7 s (reset_timeout_max); rates of 2 Hz are the slowest of the default profile
 STARVED_S = 5.0
@@ -238,7 +238,10 @@ def _judge(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidResult:
 
 
 def _change(time_s: Array, pull: Array) -> Span | None:
-    """In which window the mean of ν/√S moves farthest, from all before to two after; how far."""
+    """From which window on the mean of ν/√S is farthest from all before, in the two after; how far.
+
+    The window in between counts where it has moved by a quarter of that.
+    """
     window = np.floor((time_s - time_s[0]) / WINDOW_S)
     found = pd.Series(pull).groupby(window).agg(["mean", "size"]).query("size >= @IN_WINDOW")
     mean, worst = found["mean"].to_numpy(), None
@@ -248,7 +251,9 @@ def _change(time_s: Array, pull: Array) -> Span | None:
         chance = float(np.std(before)) / math.sqrt(2.0 * found["size"].iloc[:at].median())
         scatter = max(float(np.std(mean[:at], ddof=1)), chance)
         if abs(moved) > max(CHANGED, CHANGED_SIGMAS * scatter, abs(worst[1]) if worst else 0.0):
-            worst = float(time_s[0] + WINDOW_S * found.index[at]), moved
+            begun = abs(mean[at] - np.mean(mean[:at])) > abs(moved) / 4.0
+            first = found.index[at if begun else at + 1]
+            worst = float(time_s[0] + WINDOW_S * first), moved
     return worst
 
 
