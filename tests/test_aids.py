@@ -186,13 +186,13 @@ def test_findings_name_the_aid_its_figures_and_when() -> None:
 def test_an_aid_that_changes_in_flight_is_told_with_the_time() -> None:
     log = aid_log()
     # by windows of 10 s: from the one on in which it changes, or the next where it hardly shows
-    for from_s, told_s in ((TIMES[0] + 22.0, 20.0), (TIMES[0] + 29.5, 30.0)):
+    for from_s, told_s in ((22.0, 20.0), (39.5, 40.0)):
         changed = log.samples.copy()
         changed.loc[from_s:, "innovation_east"] -= 0.7  # 1.4 √S
         found = judged(replace(log, samples=changed))
         assert found.axes["north"].change is None
         when_s, moved = found.axes["east"].change  # type: ignore[misc]
-        assert when_s == pytest.approx(TIMES[0] + told_s, abs=0.5)
+        assert when_s == pytest.approx(told_s, abs=0.5)
         assert moved == pytest.approx(-1.4, abs=0.4)
     (told,) = find_aids({"mag": found})
     assert (told.id, told.severity, told.evidence["axis"]) == ("aid_changed", "warning", "east")

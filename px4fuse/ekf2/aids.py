@@ -240,7 +240,7 @@ def _judge(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidResult:
 def _change(time_s: Array, pull: Array) -> Span | None:
     """From which window on the mean of ν/√S is farthest from all before, in the two after; how far.
 
-    The window in between counts where it has moved by a quarter of that.
+    The window in between counts where it has moved by a third of that.
     """
     window = np.floor((time_s - time_s[0]) / WINDOW_S)
     found = pd.Series(pull).groupby(window).agg(["mean", "size"]).query("size >= @IN_WINDOW")
@@ -251,7 +251,7 @@ def _change(time_s: Array, pull: Array) -> Span | None:
         chance = float(np.std(before)) / math.sqrt(2.0 * found["size"].iloc[:at].median())
         scatter = max(float(np.std(mean[:at], ddof=1)), chance)
         if abs(moved) > max(CHANGED, CHANGED_SIGMAS * scatter, abs(worst[1]) if worst else 0.0):
-            begun = abs(mean[at] - np.mean(mean[:at])) > abs(moved) / 4.0
+            begun = abs(mean[at] - np.mean(mean[:at])) > abs(moved) / 3.0
             first = found.index[at if begun else at + 1]
             worst = float(time_s[0] + WINDOW_S * first), moved
     return worst
