@@ -5,20 +5,11 @@ from __future__ import annotations
 import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from px4fuse.cli.inputs import (
-    Named,
-    analysis_options,
-    comparison_request,
-    open_option,
-    person_options,
-    read_person,
-    report_options,
-)
-from px4fuse.cli.outputs import finish, free_report, progress, report_paths, result_files
+from px4fuse.cli import inputs, outputs
 from px4fuse.request import command_line, settings_name
 from px4fuse.writing import STANDARD_OUTPUT
 
@@ -30,24 +21,23 @@ SEVERITIES = ("error", "warning", "info")
 
 
 @click.command()
-@click.argument("log", type=Named())
-@analysis_options
-@person_options
-@report_options
-@click.option(
-    "--fail-on", type=click.Choice(SEVERITIES), help="Exit with 1 on a finding at least so severe."
+@click.argument("log", type=inputs.Named())
+@inputs.analysis_options
+@inputs.person_options
+@inputs.report_options(
+    "The report.  [default: reports/LOG.pdf, settings that are not at their defaults in its name]"
 )
-@click.option(
+@inputs.option("--fail-on", "Exit with 1 on a finding at least so severe.")
+@inputs.option(
     "--checks",
-    is_flag=True,
-    help="Exit with 1 if a verdict on EKF2 is bad: an aid starved, biased or trusted too much.",
+    "Exit with 1 if a verdict on EKF2 is bad: an aid starved, biased or trusted too much.",
 )
-@open_option
+@inputs.open_option
 def compare(
     log: Path,
     output: Path | None,
     json_path: Path | None,
-    fail_on: str | None,
+    fail_on: Literal["error", "warning", "info"] | None,
     checks: bool,
     **given: Any,
 ) -> None:
@@ -62,11 +52,13 @@ def compare(
     from px4fuse.report.terminal import print_aids, print_summary
     from px4fuse.results.build import aids_results, results
 
-    person = read_person(given)
-    request = comparison_request(log, given)
+    person = inputs.read_person(given)
+    request = inputs.comparison_request(log, given)
     alone = json_path == STANDARD_OUTPUT
-    report_paths(output or Path("reports/LOG.pdf"), json_path)  # before the work, not after it
-    with progress(alone) as step:
+    outputs.report_paths(
+        output or Path("reports/LOG.pdf"), json_path
+    )  # before the work, not after it
+    with outputs.progress(alone) as step:
         analysis, typed = run_or_judge_aids(request, step), command_line(request)
         document: AidsDocument | Document
         found: AidsResults | ComparisonResults
@@ -77,12 +69,14 @@ def compare(
             document = Document(analysis, find(analysis), person, typed)
             found = results(request, analysis, document.findings, person, typed)
         if output is None and not alone:
-            output = free_report(log.stem, settings_name(request), found)
-        contents = result_files(found, json_path, output, document, step)
+            output = outputs.free_report(log.stem, settings_name(request), found)
+        contents = outputs.result_files(found, json_path, output, document, step)
     if isinstance(document, AidsDocument):
-        finish(contents, partial(print_aids, document=document))
+        outputs.finish(contents, partial(print_aids, document=document))
     else:
-        finish(contents, partial(print_summary, document=document, request=request, report=output))
+        outputs.finish(
+            contents, partial(print_summary, document=document, request=request, report=output)
+        )
     bad = bad_verdicts(analysis) if checks else {}
     for name, verdict in bad.items():
         click.echo(f"{name}: {verdict}", err=True)

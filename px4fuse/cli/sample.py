@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli.inputs import path_option
+from px4fuse.cli.inputs import option
 from px4fuse.cli.outputs import finish
 
 FOLDER = Path("sample_logs")
@@ -43,10 +43,8 @@ def sample_log() -> Path:
 
 
 @click.command()
-@path_option(
-    "-o", "--output", metavar="DIR", default=FOLDER, help="Where to.  [default: sample_logs]"
-)
-def sample(output: Path) -> None:
+@option("-o, --output DIR", "Where to.  [default: sample_logs]")
+def sample(output: Path = FOLDER) -> None:
     """Write the sample flights: an aisle with UWB, a loop on visual-inertial odometry."""
     from importlib.resources import files
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from px4fuse.cli.inputs import Named, json_option, max_size_option, open_option, path_option
+from px4fuse.cli.inputs import Named, max_size_option, open_option, report_options
 from px4fuse.cli.outputs import check_targets, finish, progress, result_files
 from px4fuse.errors import LogError
 from px4fuse.reading import files_by_sha256, read_whole, shown
@@ -31,10 +31,7 @@ TIMEOUT_S = 1800.0
 @click.argument("report", type=Named(), metavar="REPORT.pdf")
 @click.argument("logs", type=Named(), nargs=-1, metavar="[LOG ...]")
 @max_size_option
-@path_option(
-    "-o", "--output", metavar="FILE.pdf", help="Write the report, drawn again from the log."
-)
-@json_option
+@report_options("Write the report, drawn again from the log.")
 @open_option
 def verify(
     report: Path, logs: tuple[Path, ...], output: Path | None, json_path: Path | None
