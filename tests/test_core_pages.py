@@ -10,6 +10,7 @@ from exchange import replace
 from flights import Estimator, Uwb, aisle_flight, unexplained, with_noises
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
+from msgspec import structs
 from page_tools import axes_of, texts, words
 from pypdf import PdfReader
 
@@ -23,13 +24,17 @@ from px4fuse.report.document import Document
 from px4fuse.report.page import Page
 from px4fuse.report.pdf import render
 from px4fuse.report.style import report_style
+from px4fuse.request import ComparisonRequest
+from px4fuse.results.build import results
 from px4fuse.results.model import Student
 
 MODES = (FlightMode(0.0, 40.0, "Offboard"), FlightMode(40.0, 100.0, "Land"))
 
 
 def document(comparison: Comparison, findings: tuple[Finding, ...] = ()) -> Document:
-    return Document(unexplained(comparison), findings, Student("Ada"), "px4fuse compare aisle.ulg")
+    analysis = unexplained(comparison)
+    made = results(ComparisonRequest(log="aisle.ulg"), analysis, Student("Ada"))
+    return Document(analysis, structs.replace(made, findings=findings))
 
 
 def drawn(draw, of: Document) -> list[Page]:

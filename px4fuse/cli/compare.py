@@ -5,17 +5,13 @@ from __future__ import annotations
 import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import click
 
 from px4fuse.cli import inputs, outputs
-from px4fuse.request import command_line, settings_name
+from px4fuse.request import settings_name
 from px4fuse.writing import STANDARD_OUTPUT
-
-if TYPE_CHECKING:
-    from px4fuse.report.document import AidsDocument, Document
-    from px4fuse.results.contract import AidsResults, ComparisonResults
 
 SEVERITIES = ("error", "warning", "info")
 
@@ -47,7 +43,6 @@ def compare(
     results as JSON, for example reports/LOG_sigma-z-0.05.pdf and .json.
     """
     from px4fuse.analysis import AidsAlone, bad_verdicts, run_or_judge_aids
-    from px4fuse.findings import find, find_aids
     from px4fuse.report.document import AidsDocument, Document
     from px4fuse.report.terminal import print_aids, print_summary
     from px4fuse.results.build import aids_results, results
@@ -59,18 +54,15 @@ def compare(
         output or Path("reports/LOG.pdf"), json_path
     )  # before the work, not after it
     with outputs.progress(alone) as step:
-        analysis, typed = run_or_judge_aids(request, step), command_line(request)
+        analysis = run_or_judge_aids(request, step)
         document: AidsDocument | Document
-        found: AidsResults | ComparisonResults
         if isinstance(analysis, AidsAlone):
-            document = AidsDocument(analysis, find_aids(analysis.aids), person, typed)
-            found = aids_results(request, analysis, document.findings, person, typed)
+            document = AidsDocument(analysis, aids_results(request, analysis, person))
         else:
-            document = Document(analysis, find(analysis), person, typed)
-            found = results(request, analysis, document.findings, person, typed)
+            document = Document(analysis, results(request, analysis, person))
         if output is None and not alone:
-            output = outputs.free_report(log.stem, settings_name(request), found)
-        contents = outputs.result_files(found, json_path, output, document, step)
+            output = outputs.free_report(log.stem, settings_name(request), document.results)
+        contents = outputs.result_files(document.results, json_path, output, document, step)
     if isinstance(document, AidsDocument):
         outputs.finish(contents, partial(print_aids, document=document))
     else:
@@ -84,5 +76,7 @@ def compare(
         sys.exit(1)
     if fail_on is not None:
         worst = SEVERITIES[: SEVERITIES.index(fail_on) + 1]
-        if any(one.severity in worst and one.caused_by is None for one in document.findings):
+        if any(
+            one.severity in worst and one.caused_by is None for one in document.results.findings
+        ):
             sys.exit(1)

@@ -10,7 +10,7 @@ import click
 
 from px4fuse.cli import inputs, outputs
 from px4fuse.errors import SettingsError
-from px4fuse.request import EVALUATION_OPTIONS, EvaluationRequest, command_line, settings_name
+from px4fuse.request import EVALUATION_OPTIONS, EvaluationRequest, settings_name
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def evaluate(
             rpe_deltas=rpe or None,
             all_pairs=not request.consecutive,
         )
-        results = evaluation_results(found, command_line(request))
+        results = evaluation_results(request, found)
         if output is None and not alone:
             name = f"{file_name(estimate)}_against_{file_name(reference)}"
             output = outputs.free_report(name, settings_name(request), results)

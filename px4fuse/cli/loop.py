@@ -94,7 +94,6 @@ def loop(
     Writes a report (PDF) and its results as JSON, except of a pose graph.
     """
     from px4fuse.analysis import run_loop
-    from px4fuse.findings import find_loop
     from px4fuse.loop.sources import file_name, is_g2o, split_part
     from px4fuse.report.document import LoopDocument
     from px4fuse.report.loop import print_loop
@@ -115,14 +114,12 @@ def loop(
     outputs.check_targets([tum, g2o, *results])
     with outputs.progress(json_path == STANDARD_OUTPUT) as step:
         found = run_loop(request, step)
-        findings = find_loop(found)
-        document = LoopDocument(found, findings, person, command_line(request))
-        made = loop_results(request, found, findings, person, document.command)
+        made = loop_results(request, found, person)
         if output is None and not alone:
             output = outputs.free_report(f"{file_name(source)}_loop", settings_name(request), made)
         contents = _files(found, tum, g2o)
-        contents |= outputs.result_files(made, json_path, output, document, step)
-    outputs.finish(contents, lambda console: print_loop(console, found, findings, request))
+        contents |= outputs.result_files(made, json_path, output, LoopDocument(found, made), step)
+    outputs.finish(contents, lambda console: print_loop(console, found, made.findings, request))
 
 
 def loop_request(source: Path, given: dict[str, Any]) -> LoopRequest:

@@ -28,14 +28,13 @@ def sync(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.flight import Unavailable
     from px4fuse.report.clock import clock_advice
     from px4fuse.report.terminal import print_advice
-    from px4fuse.request import command_line
     from px4fuse.results.build import sync_results
 
     request = comparison_request(log, given)
     with progress(json_path == STANDARD_OUTPUT) as step:
         compared = run_preparation(request, step)
         _, found = noises_and_clock(compared, step)
-    results = sync_results(request, compared, found, command_line(request, "sync"))
+    results = sync_results(request, compared, found)
     advice = clock_advice(compared, found)
     finish(result_files(results, json_path), lambda to: print_advice(to, advice, request))
     if isinstance(found, Unavailable) or not found.determinable:

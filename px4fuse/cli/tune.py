@@ -43,14 +43,13 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.comparison.estimates import tuned as tuned_noises
     from px4fuse.errors import MissingDataError
     from px4fuse.flight import Unavailable
-    from px4fuse.request import command_line
     from px4fuse.results.build import tuning_results
 
     request = comparison_request(log, given)
     with progress(json_path == STANDARD_OUTPUT) as step:
         compared = run_preparation(request, step)
         tuned = tuned_noises(compared, progress=step)
-    results = tuning_results(request, compared, tuned, command_line(request, "tune"))
+    results = tuning_results(request, compared, tuned)
     finish(result_files(results, json_path), lambda to: _print(to, compared, tuned, request))
     if all(isinstance(found, Unavailable) for found in tuned.values()):
         raise MissingDataError(f"{compared.flight.log.name}: no noise could be determined.")

@@ -61,7 +61,7 @@ def whatif(
     from px4fuse.analysis import run_what_if
     from px4fuse.report.document import WhatIfDocument
     from px4fuse.report.whatif import print_what_if
-    from px4fuse.request import WhatIfRequest, command_line
+    from px4fuse.request import WhatIfRequest
     from px4fuse.results.build import whatif_results
 
     if output is not None:
@@ -77,8 +77,8 @@ def whatif(
     )
     with outputs.progress(json_path == STANDARD_OUTPUT) as step:
         found = run_what_if(request, step)
-        document = WhatIfDocument(found, command_line(request))
-        results = whatif_results(request, found, document.command)
+        results = whatif_results(request, found)
+        document = WhatIfDocument(found, results)
         contents = outputs.result_files(results, json_path, output, document, step)
     outputs.finish(contents, lambda console: print_what_if(console, found))
 

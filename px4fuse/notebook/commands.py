@@ -31,7 +31,6 @@ from px4fuse.request import (
     PositionFile,
     SourceKind,
     WhatIfRequest,
-    command_line,
 )
 from px4fuse.trajectory import evaluation
 from px4fuse.trajectory.evaluation import Evaluation
@@ -252,11 +251,10 @@ def report(analysis: Analysis, path: Pathlike) -> Path:
     from px4fuse.report.pdf import render  # noqa: PLC0415
     from px4fuse.results.build import results  # noqa: PLC0415
     from px4fuse.results.contract import to_json  # noqa: PLC0415
-    from px4fuse.results.model import Student  # noqa: PLC0415
 
-    target, request, findings = _ending(path, ".pdf"), _request(analysis), find(analysis)
-    document = Document(analysis, findings, Student(), command_line(request))
-    text = to_json(results(request, analysis, findings, document.student, document.command))
+    target = _ending(path, ".pdf")
+    document = Document(analysis, results(_request(analysis), analysis))
+    text = to_json(document.results)
     write_all({target: render(document, text), target.with_suffix(".json"): text.encode()})
     return target
 

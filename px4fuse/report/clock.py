@@ -42,7 +42,7 @@ def has_page(document: Document) -> bool:
     clock = document.analysis.clock
     if isinstance(clock, Unavailable):
         return False
-    return not clock.determinable or any(one.id in FINDINGS for one in document.findings)
+    return not clock.determinable or any(one.id in FINDINGS for one in document.results.findings)
 
 
 def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> dict[str, str]:

@@ -50,12 +50,14 @@ def draw(document: Document) -> Iterator[Page]:
     """Draw the cover; findings that it has no room for go to the next page."""
     page = Page("Two-state Kalman filter against EKF2")
     page.foot(_plan(document, facts(document)))
-    page.write(about(document.student, document.analysis.flight.log), colour=MUTED, above=-4.0)
-    for sentence in document.story:
+    page.write(
+        about(document.results.student, document.analysis.flight.log), colour=MUTED, above=-4.0
+    )
+    for sentence in document.results.story:
         page.write(sentence, size=10.5, above=2.0)
     _verdict(page, document)
     write_errors(page, document)
-    write_findings(page, document.findings)
+    write_findings(page, document.results.findings)
     yield page
 
 

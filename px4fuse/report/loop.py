@@ -71,10 +71,10 @@ def draw(document: Document) -> Iterator[Page]:
 def draw_report(document: LoopDocument) -> Iterator[Page]:
     """Draw the page of a report on a loop alone, with its findings."""
     page = Page(TITLE, LEAD)
-    if student := who(document.student, ", "):
+    if student := who(document.results.student, ", "):
         page.labelled("Student", student)
     page.labelled("SHA-256", document.loop.odometry.trajectory.sha256)
-    _write(page, document.loop, document.findings)
+    _write(page, document.loop, document.results.findings)
     yield page
 
 

@@ -101,7 +101,7 @@ def render(document: Report, results_json: str) -> bytes:
     made_by = f"px4fuse {metadata.version('px4fuse')}"
     student = ""
     if isinstance(document, Document | AidsDocument | LoopDocument):
-        student = who(document.student, " · ")
+        student = who(document.results.student, " · ")
     # figures have no text of others
     words = title + name + student + json.dumps(written, ensure_ascii=False, default=repr)
     return compiled(

@@ -40,7 +40,7 @@ def print_summary(
         Where the report was written.
     """
     analysis, page = document.analysis, Page()
-    for sentence in document.story:
+    for sentence in document.results.story:
         page.write(sentence)
     show(console, page.blocks)
     console.print()
@@ -54,13 +54,13 @@ def print_summary(
     for note in (LEGEND, *verdict_notes(analysis)):
         page.write(note, colour=MUTED)
     why = analysis.why.get(analysis.main.axis.name)
-    is_told = isinstance(why, Why) and why.cause in document.story
+    is_told = isinstance(why, Why) and why.cause in document.results.story
     if why is not None and not is_told:
         write_why(page, why)
     write_appendix(page, document)
-    if not document.findings:
+    if not document.results.findings:
         page.write("No findings.")
-    groups = by_root(document.findings)
+    groups = by_root(document.results.findings)
     for group in groups[:MOST_FINDINGS]:
         write_finding(page, group)
     if (more := len(groups) - MOST_FINDINGS) > 0:

@@ -155,7 +155,7 @@ def draw(document: WhatIfDocument) -> Iterator[Page]:
         "EKF2 replayed from the log by px4fuse's model of it, which is not PX4's own code: as "
         "flown, and with other parameters. All columns are judged over the same times.",
     )
-    page.labelled("Command", document.command)
+    page.labelled("Command", document.results.provenance.command)
     _tables(page, document.made_of)
     yield page
 

@@ -32,7 +32,6 @@ from px4fuse.fleet.measures import Z95, Number, numbers
 from px4fuse.fleet.significance import SPREAD_TABLE
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
-from px4fuse.results.model import Student
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
@@ -76,7 +75,7 @@ def fly(change: Change, seed: int) -> tuple[Numbers, Numbers]:
     request = ComparisonRequest(
         log=flight.log.name, sigma_a_m_s2=SETTINGS.sigma_a_m_s2, sigma_z_m=SETTINGS.sigma_z_m
     )
-    found = results(request, analysis, (), Student(), "")
+    found = results(request, analysis)
     return numbers(found, analysis), numbers(found)
 
 
