@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import aid_of, delay_ms
@@ -13,10 +12,7 @@ from px4fuse.flight import Unavailable
 from px4fuse.plain import p_words
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page, legend_above
-from px4fuse.report.style import OURS_BAND, OURS_LINE
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from px4fuse.report.style import OURS_BAND, OURS_LINE, Axes
 
 CURVE = 170.0  # height of the axes in points
 # Beyond this the curve tells nothing more

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -20,7 +20,7 @@ from px4fuse.recording import LogInfo
 from px4fuse.report.document import Document, who
 from px4fuse.report.marks import LANDING, TAKE_OFF
 from px4fuse.report.page import WIDTH, Page, halves, legend_above, words
-from px4fuse.report.style import EKF2, LINES, MEASURED, MUTED, OURS, SEVERITY_COLOURS, as_map
+from px4fuse.report.style import EKF2, LINES, MEASURED, MUTED, OURS, SEVERITY_COLOURS, Axes, as_map
 from px4fuse.report.words import (
     clock_words,
     consequences_words,
@@ -30,9 +30,6 @@ from px4fuse.report.words import (
     write_errors,
 )
 from px4fuse.results.model import Student
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 # A track so many times longer than wide lies along the page, else north is up
 LONG = 2.2

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -15,14 +15,10 @@ from px4fuse.loop.analysis import SMALLEST_STAMP_S
 from px4fuse.report import style
 from px4fuse.report.page import WIDTH, Page, halves
 from px4fuse.report.screen import show
-from px4fuse.report.style import EKF2, MUTED, OURS, TRUTH
+from px4fuse.report.style import EKF2, MUTED, OURS, TRUTH, Axes, Colormap
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Frame, Trajectory
 from px4fuse.trajectory.scores import Interval, PairwiseError, Statistics
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.colors import Colormap
 
 # Indices of the axes that are right, up the page and vertical; and whether the last points down
 _AXES: Mapping[Frame, tuple[int, int, int, bool]] = {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import pandas as pd
 
@@ -12,12 +11,9 @@ from px4fuse.flight import Unavailable
 from px4fuse.report import marks, panels
 from px4fuse.report.document import Document
 from px4fuse.report.page import WIDTH, Page
-from px4fuse.report.style import LINES, MEASURED, OURS_BAND
+from px4fuse.report.style import LINES, MEASURED, OURS_BAND, Artist
 from px4fuse.report.why import nothing_concluded
 from px4fuse.report.words import filters, verdict_words
-
-if TYPE_CHECKING:
-    from matplotlib.artist import Artist
 
 GAP = 14.0  # points between columns
 

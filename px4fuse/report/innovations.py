@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -14,11 +13,8 @@ from px4fuse.filter.signals import Segment
 from px4fuse.report import panels
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page
-from px4fuse.report.style import EKF2, MEASUREMENT, OURS, TIME_LABEL
+from px4fuse.report.style import EKF2, MEASUREMENT, OURS, TIME_LABEL, Axes
 from px4fuse.report.words import filters, verdict_notes
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 ZOOM_UPDATES = 15
 ZOOM_LEAST_S = 1.0

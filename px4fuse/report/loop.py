@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -22,16 +22,13 @@ from px4fuse.report.document import Document, LoopDocument, who
 from px4fuse.report.evaluation import interval_words, score_words, way
 from px4fuse.report.page import AXIS_LABEL, TICKS, Cell, Page, appendix
 from px4fuse.report.screen import show
-from px4fuse.report.style import EKF2, LINES, MUTED, OURS, as_map
+from px4fuse.report.style import EKF2, LINES, MUTED, OURS, Axes, as_map
 from px4fuse.request import LoopRequest
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import MANY_CLOSURES, SOLUTIONS, SolvedGraph
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 from px4fuse.trajectory.model import AXES_OF_FRAME, in_words
 from px4fuse.trajectory.scores import Interval, Statistics
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 MOST_ROWS = 10  # of rejected closures
 GREEN, RED = "#3a7d5c", style.SEVERITY_COLOURS["error"]

@@ -9,13 +9,9 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from px4fuse.report.style import MUTED
-
-if TYPE_CHECKING:
-    from matplotlib.artist import Artist
-    from matplotlib.axes import Axes
+from px4fuse.report.style import MUTED, Artist, Axes
 
 # Points: width of the text, of the numbers beside an axes, of the labels before sentences
 WIDTH, AXIS_LEFT, LABEL = 512.0, 26.0, 52.0
