@@ -22,7 +22,7 @@ from px4fuse.cli.outputs import free_report, progress, terminal
 from px4fuse.report import screen
 from px4fuse.report.document import Document
 from px4fuse.report.screen import runnable, say
-from px4fuse.report.terminal import print_summary
+from px4fuse.report.terminal import summary
 from px4fuse.request import (
     ComparisonRequest,
     PositionFile,
@@ -91,7 +91,7 @@ def summaries(document: Document, sample_log: Path) -> dict[int | None, str]:
                 patch.setenv("COLUMNS", str(width))
             console = terminal()
             with console.capture() as captured:
-                print_summary(console, document, request, "reports/a.pdf")
+                screen.show(console, summary(document, "reports/a.pdf").blocks, request)
             made[width] = captured.get()
     return made
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -44,7 +43,7 @@ def compare(
     """
     from px4fuse.analysis import AidsAlone, bad_verdicts, run_or_judge_aids
     from px4fuse.report.document import AidsDocument, Document
-    from px4fuse.report.terminal import print_aids, print_summary
+    from px4fuse.report.terminal import aids_summary, summary
     from px4fuse.results.build import aids_results, results
 
     person = inputs.read_person(given)
@@ -64,11 +63,9 @@ def compare(
             output = outputs.free_report(log.stem, settings_name(request), document.results)
         contents = outputs.result_files(document.results, json_path, output, document, step)
     if isinstance(document, AidsDocument):
-        outputs.finish(contents, partial(print_aids, document=document))
+        outputs.finish(contents, aids_summary(document))
     else:
-        outputs.finish(
-            contents, partial(print_summary, document=document, request=request, report=output)
-        )
+        outputs.finish(contents, summary(document, output), request)
     bad = bad_verdicts(analysis) if checks else {}
     for name, verdict in bad.items():
         click.echo(f"{name}: {verdict}", err=True)

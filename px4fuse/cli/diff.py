@@ -36,7 +36,7 @@ def diff(
     Writes a PDF report and its results as JSON.
     """
     from px4fuse.fleet.changes import diff as compared
-    from px4fuse.report.changes import print_changes
+    from px4fuse.report.changes import summary
 
     alone = json_path == STANDARD_OUTPUT
     outputs.report_paths(
@@ -48,6 +48,6 @@ def diff(
         if output is None and not alone:
             output = outputs.free_report(f"{a.stem}_to_{b.stem}", "", results)
         contents = outputs.result_files(results, json_path, output, results, step)
-    outputs.finish(contents, lambda console: print_changes(console, results))
+    outputs.finish(contents, summary(results))
     if fail_on is not None and found.is_worse:
         sys.exit(1)

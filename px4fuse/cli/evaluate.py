@@ -63,7 +63,8 @@ def evaluate(
     --json names a file and -o none, only that.
     """
     from px4fuse.loop.sources import file_name, read_source
-    from px4fuse.report.evaluation import print_evaluation
+    from px4fuse.report.evaluation import write_evaluation
+    from px4fuse.report.page import Page
     from px4fuse.results.build_trajectories import evaluation_results
     from px4fuse.trajectory.evaluation import evaluate as score
 
@@ -96,4 +97,6 @@ def evaluate(
             name = f"{file_name(estimate)}_against_{file_name(reference)}"
             output = outputs.free_report(name, settings_name(request), results)
         contents = outputs.result_files(results, json_path, output, found, step)
-    outputs.finish(contents, lambda console: print_evaluation(console, found))
+    page = Page()
+    write_evaluation(page, found)
+    outputs.finish(contents, page)

@@ -49,4 +49,4 @@ def explore(logs: tuple[Path, ...], output: Path | None, **given: Any) -> None:
         from px4fuse.explore.page import html_text
 
         content = html_text(found).encode()
-    outputs.finish({target: content}, lambda _: None)
+    outputs.finish({target: content})

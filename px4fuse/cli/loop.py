@@ -96,7 +96,7 @@ def loop(
     from px4fuse.analysis import run_loop
     from px4fuse.loop.sources import file_name, is_g2o, split_part
     from px4fuse.report.document import LoopDocument
-    from px4fuse.report.loop import print_loop
+    from px4fuse.report.loop import summary
     from px4fuse.results.build_trajectories import loop_results
 
     person = inputs.read_person(given)
@@ -119,7 +119,7 @@ def loop(
             output = outputs.free_report(f"{file_name(source)}_loop", settings_name(request), made)
         contents = _files(found, tum, g2o)
         contents |= outputs.result_files(made, json_path, output, LoopDocument(found, made), step)
-    outputs.finish(contents, lambda console: print_loop(console, found, made.findings, request))
+    outputs.finish(contents, summary(found, made.findings), request)
 
 
 def loop_request(source: Path, given: dict[str, Any]) -> LoopRequest:
@@ -152,7 +152,7 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
     """Solve a pose graph from a file."""
     from px4fuse.loop.sources import split_part
     from px4fuse.readers.g2o import g2o_text, read_g2o
-    from px4fuse.report.loop import print_graph
+    from px4fuse.report.loop import graph_summary
     from px4fuse.results.build_trajectories import graph_results
     from px4fuse.trajectory.graph.analysis import analyse_graph
 
@@ -173,4 +173,4 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
     command = command_line(LoopRequest(source=str(source))) + (" --robust" if robust else "")
     contents = {} if g2o is None else {g2o: g2o_text(solved.graph).encode()}
     contents |= outputs.result_files(graph_results(solved, command), json_path)
-    outputs.finish(contents, lambda to: print_graph(to, solved))
+    outputs.finish(contents, graph_summary(solved))

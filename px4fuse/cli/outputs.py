@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from msgspec import Struct
     from rich.console import Console
 
+    from px4fuse.report.page import Page
     from px4fuse.report.pdf import Report
+    from px4fuse.request import Request
     from px4fuse.results.contract import Results
 
 # Of a report with and without the settings in its name: file systems take 255 bytes
@@ -267,17 +269,25 @@ def check_targets(targets: Iterable[Path | None]) -> None:
                 )
 
 
-def finish(contents: Mapping[Path, bytes], show: Callable[[Console], None]) -> None:
+def finish(
+    contents: Mapping[Path, bytes],
+    told: Page | Callable[[Console], None] | None = None,
+    request: Request | None = None,
+) -> None:
     """Write all outputs or none; then tell people what was found and written.
 
-    Nothing is told where the results have standard output to themselves.
+    Nothing is told where the results have standard output to themselves. Commands in the words are
+    printed so that they run, where the request is given.
     """
-    from px4fuse.report.screen import print_file
+    from px4fuse.report.screen import print_file, show
 
     write_outputs(contents)
     if STANDARD_OUTPUT not in contents:
         console = terminal()
-        show(console)
+        if callable(told):
+            told(console)
+        elif told is not None:
+            show(console, told.blocks, request)
         for path in contents:
             print_file(console, "Wrote", path)
     open_written()

@@ -49,7 +49,7 @@ def sample(output: Path = FOLDER) -> None:
     from importlib.resources import files
 
     from px4fuse.errors import MissingDataError, OutputError
-    from px4fuse.report.screen import print_command
+    from px4fuse.report.page import Page
     from px4fuse.request import ComparisonRequest, command_line
 
     try:
@@ -65,4 +65,6 @@ def sample(output: Path = FOLDER) -> None:
             )
     first = next(path for path in contents if path.suffix == ".ulg")
     command = command_line(ComparisonRequest(log=str(first)), "compare", typed=True)
-    finish(contents, lambda console: print_command(console, command, "Next"))
+    page = Page()
+    page.add("command", text=command, label="Next")
+    finish(contents, page)

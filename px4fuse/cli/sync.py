@@ -27,7 +27,7 @@ def sync(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.errors import MissingDataError
     from px4fuse.flight import Unavailable
     from px4fuse.report.clock import clock_advice
-    from px4fuse.report.terminal import print_advice
+    from px4fuse.report.page import Page
     from px4fuse.results.build import sync_results
 
     request = comparison_request(log, given)
@@ -35,7 +35,8 @@ def sync(log: Path, json_path: Path | None, **given: Any) -> None:
         compared = run_preparation(request, step)
         _, found = noises_and_clock(compared, step)
     results = sync_results(request, compared, found)
-    advice = clock_advice(compared, found)
-    finish(result_files(results, json_path), lambda to: print_advice(to, advice, request))
+    page = Page()
+    page.advice(clock_advice(compared, found))
+    finish(result_files(results, json_path), page, request)
     if isinstance(found, Unavailable) or not found.determinable:
         raise MissingDataError(f"{compared.flight.log.name}: no clock offset could be determined.")

@@ -60,7 +60,7 @@ def whatif(
     """
     from px4fuse.analysis import run_what_if
     from px4fuse.report.document import WhatIfDocument
-    from px4fuse.report.whatif import print_what_if
+    from px4fuse.report.whatif import summary
     from px4fuse.request import WhatIfRequest
     from px4fuse.results.build import whatif_results
 
@@ -80,7 +80,7 @@ def whatif(
         results = whatif_results(request, found)
         document = WhatIfDocument(found, results)
         contents = outputs.result_files(results, json_path, output, document, step)
-    outputs.finish(contents, lambda console: print_what_if(console, found))
+    outputs.finish(contents, summary(found))
 
 
 def _changes(given: tuple[str, ...]) -> dict[str, float]:

@@ -96,8 +96,7 @@ def draw(document: Document) -> Iterator[Page]:
         "maximised over the offset, jointly with sensor biases, attitude errors and noises; the "
         "attitude is from the gyros alone, because EKF2's was corrected by these very positions.",
     )
-    for label, text in clock_advice(document.analysis, clock).items():
-        page.labelled(label, text, size=8.5)
+    page.advice(clock_advice(document.analysis, clock), size=8.5)
     (low, high), best = clock.interval_s, clock.offset_s
     say = (
         f"Best at {best:+.3f} s; 95 % from {low:+.3f} to {high:+.3f} s, wider than the curve alone "

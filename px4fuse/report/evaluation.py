@@ -7,14 +7,12 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from rich.console import Console
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.flight import Unavailable
 from px4fuse.loop.analysis import SMALLEST_STAMP_S
 from px4fuse.report import style
 from px4fuse.report.page import WIDTH, Page, halves
-from px4fuse.report.screen import show
 from px4fuse.report.style import EKF2, MUTED, OURS, TRUTH, Axes, Colormap
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Frame, Trajectory
@@ -226,13 +224,6 @@ def way(axes: Axes, seen: Array, time_s: Array, **style: Any) -> None:
 
 
 # ---------------------------------------------------------------------------------------- words
-
-
-def print_evaluation(console: Console, score: Evaluation) -> None:
-    """Print the scores of one trajectory against another."""
-    page = Page()
-    write_evaluation(page, score)
-    show(console, page.blocks)
 
 
 def metres(value: float) -> str:

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from px4fuse.findings import Finding, by_root
 from px4fuse.flight import Unavailable
@@ -21,9 +20,7 @@ from px4fuse.report.cover import write_finding
 from px4fuse.report.document import Document, LoopDocument, who
 from px4fuse.report.evaluation import interval_words, score_words, way
 from px4fuse.report.page import AXIS_LABEL, TICKS, Cell, Page, appendix
-from px4fuse.report.screen import show
 from px4fuse.report.style import EKF2, LINES, MUTED, OURS, Axes, as_map
-from px4fuse.request import LoopRequest
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import MANY_CLOSURES, SOLUTIONS, SolvedGraph
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
@@ -134,16 +131,14 @@ def _reference(axes: Axes, loop: Loop) -> None:
 # ---------------------------------------------------------------------------------------- words
 
 
-def print_loop(
-    console: Console, loop: Loop, findings: tuple[Finding, ...], request: LoopRequest
-) -> None:
-    """Print what was found about a loop."""
+def summary(loop: Loop, findings: tuple[Finding, ...]) -> Page:
+    """What was found about a loop."""
     page = Page()
     write_loop(page, loop)
     write_scores(page, loop)
     for group in by_root(findings):
         write_finding(page, group)
-    show(console, page.blocks, request)
+    return page
 
 
 def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
@@ -301,8 +296,8 @@ def moved_words(correction: CorrectedPath) -> str:
     return f"{correction.moved_rms_m:.2f} / {correction.moved_max_m:.2f}"
 
 
-def print_graph(console: Console, solved: SolvedGraph) -> None:
-    """Print how a pose graph was solved, and the closures that the gate rejects."""
+def graph_summary(solved: SolvedGraph) -> Page:
+    """How a pose graph was solved, and the closures that the gate rejects."""
     page = Page()
     page.labelled(
         "Graph",
@@ -331,4 +326,4 @@ def print_graph(console: Console, solved: SolvedGraph) -> None:
     ]  # fmt: skip
     head = ("path", "cost before", "cost", "iterations", "closures dropped")
     page.table(head, rows, right=(1, 2, 3, 4))
-    show(console, page.blocks)
+    return page

@@ -70,6 +70,11 @@ class Page:
         looks = words(label, size, colour, bold)
         self.add("labelled", label=looks, texts=beside, width=width, above=above)
 
+    def advice(self, texts: Mapping[str, str], size: float = 8.0) -> None:
+        """Write sentences, each with its label."""
+        for label, text in texts.items():
+            self.labelled(label, text, size=size)
+
     def table(
         self, head: Sequence[str], rows: Sequence[Sequence[Cell]], *,
         shares: Sequence[float] | None = None, right: Sequence[int] = (), size: float = 7.4,

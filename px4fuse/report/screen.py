@@ -59,6 +59,10 @@ def show(console: Console, blocks: Iterable[Block], request: Request | None = No
                 _show_labelled(console, block, request)
             case "table":
                 console.print(_table(**block))
+            case "command":
+                print_command(console, block["text"], block["label"])
+            case "blank":
+                console.print()
             case "beside":
                 for column in block["columns"]:
                     show(console, column, request)
