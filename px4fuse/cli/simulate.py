@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
 import click
 
-from px4fuse.cli.inputs import option, path_option, typed_parameters
+from px4fuse.cli.inputs import TypedQuantity, option, path_option, typed_parameters
 from px4fuse.cli.outputs import check_targets, progress, terminal, write_outputs
-from px4fuse.cli.quantity import TypedQuantity
 from px4fuse.errors import OutputError, SettingsError, on_one_line
 from px4fuse.reading import read_text
 from px4fuse.simulation.mistakes import MISTAKES, as_typed, made, parse

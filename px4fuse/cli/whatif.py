@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from px4fuse.cli import inputs, outputs
-from px4fuse.cli.quantity import TypedQuantity
 from px4fuse.errors import SettingsError
 from px4fuse.units import NAMES, in_unit
 from px4fuse.writing import STANDARD_OUTPUT
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
 @click.option(
     "--from",
     "since",
-    type=TypedQuantity("s", 60.0),
+    type=inputs.TypedQuantity("s", 60.0),
     metavar="SECONDS",
     help="When the aids of --without are lost.  [default: from the start]",
 )
