@@ -26,12 +26,13 @@ from px4fuse.fleet.measures import (
     Measure,
     Number,
     bootstrapped,
+    contrast,
     independent_count,
     interval_of,
     numbers,
     share_interval,
+    spreads,
 )
-from px4fuse.fleet.significance import contrast, spreads
 from px4fuse.flight import Unavailable
 from px4fuse.report.changes import change_line, printed
 from px4fuse.request import ComparisonRequest

@@ -28,8 +28,7 @@ from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.filter.settings import Settings
 from px4fuse.fleet.changes import number_changes
-from px4fuse.fleet.measures import Z95, Number, numbers
-from px4fuse.fleet.significance import SPREAD_TABLE
+from px4fuse.fleet.measures import SPREAD_TABLE, Z95, Number, numbers
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
 from px4fuse.simulation.flights import simulate_flight
