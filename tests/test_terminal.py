@@ -277,7 +277,7 @@ def test_the_bar_shows_what_is_done_on_a_terminal_only(monkeypatch, capsys) -> N
     shown = capsys.readouterr().err
     assert "fitting y" in shown
     assert "2 of 5" in shown
-    with progress(quiet=True) as step:
+    with progress(Path("-")) as step:
         step("reading x")
     assert capsys.readouterr().err == ""
 

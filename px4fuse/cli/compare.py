@@ -49,10 +49,8 @@ def compare(
     person = inputs.read_person(given)
     request = inputs.comparison_request(log, given)
     alone = json_path == STANDARD_OUTPUT
-    outputs.report_paths(
-        output or Path("reports/LOG.pdf"), json_path
-    )  # before the work, not after it
-    with outputs.progress(alone) as step:
+    outputs.report_paths(output, json_path)  # before the work, not after it
+    with outputs.progress(json_path) as step:
         analysis = run_or_judge_aids(request, step)
         document: AidsDocument | Document
         if isinstance(analysis, AidsAlone):

@@ -39,10 +39,8 @@ def diff(
     from px4fuse.report.changes import summary
 
     alone = json_path == STANDARD_OUTPUT
-    outputs.report_paths(
-        output or Path("reports/LOG.pdf"), json_path
-    )  # before the work, not after it
-    with outputs.progress(alone) as step:
+    outputs.report_paths(output, json_path)  # before the work, not after it
+    with outputs.progress(json_path) as step:
         found = compared(a, b, progress=step)
         results = found.results
         if output is None and not alone:

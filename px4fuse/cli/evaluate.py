@@ -11,7 +11,6 @@ import click
 from px4fuse.cli import inputs, outputs
 from px4fuse.errors import SettingsError
 from px4fuse.request import EVALUATION_OPTIONS, EvaluationRequest, settings_name
-from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
     from px4fuse.trajectory.scores import Delta
@@ -74,10 +73,8 @@ def evaluate(
     if request.max_gap_s is not None and request.max_gap_s <= 0.0:
         raise SettingsError(f"--max-gap {request.max_gap_s:g}: give more than 0 seconds.")
     alone = output is None and json_path is not None
-    outputs.check_targets(
-        (json_path,) if alone else outputs.report_paths(output or Path("A.pdf"), json_path)
-    )
-    with outputs.progress(json_path == STANDARD_OUTPUT) as step:
+    outputs.report_paths(output, json_path)
+    with outputs.progress(json_path) as step:
         step("reading")
         first = read_source(request.estimate, system=request.system)
         second = read_source(request.reference, default="truth", system=request.system)

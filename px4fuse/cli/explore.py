@@ -11,7 +11,6 @@ from px4fuse.cli import inputs, outputs
 from px4fuse.cli.sample import sample_log
 from px4fuse.errors import SettingsError
 from px4fuse.request import settings_name
-from px4fuse.writing import STANDARD_OUTPUT
 
 
 @click.command()
@@ -39,7 +38,7 @@ def explore(logs: tuple[Path, ...], output: Path | None, **given: Any) -> None:
     stems = "_".join(log.stem for log in logs)
     target = outputs.web_page(output, Path("reports", f"{stems}{settings_name(requests[0])}.html"))
     outputs.check_targets([target])  # before the work, not after it
-    with outputs.progress(target == STANDARD_OUTPUT) as step:
+    with outputs.progress(target) as step:
         found = []
         for request in requests:
             analysis = run(request, step)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from px4fuse.cli.inputs import Named, comparison_request, option, path_option, recording_options
+from px4fuse.cli.inputs import Named, comparison_request, option, recording_options
 from px4fuse.cli.outputs import write_outputs
 from px4fuse.errors import OutputError, on_one_line
 from px4fuse.reading import read_text
@@ -24,14 +24,12 @@ MAX_DESCRIPTION_BYTES = 50_000_000
 
 @click.command()
 @click.argument("log", type=Named())
-@path_option(
-    "-o", "--output", "folder", required=True, metavar="DIR", help="Folder for the tables."
-)
+@option("-o, --output DIR", "Folder for the tables.")
 @option("--format", 'Of the tables; Parquet needs pip install "px4fuse[parquet]".')
 @recording_options
 def extract(
     log: Path,
-    folder: Path,
+    output: Path,
     format: Literal["csv", "parquet"] = "csv",  # noqa: A002 - the name of the option
     **given: Any,
 ) -> None:
@@ -40,8 +38,8 @@ def extract(
     With data_dictionary.csv, which says the unit, frame, meaning, source topic and clock of every
     column, and flight.json, which says what the log is and what is missing from it.
     """
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(f"{folder}: is a file. Give a folder with -o.")
+    if output.exists() and not output.is_dir():
+        raise OutputError(f"{output}: is a file. Give a folder with -o.")
     if format == "parquet" and importlib.util.find_spec("pyarrow") is None:
         raise OutputError(
             '--format parquet needs pyarrow: pip install "px4fuse[parquet]", or take --format csv.'
@@ -51,14 +49,14 @@ def extract(
     from px4fuse.results.contract import to_json
 
     flight = extraction.of_best_source(read_flight(comparison_request(log, given)))
-    _refuse_mixture(folder, flight.log.sha256)
+    _refuse_mixture(output, flight.log.sha256)
     tables = extraction.tables(flight)
     encode = _parquet if format == "parquet" else _csv
-    contents = {folder / f"{name}.{format}": encode(table) for name, table in tables.items()}
-    contents[folder / "data_dictionary.csv"] = _csv(extraction.data_dictionary(flight))
-    contents[folder / "flight.json"] = to_json(extraction.description(flight)).encode()
+    contents = {output / f"{name}.{format}": encode(table) for name, table in tables.items()}
+    contents[output / "data_dictionary.csv"] = _csv(extraction.data_dictionary(flight))
+    contents[output / "flight.json"] = to_json(extraction.description(flight)).encode()
     write_outputs(contents)
-    click.echo(f"Wrote to {on_one_line(str(folder))}:")
+    click.echo(f"Wrote to {on_one_line(str(output))}:")
     for name, table in tables.items():
         click.echo(f"  {f'{name}.{format}':44} {len(table):8} rows")
     click.echo("  data_dictionary.csv, flight.json")

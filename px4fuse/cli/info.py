@@ -11,7 +11,6 @@ import click
 from px4fuse.cli.inputs import Named, comparison_request, json_option, recording_options
 from px4fuse.cli.outputs import finish, progress, result_files
 from px4fuse.plain import few_words
-from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
     from px4fuse.inspect.inventory import Inventory, Source
@@ -49,7 +48,7 @@ def info(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.inspect.inventory import take_inventory, to_plain
 
     request = comparison_request(log, given)
-    with progress(json_path == STANDARD_OUTPUT) as step:
+    with progress(json_path) as step:
         flight = read_flight(request, step)
         step("looking at what is in it")
         inventory = take_inventory(flight)

@@ -141,6 +141,8 @@ def option(
         details = _taken(hint) | {"help": meaning, "metavar": metavar or None}
         if default is not Parameter.empty:
             details["default"] = default
+        elif hint is Path:
+            details["required"] = True
         if (least, most) != (None, None):
             within: Any = click.FloatRange if details["type"] is float else click.IntRange
             details["type"] = within(least, most)

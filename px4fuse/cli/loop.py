@@ -108,11 +108,8 @@ def loop(
         return
     request = loop_request(source, given)
     alone = output is None and json_path is not None
-    results = (
-        (json_path,) if alone else outputs.report_paths(output or Path("reports/A.pdf"), json_path)
-    )
-    outputs.check_targets([tum, g2o, *results])
-    with outputs.progress(json_path == STANDARD_OUTPUT) as step:
+    outputs.check_targets([tum, g2o, *outputs.report_paths(output, json_path)])
+    with outputs.progress(json_path) as step:
         found = run_loop(request, step)
         made = loop_results(request, found, person)
         if output is None and not alone:
@@ -167,7 +164,7 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
                 "With one, give only --g2o FILE and --json FILE.",
             )
     outputs.check_targets([json_path, g2o])
-    with outputs.progress(json_path == STANDARD_OUTPUT) as step:
+    with outputs.progress(json_path) as step:
         step(f"reading {shown(source)}")
         solved = analyse_graph(shown(source), read_g2o(path), step, robust=robust)
     command = command_line(LoopRequest(source=str(source))) + (" --robust" if robust else "")

@@ -10,7 +10,6 @@ import click
 
 from px4fuse.cli.inputs import option
 from px4fuse.cli.outputs import OPENED, check_targets, finish, progress, web_page
-from px4fuse.writing import STANDARD_OUTPUT
 
 
 @click.command()
@@ -37,7 +36,7 @@ def practice(
     target = web_page(output, Path("reports", f"practice_{seed}.html"))
     check_targets([target])
     ctx.meta[OPENED] = sys.stdout.isatty() if opened is None else opened
-    with progress(target == STANDARD_OUTPUT) as step:
+    with progress(target) as step:
         from px4fuse.assignment.practice import practice_text
 
         content = practice_text(seed, level, flights, step).encode()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
 import click
 
-from px4fuse.cli.inputs import TypedQuantity, option, path_option, typed_parameters
+from px4fuse.cli.inputs import TypedQuantity, option, typed_parameters
 from px4fuse.cli.outputs import check_targets, progress, terminal, write_outputs
 from px4fuse.errors import OutputError, SettingsError, on_one_line
 from px4fuse.reading import read_text
@@ -64,9 +64,7 @@ class WithMistakes(click.Command):
 
 
 @click.command(cls=WithMistakes)
-@path_option(
-    "-o", "--output", required=True, metavar="FLIGHT.ulg|DIR", help="The log, or a class's folder."
-)
+@option("-o, --output FLIGHT.ulg|DIR", "The log, or a class's folder.")
 @option(
     "--assignment ROSTER.csv",
     "A flight for every student of a class list (student id, name), with noises and mistakes of "

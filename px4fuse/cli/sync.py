@@ -9,7 +9,6 @@ import click
 
 from px4fuse.cli.inputs import Named, analysis_options, comparison_request, json_option
 from px4fuse.cli.outputs import finish, progress, result_files
-from px4fuse.writing import STANDARD_OUTPUT
 
 
 @click.command()
@@ -31,7 +30,7 @@ def sync(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.results.build import sync_results
 
     request = comparison_request(log, given)
-    with progress(json_path == STANDARD_OUTPUT) as step:
+    with progress(json_path) as step:
         compared = run_preparation(request, step)
         _, found = noises_and_clock(compared, step)
     results = sync_results(request, compared, found)

@@ -9,7 +9,6 @@ import click
 
 from px4fuse.cli.inputs import Named, analysis_options, comparison_request, json_option
 from px4fuse.cli.outputs import finish, progress, result_files
-from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
     from px4fuse.comparison.model import Comparison
@@ -44,7 +43,7 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.results.build import tuning_results
 
     request = comparison_request(log, given)
-    with progress(json_path == STANDARD_OUTPUT) as step:
+    with progress(json_path) as step:
         compared = run_preparation(request, step)
         tuned = tuned_noises(compared, progress=step)
     results = tuning_results(request, compared, tuned)

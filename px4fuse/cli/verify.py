@@ -14,7 +14,6 @@ from px4fuse.cli.inputs import Named, max_size_option, open_option, report_optio
 from px4fuse.cli.outputs import check_targets, finish, progress, result_files
 from px4fuse.errors import LogError
 from px4fuse.reading import files_by_sha256, read_whole, shown
-from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -58,7 +57,7 @@ def verify(
     if isinstance(read, Refused):
         raise LogError(read.reason)
     check_targets([json_path, output])
-    with progress(json_path == STANDARD_OUTPUT) as step:
+    with progress(json_path) as step:
         step("hashing the logs")
         files = files_by_sha256(logs)
         if logs and not files:

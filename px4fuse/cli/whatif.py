@@ -10,7 +10,6 @@ import click
 from px4fuse.cli import inputs, outputs
 from px4fuse.errors import SettingsError
 from px4fuse.units import NAMES, in_unit
-from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
     from px4fuse.request import Sweep
@@ -63,8 +62,7 @@ def whatif(
     from px4fuse.request import WhatIfRequest
     from px4fuse.results.build import whatif_results
 
-    if output is not None:
-        outputs.report_paths(output, json_path)  # before the work, not after it
+    outputs.report_paths(output, json_path)  # before the work, not after it
     if since is not None and not without:
         raise SettingsError("--from says when --without begins: give that too.")
     request = WhatIfRequest(
@@ -74,7 +72,7 @@ def whatif(
         without=dict.fromkeys(without, since or 0.0),
         **given,
     )
-    with outputs.progress(json_path == STANDARD_OUTPUT) as step:
+    with outputs.progress(json_path) as step:
         found = run_what_if(request, step)
         results = whatif_results(request, found)
         document = WhatIfDocument(found, results)
