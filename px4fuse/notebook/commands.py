@@ -102,8 +102,9 @@ def compare(
     LogError, MissingDataError, SettingsError
         A file cannot be read, the flight lacks what was asked for, or a setting is out of range.
     """
-    known, asked = get_args(AxisName), (axes,) if isinstance(axes, str) else tuple(axes)
-    if unknown := set(asked).difference(known):
+    given = locals()  # arguments are called as the fields of the request
+    known, named = get_args(AxisName), (axes,) if isinstance(axes, str) else tuple(axes)
+    if unknown := set(named).difference(known):
         raise SettingsError(f"`axes` {unknown.pop()!r}: choose from {', '.join(known)}.")
     if isinstance(log, Flight) and (position, mavlink, system) != (None, None, None):
         raise SettingsError(
@@ -113,24 +114,15 @@ def compare(
         )
     if isinstance(clock_offset_s, str) and clock_offset_s != AUTO:
         raise SettingsError(f"`clock_offset_s` {clock_offset_s!r}: give seconds, or 'auto'.")
-    request = ComparisonRequest(
-        log=log.log.name if isinstance(log, Flight) else str(log),
-        mavlink=None if mavlink is None else str(mavlink),
-        system=system,
-        position=PositionFile(path=str(position)) if isinstance(position, str | Path) else position,
-        position_source=position_source,
-        source_kind=source_kind,
-        height=height,
-        sigma_a_m_s2=sigma_a_m_s2,
-        sigma_z_m=sigma_z_m,
-        dt_s=dt_s,
-        input=input,
-        axes=asked,
-        heading_deg=heading_deg,
-        start_s=start_s,
-        end_s=end_s,
-        clock_offset_s=float(clock_offset_s) if isinstance(clock_offset_s, int) else clock_offset_s,
-    )
+    asked = {name: given[name] for name in ComparisonRequest.__struct_fields__}
+    asked |= {"log": log.log.name if isinstance(log, Flight) else str(log), "axes": named}
+    if mavlink is not None:
+        asked["mavlink"] = str(mavlink)
+    if isinstance(position, str | Path):
+        asked["position"] = PositionFile(path=str(position))
+    if isinstance(clock_offset_s, int):
+        asked["clock_offset_s"] = float(clock_offset_s)
+    request = ComparisonRequest(**asked)
     return run(request, progress, log if isinstance(log, Flight) else None)
 
 

@@ -19,7 +19,7 @@ from px4fuse.trajectory.model import AXES_OF_FRAME, Frame, Trajectory
 from px4fuse.trajectory.scores import Interval, PairwiseError, Statistics
 
 # Indices of the axes that are right, up the page and vertical; and whether the last points down
-_AXES: Mapping[Frame, tuple[int, int, int, bool]] = {
+AXES: Mapping[Frame, tuple[int, int, int, bool]] = {
     "NED": (1, 0, 2, True), "FRD": (1, 0, 2, True), "ENU": (0, 1, 2, False),
     "camera": (0, 2, 1, True), "unknown": (0, 1, 2, False),
 }  # fmt: skip
@@ -74,7 +74,7 @@ class View(NamedTuple):
 
 def views(score: Evaluation) -> list[View]:
     """From above; and from the side where the path is not flat."""
-    across, up, vertical, down = _AXES[score.reference.frame]
+    across, up, vertical, down = AXES[score.reference.frame]
     names = AXES_OF_FRAME[score.reference.frame]
     extent = np.maximum(np.ptp(score.reference_m, axis=0), np.ptp(score.estimate_m, axis=0))
     level = across if extent[across] >= extent[up] else up
