@@ -36,8 +36,7 @@ from px4fuse.fleet.engine import connected, outcomes
 from px4fuse.fleet.job import Job
 from px4fuse.fleet.logs import find_logs
 from px4fuse.fleet.rows import COLUMNS, csv_bytes, rows_of, table_of
-from px4fuse.fleet.run import Fleet
-from px4fuse.fleet.store import kept_in
+from px4fuse.fleet.run import Fleet, kept_in
 from px4fuse.fleet.terminal import print_fleet
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.contract import schema, to_json

@@ -10,6 +10,7 @@ from exchange import replace
 from flights import Estimator, Uwb, aisle_flight, unexplained, with_noises
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
+from msgspec import structs
 from page_tools import axes_of, texts, words
 from pypdf import PdfReader
 
@@ -18,18 +19,22 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.findings import Finding
 from px4fuse.flight import FlightMode, Reset
 from px4fuse.recording import Dropout
-from px4fuse.report import cover, flight, innovations, marks, panels
+from px4fuse.report import cover, flight, marks, panels
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page
 from px4fuse.report.pdf import render
 from px4fuse.report.style import report_style
+from px4fuse.request import ComparisonRequest
+from px4fuse.results.build import results
 from px4fuse.results.model import Student
 
 MODES = (FlightMode(0.0, 40.0, "Offboard"), FlightMode(40.0, 100.0, "Land"))
 
 
 def document(comparison: Comparison, findings: tuple[Finding, ...] = ()) -> Document:
-    return Document(unexplained(comparison), findings, Student("Ada"), "px4fuse compare aisle.ulg")
+    analysis = unexplained(comparison)
+    made = results(ComparisonRequest(log="aisle.ulg"), analysis, Student("Ada"))
+    return Document(analysis, structs.replace(made, findings=findings))
 
 
 def drawn(draw, of: Document) -> list[Page]:
@@ -85,9 +90,9 @@ def test_marks_of_a_long_flight_do_not_pile_up() -> None:
 def test_the_zoom_is_where_the_filter_is_updated() -> None:
     made = aisle_flight(duration_s=120.0, uwb=Uwb(gap_s=(50.0, 70.0)))
     comparison = compare(made)
-    start, end = innovations.zoom_window(comparison.main, comparison.segment)
+    start, end = flight.zoom_window(comparison.main, comparison.segment)
     updates = comparison.main.replay.updates.index
-    assert ((updates >= start) & (updates <= end)).sum() == innovations.ZOOM_UPDATES + 1
+    assert ((updates >= start) & (updates <= end)).sum() == flight.ZOOM_UPDATES + 1
     assert end - start < 4.0  # beside the gap in the middle, not across it
     assert abs((start + end) / 2.0 - 60.0) < 12.5
     assert "In the 20." in panels.sigma_words(document(comparison), comparison.main)
@@ -137,7 +142,7 @@ def test_what_is_absent_leaves_a_line_and_no_empty_panel(changes, says: str) -> 
     of = document(compare(aisle_flight(**changes)))
     pages = [
         page
-        for draw in (cover.draw, flight.draw, innovations.draw, flight.draw_other_axes)
+        for draw in (cover.draw, flight.draw, flight.draw_innovations, flight.draw_other_axes)
         for page in drawn(draw, of)
     ]
     assert says in words(*pages)

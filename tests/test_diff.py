@@ -19,7 +19,6 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import FilterSummary
 from px4fuse.ekf2.aids import AidAxis, AidResult
 from px4fuse.filter.consistency import assess
-from px4fuse.findings import find
 from px4fuse.fleet.changes import Changes, changes, number_changes
 from px4fuse.fleet.inputs import DiffInput
 from px4fuse.fleet.measures import (
@@ -27,19 +26,19 @@ from px4fuse.fleet.measures import (
     Measure,
     Number,
     bootstrapped,
+    contrast,
     independent_count,
     interval_of,
     numbers,
     share_interval,
+    spreads,
 )
-from px4fuse.fleet.significance import contrast, spreads
 from px4fuse.flight import Unavailable
 from px4fuse.report.changes import change_line, printed
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
 from px4fuse.results.changes import NumberChange
 from px4fuse.results.contract import to_json
-from px4fuse.results.model import Student
 from px4fuse.results.reading import read_results
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
@@ -244,7 +243,7 @@ def flown(name: str, seed: int, *mistakes: str, with_log: bool = True, **scenari
     request = ComparisonRequest(
         log=name, sigma_a_m_s2=SETTINGS.sigma_a_m_s2, sigma_z_m=SETTINGS.sigma_z_m
     )
-    found = results(request, analysis, find(analysis), Student(), "px4fuse compare")
+    found = results(request, analysis)
     read = read_results(to_json(found).encode())
     return DiffInput(name, *(("log", read, analysis) if with_log else ("results", read)))
 

@@ -110,7 +110,7 @@ def hostile_table(word: str, count: int = 2) -> pd.DataFrame:
 def test_text_makes_no_elements(text: str) -> None:
     def shape(word: str) -> list[tuple[str, list[str]]]:
         # pictures take their time
-        with mock.patch("px4fuse.fleet.questions.over_time", return_value="data:,"):
+        with mock.patch("px4fuse.fleet.page.over_time", return_value="data:,"):
             made = html_text(hostile_table(f"a{word}z"), word, word)
         made.encode()
         assert not re.search("[\x1b\u202e]", made)

@@ -139,7 +139,7 @@ def test_any_markdown_is_read(text: str) -> None:
 
 
 def document(student: Student) -> Document:
-    return Document(SimpleNamespace(), (), student, "px4fuse compare x.ulg")  # type: ignore[arg-type]
+    return Document(SimpleNamespace(), SimpleNamespace(student=student))  # type: ignore[arg-type]
 
 
 def set_by_typst(*pages: Page) -> list[str]:
@@ -220,7 +220,7 @@ def with_clock(found: ClockOffset | Unavailable, *findings: str, delay_ms: float
         source=source(),
     )
     named = tuple(Finding(name, "error", "", "") for name in findings)
-    return Document(analysis, named, Student(), "")  # type: ignore[arg-type]
+    return Document(analysis, SimpleNamespace(findings=named))  # type: ignore[arg-type]
 
 
 def test_the_clock_has_its_page_when_there_is_something_to_say() -> None:

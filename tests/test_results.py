@@ -20,7 +20,6 @@ from px4fuse.report.pdf import render
 from px4fuse.request import ComparisonRequest
 from px4fuse.results import build
 from px4fuse.results.contract import KINDS, ComparisonResults, schema, to_json
-from px4fuse.results.model import Student
 from px4fuse.results.reading import read_results
 
 ROOT = Path(__file__).parent.parent
@@ -30,12 +29,11 @@ NOTHING = {"what": "noises", "reason": "too short", "remedy": ""}
 def document(flight: px4fuse.Flight, explained: bool = True, **options: object) -> Document:
     comparison = compare(flight, **options)
     analysis = px4fuse.explain(comparison) if explained else unexplained(comparison)
-    return Document(analysis, px4fuse.find(analysis), Student(), "px4fuse compare")
+    return Document(analysis, build.results(ComparisonRequest(log=flight.log.name), analysis))
 
 
 def results(made: Document) -> ComparisonResults:
-    request = ComparisonRequest(log=made.analysis.flight.log.name)
-    return build.results(request, made.analysis, made.findings, made.student, made.command)
+    return made.results
 
 
 def numbers(part: object, where: str = "") -> dict[str, object]:

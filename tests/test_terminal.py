@@ -19,11 +19,10 @@ from rich.console import Console
 from px4fuse.analysis import run as analyse
 from px4fuse.cli import cli
 from px4fuse.cli.outputs import free_report, progress, terminal
-from px4fuse.findings import find
 from px4fuse.report import screen
 from px4fuse.report.document import Document
 from px4fuse.report.screen import runnable, say
-from px4fuse.report.terminal import print_summary
+from px4fuse.report.terminal import summary
 from px4fuse.request import (
     ComparisonRequest,
     PositionFile,
@@ -77,7 +76,7 @@ def document(sample_log: Path) -> Document:
     """The sample with a setting that gives a finding."""
     request = ComparisonRequest(log=str(sample_log), sigma_z_m=0.3)
     analysis = analyse(request)
-    return Document(analysis, find(analysis), Student(), command_line(request))
+    return Document(analysis, results(request, analysis))
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +91,7 @@ def summaries(document: Document, sample_log: Path) -> dict[int | None, str]:
                 patch.setenv("COLUMNS", str(width))
             console = terminal()
             with console.capture() as captured:
-                print_summary(console, document, request, "reports/a.pdf")
+                screen.show(console, summary(document, "reports/a.pdf").blocks, request)
             made[width] = captured.get()
     return made
 
@@ -108,7 +107,7 @@ def test_nothing_is_cut_and_words_are_whole(summaries, document) -> None:
     assert "\x1b" not in whole
     # in a pipe a paragraph is one line; the first ones are the story, and the rest is not it again
     lines = whole.splitlines()
-    assert lines[: len(document.story) + 1] == [*document.story, ""]
+    assert lines[: len(document.results.story) + 1] == [*document.results.story, ""]
     assert len(re.findall("(?:Most|The largest part) of what ours and EKF2", whole)) == 1
 
 
@@ -205,7 +204,7 @@ def made(document: Document, sample_log: Path, tmp_path, monkeypatch) -> Compari
     """Results of a run in an empty folder."""
     monkeypatch.chdir(tmp_path)
     request = ComparisonRequest(log=str(sample_log))
-    return results(request, document.analysis, document.findings, Student(), "")
+    return results(request, document.analysis)
 
 
 def reported(made: ComparisonResults, **changes: object) -> str:
@@ -278,7 +277,7 @@ def test_the_bar_shows_what_is_done_on_a_terminal_only(monkeypatch, capsys) -> N
     shown = capsys.readouterr().err
     assert "fitting y" in shown
     assert "2 of 5" in shown
-    with progress(quiet=True) as step:
+    with progress(Path("-")) as step:
         step("reading x")
     assert capsys.readouterr().err == ""
 

@@ -237,12 +237,12 @@ def test_who_is_stopped_while_writing_leaves_nothing_and_says_so_in_one_line(
 
 
 def test_who_is_stopped_after_writing_says_what_is_there(desk, monkeypatch, capsys) -> None:
-    from px4fuse.report import loop as loop_report
+    from px4fuse.report import screen
 
     def stopped(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(loop_report, "print_loop", stopped)
+    monkeypatch.setattr(screen, "show", stopped)
     code, _, err = run_main(monkeypatch, capsys, *LOOP, "--json", "c.json")
     assert (code, err) == (130, "px4fuse: interrupted, c.tum, c.json written before.\n")
     assert names(desk) == ["c.json", "c.tum", "l.ulg", "s.tum"]

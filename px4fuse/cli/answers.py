@@ -7,15 +7,13 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli.inputs import Named, path_option
+from px4fuse.cli.inputs import Named, option
 from px4fuse.cli.outputs import write_new
 
 
 @click.command()
 @click.argument("log", type=Named())
-@path_option(
-    "-o", "--output", metavar="FILE.toml", help="The form.  [default: LOG.answers.toml beside LOG]"
-)
+@option("-o, --output FILE.toml", "The form.  [default: LOG.answers.toml beside LOG]")
 def answers(log: Path, output: Path | None) -> None:
     """Write the form about a flight: what is wrong with it, what EKF2 did, three numbers.
 

@@ -8,21 +8,12 @@ import time
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import click
 
+from px4fuse.cli import inputs, outputs
 from px4fuse.cli.compare import SEVERITIES
-from px4fuse.cli.inputs import open_option, path_option, settings_options
-from px4fuse.cli.outputs import (
-    Interrupted,
-    ShowStep,
-    check_targets,
-    open_written,
-    progress,
-    terminal,
-    write_outputs,
-)
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.fleet import TIMEOUT_S
 
@@ -33,66 +24,47 @@ CLUSTERS = ("slurm", "kubernetes")
 
 @click.command()
 @click.argument("logs", nargs=-1, metavar="LOGS...")
-@path_option("-o", "--output", metavar="DIR", help="Folder for the table and every log's results.")
-@click.option("--reports", is_flag=True, help="Make every log's PDF report too.")
-@click.option(
-    "--timeout",
-    "timeout_s",
-    type=click.FloatRange(min=1.0),
-    default=TIMEOUT_S,
-    metavar="SECONDS",
-    help="Time for one log; what takes longer is ended.",
+@inputs.option("-o, --output DIR", "Folder for the table and every log's results.")
+@inputs.option("--reports", "Make every log's PDF report too.")
+@inputs.option("--timeout SECONDS", "Time for one log; what takes longer is ended.", 1.0)
+@inputs.option(
+    "--workers N", "How many logs at once on this computer.  [default: one per core]", 1, 1024
 )
-@click.option(
-    "--workers",
-    type=click.IntRange(1, 1024),
-    metavar="N",
-    help="How many logs at once on this computer.  [default: one per core]",
+@inputs.option(
+    "--memory GB", "Memory for each (on Linux); what needs more is ended.  [default: 4]", 1.0
 )
-@click.option(
-    "--memory",
-    "memory_gb",
-    type=click.FloatRange(min=1.0),
-    default=4.0,
-    metavar="GB",
-    help="Memory for each (on Linux); what needs more is ended.  [default: 4]",
+@inputs.option(
+    "--scheduler ADDRESS",
+    "Dask scheduler that runs already, as tcp://host:8786; slurm or kubernetes prints how to start "
+    "one.",
 )
-@click.option(
-    "--scheduler",
-    metavar="ADDRESS",
-    help="Dask scheduler that runs already, as tcp://host:8786; slurm or kubernetes prints how to "
-    "start one.",
+@inputs.option(
+    "--baseline FILE.parquet",
+    "Table of an earlier run: the column change says what is worse than in it.",
 )
-@path_option(
-    "--baseline",
-    metavar="FILE.parquet",
-    help="Table of an earlier run: the column change says what is worse than in it.",
+@inputs.option(
+    "--junit FILE.xml",
+    "Write JUnit XML: a test case per log, which fails where the log failed or is worse.",
 )
-@path_option(
-    "--junit",
-    "junit_path",
-    metavar="FILE.xml",
-    help="Write JUnit XML: a test case per log, which fails where the log failed or is worse.",
-)
-@settings_options
-@click.option(
+@inputs.settings_options
+@inputs.option(
     "--fail-on",
-    type=click.Choice((FAILED, WORSE, *SEVERITIES)),
-    help="Exit with 1 if a log has failed, is worse than the baseline (or has failed), or there is "
-    "a finding of at least this severity.",
+    "Exit with 1 if a log has failed, is worse than the baseline (or has failed), or there is a "
+    "finding of at least this severity.",
 )
-@open_option
+@inputs.open_option
 def batch(
     logs: tuple[str, ...],
+    *,
     output: Path | None,
     reports: bool,
-    timeout_s: float,
+    timeout: float = TIMEOUT_S,
     workers: int | None,
-    memory_gb: float,
+    memory: float = 4.0,
     scheduler: str | None,
     baseline: Path | None,
-    junit_path: Path | None,
-    fail_on: str | None,
+    junit: Path | None,
+    fail_on: Literal["failed", "worse", "error", "warning", "info"] | None,
     **given: Any,
 ) -> None:
     """Compare many logs, as px4fuse compare does each, into one table.
@@ -110,37 +82,36 @@ def batch(
         raise OutputError(f"-o {output}: is not a folder. Give another place.")
     if scheduler is not None and workers is not None:
         raise SettingsError("--workers is for this computer, and --scheduler for a cluster.")
-    check_targets([] if junit_path is None else [junit_path])  # before the work, not after it
+    outputs.check_targets([junit])  # before the work, not after it
     if fail_on == WORSE and baseline is None:
         raise SettingsError("--fail-on worse requires --baseline: worse than what?")
-    from px4fuse.fleet.junit import junit
+    from px4fuse.fleet.junit import junit as as_junit
     from px4fuse.fleet.regressions import read_baseline
     from px4fuse.fleet.run import run
     from px4fuse.fleet.terminal import print_fleet
 
     gc.enable()  # a long run, of a library that leaves circles
-    before = None if baseline is None else read_baseline(baseline)
     try:
-        with progress() as step:
+        with outputs.progress() as step:
             fleet = run(
                 logs,
                 output,
                 reports=reports,
-                timeout_s=timeout_s,
-                baseline=before,
+                timeout_s=timeout,
+                baseline=None if baseline is None else read_baseline(baseline),
                 scheduler=scheduler,
                 workers=workers,
-                memory_gb=memory_gb,
+                memory_gb=memory,
                 progress=partial(_shown, step, time.monotonic()),
                 **given,
             )
     except KeyboardInterrupt as stopped:
         left = f"what is done is kept in {output}. The same command goes on from there."
-        raise Interrupted(stopped, left) from None
-    if junit_path is not None:
-        write_outputs({junit_path: junit(fleet.table)})
-    print_fleet(terminal(), fleet)
-    open_written(output / "fleet.html")
+        raise outputs.Interrupted(stopped, left) from None
+    if junit is not None:
+        outputs.write_outputs({junit: as_junit(fleet.table)})
+    print_fleet(outputs.terminal(), fleet)
+    outputs.open_written(output / "fleet.html")
     severities = SEVERITIES[: SEVERITIES.index(fail_on) + 1] if fail_on in SEVERITIES else ()
     failed = fail_on is not None and bool((fleet.table["status"] == FAILED).any())
     failed |= fail_on == WORSE and bool((fleet.table["change"] != "").any())
@@ -148,7 +119,7 @@ def batch(
         sys.exit(1)
 
 
-def _shown(step: ShowStep, since_s: float, what: str, done: int, of: int) -> None:
+def _shown(step: outputs.ShowStep, since_s: float, what: str, done: int, of: int) -> None:
     """How far it is, with its rate."""
     per_minute = 60.0 * done / (time.monotonic() - since_s)
     step(f"{what}, {per_minute:.3g} per minute" if done else what, done, of)

@@ -3,51 +3,36 @@
 from __future__ import annotations
 
 import sys
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
 import click
 
-from px4fuse.cli.inputs import (
-    Named,
-    analysis_options,
-    comparison_request,
-    open_option,
-    person_options,
-    read_person,
-    report_options,
-)
-from px4fuse.cli.outputs import finish, free_report, progress, report_paths, result_files
-from px4fuse.request import command_line, settings_name
+from px4fuse.cli import inputs, outputs
+from px4fuse.request import settings_name
 from px4fuse.writing import STANDARD_OUTPUT
-
-if TYPE_CHECKING:
-    from px4fuse.report.document import AidsDocument, Document
-    from px4fuse.results.contract import AidsResults, ComparisonResults
 
 SEVERITIES = ("error", "warning", "info")
 
 
 @click.command()
-@click.argument("log", type=Named())
-@analysis_options
-@person_options
-@report_options
-@click.option(
-    "--fail-on", type=click.Choice(SEVERITIES), help="Exit with 1 on a finding at least so severe."
+@click.argument("log", type=inputs.Named())
+@inputs.analysis_options
+@inputs.person_options
+@inputs.report_options(
+    "The report.  [default: reports/LOG.pdf, settings that are not at their defaults in its name]"
 )
-@click.option(
+@inputs.option("--fail-on", "Exit with 1 on a finding at least so severe.")
+@inputs.option(
     "--checks",
-    is_flag=True,
-    help="Exit with 1 if a verdict on EKF2 is bad: an aid starved, biased or trusted too much.",
+    "Exit with 1 if a verdict on EKF2 is bad: an aid starved, biased or trusted too much.",
 )
-@open_option
+@inputs.open_option
 def compare(
     log: Path,
     output: Path | None,
     json_path: Path | None,
-    fail_on: str | None,
+    fail_on: Literal["error", "warning", "info"] | None,
     checks: bool,
     **given: Any,
 ) -> None:
@@ -57,32 +42,28 @@ def compare(
     results as JSON, for example reports/LOG_sigma-z-0.05.pdf and .json.
     """
     from px4fuse.analysis import AidsAlone, bad_verdicts, run_or_judge_aids
-    from px4fuse.findings import find, find_aids
     from px4fuse.report.document import AidsDocument, Document
-    from px4fuse.report.terminal import print_aids, print_summary
+    from px4fuse.report.terminal import aids_summary, summary
     from px4fuse.results.build import aids_results, results
 
-    person = read_person(given)
-    request = comparison_request(log, given)
+    person = inputs.read_person(given)
+    request = inputs.comparison_request(log, given)
     alone = json_path == STANDARD_OUTPUT
-    report_paths(output or Path("reports/LOG.pdf"), json_path)  # before the work, not after it
-    with progress(alone) as step:
-        analysis, typed = run_or_judge_aids(request, step), command_line(request)
+    outputs.report_paths(output, json_path)  # before the work, not after it
+    with outputs.progress(json_path) as step:
+        analysis = run_or_judge_aids(request, step)
         document: AidsDocument | Document
-        found: AidsResults | ComparisonResults
         if isinstance(analysis, AidsAlone):
-            document = AidsDocument(analysis, find_aids(analysis.aids), person, typed)
-            found = aids_results(request, analysis, document.findings, person, typed)
+            document = AidsDocument(analysis, aids_results(request, analysis, person))
         else:
-            document = Document(analysis, find(analysis), person, typed)
-            found = results(request, analysis, document.findings, person, typed)
+            document = Document(analysis, results(request, analysis, person))
         if output is None and not alone:
-            output = free_report(log.stem, settings_name(request), found)
-        contents = result_files(found, json_path, output, document, step)
+            output = outputs.free_report(log.stem, settings_name(request), document.results)
+        contents = outputs.result_files(document.results, json_path, output, document, step)
     if isinstance(document, AidsDocument):
-        finish(contents, partial(print_aids, document=document))
+        outputs.finish(contents, aids_summary(document))
     else:
-        finish(contents, partial(print_summary, document=document, request=request, report=output))
+        outputs.finish(contents, summary(document, output), request)
     bad = bad_verdicts(analysis) if checks else {}
     for name, verdict in bad.items():
         click.echo(f"{name}: {verdict}", err=True)
@@ -90,5 +71,7 @@ def compare(
         sys.exit(1)
     if fail_on is not None:
         worst = SEVERITIES[: SEVERITIES.index(fail_on) + 1]
-        if any(one.severity in worst and one.caused_by is None for one in document.findings):
+        if any(
+            one.severity in worst and one.caused_by is None for one in document.results.findings
+        ):
             sys.exit(1)

@@ -8,25 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import (
-    Named,
-    json_option,
-    max_size_option,
-    open_option,
-    path_option,
-    request_options,
-)
-from px4fuse.cli.outputs import (
-    check_targets,
-    finish,
-    free_report,
-    progress,
-    report_paths,
-    result_files,
-)
+from px4fuse.cli import inputs, outputs
 from px4fuse.errors import SettingsError
-from px4fuse.request import EVALUATION_OPTIONS, EvaluationRequest, command_line, settings_name
-from px4fuse.writing import STANDARD_OUTPUT
+from px4fuse.request import EVALUATION_OPTIONS, EvaluationRequest, settings_name
 
 if TYPE_CHECKING:
     from px4fuse.trajectory.scores import Delta
@@ -49,8 +33,8 @@ def delta(text: str) -> Delta:
 
 
 @click.command()
-@click.argument("estimate", type=Named())
-@click.argument("reference", type=Named())
+@click.argument("estimate", type=inputs.Named())
+@click.argument("reference", type=inputs.Named())
 @click.option(
     "--rpe",
     type=delta,
@@ -59,13 +43,10 @@ def delta(text: str) -> Delta:
     help="RPE over a distance (5m), a time (10s) or frames (1f); may be repeated.  [default: some "
     "that suit the path]",
 )
-@request_options(EvaluationRequest, EVALUATION_OPTIONS)
-@max_size_option
-@path_option(
-    "-o", "--output", metavar="FILE.pdf", help="The page.  [default: reports/A_against_B.pdf]"
-)
-@json_option
-@open_option
+@inputs.request_options(EvaluationRequest, EVALUATION_OPTIONS)
+@inputs.max_size_option
+@inputs.report_options("The page.  [default: reports/A_against_B.pdf]")
+@inputs.open_option
 def evaluate(
     estimate: Path,
     reference: Path,
@@ -81,7 +62,8 @@ def evaluate(
     --json names a file and -o none, only that.
     """
     from px4fuse.loop.sources import file_name, read_source
-    from px4fuse.report.evaluation import print_evaluation
+    from px4fuse.report.evaluation import write_evaluation
+    from px4fuse.report.page import Page
     from px4fuse.results.build_trajectories import evaluation_results
     from px4fuse.trajectory.evaluation import evaluate as score
 
@@ -91,8 +73,8 @@ def evaluate(
     if request.max_gap_s is not None and request.max_gap_s <= 0.0:
         raise SettingsError(f"--max-gap {request.max_gap_s:g}: give more than 0 seconds.")
     alone = output is None and json_path is not None
-    check_targets((json_path,) if alone else report_paths(output or Path("A.pdf"), json_path))
-    with progress(json_path == STANDARD_OUTPUT) as step:
+    outputs.report_paths(output, json_path)
+    with outputs.progress(json_path) as step:
         step("reading")
         first = read_source(request.estimate, system=request.system)
         second = read_source(request.reference, default="truth", system=request.system)
@@ -107,9 +89,11 @@ def evaluate(
             rpe_deltas=rpe or None,
             all_pairs=not request.consecutive,
         )
-        results = evaluation_results(found, command_line(request))
+        results = evaluation_results(request, found)
         if output is None and not alone:
             name = f"{file_name(estimate)}_against_{file_name(reference)}"
-            output = free_report(name, settings_name(request), results)
-        contents = result_files(results, json_path, output, found, step)
-    finish(contents, lambda console: print_evaluation(console, found))
+            output = outputs.free_report(name, settings_name(request), results)
+        contents = outputs.result_files(results, json_path, output, found, step)
+    page = Page()
+    write_evaluation(page, found)
+    outputs.finish(contents, page)

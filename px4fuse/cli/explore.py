@@ -7,25 +7,17 @@ from typing import Any
 
 import click
 
-from px4fuse.cli.inputs import (
-    Named,
-    analysis_options,
-    comparison_request,
-    open_option,
-    path_option,
-)
-from px4fuse.cli.outputs import check_targets, finish, progress, web_page
+from px4fuse.cli import inputs, outputs
 from px4fuse.cli.sample import sample_log
 from px4fuse.errors import SettingsError
 from px4fuse.request import settings_name
-from px4fuse.writing import STANDARD_OUTPUT
 
 
 @click.command()
-@click.argument("logs", nargs=-1, type=Named())
-@analysis_options
-@path_option("-o", "--output", metavar="FILE.html", help="The page.  [default: reports/LOG.html]")
-@open_option
+@click.argument("logs", nargs=-1, type=inputs.Named())
+@inputs.analysis_options
+@inputs.option("-o, --output FILE.html", "The page.  [default: reports/LOG.html]")
+@inputs.open_option
 def explore(logs: tuple[Path, ...], output: Path | None, **given: Any) -> None:
     """Write a web page with sliders for SIGMA_A, SIGMA_Z, DT and the clock offset.
 
@@ -42,11 +34,11 @@ def explore(logs: tuple[Path, ...], output: Path | None, **given: Any) -> None:
     if len(logs) == 2 and (given["mavlink"] is not None or given["position"] is not None):
         raise SettingsError("--mavlink and --position belong to one log: give only one LOG.")
     logs = logs or (sample_log(),)
-    requests = [comparison_request(log, dict(given)) for log in logs]
+    requests = [inputs.comparison_request(log, dict(given)) for log in logs]
     stems = "_".join(log.stem for log in logs)
-    target = web_page(output, Path("reports", f"{stems}{settings_name(requests[0])}.html"))
-    check_targets([target])  # before the work, not after it
-    with progress(target == STANDARD_OUTPUT) as step:
+    target = outputs.web_page(output, Path("reports", f"{stems}{settings_name(requests[0])}.html"))
+    outputs.check_targets([target])  # before the work, not after it
+    with outputs.progress(target) as step:
         found = []
         for request in requests:
             analysis = run(request, step)
@@ -56,4 +48,4 @@ def explore(logs: tuple[Path, ...], output: Path | None, **given: Any) -> None:
         from px4fuse.explore.page import html_text
 
         content = html_text(found).encode()
-    finish({target: content}, lambda _: None)
+    outputs.finish({target: content})

@@ -6,11 +6,11 @@ import importlib.util
 import io
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from px4fuse.cli.inputs import Named, comparison_request, path_option, recording_options
+from px4fuse.cli.inputs import Named, comparison_request, option, recording_options
 from px4fuse.cli.outputs import write_outputs
 from px4fuse.errors import OutputError, on_one_line
 from px4fuse.reading import read_text
@@ -18,33 +18,29 @@ from px4fuse.reading import read_text
 if TYPE_CHECKING:
     import pandas as pd
 
-FORMATS = ("csv", "parquet")
 # Of flight.json
 MAX_DESCRIPTION_BYTES = 50_000_000
 
 
 @click.command()
 @click.argument("log", type=Named())
-@path_option(
-    "-o", "--output", "folder", required=True, metavar="DIR", help="Folder for the tables."
-)
-@click.option(
-    "--format",
-    "kind",
-    type=click.Choice(FORMATS),
-    default="csv",
-    help='Of the tables; Parquet needs pip install "px4fuse[parquet]".',
-)
+@option("-o, --output DIR", "Folder for the tables.")
+@option("--format", 'Of the tables; Parquet needs pip install "px4fuse[parquet]".')
 @recording_options
-def extract(log: Path, folder: Path, kind: str, **given: Any) -> None:
+def extract(
+    log: Path,
+    output: Path,
+    format: Literal["csv", "parquet"] = "csv",  # noqa: A002 - the name of the option
+    **given: Any,
+) -> None:
     """Write everything that a log holds as tidy tables, one file each.
 
     With data_dictionary.csv, which says the unit, frame, meaning, source topic and clock of every
     column, and flight.json, which says what the log is and what is missing from it.
     """
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(f"{folder}: is a file. Give a folder with -o.")
-    if kind == "parquet" and importlib.util.find_spec("pyarrow") is None:
+    if output.exists() and not output.is_dir():
+        raise OutputError(f"{output}: is a file. Give a folder with -o.")
+    if format == "parquet" and importlib.util.find_spec("pyarrow") is None:
         raise OutputError(
             '--format parquet needs pyarrow: pip install "px4fuse[parquet]", or take --format csv.'
         )
@@ -53,16 +49,16 @@ def extract(log: Path, folder: Path, kind: str, **given: Any) -> None:
     from px4fuse.results.contract import to_json
 
     flight = extraction.of_best_source(read_flight(comparison_request(log, given)))
-    _refuse_mixture(folder, flight.log.sha256)
+    _refuse_mixture(output, flight.log.sha256)
     tables = extraction.tables(flight)
-    encode = _parquet if kind == "parquet" else _csv
-    contents = {folder / f"{name}.{kind}": encode(table) for name, table in tables.items()}
-    contents[folder / "data_dictionary.csv"] = _csv(extraction.data_dictionary(flight))
-    contents[folder / "flight.json"] = to_json(extraction.description(flight)).encode()
+    encode = _parquet if format == "parquet" else _csv
+    contents = {output / f"{name}.{format}": encode(table) for name, table in tables.items()}
+    contents[output / "data_dictionary.csv"] = _csv(extraction.data_dictionary(flight))
+    contents[output / "flight.json"] = to_json(extraction.description(flight)).encode()
     write_outputs(contents)
-    click.echo(f"Wrote to {on_one_line(str(folder))}:")
+    click.echo(f"Wrote to {on_one_line(str(output))}:")
     for name, table in tables.items():
-        click.echo(f"  {f'{name}.{kind}':44} {len(table):8} rows")
+        click.echo(f"  {f'{name}.{format}':44} {len(table):8} rows")
     click.echo("  data_dictionary.csv, flight.json")
     for part in extraction.absent(flight):
         click.echo(f"Not in this log: {part.what} ({part.reason})")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Literal
 
 import click
 
-from px4fuse.cli.inputs import Named, max_size_option, open_option, path_option
+from px4fuse.cli.inputs import Named, max_size_option, open_option, option
 from px4fuse.cli.outputs import Interrupted, open_written, progress, terminal, write_new
 from px4fuse.errors import OutputError, SettingsError
 
@@ -18,75 +18,64 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("submissions", nargs=-1, type=Named())
-@path_option(
-    "--logs",
-    multiple=True,
-    metavar="DIR",
-    help="Folder of the flight logs (or one log); may be repeated. Without a report's log its "
-    "numbers cannot be verified.",
+@option(
+    "--logs DIR",
+    "Folder of the flight logs (or one log); may be repeated. Without a report's log its numbers "
+    "cannot be verified.",
 )
-@path_option(
-    "--rubric", metavar="FILE.toml", help="What is worth how many points.  [default: of this lab]"
-)
+@option("--rubric FILE.toml", "What is worth how many points.  [default: of this lab]")
 @max_size_option
-@path_option("--key", metavar="FILE.json", help="Answer key of px4fuse simulate --assignment.")
-@path_option("-o", "--output", metavar="DIR", help="Folder for the class table and the feedback.")
-@click.option(
-    "--title", default="", show_default=False, help="Of the class page.  [default: the rubric's]"
+@option("--key FILE.json", "Answer key of px4fuse simulate --assignment.")
+@option("-o, --output DIR", "Folder for the class table and the feedback.")
+@option("--title", "Of the class page.  [default: the rubric's]")
+@option("--roster FILE.csv", "Everyone in the class.  [default: those of --key]")
+@option("--attempt", "Which of a student's files counts.")
+@option(
+    "--due TIME",
+    "When it was due: '2026-11-20 23:59', in this computer's time zone or with '+01:00' or "
+    "'Europe/Berlin' behind it. Platforms' times without a zone are in the same.",
 )
-@path_option(
-    "--roster", metavar="FILE.csv", help="Everyone in the class.  [default: those of --key]"
+@option(
+    "--late RULE",
+    "What being late costs: '10%/day' or '10%/day up to 50%' of all points, per started day.",
 )
-@click.option(
-    "--attempt",
-    type=click.Choice(["latest", "best", "first"]),
-    default="latest",
-    help="Which of a student's files counts.",
+@option("--include-pending", "Enter points that still wait for you as they are proposed.")
+@option(
+    "--worksheet FILE.csv",
+    "Moodle's grading worksheet, Canvas's gradebook, or another table with ids or names: a copy "
+    "with the grades filled in is written. May be repeated.",
 )
-@click.option(
-    "--due",
-    metavar="TIME",
-    help="When it was due: '2026-11-20 23:59', in this computer's time zone or with "
-    "'+01:00' or 'Europe/Berlin' behind it. Platforms' times without a zone are in the same.",
+@option("--column TITLE", "Of the worksheets, for the grade.")
+@option("--anonymous", "The class page shows pseudonyms; names.csv says whose.")
+@option("--jobs N", "How many reports at once.  [default: one per core]", 1, 256)
+@option("--write-rubric FILE.toml", "Write the default rubric, to edit it, and stop.")
+@option(
+    "--write-autograder FILE.zip",
+    "Write an autograder for Gradescope, with --logs, --key, --rubric and --late, and stop.",
 )
-@click.option(
-    "--late",
-    metavar="RULE",
-    help="What being late costs: '10%/day' or '10%/day up to 50%' of all points, per started day.",
-)
-@click.option(
-    "--include-pending",
-    is_flag=True,
-    help="Enter points that still wait for you as they are proposed.",
-)
-@path_option(
-    "--worksheet",
-    multiple=True,
-    metavar="FILE.csv",
-    help="Moodle's grading worksheet, Canvas's gradebook, or another table with ids or names: a "
-    "copy with the grades filled in is written. May be repeated.",
-)
-@click.option("--column", metavar="TITLE", help="Of the worksheets, for the grade.")
-@click.option(
-    "--anonymous", is_flag=True, help="The class page shows pseudonyms; names.csv says whose."
-)
-@click.option(
-    "--jobs",
-    type=click.IntRange(1, 256),
-    metavar="N",
-    help="How many reports at once.  [default: one per core]",
-)
-@path_option(
-    "--write-rubric", metavar="FILE.toml", help="Write the default rubric, to edit it, and stop."
-)
-@path_option(
-    "--write-autograder",
-    metavar="FILE.zip",
-    help="Write an autograder for Gradescope, with --logs, --key, --rubric and --late, and stop.",
-)
-@path_option("--gradescope", metavar="DIR", help="Run inside that autograder, on its folder.")
+@option("--gradescope DIR", "Run inside that autograder, on its folder.")
 @open_option
-def grade(submissions: tuple[Path, ...], output: Path | None, **given: Any) -> None:
+def grade(
+    submissions: tuple[Path, ...],
+    *,
+    logs: tuple[Path, ...],
+    rubric: Path | None,
+    key: Path | None,
+    output: Path | None,
+    title: str | None,
+    roster: Path | None,
+    attempt: Literal["latest", "best", "first"] = "latest",
+    due: str | None,
+    late: str | None,
+    include_pending: bool,
+    worksheet: tuple[Path, ...],
+    column: str | None,
+    anonymous: bool,
+    jobs: int | None,
+    write_rubric: Path | None,
+    write_autograder: Path | None,
+    gradescope: Path | None,
+) -> None:
     """Verify and score reports: PDFs, folders of them, and zip files of learning platforms.
 
     Writes class.csv, class.html, a feedback text per student and files that learning platforms
@@ -100,54 +89,50 @@ def grade(submissions: tuple[Path, ...], output: Path | None, **given: Any) -> N
     from px4fuse.assignment.sheet import read_sheet
     from px4fuse.grading.entries import Course
     from px4fuse.grading.grade import grade as grade_all
+    from px4fuse.grading.gradescope import autograder_zip, run_autograder
     from px4fuse.grading.lateness import due_time, late_rule
     from px4fuse.grading.rubric import read_rubric, rubric_text
 
-    if given["write_rubric"] is not None:
-        write_new(given["write_rubric"], rubric_text().encode())
+    if write_rubric is not None:
+        write_new(write_rubric, rubric_text().encode())
         return
-    late = late_rule(given["late"]) if given["late"] else None
-    if given["gradescope"] is not None:
-        from px4fuse.grading.gradescope import run_autograder
-
-        run_autograder(given["gradescope"], late)
+    costs = late_rule(late) if late else None
+    if gradescope is not None:
+        run_autograder(gradescope, costs)
         return
-    if given["write_autograder"] is not None:
-        from px4fuse.grading.gradescope import autograder_zip
-
-        content = autograder_zip(given["logs"], given["rubric"], given["key"], late)
-        write_new(given["write_autograder"], content)
+    if write_autograder is not None:
+        write_new(write_autograder, autograder_zip(logs, rubric, key, costs))
         return
-    if late is not None and given["due"] is None:
+    if costs is not None and due is None:
         raise SettingsError("--late: say with --due when it was due.")
     if not submissions:
         raise SettingsError("nothing to grade: give PDFs, folders or zip files.")
     if output is None:
         raise SettingsError("say with -o where the class table goes.")
-    _check_place(output, (*submissions, *given["logs"]))
-    key = None if given["key"] is None else read_key(given["key"])
-    rubric = read_rubric(given["rubric"])
+    _check_place(output, (*submissions, *logs))
+    answers = None if key is None else read_key(key)
+    worth = read_rubric(rubric)
     course = Course(
-        roster=None if given["roster"] is None else read_people(given["roster"]),
-        worksheets=tuple(map(read_sheet, given["worksheet"])),
-        column=given["column"] or "",
-        attempt=given["attempt"],
-        due=due_time(given["due"]) if given["due"] else None,
-        late=late,
-        include_pending=given["include_pending"],
-        anonymous=given["anonymous"],
+        roster=None if roster is None else read_people(roster),
+        worksheets=tuple(map(read_sheet, worksheet)),
+        column=column or "",
+        attempt=attempt,
+        due=due_time(due) if due else None,
+        late=costs,
+        include_pending=include_pending,
+        anonymous=anonymous,
     )
     try:
         with progress() as step:
             outcome = grade_all(
                 submissions,
-                given["logs"],
-                rubric,
+                logs,
+                worth,
                 output,
-                key=key,
+                key=answers,
                 course=course,
-                title=given["title"],
-                processes=given["jobs"],
+                title=title or "",
+                processes=jobs,
                 progress=partial(step, "grading"),
             )
     except KeyboardInterrupt as stopped:

@@ -11,13 +11,10 @@ import click
 from px4fuse.cli.inputs import Named, comparison_request, json_option, recording_options
 from px4fuse.cli.outputs import finish, progress, result_files
 from px4fuse.plain import few_words
-from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from px4fuse.inspect.inventory import Inventory, Source
-    from px4fuse.report.page import Cell
+    from px4fuse.report.page import Cell, Page
     from px4fuse.request import ComparisonRequest
 
 SOURCES_HEAD = ("", "source", "samples", "Hz", "gaps", "span (s)")
@@ -51,17 +48,16 @@ def info(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.inspect.inventory import take_inventory, to_plain
 
     request = comparison_request(log, given)
-    with progress(json_path == STANDARD_OUTPUT) as step:
+    with progress(json_path) as step:
         flight = read_flight(request, step)
         step("looking at what is in it")
         inventory = take_inventory(flight)
     contents = result_files(to_plain(inventory), json_path)
-    finish(contents, lambda console: _print(console, inventory, request))
+    finish(contents, _page(inventory, request))
 
 
-def _print(console: Console, inventory: Inventory, request: ComparisonRequest) -> None:
+def _page(inventory: Inventory, request: ComparisonRequest) -> Page:
     from px4fuse.report.page import Page
-    from px4fuse.report.screen import print_command, show
     from px4fuse.report.style import GOOD, SEVERITY_COLOURS
     from px4fuse.request import command_line
 
@@ -75,20 +71,19 @@ def _print(console: Console, inventory: Inventory, request: ComparisonRequest) -
     looks = {True: ("yes", GOOD), False: ("no", SEVERITY_COLOURS["warning"])}
     rows = [(looks[can.possible], can.name, can.reason) for can in inventory.abilities]
     page.table(("", "", "What px4fuse can do with it"), rows)
-    show(console, page.blocks)
     if next(ability.possible for ability in inventory.abilities if ability.name == "compare"):
-        print_command(console, command_line(request, "compare", typed=True), "Compare")
+        command = command_line(request, "compare", typed=True)
+        page.add("command", text=command, label="Compare")
     lists = {
         "Next": [f"{one.remedy} ({'; '.join(one.improves)})" for one in inventory.advice],
         "Clocks": _clocks(inventory),
         "Not used": [f"{one.name}, {one.count} messages: {one.reason}" for one in inventory.unused],
         "Notes": inventory.notes,
     }
-    page = Page()
     for label, texts in lists.items():
         if texts:
             page.labelled(label, *texts)
-    show(console, page.blocks)
+    return page
 
 
 def _facts(inventory: Inventory) -> list[tuple[str, str]]:

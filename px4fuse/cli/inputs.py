@@ -1,9 +1,14 @@
-"""Options that several commands share: which recordings of one flight are read, and how."""
+"""What commands take: kinds of options, and those that several share.
+
+A unit is not typed: who types it is told the number.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from inspect import Parameter, signature
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -14,10 +19,10 @@ from msgspec import NODEFAULT, Struct
 from msgspec.structs import fields
 
 from px4fuse.cli.outputs import OPENED
-from px4fuse.cli.quantity import TypedQuantity
 from px4fuse.errors import SettingsError
 from px4fuse.reading import max_log_bytes, read_text
 from px4fuse.request import (
+    AUTO,
     CLOCK_OPTION,
     FILTER_OPTIONS,
     OPTIONS,
@@ -28,6 +33,7 @@ from px4fuse.request import (
     PositionFile,
 )
 from px4fuse.request import Option as Declared
+from px4fuse.units import NAMES, in_unit
 
 if TYPE_CHECKING:
     from px4fuse.results.model import Student
@@ -65,8 +71,84 @@ class Named(click.Path):
         return super().convert(value, param, ctx)
 
 
+class TypedQuantity(click.ParamType["float | str"]):
+    """A number in a unit.
+
+    Parameters
+    ----------
+    unit : str
+        One of :data:`px4fuse.units.NAMES`.
+    example : float
+        Shown where what was typed cannot be understood.
+    auto : bool
+        Also take the word ``auto``.
+    """
+
+    name = "number"
+
+    def __init__(self, unit: str, example: float = 0.1, *, auto: bool = False) -> None:
+        self.unit, self.example, self.auto = unit, example, auto
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        """Its unit, as the help shows what to type."""
+        del param, ctx
+        unit = "DEG" if self.unit == "°" else self.unit.upper() or "NUMBER"
+        return f"{unit}|auto" if self.auto else unit
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float | str:
+        """Convert what was typed."""
+        if self.auto and value == AUTO:
+            return str(value)
+        name = NAMES[self.unit]
+        try:
+            number = float(value)
+        except ValueError:
+            meant = in_unit(value, self.unit)
+            shown = f"{self.example if meant is None else meant:.12g}"
+            self.fail(
+                f"{value!r}: give {name}, as {shown}{', or auto' if self.auto else ''}.", param, ctx
+            )
+        if not math.isfinite(number):
+            self.fail(f"{value} is not a finite number.", param, ctx)
+        return number
+
+
 # An option that names a file or folder
 path_option = partial(click.option, type=Named())
+
+
+def option(
+    typed: str, meaning: str, least: float | None = None, most: float | None = None
+) -> Option:
+    """An option of the command below: what it takes and its default are its parameter's there.
+
+    Parameters
+    ----------
+    typed : str
+        As the help has it: "-o, --output FILE".
+    meaning : str
+        Its help.
+    least, most : float, optional
+        Of a number.
+    """
+    names, _, metavar = typed.replace(", ", ",").partition(" ")
+
+    def add(command: Callable[..., None]) -> Callable[..., None]:
+        field = names.rpartition("--")[2].replace("-", "_")
+        hint, default = get_type_hints(command)[field], signature(command).parameters[field].default
+        details = _taken(hint) | {"help": meaning, "metavar": metavar or None}
+        if default is not Parameter.empty:
+            details["default"] = default
+        elif hint is Path:
+            details["required"] = True
+        if (least, most) != (None, None):
+            within: Any = click.FloatRange if details["type"] is float else click.IntRange
+            details["type"] = within(least, most)
+        return click.option(*names.split(","), **details)(command)
+
+    return add
 
 
 def request_options(kind: type[Struct], options: Mapping[str, Declared]) -> Option:
@@ -74,37 +156,41 @@ def request_options(kind: type[Struct], options: Mapping[str, Declared]) -> Opti
     hints, defaults = get_type_hints(kind), {field.name: field for field in fields(kind)}
     return _together(
         *(
-            _option(name, declared, hints[name], defaults[name].default)
-            for name, declared in options.items()
-            if declared.meaning
+            _declared(name, one, hints[name], defaults[name].default)
+            for name, one in options.items()
+            if one.meaning
         )
     )
 
 
-def _option(field: str, declared: Declared, hint: Any, default: Any) -> Option:
+def _declared(field: str, declared: Declared, hint: Any, default: Any) -> Option:
     """One of them; the parameters of a position file begin with what file they are about."""
-    # Literal["a"] | None, tuple[Literal["a"], ...] and Annotated say inside what may be typed
-    parts = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    inner = next(part for part in parts if part is not NoneType)
     name = declared.name[2:].replace("-", "_") if declared.name.startswith("--position") else field
-    details: dict[str, Any] = {"help": declared.meaning, "metavar": declared.metavar}
-    if default is not NODEFAULT:
-        details["default"] = default or None
+    details = {"default": default or None} if default is not NODEFAULT else {}
+    details |= _taken(hint) | {"help": declared.meaning, "metavar": declared.metavar}
     if field in ("path", "mavlink", "reference"):
         details["type"] = Named(str)
     elif declared.unit:
-        details["type"] = TypedQuantity(declared.unit, declared.example, auto=len(parts) > 2)
-    elif inner is bool:
-        details |= {"is_flag": True, "default": False}
-    elif inner is int:
+        auto = len(get_args(hint)) > 2
+        details["type"] = TypedQuantity(declared.unit, declared.example, auto=auto)
+    elif field == "columns":
+        details |= {"type": column_names, "multiple": False}
+    elif field == "system":
         details["type"] = click.IntRange(0, 255)
-    elif get_origin(inner) is tuple:
-        choices = get_args(get_args(inner)[0])
-        details["type"] = click.Choice(choices) if choices else column_names
-        details["multiple"] = bool(choices)
-    elif get_origin(inner) is Literal:
-        details["type"] = click.Choice(get_args(inner), case_sensitive=False)
     return click.option(declared.name, name, **details)
+
+
+def _taken(hint: Any) -> dict[str, Any]:
+    """What a parameter of a type takes: of a Literal one of its words, of a tuple several."""
+    parts = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    inner = next(part for part in parts if part is not NoneType)
+    if get_origin(inner) is tuple:
+        return _taken(get_args(inner)[0]) | {"multiple": True}
+    if get_origin(inner) is Literal:
+        return {"type": click.Choice(get_args(inner), case_sensitive=False)}
+    if inner is bool:
+        return {"is_flag": True, "default": False}
+    return {"type": Named() if inner is Path else inner}
 
 
 def _allow_size(ctx: click.Context, _: click.Parameter, megabytes: int | None) -> None:
@@ -156,17 +242,12 @@ person_options = _together(
     path_option("--notes", metavar="FILE.md", help="Your own words, printed in the report."),
     path_option("--answers", metavar="FILE.toml", help="The form of px4fuse answers, filled in."),
 )
-#: Of every command that makes a report: the PDF and its results
-report_options = _together(
-    path_option(
-        "-o",
-        "--output",
-        metavar="FILE.pdf",
-        help="The report.  [default: reports/LOG.pdf, settings that are not at their defaults in "
-        "its name]",
-    ),
-    json_option,
-)
+
+
+def report_options(meaning: str) -> Option:
+    """Of every command that makes a report: the PDF and its results."""
+    output = path_option("-o", "--output", metavar="FILE.pdf", help=meaning)
+    return _together(output, json_option)
 
 
 system_option = request_options(EvaluationRequest, {"system": OPTIONS["system"]})

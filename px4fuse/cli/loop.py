@@ -8,25 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import (
-    Named,
-    json_option,
-    max_size_option,
-    path_option,
-    person_options,
-    read_person,
-    request_options,
-    show_option,
-    typed_parameters,
-)
-from px4fuse.cli.outputs import (
-    check_targets,
-    finish,
-    free_report,
-    progress,
-    report_paths,
-    result_files,
-)
+from px4fuse.cli import inputs, outputs
 from px4fuse.errors import SettingsError
 from px4fuse.reading import shown
 from px4fuse.request import (
@@ -70,7 +52,7 @@ def closure(text: str) -> GivenClosure:
 
 
 @click.command()
-@click.argument("source", type=Named())
+@click.argument("source", type=inputs.Named())
 @click.option(
     "--landed-at",
     type=landing,
@@ -90,18 +72,13 @@ def closure(text: str) -> GivenClosure:
 @click.option(
     "--robust", is_flag=True, help="Solve a pose graph of over 1000 closures robustly too: minutes."
 )
-@request_options(LoopRequest, LOOP_OPTIONS)
-@max_size_option
-@person_options
-@path_option(
-    "-o", "--output", metavar="FILE.pdf", help="The report.  [default: reports/SOURCE_loop.pdf]"
-)
-@json_option
-@path_option(
-    "--tum", metavar="FILE", help="Write the corrected path as a TUM file, in the axes of SOURCE."
-)
-@path_option("--g2o", metavar="FILE", help="Write the pose graph, solved, as a g2o file.")
-@show_option
+@inputs.request_options(LoopRequest, LOOP_OPTIONS)
+@inputs.max_size_option
+@inputs.person_options
+@inputs.report_options("The report.  [default: reports/SOURCE_loop.pdf]")
+@inputs.option("--tum FILE", "Write the corrected path as a TUM file, in the axes of SOURCE.")
+@inputs.option("--g2o FILE", "Write the pose graph, solved, as a g2o file.")
+@inputs.show_option
 def loop(
     source: Path,
     output: Path | None,
@@ -117,33 +94,29 @@ def loop(
     Writes a report (PDF) and its results as JSON, except of a pose graph.
     """
     from px4fuse.analysis import run_loop
-    from px4fuse.findings import find_loop
     from px4fuse.loop.sources import file_name, is_g2o, split_part
     from px4fuse.report.document import LoopDocument
-    from px4fuse.report.loop import print_loop
+    from px4fuse.report.loop import summary
     from px4fuse.results.build_trajectories import loop_results
 
-    person = read_person(given)
-    for option, path in (("--tum", tum), ("--g2o", g2o)):
+    person = inputs.read_person(given)
+    for name, path in (("--tum", tum), ("--g2o", g2o)):
         if path == STANDARD_OUTPUT:
-            raise SettingsError(f"{option} -: only --json can print", "Give a file name.")
+            raise SettingsError(f"{name} -: only --json can print", "Give a file name.")
     if is_g2o(split_part(str(source))[0]):
         _solve(source, json_path, g2o, True if given["robust"] else None)
         return
     request = loop_request(source, given)
     alone = output is None and json_path is not None
-    results = (json_path,) if alone else report_paths(output or Path("reports/A.pdf"), json_path)
-    check_targets([tum, g2o, *results])
-    with progress(json_path == STANDARD_OUTPUT) as step:
+    outputs.check_targets([tum, g2o, *outputs.report_paths(output, json_path)])
+    with outputs.progress(json_path) as step:
         found = run_loop(request, step)
-        findings = find_loop(found)
-        document = LoopDocument(found, findings, person, command_line(request))
-        made = loop_results(request, found, findings, person, document.command)
+        made = loop_results(request, found, person)
         if output is None and not alone:
-            output = free_report(f"{file_name(source)}_loop", settings_name(request), made)
+            output = outputs.free_report(f"{file_name(source)}_loop", settings_name(request), made)
         contents = _files(found, tum, g2o)
-        contents |= result_files(made, json_path, output, document, step)
-    finish(contents, lambda console: print_loop(console, found, findings, request))
+        contents |= outputs.result_files(made, json_path, output, LoopDocument(found, made), step)
+    outputs.finish(contents, summary(found, made.findings), request)
 
 
 def loop_request(source: Path, given: dict[str, Any]) -> LoopRequest:
@@ -176,25 +149,25 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
     """Solve a pose graph from a file."""
     from px4fuse.loop.sources import split_part
     from px4fuse.readers.g2o import g2o_text, read_g2o
-    from px4fuse.report.loop import print_graph
+    from px4fuse.report.loop import graph_summary
     from px4fuse.results.build_trajectories import graph_results
     from px4fuse.trajectory.graph.analysis import analyse_graph
 
     path, part = split_part(str(source))
     if part is not None:
         raise SettingsError(f"{shown(source)}: a pose graph has no part {part!r}", "Leave it out.")
-    for parameter in typed_parameters():
+    for parameter in inputs.typed_parameters():
         if parameter.name not in FOR_GRAPHS:
             raise SettingsError(
                 f"{shown(source)}: {parameter.opts[-1]} is for flights and trajectories, not for a "
                 "pose graph",
                 "With one, give only --g2o FILE and --json FILE.",
             )
-    check_targets([json_path, g2o])
-    with progress(json_path == STANDARD_OUTPUT) as step:
+    outputs.check_targets([json_path, g2o])
+    with outputs.progress(json_path) as step:
         step(f"reading {shown(source)}")
         solved = analyse_graph(shown(source), read_g2o(path), step, robust=robust)
     command = command_line(LoopRequest(source=str(source))) + (" --robust" if robust else "")
     contents = {} if g2o is None else {g2o: g2o_text(solved.graph).encode()}
-    contents |= result_files(graph_results(solved, command), json_path)
-    finish(contents, lambda to: print_graph(to, solved))
+    contents |= outputs.result_files(graph_results(solved, command), json_path)
+    outputs.finish(contents, graph_summary(solved))

@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from msgspec import Struct
     from rich.console import Console
 
+    from px4fuse.report.page import Page
     from px4fuse.report.pdf import Report
+    from px4fuse.request import Request
     from px4fuse.results.contract import Results
 
 # Of a report with and without the settings in its name: file systems take 255 bytes
@@ -67,15 +69,16 @@ def silent(what: str, done: int = 0, of: int | None = None) -> None:
 
 
 @contextmanager
-def progress(quiet: bool = False) -> Iterator[ShowStep]:
+def progress(output: Path | None = None) -> Iterator[ShowStep]:
     """A bar on a terminal about what is being done, and what remains where that can be counted.
 
-    Nothing in a pipe, nor where it is to be ``quiet``.
+    Nothing in a pipe, nor where the output has standard output to itself.
     """
     from rich.console import Console
 
     console = Console(stderr=True)
-    if not console.is_terminal or quiet:  # an older rich ends a disabled bar with an empty line
+    # an older rich ends a disabled bar with an empty line
+    if not console.is_terminal or output == STANDARD_OUTPUT:
         yield silent
         return
     from rich import progress as bars
@@ -155,19 +158,24 @@ def web_page(output: Path | None, default: Path) -> Path:
     return output or default
 
 
-def report_paths(output: Path, json_path: Path | None) -> tuple[Path, Path]:
+def report_paths(output: Path | None, json_path: Path | None) -> list[Path]:
     """Where a report and its results go: the results beside it, unless --json names a file.
+
+    Of a report whose name will be found, what is known by now.
 
     Raises
     ------
     OutputError
         The report is no PDF, or as :func:`check_targets` says.
     """
-    if output.suffix.lower() != ".pdf":
+    if output is not None and output.suffix.lower() != ".pdf":
         raise OutputError(f"{output}: the report is a PDF. Give a name that ends in .pdf with -o.")
-    beside = output.with_suffix(".json") if json_path in (None, STANDARD_OUTPUT) else json_path
-    check_targets([output, beside])
-    return output, beside
+    beside = json_path
+    if output is not None and json_path in (None, STANDARD_OUTPUT):
+        beside = output.with_suffix(".json")
+    known = [path for path in (output, beside) if path is not None]
+    check_targets(known)
+    return known
 
 
 def result_files(
@@ -267,17 +275,25 @@ def check_targets(targets: Iterable[Path | None]) -> None:
                 )
 
 
-def finish(contents: Mapping[Path, bytes], show: Callable[[Console], None]) -> None:
+def finish(
+    contents: Mapping[Path, bytes],
+    told: Page | Callable[[Console], None] | None = None,
+    request: Request | None = None,
+) -> None:
     """Write all outputs or none; then tell people what was found and written.
 
-    Nothing is told where the results have standard output to themselves.
+    Nothing is told where the results have standard output to themselves. Commands in the words are
+    printed so that they run, where the request is given.
     """
-    from px4fuse.report.screen import print_file
+    from px4fuse.report.screen import print_file, show
 
     write_outputs(contents)
     if STANDARD_OUTPUT not in contents:
         console = terminal()
-        show(console)
+        if callable(told):
+            told(console)
+        elif told is not None:
+            show(console, told.blocks, request)
         for path in contents:
             print_file(console, "Wrote", path)
     open_written()

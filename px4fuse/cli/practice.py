@@ -8,39 +8,24 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli.inputs import path_option
+from px4fuse.cli.inputs import option
 from px4fuse.cli.outputs import OPENED, check_targets, finish, progress, web_page
-from px4fuse.writing import STANDARD_OUTPUT
 
 
 @click.command()
-@click.option(
-    "--seed",
-    type=click.IntRange(0, 2**32 - 1),
-    metavar="N",
-    help="The same number gives the same flights.  [default: drawn]",
-)
-@click.option(
-    "--level",
-    type=click.IntRange(1, 3),
-    default=1,
-    help="1: one mistake, large; 2: smaller; 3: small, and sometimes two.",
-)
-@click.option(
-    "--flights", "count", type=click.IntRange(1, 20), default=10, metavar="N", help="How many."
-)
-@path_option(
-    "-o", "--output", metavar="FILE.html", help="The page.  [default: reports/practice_SEED.html]"
-)
+@option("--seed N", "The same number gives the same flights.  [default: drawn]", 0, 2**32 - 1)
+@option("--level", "1: one mistake, large; 2: smaller; 3: small, and sometimes two.", 1, 3)
+@option("--flights N", "How many.", 1, 20)
+@option("-o, --output FILE.html", "The page.  [default: reports/practice_SEED.html]")
 @click.option("--open/--no-open", "opened", default=None, help="Open it.  [default: on a terminal]")
 @click.pass_context
 def practice(
     ctx: click.Context,
     seed: int | None,
-    level: int,
-    count: int,
     output: Path | None,
     opened: bool | None,
+    level: int = 1,
+    flights: int = 10,
 ) -> None:
     """Find what is wrong with simulated flights, ten in a row.
 
@@ -51,8 +36,8 @@ def practice(
     target = web_page(output, Path("reports", f"practice_{seed}.html"))
     check_targets([target])
     ctx.meta[OPENED] = sys.stdout.isatty() if opened is None else opened
-    with progress(target == STANDARD_OUTPUT) as step:
+    with progress(target) as step:
         from px4fuse.assignment.practice import practice_text
 
-        content = practice_text(seed, level, count, step).encode()
-    finish({target: content}, lambda _: None)
+        content = practice_text(seed, level, flights, step).encode()
+    finish({target: content})

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli.inputs import path_option
+from px4fuse.cli.inputs import option
 from px4fuse.cli.outputs import finish
 
 FOLDER = Path("sample_logs")
@@ -43,15 +43,13 @@ def sample_log() -> Path:
 
 
 @click.command()
-@path_option(
-    "-o", "--output", metavar="DIR", default=FOLDER, help="Where to.  [default: sample_logs]"
-)
-def sample(output: Path) -> None:
+@option("-o, --output DIR", "Where to.  [default: sample_logs]")
+def sample(output: Path = FOLDER) -> None:
     """Write the sample flights: an aisle with UWB, a loop on visual-inertial odometry."""
     from importlib.resources import files
 
     from px4fuse.errors import MissingDataError, OutputError
-    from px4fuse.report.screen import print_command
+    from px4fuse.report.page import Page
     from px4fuse.request import ComparisonRequest, command_line
 
     try:
@@ -67,4 +65,6 @@ def sample(output: Path) -> None:
             )
     first = next(path for path in contents if path.suffix == ".ulg")
     command = command_line(ComparisonRequest(log=str(first)), "compare", typed=True)
-    finish(contents, lambda console: print_command(console, command, "Next"))
+    page = Page()
+    page.add("command", text=command, label="Next")
+    finish(contents, page)

@@ -6,25 +6,16 @@ from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
 import click
 
-from px4fuse.cli.inputs import path_option, typed_parameters
+from px4fuse.cli.inputs import TypedQuantity, option, typed_parameters
 from px4fuse.cli.outputs import check_targets, progress, terminal, write_outputs
-from px4fuse.cli.quantity import TypedQuantity
 from px4fuse.errors import OutputError, SettingsError, on_one_line
 from px4fuse.reading import read_text
 from px4fuse.simulation.mistakes import MISTAKES, as_typed, made, parse
-from px4fuse.simulation.scenario import (
-    KINDS,
-    OF_KIND,
-    YAWS,
-    Kind,
-    Scenario,
-    quantities,
-    scenario_of,
-)
+from px4fuse.simulation.scenario import OF_KIND, Kind, Scenario, Yaw, quantities, scenario_of
 
 if TYPE_CHECKING:
     from px4fuse.assignment.drawing import Kinds
@@ -35,8 +26,8 @@ MIXED = "mixed"
 OUTDOOR: Kind = "outdoor"
 SOURCES = {"aisle": "UWB", "loop": "VIO", OUTDOOR: "GNSS"}
 # What goes with --assignment, and what goes with nothing else
-ONLY_ASSIGNMENTS = ("secret_file", "count", "preview")
-OF_ASSIGNMENTS = ("output", "assignment", "kind", "answer_path", "no_truth", *ONLY_ASSIGNMENTS)
+ONLY_ASSIGNMENTS = ("secret_file", "mistakes", "preview")
+OF_ASSIGNMENTS = ("output", "assignment", "kind", "answer", "no_truth", *ONLY_ASSIGNMENTS)
 MAX_SECRET_BYTES = 10_000
 Command = TypeVar("Command", bound=Callable[..., None])
 
@@ -73,74 +64,54 @@ class WithMistakes(click.Command):
 
 
 @click.command(cls=WithMistakes)
-@path_option(
-    "-o", "--output", required=True, metavar="FLIGHT.ulg|DIR", help="The log, or a class's folder."
+@option("-o, --output FLIGHT.ulg|DIR", "The log, or a class's folder.")
+@option(
+    "--assignment ROSTER.csv",
+    "A flight for every student of a class list (student id, name), with noises and mistakes of "
+    "their own, and the answer key beside the folder.",
 )
-@path_option(
-    "--assignment",
-    metavar="ROSTER.csv",
-    help="A flight for every student of a class list (student id, name), with noises and mistakes "
-    "of their own, and the answer key beside the folder.",
-)
-@path_option(
-    "--secret-file",
-    metavar="FILE",
-    help="Holds the secret from which assignments are drawn: the same secret and id give the same "
+@option(
+    "--secret-file FILE",
+    "Holds the secret from which assignments are drawn: the same secret and id give the same "
     "flight.  [default: made up, and kept in the answer key]",
 )
-@click.option(
-    "--mistakes",
-    "count",
-    type=int,
-    metavar="N",
-    help="How many mistakes each assigned flight has.  [default: drawn: none, one or two]",
+@option(
+    "--mistakes N",
+    "How many mistakes each assigned flight has.  [default: drawn: none, one or two]",
 )
-@click.option("--preview", is_flag=True, help="Print what --assignment draws; write nothing.")
-@click.option(
+@option("--preview", "Print what --assignment draws; write nothing.")
+@option(
     "--kind",
-    type=click.Choice((*KINDS, MIXED)),
-    default=_DEFAULT.kind,
-    help="Passes along an aisle with UWB, or laps around a square with drifting VIO or, outdoors, "
-    "with GNSS. With --assignment mixed: a loop for a third of the class, the aisle for the "
-    "others.",
+    "Passes along an aisle with UWB, or laps around a square with drifting VIO or, outdoors, with "
+    "GNSS. With --assignment mixed: a loop for a third of the class, the aisle for the others.",
 )
-@click.option(
-    "--seed", type=int, default=_DEFAULT.seed, metavar="N", help="The same number: the same flight."
+@option("--seed N", "The same number: the same flight.")
+@option("--mistake NAME[=VALUE]", "See below. Repeatable.")
+@option(
+    "--answer FILE.json",
+    "Write the answer: mistakes, biases, outliers, clock offset. Keep it to yourself.  [default "
+    "with --assignment: DIR_answers.json]",
 )
-@click.option(
-    "--mistake",
-    "mistakes",
-    multiple=True,
-    metavar="NAME[=VALUE]",
-    help="See below. Repeatable.",
-)
-@path_option(
-    "--answer",
-    "answer_path",
-    metavar="FILE.json",
-    help="Write the answer: mistakes, biases, outliers, clock offset. Keep it to yourself.  "
-    "[default with --assignment: DIR_answers.json]",
-)
-@click.option("--no-truth", is_flag=True, help="Leave the ground truth out of the log.")
-@click.option("--no-ekf2", is_flag=True, help="Fly without EKF2, which is faster.")
-@click.option(
-    "--passes", type=int, metavar="N", help="Passes [6], or laps of a square [1; outdoors 3]."
-)
-@click.option(
-    "--yaw", type=click.Choice(YAWS), help="Of the nose.  [default: fixed; follow around a square]"
-)
+@option("--no-truth", "Leave the ground truth out of the log.")
+@option("--no-ekf2", "Fly without EKF2, which is faster.")
+@option("--passes N", "Passes [6], or laps of a square [1; outdoors 3].")
+@option("--yaw", "Of the nose.  [default: fixed; follow around a square]")
 @_scenario_options
 def simulate(
     output: Path,
+    *,
     assignment: Path | None,
     secret_file: Path | None,
-    count: int | None,
-    mistakes: tuple[str, ...],
-    answer_path: Path | None,
+    mistakes: int | None,
+    mistake: tuple[str, ...],
+    answer: Path | None,
     no_truth: bool,
     no_ekf2: bool,
     preview: bool,
-    kind: str,
+    kind: Literal[Kind, "mixed"] = _DEFAULT.kind,
+    seed: int = _DEFAULT.seed,
+    passes: int | None,
+    yaw: Yaw | None,
     **chosen: Any,
 ) -> None:
     """Simulate a flight with known truth and chosen mistakes, for exercises and exams.
@@ -156,15 +127,16 @@ def simulate(
     """
     _check_options(assignment)
     if assignment is not None:
-        drawn_from = _read_secret(secret_file), cast("Kinds", kind), count
-        _assign(assignment, output, answer_path, *drawn_from, truth=not no_truth, preview=preview)
+        drawn_from = _read_secret(secret_file), cast("Kinds", kind), mistakes
+        _assign(assignment, output, answer, *drawn_from, truth=not no_truth, preview=preview)
         return
     if kind == MIXED:
         raise SettingsError(f"--kind {MIXED} requires --assignment ROSTER.csv.")
     if output.suffix.lower() != ".ulg":
         raise OutputError(f"{output}: the log is a ULog. Give a name that ends in .ulg with -o.")
-    check_targets([output, answer_path])
-    parsed = parse(mistakes)
+    check_targets([output, answer])
+    parsed = parse(mistake)
+    chosen |= {"seed": seed, "passes": passes, "yaw": yaw}
     scenario = scenario_of(
         cast(Kind, kind),
         truth=not no_truth,
@@ -179,14 +151,14 @@ def simulate(
         simulation = flights.simulate(scenario, parsed)
         step("writing the log")
         contents = {output: flights.to_ulog(simulation)}
-    if answer_path is not None:
-        contents[answer_path] = to_json(flights.answer(simulation)).encode()
+    if answer is not None:
+        contents[answer] = to_json(flights.answer(simulation)).encode()
     write_outputs(contents)
     for line in _summary(simulation):
         click.echo(line)
     click.echo(on_one_line(f"Log       {output}"))
-    if answer_path is not None:
-        click.echo(on_one_line(f"Answer    {answer_path} (not for students)"))
+    if answer is not None:
+        click.echo(on_one_line(f"Answer    {answer} (not for students)"))
 
 
 def _check_options(assignment: Path | None) -> None:

@@ -9,7 +9,6 @@ import click
 
 from px4fuse.cli.inputs import Named, analysis_options, comparison_request, json_option
 from px4fuse.cli.outputs import finish, progress, result_files
-from px4fuse.writing import STANDARD_OUTPUT
 
 
 @click.command()
@@ -27,16 +26,16 @@ def sync(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.errors import MissingDataError
     from px4fuse.flight import Unavailable
     from px4fuse.report.clock import clock_advice
-    from px4fuse.report.terminal import print_advice
-    from px4fuse.request import command_line
+    from px4fuse.report.page import Page
     from px4fuse.results.build import sync_results
 
     request = comparison_request(log, given)
-    with progress(json_path == STANDARD_OUTPUT) as step:
+    with progress(json_path) as step:
         compared = run_preparation(request, step)
         _, found = noises_and_clock(compared, step)
-    results = sync_results(request, compared, found, command_line(request, "sync"))
-    advice = clock_advice(compared, found)
-    finish(result_files(results, json_path), lambda to: print_advice(to, advice, request))
+    results = sync_results(request, compared, found)
+    page = Page()
+    page.advice(clock_advice(compared, found))
+    finish(result_files(results, json_path), page, request)
     if isinstance(found, Unavailable) or not found.determinable:
         raise MissingDataError(f"{compared.flight.log.name}: no clock offset could be determined.")

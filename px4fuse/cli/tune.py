@@ -9,15 +9,12 @@ import click
 
 from px4fuse.cli.inputs import Named, analysis_options, comparison_request, json_option
 from px4fuse.cli.outputs import finish, progress, result_files
-from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from px4fuse.comparison.model import Comparison
     from px4fuse.filter.tuning import AxisTuning
     from px4fuse.flight import Unavailable
-    from px4fuse.request import ComparisonRequest
+    from px4fuse.report.page import Page
 
 HEAD = (
     "axis", "SIGMA_A (m/s²)\nvalue, 95 %", "SIGMA_Z (m)\nvalue, 95 %", "\ngain", "held\nout",
@@ -43,31 +40,23 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.comparison.estimates import tuned as tuned_noises
     from px4fuse.errors import MissingDataError
     from px4fuse.flight import Unavailable
-    from px4fuse.request import command_line
     from px4fuse.results.build import tuning_results
 
     request = comparison_request(log, given)
-    with progress(json_path == STANDARD_OUTPUT) as step:
+    with progress(json_path) as step:
         compared = run_preparation(request, step)
         tuned = tuned_noises(compared, progress=step)
-    results = tuning_results(request, compared, tuned, command_line(request, "tune"))
-    finish(result_files(results, json_path), lambda to: _print(to, compared, tuned, request))
+    results = tuning_results(request, compared, tuned)
+    finish(result_files(results, json_path), _page(compared, tuned), request)
     if all(isinstance(found, Unavailable) for found in tuned.values()):
         raise MissingDataError(f"{compared.flight.log.name}: no noise could be determined.")
 
 
-def _print(
-    console: Console,
-    compared: Comparison,
-    tuned: dict[str, AxisTuning | Unavailable],
-    request: ComparisonRequest,
-) -> None:
+def _page(compared: Comparison, tuned: dict[str, AxisTuning | Unavailable]) -> Page:
     from px4fuse.flight import Unavailable
     from px4fuse.notebook.tables import noise_words
     from px4fuse.report.page import Page
-    from px4fuse.report.screen import show
     from px4fuse.report.style import MUTED
-    from px4fuse.report.terminal import print_advice
     from px4fuse.report.words import settings_words, tuning_advice
 
     page, rows, page_below = Page(), [], Page()
@@ -90,8 +79,9 @@ def _print(
     if rows:
         page.table(HEAD, rows, right=(1, 2, 3, 4, 5))
         page_below.write(NOTE, colour=MUTED)
-    show(console, page.blocks + page_below.blocks)
-    print_advice(console, tuning_advice(compared, tuned), request)
+    page_below.advice(tuning_advice(compared, tuned))
+    page.blocks += page_below.blocks
+    return page
 
 
 def _whiteness(found: AxisTuning) -> str:

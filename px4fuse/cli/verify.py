@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from px4fuse.cli.inputs import Named, json_option, max_size_option, open_option, path_option
+from px4fuse.cli.inputs import Named, max_size_option, open_option, report_options
 from px4fuse.cli.outputs import check_targets, finish, progress, result_files
 from px4fuse.errors import LogError
 from px4fuse.reading import files_by_sha256, read_whole, shown
-from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -31,10 +30,7 @@ TIMEOUT_S = 1800.0
 @click.argument("report", type=Named(), metavar="REPORT.pdf")
 @click.argument("logs", type=Named(), nargs=-1, metavar="[LOG ...]")
 @max_size_option
-@path_option(
-    "-o", "--output", metavar="FILE.pdf", help="Write the report, drawn again from the log."
-)
-@json_option
+@report_options("Write the report, drawn again from the log.")
 @open_option
 def verify(
     report: Path, logs: tuple[Path, ...], output: Path | None, json_path: Path | None
@@ -61,7 +57,7 @@ def verify(
     if isinstance(read, Refused):
         raise LogError(read.reason)
     check_targets([json_path, output])
-    with progress(json_path == STANDARD_OUTPUT) as step:
+    with progress(json_path) as step:
         step("hashing the logs")
         files = files_by_sha256(logs)
         if logs and not files:

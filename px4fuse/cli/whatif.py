@@ -7,19 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import Named, flight_options, json_option, open_option, path_option
-from px4fuse.cli.outputs import finish, progress, report_paths, result_files
-from px4fuse.cli.quantity import TypedQuantity
+from px4fuse.cli import inputs, outputs
 from px4fuse.errors import SettingsError
 from px4fuse.units import NAMES, in_unit
-from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
     from px4fuse.request import Sweep
 
 
 @click.command()
-@click.argument("log", type=Named())
+@click.argument("log", type=inputs.Named())
 @click.option(
     "--set",
     "changes",
@@ -27,26 +24,21 @@ if TYPE_CHECKING:
     metavar="NAME=VALUE",
     help="Parameter to change, in PX4's unit; may be repeated.  [default: what the data ask for]",
 )
-@click.option(
-    "--sweep", metavar="NAME=LOW:HIGH[:COUNT]", help="Parameter to change over several values."
-)
-@click.option(
-    "--without",
-    multiple=True,
-    metavar="AID",
-    help="Aid that is no longer fused, as gnss_pos, gnss_vel, mag or ev_pos; may be repeated.",
+@inputs.option("--sweep NAME=LOW:HIGH[:COUNT]", "Parameter to change over several values.")
+@inputs.option(
+    "--without AID",
+    "Aid that is no longer fused, as gnss_pos, gnss_vel, mag or ev_pos; may be repeated.",
 )
 @click.option(
     "--from",
     "since",
-    type=TypedQuantity("s", 60.0),
+    type=inputs.TypedQuantity("s", 60.0),
     metavar="SECONDS",
     help="When the aids of --without are lost.  [default: from the start]",
 )
-@flight_options
-@path_option("-o", "--output", metavar="FILE.pdf", help="A page, and its results beside it.")
-@json_option
-@open_option
+@inputs.flight_options
+@inputs.report_options("A page, and its results beside it.")
+@inputs.open_option
 def whatif(
     log: Path,
     changes: tuple[str, ...],
@@ -66,12 +58,11 @@ def whatif(
     """
     from px4fuse.analysis import run_what_if
     from px4fuse.report.document import WhatIfDocument
-    from px4fuse.report.whatif import print_what_if
-    from px4fuse.request import WhatIfRequest, command_line
+    from px4fuse.report.whatif import summary
+    from px4fuse.request import WhatIfRequest
     from px4fuse.results.build import whatif_results
 
-    if output is not None:
-        report_paths(output, json_path)  # before the work, not after it
+    outputs.report_paths(output, json_path)  # before the work, not after it
     if since is not None and not without:
         raise SettingsError("--from says when --without begins: give that too.")
     request = WhatIfRequest(
@@ -81,12 +72,12 @@ def whatif(
         without=dict.fromkeys(without, since or 0.0),
         **given,
     )
-    with progress(json_path == STANDARD_OUTPUT) as step:
+    with outputs.progress(json_path) as step:
         found = run_what_if(request, step)
-        document = WhatIfDocument(found, command_line(request))
-        results = whatif_results(request, found, document.command)
-        contents = result_files(results, json_path, output, document, step)
-    finish(contents, lambda console: print_what_if(console, found))
+        results = whatif_results(request, found)
+        document = WhatIfDocument(found, results)
+        contents = outputs.result_files(results, json_path, output, document, step)
+    outputs.finish(contents, summary(found))
 
 
 def _changes(given: tuple[str, ...]) -> dict[str, float]:

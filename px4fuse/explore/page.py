@@ -16,7 +16,7 @@ from px4fuse.explore.figures import document_json
 from px4fuse.explore.packing import Packer
 from px4fuse.findings.model import Finding
 from px4fuse.request import ComparisonRequest
-from px4fuse.webpage.safe import clean, escaped, inert_json, policy_hash
+from px4fuse.webpage.safe import cleaned, escaped, inert_json, policy_hash
 from px4fuse.webpage.safe import part as shared
 
 # Longer text from a log is cut
@@ -70,7 +70,7 @@ def data_scripts(
     return "\n".join(
         f'<script type="{kind}" id="{name}{suffix}">{text}</script>'
         for name, kind, text in (
-            ("content", "application/json", inert_json(_plain(content))),
+            ("content", "application/json", inert_json(cleaned(content, MAX_CHARACTERS))),
             ("document", "application/json", inert_json(document)),
             ("arrays", "text/plain", packer.text()),
         )
@@ -122,17 +122,6 @@ def _bokeh() -> str:
     """BokehJS itself; widgets, tables and formulas stay out."""
     # what follows it only sets a log level, and says so on the console
     return Resources(mode="inline", components=["bokeh"]).js_raw[0]
-
-
-def _plain(value: Any) -> Any:
-    """Numbers of numpy as Python's, and every text without what a page cannot hold."""
-    if isinstance(value, dict):
-        return {clean(str(name), MAX_CHARACTERS): _plain(part) for name, part in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(part) for part in value]
-    if isinstance(value, str):
-        return clean(value, MAX_CHARACTERS)
-    return value.item() if hasattr(value, "item") else value
 
 
 PANELS = (

@@ -16,15 +16,9 @@ import pandas as pd
 
 from px4fuse.display import Shown, draw, frame, words
 from px4fuse.findings import named
+from px4fuse.fleet import measures
 from px4fuse.fleet.inputs import DiffInput, Progress, read_inputs
-from px4fuse.fleet.measures import LEAST_RATIO, Number, at, numbers
-from px4fuse.fleet.significance import (
-    FALSE_DISCOVERY_RATE,
-    Contrast,
-    contrast,
-    corrected,
-    spreads,
-)
+from px4fuse.fleet.measures import FALSE_DISCOVERY_RATE, LEAST_RATIO, Contrast, Number, at
 from px4fuse.report.changes import change_line
 from px4fuse.results.changes import (
     Compared,
@@ -145,7 +139,9 @@ def changes(a: DiffInput, b: DiffInput) -> Changes:
         paired=paired,
         summary=(),
         numbers=number_changes(
-            numbers(a.results, a.analysis), numbers(b.results, b.analysis), paired=paired
+            measures.numbers(a.results, a.analysis),
+            measures.numbers(b.results, b.analysis),
+            paired=paired,
         ),
         texts=tuple(_texts(a.results, b.results, paired=paired)),
         findings=tuple(_findings(a.results, b.results)),
@@ -168,14 +164,14 @@ def number_changes(
     paired : bool
         Both are of one flight, so that nothing is left to chance.
     """
-    spread_of: Mapping[str, float] = {} if paired else spreads()
+    spread_of: Mapping[str, float] = {} if paired else measures.spreads()
     contrasts = {
-        path: contrast(a, second[path], spread_of.get(a.measure.path, 0.0))
+        path: measures.contrast(a, second[path], spread_of.get(a.measure.path, 0.0))
         for path, a in first.items()
         if path in second
     }
     ps = {path: c.p for path, c in contrasts.items() if c and c.interval and not paired}
-    qs = dict(zip(ps, corrected(list(ps.values())), strict=True))
+    qs = dict(zip(ps, measures.corrected(list(ps.values())), strict=True))
     made = [
         _change(path, first.get(path), second.get(path), contrasts.get(path), qs.get(path), paired)
         for path in {**first, **second}

@@ -12,12 +12,10 @@ from msgspec.structs import replace
 from px4fuse.analysis import AidsAlone, Analysis, run_or_judge_aids
 from px4fuse.display import brief
 from px4fuse.errors import LogError, ResultsError
-from px4fuse.findings import find, find_aids
 from px4fuse.reading import files_by_sha256, read_head, read_whole, shown
-from px4fuse.request import ComparisonRequest, command_line
+from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import aids_results, results
 from px4fuse.results.contract import AidsResults, ComparisonResults
-from px4fuse.results.model import Student
 from px4fuse.results.reading import MAX_BYTES as MAX_RESULTS_BYTES
 from px4fuse.results.reading import read_results
 from px4fuse.verification.intake import MAX_BYTES as MAX_REPORT_BYTES
@@ -98,10 +96,7 @@ def _analysed(path: Path, other: DiffInput | None, progress: Progress) -> DiffIn
         request = replace(
             request, **{name: getattr(other.results.request, name) for name in fields}
         )
-    analysis, typed = run_or_judge_aids(request, progress), command_line(request)
+    analysis = run_or_judge_aids(request, progress)
     if isinstance(analysis, AidsAlone):
-        findings = find_aids(analysis.aids)
-        alone = aids_results(request, analysis, findings, Student(), typed)
-        return DiffInput(shown(path), "log", alone)
-    found = results(request, analysis, find(analysis), Student(), typed)
-    return DiffInput(shown(path), "log", found, analysis)
+        return DiffInput(shown(path), "log", aids_results(request, analysis))
+    return DiffInput(shown(path), "log", results(request, analysis), analysis)

@@ -12,7 +12,7 @@ from px4fuse.errors import LogError, MissingDataError, Px4FuseError
 from px4fuse.fleet.logs import local_file
 from px4fuse.fleet.rows import FAILED, NOT_JUDGED, Row, log_columns, rows_of, what_was_found
 from px4fuse.reading import files_by_sha256, max_log_bytes
-from px4fuse.request import ComparisonRequest, command_line, with_options
+from px4fuse.request import ComparisonRequest, with_options
 
 
 @dataclass(frozen=True)
@@ -93,29 +93,27 @@ def refused(error: Px4FuseError, status: str, name: str = "") -> Row:
 def _compared(job: Job, path: Path, sha256: str) -> Outcome:
     # only workers need all of it
     from px4fuse.analysis import AidsAlone, read_flight, run_or_judge_aids  # noqa: PLC0415
-    from px4fuse.findings import find, find_aids  # noqa: PLC0415
+    from px4fuse.findings import find_aids  # noqa: PLC0415
     from px4fuse.results.build import log_part, results  # noqa: PLC0415
     from px4fuse.results.contract import to_json  # noqa: PLC0415
-    from px4fuse.results.model import Student  # noqa: PLC0415
 
     request = msgspec.structs.replace(job.request, log=str(path))
     known: Row = {"name": path.name, "log_sha256": sha256}
     try:
         flight = read_flight(request)
         known |= log_columns(log_part(flight))
-        analysis, command = run_or_judge_aids(request, flight=flight), command_line(request)
+        analysis = run_or_judge_aids(request, flight=flight)
         if isinstance(analysis, AidsAlone):
             known |= what_was_found(find_aids(analysis.aids), analysis.aids)
             lacking = MissingDataError(analysis.lacking.reason, analysis.lacking.remedy)
             return Outcome(sha256, (known | refused(lacking, NOT_JUDGED, path.name),))
-        findings = find(analysis)
-        found = results(request, analysis, findings, Student(), command)
+        found = results(request, analysis)
         text, report = to_json(found), b""
         if job.reports:
             from px4fuse.report.document import Document  # noqa: PLC0415
             from px4fuse.report.pdf import render  # noqa: PLC0415
 
-            report = render(Document(analysis, findings, Student(), command), text)
+            report = render(Document(analysis, found), text)
     except Px4FuseError as error:
         status = NOT_JUDGED if isinstance(error, MissingDataError) else FAILED
         return Outcome(sha256, (known | refused(error, status, path.name),))

@@ -17,9 +17,8 @@ import pandas as pd
 from scipy.special import stdtr, stdtrit
 
 from px4fuse.errors import SettingsError
-from px4fuse.fleet.measures import APART, MEASURES, Measure
+from px4fuse.fleet.measures import APART, FALSE_DISCOVERY_RATE, MEASURES, Measure, corrected
 from px4fuse.fleet.rows import COLUMNS, DONE, FAILED, PLACES
-from px4fuse.fleet.significance import FALSE_DISCOVERY_RATE, corrected
 from px4fuse.plain import number_words
 from px4fuse.reading import size_of
 

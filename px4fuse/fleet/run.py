@@ -12,7 +12,7 @@ from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import pandas as pd
@@ -26,7 +26,6 @@ from px4fuse.fleet.logs import FoundLog, find_logs
 from px4fuse.fleet.page import html_text
 from px4fuse.fleet.regressions import marked
 from px4fuse.fleet.rows import FAILED, NOT_JUDGED, Row, csv_bytes, table_of, writable
-from px4fuse.fleet.store import Kept, kept_in
 from px4fuse.reading import max_log_bytes
 from px4fuse.request import ComparisonRequest, command_line
 from px4fuse.verification.workers import MEMORY_BYTES, Failed, run_bounded
@@ -60,6 +59,21 @@ class Fleet:
     severities: frozenset[str]
     written: tuple[Path, ...]
     against: str = ""
+
+
+class Kept(msgspec.Struct, frozen=True):
+    """The rows of a log, of one px4fuse and one set of settings."""
+
+    sha256: str
+    px4fuse: str
+    settings: str
+    size_bytes: int | None
+    rows: Annotated[list[Row], msgspec.Meta(min_length=1)]
+
+    @property
+    def file(self) -> str:
+        """Where it is kept, relative to the fleet's folder."""
+        return f"rows/{self.sha256}.json"
 
 
 @dataclass(frozen=True)
@@ -218,6 +232,17 @@ def _known(now: _Run, reports: bool) -> dict[int | None, set[str]]:
         if "axis" not in first or all(file.is_file() for file in files):
             known[kept.size_bytes].add(kept.sha256)
     return known
+
+
+def kept_in(folder: Path, px4fuse: str, settings: str) -> Iterator[Kept]:
+    """What a folder keeps of this px4fuse and these settings."""
+    for file in sorted((folder / "rows").glob("*.json")):
+        try:
+            kept = msgspec.json.decode(file.read_bytes(), type=Kept)
+        except msgspec.MsgspecError:  # not ours, or of another px4fuse: the log is done again
+            continue
+        if (kept.px4fuse, kept.settings) == (px4fuse, settings):
+            yield kept
 
 
 def _keep(now: _Run, log: FoundLog, outcome: Outcome | Failed) -> None:

@@ -9,7 +9,8 @@ from px4fuse.findings import named
 from px4fuse.fleet.rows import BETWEEN_FINDINGS, FAILED
 from px4fuse.fleet.run import Fleet
 from px4fuse.plain import factor_words
-from px4fuse.report.screen import plain_table, print_file, say
+from px4fuse.report.page import Page
+from px4fuse.report.screen import print_file, say, show
 
 # Reasons why logs are not compared, findings and what is worse
 SHOWN = 8
@@ -29,14 +30,16 @@ def print_fleet(console: Console, fleet: Fleet) -> None:
     if len(most) > SHOWN:
         say(console, f"{len(most) - SHOWN} more reasons are in fleet.html.")
     heads = [f"{whose}\n{what}" for whose in ("ours", "EKF2") for what in ("logs", "factor")]
-    table = plain_table(("axis", "left"), *((head, "right") for head in heads))
+    lines = []
     for axis, rows in fleet.table[fleet.table["axis"] != ""].groupby("axis", sort=False):
         cells = []
         for factors in (rows["kf_factor"].dropna(), rows["ekf2_factor"].dropna()):
             cells += [f"{len(factors)}", factor_words(factors.median()) if len(factors) else "–"]
-        table.add_row(str(axis), *cells)
-    if table.row_count:
-        console.print(table)
+        lines.append((str(axis), *cells))
+    if lines:
+        page = Page()
+        page.table(("axis", *heads), lines, right=(1, 2, 3, 4))
+        show(console, page.blocks)
         say(console, Text("factor: median of how many times √S is overstated (above 1)", "dim"))
     found = logs["findings"].str.split(BETWEEN_FINDINGS).explode()
     for finding, count in found[found != ""].value_counts().head(SHOWN).items():

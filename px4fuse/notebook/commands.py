@@ -31,7 +31,6 @@ from px4fuse.request import (
     PositionFile,
     SourceKind,
     WhatIfRequest,
-    command_line,
 )
 from px4fuse.trajectory import evaluation
 from px4fuse.trajectory.evaluation import Evaluation
@@ -103,8 +102,9 @@ def compare(
     LogError, MissingDataError, SettingsError
         A file cannot be read, the flight lacks what was asked for, or a setting is out of range.
     """
-    known, asked = get_args(AxisName), (axes,) if isinstance(axes, str) else tuple(axes)
-    if unknown := set(asked).difference(known):
+    given = locals()  # arguments are called as the fields of the request
+    known, named = get_args(AxisName), (axes,) if isinstance(axes, str) else tuple(axes)
+    if unknown := set(named).difference(known):
         raise SettingsError(f"`axes` {unknown.pop()!r}: choose from {', '.join(known)}.")
     if isinstance(log, Flight) and (position, mavlink, system) != (None, None, None):
         raise SettingsError(
@@ -114,24 +114,15 @@ def compare(
         )
     if isinstance(clock_offset_s, str) and clock_offset_s != AUTO:
         raise SettingsError(f"`clock_offset_s` {clock_offset_s!r}: give seconds, or 'auto'.")
-    request = ComparisonRequest(
-        log=log.log.name if isinstance(log, Flight) else str(log),
-        mavlink=None if mavlink is None else str(mavlink),
-        system=system,
-        position=PositionFile(path=str(position)) if isinstance(position, str | Path) else position,
-        position_source=position_source,
-        source_kind=source_kind,
-        height=height,
-        sigma_a_m_s2=sigma_a_m_s2,
-        sigma_z_m=sigma_z_m,
-        dt_s=dt_s,
-        input=input,
-        axes=asked,
-        heading_deg=heading_deg,
-        start_s=start_s,
-        end_s=end_s,
-        clock_offset_s=float(clock_offset_s) if isinstance(clock_offset_s, int) else clock_offset_s,
-    )
+    asked = {name: given[name] for name in ComparisonRequest.__struct_fields__}
+    asked |= {"log": log.log.name if isinstance(log, Flight) else str(log), "axes": named}
+    if mavlink is not None:
+        asked["mavlink"] = str(mavlink)
+    if isinstance(position, str | Path):
+        asked["position"] = PositionFile(path=str(position))
+    if isinstance(clock_offset_s, int):
+        asked["clock_offset_s"] = float(clock_offset_s)
+    request = ComparisonRequest(**asked)
     return run(request, progress, log if isinstance(log, Flight) else None)
 
 
@@ -252,11 +243,10 @@ def report(analysis: Analysis, path: Pathlike) -> Path:
     from px4fuse.report.pdf import render  # noqa: PLC0415
     from px4fuse.results.build import results  # noqa: PLC0415
     from px4fuse.results.contract import to_json  # noqa: PLC0415
-    from px4fuse.results.model import Student  # noqa: PLC0415
 
-    target, request, findings = _ending(path, ".pdf"), _request(analysis), find(analysis)
-    document = Document(analysis, findings, Student(), command_line(request))
-    text = to_json(results(request, analysis, findings, document.student, document.command))
+    target = _ending(path, ".pdf")
+    document = Document(analysis, results(_request(analysis), analysis))
+    text = to_json(document.results)
     write_all({target: render(document, text), target.with_suffix(".json"): text.encode()})
     return target
 

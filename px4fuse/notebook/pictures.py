@@ -21,7 +21,7 @@ from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.loop import Loop
 from px4fuse.notebook.tables import EKF2, tracks, variants
 from px4fuse.report.clock import draw_curve
-from px4fuse.report.evaluation import draw_ape, draw_path, over_time, views
+from px4fuse.report.evaluation import AXES, draw_ape, draw_path, over_time, views
 from px4fuse.report.loop import draw_map
 from px4fuse.report.panels import ERROR, INNOVATIONS, POSITION, SIGMA_P, error_reference
 from px4fuse.report.style import EKF2 as EKF2_COLOUR
@@ -35,8 +35,6 @@ from px4fuse.trajectory.scores import PairwiseError
 REGION_DROP, SHOWN_DROP = 3.0, 12.0
 # Characters in a line of what stands beside an axis
 LABEL_WIDTH = 26
-# Of a frame, which coordinates a map shows to the right and upwards
-ACROSS = {"NED": (1, 0), "FRD": (1, 0), "ENU": (0, 1), "camera": (0, 2), "unknown": (0, 1)}
 
 
 def _map(ax: Axes, right: str, up: str) -> Axes:
@@ -114,7 +112,7 @@ def loop(result: Loop, ax: Axes) -> Axes:
 
 def trajectory(result: Trajectory, ax: Axes) -> Axes:
     """The path from above."""
-    right, up = ACROSS[result.frame]
+    right, up, *_ = AXES[result.frame]
     table = frame(result)
     ax.plot(table.iloc[:, right], table.iloc[:, up], lw=0.9, label=result.name)
     return _map(ax, table.columns[right], table.columns[up])

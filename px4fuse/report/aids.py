@@ -60,7 +60,7 @@ def write_appendix(page: Page, document: Document) -> Mapping[str, AidResult]:
 def draw_alone(document: AidsDocument) -> Iterator[Page]:
     """Draw the page of a flight without a position source."""
     alone, page = document.alone, Page(TITLE, LEAD)
-    page.write(about(document.student, alone.flight.log), colour=MUTED)
+    page.write(about(document.results.student, alone.flight.log), colour=MUTED)
     write_alone(page, document)
     _strips(page, alone.flight, alone.aids)
     yield page
@@ -72,7 +72,7 @@ def write_alone(page: Page, document: AidsDocument) -> None:
     page.write(f"Our filter has nothing to compare with EKF2: {lacking.reason}.", above=2.0)
     page.write(with_options(lacking.remedy), colour=MUTED)
     write_aids(page, document.alone.aids)
-    write_findings(page, document.findings)
+    write_findings(page, document.results.findings)
 
 
 def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from rich.console import Console
-
 from px4fuse.plain import number_words
 from px4fuse.report.page import Cell, Page, words
-from px4fuse.report.screen import show
 from px4fuse.report.style import GOOD, MUTED, SEVERITY_COLOURS
 from px4fuse.results.changes import NumberChange
 from px4fuse.results.contract import ChangeResults
@@ -38,11 +35,11 @@ def draw(results: ChangeResults) -> Iterator[Page]:
     yield page
 
 
-def print_changes(console: Console, results: ChangeResults) -> None:
-    """Print what changed, significant changes first."""
+def summary(results: ChangeResults) -> Page:
+    """What changed, significant changes first, as much as fits on a screen."""
     page = Page()
     _write(page, results, short=True)
-    show(console, page.blocks)
+    return page
 
 
 def _write(page: Page, results: ChangeResults, *, short: bool = False) -> None:

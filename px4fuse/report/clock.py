@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import aid_of, delay_ms
@@ -13,10 +12,7 @@ from px4fuse.flight import Unavailable
 from px4fuse.plain import p_words
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page, legend_above
-from px4fuse.report.style import OURS_BAND, OURS_LINE
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from px4fuse.report.style import OURS_BAND, OURS_LINE, Axes
 
 CURVE = 170.0  # height of the axes in points
 # Beyond this the curve tells nothing more
@@ -42,7 +38,7 @@ def has_page(document: Document) -> bool:
     clock = document.analysis.clock
     if isinstance(clock, Unavailable):
         return False
-    return not clock.determinable or any(one.id in FINDINGS for one in document.findings)
+    return not clock.determinable or any(one.id in FINDINGS for one in document.results.findings)
 
 
 def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> dict[str, str]:
@@ -100,8 +96,7 @@ def draw(document: Document) -> Iterator[Page]:
         "maximised over the offset, jointly with sensor biases, attitude errors and noises; the "
         "attitude is from the gyros alone, because EKF2's was corrected by these very positions.",
     )
-    for label, text in clock_advice(document.analysis, clock).items():
-        page.labelled(label, text, size=8.5)
+    page.advice(clock_advice(document.analysis, clock), size=8.5)
     (low, high), best = clock.interval_s, clock.offset_s
     say = (
         f"Best at {best:+.3f} s; 95 % from {low:+.3f} to {high:+.3f} s, wider than the curve alone "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -17,11 +17,8 @@ from px4fuse.plain import capital, number_words, p_words
 from px4fuse.report import marks
 from px4fuse.report.document import Document
 from px4fuse.report.page import Cell, Page, halves, legend_above
-from px4fuse.report.style import DOTS, LINES, MUTED, OURS_BAND, curve, plain_ticks
+from px4fuse.report.style import DOTS, LINES, MUTED, OURS_BAND, Axes, curve, plain_ticks
 from px4fuse.report.words import VERDICT_HEAD, filters, verdict_rows, verdict_words
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 LAGS = 20
 WIDEST = 4.0

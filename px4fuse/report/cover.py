@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -20,7 +20,7 @@ from px4fuse.recording import LogInfo
 from px4fuse.report.document import Document, who
 from px4fuse.report.marks import LANDING, TAKE_OFF
 from px4fuse.report.page import WIDTH, Page, halves, legend_above, words
-from px4fuse.report.style import EKF2, LINES, MEASURED, MUTED, OURS, SEVERITY_COLOURS, as_map
+from px4fuse.report.style import EKF2, LINES, MEASURED, MUTED, OURS, SEVERITY_COLOURS, Axes, as_map
 from px4fuse.report.words import (
     clock_words,
     consequences_words,
@@ -30,9 +30,6 @@ from px4fuse.report.words import (
     write_errors,
 )
 from px4fuse.results.model import Student
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 # A track so many times longer than wide lies along the page, else north is up
 LONG = 2.2
@@ -50,12 +47,14 @@ def draw(document: Document) -> Iterator[Page]:
     """Draw the cover; findings that it has no room for go to the next page."""
     page = Page("Two-state Kalman filter against EKF2")
     page.foot(_plan(document, facts(document)))
-    page.write(about(document.student, document.analysis.flight.log), colour=MUTED, above=-4.0)
-    for sentence in document.story:
+    page.write(
+        about(document.results.student, document.analysis.flight.log), colour=MUTED, above=-4.0
+    )
+    for sentence in document.results.story:
         page.write(sentence, size=10.5, above=2.0)
     _verdict(page, document)
     write_errors(page, document)
-    write_findings(page, document.findings)
+    write_findings(page, document.results.findings)
     yield page
 
 

@@ -1,4 +1,4 @@
-"""What a report is made of: the comparison or the loop, its findings, and who it is for."""
+"""What a report is made of: what was analysed, and its results as they are attached."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from functools import cached_property
 from px4fuse.analysis import AidsAlone, Analysis, Counterfactual
 from px4fuse.comparison.events import Events, happened
 from px4fuse.comparison.model import AxisComparison
-from px4fuse.findings import Finding
-from px4fuse.findings.story import story
 from px4fuse.flight import Unavailable
 from px4fuse.loop.loop import Loop
-from px4fuse.results.model import Provenance, Student
+from px4fuse.results.contract import AidsResults, ComparisonResults, LoopResults, WhatIfResults
+from px4fuse.results.model import Student
 
 
 def who(student: Student, between: str) -> str:
@@ -22,35 +21,15 @@ def who(student: Student, between: str) -> str:
 
 @dataclass(frozen=True)
 class Document:
-    """One report.
-
-    Attributes
-    ----------
-    analysis : Analysis
-    findings : tuple of Finding
-        Most severe first.
-    student : Student
-    command : str
-        The command line that makes it again, without folders.
-    made : Provenance or None
-        Versions to print; None for those that run.
-    """
+    """A report on a comparison."""
 
     analysis: Analysis
-    findings: tuple[Finding, ...]
-    student: Student
-    command: str
-    made: Provenance | None = None
+    results: ComparisonResults
 
     @property
     def other_axes(self) -> list[AxisComparison]:
         """The axes beside the main one."""
         return [axis for axis in self.analysis.axes.values() if axis is not self.analysis.main]
-
-    @cached_property
-    def story(self) -> tuple[str, ...]:
-        """What happened, in up to three sentences."""
-        return story(self.analysis, self.findings)
 
     @property
     def truth_known(self) -> bool:
@@ -65,55 +44,23 @@ class Document:
 
 @dataclass(frozen=True)
 class AidsDocument:
-    """A report on the aids of EKF2 alone.
-
-    Attributes
-    ----------
-    alone : AidsAlone
-    findings : tuple of Finding
-        Most severe first.
-    student : Student
-    command : str
-    """
+    """A report on the aids of EKF2 alone."""
 
     alone: AidsAlone
-    findings: tuple[Finding, ...]
-    student: Student
-    command: str
+    results: AidsResults
 
 
 @dataclass(frozen=True)
 class WhatIfDocument:
-    """A page on EKF2 with other parameters.
-
-    Attributes
-    ----------
-    made_of : Counterfactual
-    command : str
-        The command line that makes it again, without folders.
-    """
+    """A page on EKF2 with other parameters."""
 
     made_of: Counterfactual
-    command: str
+    results: WhatIfResults
 
 
 @dataclass(frozen=True)
 class LoopDocument:
-    """A report on a loop alone.
-
-    Attributes
-    ----------
-    loop : Loop
-    findings : tuple of Finding
-        Most severe first.
-    student : Student
-    command : str
-    made : Provenance or None
-        As in :class:`Document`.
-    """
+    """A report on a loop alone."""
 
     loop: Loop
-    findings: tuple[Finding, ...]
-    student: Student
-    command: str
-    made: Provenance | None = None
+    results: LoopResults

@@ -4,28 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from rich.console import Console
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.flight import Unavailable
 from px4fuse.loop.analysis import SMALLEST_STAMP_S
 from px4fuse.report import style
 from px4fuse.report.page import WIDTH, Page, halves
-from px4fuse.report.screen import show
-from px4fuse.report.style import EKF2, MUTED, OURS, TRUTH
+from px4fuse.report.style import EKF2, MUTED, OURS, TRUTH, Axes, Colormap
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Frame, Trajectory
 from px4fuse.trajectory.scores import Interval, PairwiseError, Statistics
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.colors import Colormap
-
 # Indices of the axes that are right, up the page and vertical; and whether the last points down
-_AXES: Mapping[Frame, tuple[int, int, int, bool]] = {
+AXES: Mapping[Frame, tuple[int, int, int, bool]] = {
     "NED": (1, 0, 2, True), "FRD": (1, 0, 2, True), "ENU": (0, 1, 2, False),
     "camera": (0, 2, 1, True), "unknown": (0, 1, 2, False),
 }  # fmt: skip
@@ -80,7 +74,7 @@ class View(NamedTuple):
 
 def views(score: Evaluation) -> list[View]:
     """From above; and from the side where the path is not flat."""
-    across, up, vertical, down = _AXES[score.reference.frame]
+    across, up, vertical, down = AXES[score.reference.frame]
     names = AXES_OF_FRAME[score.reference.frame]
     extent = np.maximum(np.ptp(score.reference_m, axis=0), np.ptp(score.estimate_m, axis=0))
     level = across if extent[across] >= extent[up] else up
@@ -230,13 +224,6 @@ def way(axes: Axes, seen: Array, time_s: Array, **style: Any) -> None:
 
 
 # ---------------------------------------------------------------------------------------- words
-
-
-def print_evaluation(console: Console, score: Evaluation) -> None:
-    """Print the scores of one trajectory against another."""
-    page = Page()
-    write_evaluation(page, score)
-    show(console, page.blocks)
 
 
 def metres(value: float) -> str:

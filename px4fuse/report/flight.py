@@ -1,25 +1,30 @@
-"""The flight along the main axis, both filters on one time axis; and the other axes beside it."""
+"""The flight along the main axis, both filters on one time axis: tracks, innovations, variances.
+
+Besides, a zoom into predict and update, and the other axes beside the main one.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
+import numpy as np
 import pandas as pd
 
-from px4fuse.comparison.model import Difference
+from px4fuse.comparison.events import Span
+from px4fuse.comparison.model import AxisComparison, Difference
+from px4fuse.filter.signals import Segment
 from px4fuse.flight import Unavailable
-from px4fuse.report import marks, panels
+from px4fuse.report import marks, panels, style
 from px4fuse.report.document import Document
 from px4fuse.report.page import WIDTH, Page
-from px4fuse.report.style import LINES, MEASURED, OURS_BAND
+from px4fuse.report.style import EKF2, LINES, OURS, Artist, Axes
 from px4fuse.report.why import nothing_concluded
-from px4fuse.report.words import filters, verdict_words
-
-if TYPE_CHECKING:
-    from matplotlib.artist import Artist
+from px4fuse.report.words import filters, verdict_notes, verdict_words
 
 GAP = 14.0  # points between columns
+ZOOM_UPDATES = 15
+ZOOM_LEAST_S = 1.0
+ZOOM = 125.0  # height of the axes in points
 
 
 def draw(document: Document) -> Iterator[Page]:
@@ -46,14 +51,105 @@ def _legend(page: Page, document: Document) -> None:
 
     result = document.analysis.main
     lines: list[Artist] = [
-        Line2D([], [], **{**MEASURED, "ms": 5.0}, label="measurement"),
+        Line2D([], [], **{**style.MEASURED, "ms": 5.0}, label="measurement"),
         Line2D([], [], **LINES["ours"], label="ours"),
-        Patch(facecolor=OURS_BAND, lw=0, label="ours ±2σ"),
+        Patch(facecolor=style.OURS_BAND, lw=0, label="ours ±2σ"),
     ]
     for name, frame in (("EKF2", result.ekf2_state), ("truth", result.truth)):
         if isinstance(frame, pd.DataFrame):
             lines.append(Line2D([], [], **LINES[name], label=name))
     page.legend(lines, marks.handles(document))
+
+
+def draw_innovations(document: Document) -> Iterator[Page]:
+    """Draw one page: innovations, σ_p and σ_v on one time axis, then a zoom."""
+    result = document.analysis.main
+    page = Page(f"Innovations and variances along {result.axis.called}")
+    for panel in (panels.INNOVATIONS, panels.SIGMA_P, panels.SIGMA_V):
+        last, first = panel is panels.SIGMA_V, panel is panels.INNOVATIONS
+        panel.put(page, document, result, last=last, strip=first)
+    _zoom(page, document)
+    for note in verdict_notes(document.analysis):
+        page.numbers(note)
+    yield page
+
+
+def _zoom(page: Page, document: Document) -> None:
+    """Predict and update, seen near."""
+    result = document.analysis.main
+    start_s, end_s = window = zoom_window(result, document.analysis.segment)
+    title = f"σ of position (m), {end_s - start_s:.1f} s of the flight"
+    axes = page.panel(title, zoom_words(result), ZOOM)
+    _sawtooth(axes, result, window)
+    updates = result.replay.updates.loc[start_s:end_s].index
+    axes.vlines(
+        updates, 0.0, 0.03, transform=axes.get_xaxis_transform(), color=style.MEASUREMENT, lw=1.2
+    )
+    axes.set_xlabel(style.TIME_LABEL)
+    shown = []
+    if isinstance(result.ekf2_innovations, pd.DataFrame):
+        shown += ["triangle up just before an update", "down just after"]
+    if isinstance(result.ekf2_variance, pd.DataFrame):
+        shown.append("square as logged")
+    ekf2 = f" EKF2: {', '.join(shown)}." if shown else ""
+    page.numbers(f"Line: our filter, predict and update; grey ticks: measurements.{ekf2}")
+
+
+def zoom_window(result: AxisComparison, segment: Segment) -> Span:
+    """Part of the flight with about fifteen updates, near the middle of what EKF2 logged too.
+
+    That middle is a measurement, so that the part does not lie in a gap of the source.
+    """
+    times = result.replay.updates.index.to_numpy()
+    if len(times) < 2:
+        return segment.start_s, min(segment.start_s + ZOOM_LEAST_S, segment.end_s)
+    interval = float(np.median(np.diff(times)))
+    count = min(max(ZOOM_UPDATES, round(ZOOM_LEAST_S / interval)), len(times) - 1)
+    spans = times[count:] - times[:-count]
+    middle = float(times[len(times) // 2])
+    if isinstance(result.ekf2_innovations, pd.DataFrame) and len(result.ekf2_innovations):
+        middle = float(result.ekf2_innovations.index[len(result.ekf2_innovations) // 2])
+    start = np.argmin(np.abs(times[:-count] + spans / 2.0 - middle))
+    return float(times[start]), float(times[start + count])
+
+
+def _sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
+    """σ_p with both values at each update, just before and just after."""
+    updates, steps = result.replay.updates, result.replay.steps
+    prior, after_each = updates["prior_position_variance_m2"], steps["position_variance_m2"]
+    # stable, so that the prior stands first at equal times
+    both = pd.concat([prior, after_each]).sort_index(kind="stable").loc[slice(*window)]
+    axes.plot(both.index, np.sqrt(both), color=OURS, lw=1.1, marker=".", ms=2.4, mew=0)
+    if isinstance(result.ekf2_innovations, pd.DataFrame):
+        ekf2 = result.ekf2_innovations.loc[slice(*window)].dropna(subset=["prior_variance_m2"])
+        before, after = np.sqrt(ekf2["prior_variance_m2"]), np.sqrt(ekf2["posterior_variance_m2"])
+        axes.vlines(ekf2.index, after, before, color=EKF2, lw=1.0)
+        axes.plot(before, ls="none", marker="^", ms=3.6, mew=0.7, mfc="none", color=EKF2)
+        axes.plot(after, ls="none", marker="v", ms=3.6, mew=0, color=EKF2)
+    if isinstance(result.ekf2_variance, pd.DataFrame):
+        logged = np.sqrt(result.ekf2_variance["position_variance_m2"].loc[slice(*window)])
+        axes.plot(logged, ls="none", marker="s", ms=3.0, mew=0.7, mfc="white", color=EKF2)
+    axes.set_xlim(*window)
+
+
+def zoom_words(result: AxisComparison) -> str:
+    """What to see in the zoom."""
+    said = []
+    for name, one in filters(result).items():
+        before, after = one.sigma_p_before_update_m, one.sigma_p_after_update_m
+        if before is None or after is None:
+            said += ["EKF2: S or R not logged, so no before and after"] if name == "EKF2" else []
+            continue
+        shrink = 1.0 - after**2 / before**2
+        shrinks = f"{name} {before:.3f} to {after:.3f} m, {shrink:.0%} of the variance"
+        if name == "ours":
+            shrinks = (
+                f"Without measurement σ grows, by SIGMA_A "
+                f"{result.replay.settings.sigma_a_m_s2:g} m/s² (predict); each measurement shrinks "
+                f"it ({shrinks})"
+            )
+        said.append(shrinks)
+    return f"{'; '.join(said)}." if said else ""
 
 
 def draw_other_axes(document: Document) -> Iterator[Page]:

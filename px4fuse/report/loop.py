@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from px4fuse.findings import Finding, by_root
 from px4fuse.flight import Unavailable
@@ -21,17 +20,12 @@ from px4fuse.report.cover import write_finding
 from px4fuse.report.document import Document, LoopDocument, who
 from px4fuse.report.evaluation import interval_words, score_words, way
 from px4fuse.report.page import AXIS_LABEL, TICKS, Cell, Page, appendix
-from px4fuse.report.screen import show
-from px4fuse.report.style import EKF2, LINES, MUTED, OURS, as_map
-from px4fuse.request import LoopRequest
+from px4fuse.report.style import EKF2, LINES, MUTED, OURS, Axes, as_map
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import MANY_CLOSURES, SOLUTIONS, SolvedGraph
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 from px4fuse.trajectory.model import AXES_OF_FRAME, in_words
 from px4fuse.trajectory.scores import Interval, Statistics
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 MOST_ROWS = 10  # of rejected closures
 GREEN, RED = "#3a7d5c", style.SEVERITY_COLOURS["error"]
@@ -71,10 +65,10 @@ def draw(document: Document) -> Iterator[Page]:
 def draw_report(document: LoopDocument) -> Iterator[Page]:
     """Draw the page of a report on a loop alone, with its findings."""
     page = Page(TITLE, LEAD)
-    if student := who(document.student, ", "):
+    if student := who(document.results.student, ", "):
         page.labelled("Student", student)
     page.labelled("SHA-256", document.loop.odometry.trajectory.sha256)
-    _write(page, document.loop, document.findings)
+    _write(page, document.loop, document.results.findings)
     yield page
 
 
@@ -137,16 +131,14 @@ def _reference(axes: Axes, loop: Loop) -> None:
 # ---------------------------------------------------------------------------------------- words
 
 
-def print_loop(
-    console: Console, loop: Loop, findings: tuple[Finding, ...], request: LoopRequest
-) -> None:
-    """Print what was found about a loop."""
+def summary(loop: Loop, findings: tuple[Finding, ...]) -> Page:
+    """What was found about a loop."""
     page = Page()
     write_loop(page, loop)
     write_scores(page, loop)
     for group in by_root(findings):
         write_finding(page, group)
-    show(console, page.blocks, request)
+    return page
 
 
 def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
@@ -304,8 +296,8 @@ def moved_words(correction: CorrectedPath) -> str:
     return f"{correction.moved_rms_m:.2f} / {correction.moved_max_m:.2f}"
 
 
-def print_graph(console: Console, solved: SolvedGraph) -> None:
-    """Print how a pose graph was solved, and the closures that the gate rejects."""
+def graph_summary(solved: SolvedGraph) -> Page:
+    """How a pose graph was solved, and the closures that the gate rejects."""
     page = Page()
     page.labelled(
         "Graph",
@@ -334,4 +326,4 @@ def print_graph(console: Console, solved: SolvedGraph) -> None:
     ]  # fmt: skip
     head = ("path", "cost before", "cost", "iterations", "closures dropped")
     page.table(head, rows, right=(1, 2, 3, 4))
-    show(console, page.blocks)
+    return page

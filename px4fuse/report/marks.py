@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,11 +11,7 @@ from px4fuse.arrays import Array
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page
-from px4fuse.report.style import EKF2_REJECTED, MUTED, time_axis
-
-if TYPE_CHECKING:
-    from matplotlib.artist import Artist
-    from matplotlib.axes import Axes
+from px4fuse.report.style import EKF2_REJECTED, MUTED, Artist, Axes, time_axis
 
 # Bands differ in grey by hatch and depth; marks stand on lines at the foot of the axes, resets
 # hang from their top

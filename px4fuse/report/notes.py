@@ -41,13 +41,13 @@ SYMBOLS = {
 
 def draw(document: Document | AidsDocument | LoopDocument) -> Iterator[Page]:
     """Draw as many pages as the form and the notes need; none without both."""
-    title, answers = "What the student found", document.student.answers
+    title, answers = "What the student found", document.results.student.answers
     page = Page(appendix(title) if isinstance(document, Document) else title)
     if isinstance(answers, Answers):
         page.heading("The form, as it was filled in")
         rows = [list(row) for row in form_rows(answers)]
         page.table(("Asked", "Answer"), rows, shares=[3.0, 4.0], size=TABLE_SIZE)
-    write(page, document.student.notes)
+    write(page, document.results.student.notes)
     if len(page.blocks) > 1:
         yield page
 

@@ -9,13 +9,9 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from px4fuse.report.style import MUTED
-
-if TYPE_CHECKING:
-    from matplotlib.artist import Artist
-    from matplotlib.axes import Axes
+from px4fuse.report.style import MUTED, Artist, Axes
 
 # Points: width of the text, of the numbers beside an axes, of the labels before sentences
 WIDTH, AXIS_LEFT, LABEL = 512.0, 26.0, 52.0
@@ -73,6 +69,11 @@ class Page:
         beside = [words(text, size) if isinstance(text, str) else text for text in texts]
         looks = words(label, size, colour, bold)
         self.add("labelled", label=looks, texts=beside, width=width, above=above)
+
+    def advice(self, texts: Mapping[str, str], size: float = 8.0) -> None:
+        """Write sentences, each with its label."""
+        for label, text in texts.items():
+            self.labelled(label, text, size=size)
 
     def table(
         self, head: Sequence[str], rows: Sequence[Sequence[Cell]], *,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -16,11 +16,8 @@ from px4fuse.plain import capital
 from px4fuse.report import marks, style
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page
-from px4fuse.report.style import DOTS, LINES, band, curve, log_ticks
+from px4fuse.report.style import DOTS, LINES, Axes, band, curve, log_ticks
 from px4fuse.report.words import filters, verdict_words
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 NARROW = 72.0  # points: height of the axes in a column of three
 # The axes of innovations reach this much beyond 2√S, or beyond 99 % of the innovations if that is

@@ -24,7 +24,6 @@ from px4fuse.report import (
     evaluation,
     flight,
     fonts,
-    innovations,
     loop,
     notes,
     provenance,
@@ -50,7 +49,7 @@ RESULTS_NAME = "results.json"
 STANDARDS: list[Any] = ["a-3a", "ua-1"]
 PAGES: Mapping[type, tuple[Callable[[Any], Iterator[Page]], ...]] = {
     Document: (
-        cover.draw, flight.draw, innovations.draw, why.draw, flight.draw_other_axes,
+        cover.draw, flight.draw, flight.draw_innovations, why.draw, flight.draw_other_axes,
         consistency.draw, sensitivity.draw, clock.draw, aids.draw, loop.draw, notes.draw,
         provenance.draw,
     ),
@@ -101,7 +100,7 @@ def render(document: Report, results_json: str) -> bytes:
     made_by = f"px4fuse {metadata.version('px4fuse')}"
     student = ""
     if isinstance(document, Document | AidsDocument | LoopDocument):
-        student = who(document.student, " · ")
+        student = who(document.results.student, " · ")
     # figures have no text of others
     words = title + name + student + json.dumps(written, ensure_ascii=False, default=repr)
     return compiled(

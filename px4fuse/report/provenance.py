@@ -13,7 +13,6 @@ from px4fuse.report.page import Page
 from px4fuse.report.style import MUTED
 from px4fuse.report.words import alignment_words, clock_words
 from px4fuse.request import with_options
-from px4fuse.results.model import provenance
 
 INDENT, SIZE = 140.0, 7.5
 
@@ -95,9 +94,7 @@ def draw_loop(document: LoopDocument) -> Iterator[Page]:
 
 def _begin(title: str, document: Document | AidsDocument | LoopDocument) -> Page:
     """A page that begins with what the report was made with."""
-    page, student = Page(title), document.student
-    made = None if isinstance(document, AidsDocument) else document.made
-    made = provenance(document.command) if made is None else made
+    page, student, made = Page(title), document.results.student, document.results.provenance
     facts = {
         "command": made.command,
         "px4fuse": f"{made.px4fuse} on Python {made.python}",

@@ -9,7 +9,7 @@ Words are made without knowing where the log lies, and a report names no folder.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import zip_longest
 from typing import Literal
 
@@ -19,7 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from px4fuse.errors import on_one_line
-from px4fuse.report.page import Block
+from px4fuse.report.page import Block, Cell
 from px4fuse.report.style import GOOD, MUTED, SEVERITY_COLOURS
 from px4fuse.request import (
     OPTIONS,
@@ -58,13 +58,11 @@ def show(console: Console, blocks: Iterable[Block], request: Request | None = No
             case "labelled":
                 _show_labelled(console, block, request)
             case "table":
-                table = plain_table(
-                    *((head, "right" if at in block["right"] else "left")
-                      for at, head in enumerate(block["head"]))
-                )  # fmt: skip
-                for row in block["rows"]:
-                    table.add_row(*map(_cell, row))
-                console.print(table)
+                console.print(_table(**block))
+            case "command":
+                print_command(console, block["text"], block["label"])
+            case "blank":
+                console.print()
             case "beside":
                 for column in block["columns"]:
                     show(console, column, request)
@@ -129,10 +127,6 @@ def _styled(block: Block) -> Text:
     return Text(block["text"], f"{style} bold" if block["weight"] == "bold" else style)
 
 
-def _cell(cell: str | tuple[str, str]) -> Text:
-    return Text(cell) if isinstance(cell, str) else Text(cell[0], STYLES.get(cell[1], ""))
-
-
 def say(console: Console, text: str | Text, head: str | Text = "", indent: int = 0) -> None:
     """Print a paragraph.
 
@@ -167,21 +161,16 @@ def print_file(console: Console, label: str, path: object) -> None:
     console.print(Text(f"{label:{INDENT}}{on_one_line(str(path))}", "bold"), soft_wrap=True)
 
 
-def plain_table(*heads: tuple[str, str]) -> Table:
-    """A table without lines.
-
-    Parameters
-    ----------
-    *heads : tuple of (str, str)
-        Head of each column, whose lines are its group, name and unit, and "left" or "right".
-    """
-    vertical: Literal["bottom", "top"] = "top"
-    if any("\n" in head for head, _ in heads):
-        vertical = "bottom"
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
-    for head, justify in heads:
-        table.add_column(
-            Text(head), justify="left" if justify == "left" else "right", overflow="fold",
-            vertical=vertical,
-        )  # fmt: skip
-    return table
+def _table(
+    head: Sequence[str], rows: Iterable[Iterable[Cell]], right: Sequence[int], **_: object
+) -> Table:
+    """A table without lines; of a head the lines are its group, name and unit."""
+    made = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
+    vertical: Literal["bottom", "top"] = "bottom" if any("\n" in one for one in head) else "top"
+    for at, one in enumerate(head):
+        side: Literal["right", "left"] = "right" if at in right else "left"
+        made.add_column(Text(one), justify=side, overflow="fold", vertical=vertical)
+    for row in rows:
+        texts = [(cell, "") if isinstance(cell, str) else cell for cell in row]
+        made.add_row(*(Text(text, STYLES.get(colour, "")) for text, colour in texts))
+    return made

@@ -17,8 +17,13 @@ from px4fuse.arrays import Array
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
+    from matplotlib.colors import Colormap
+else:  # matplotlib costs a third of a second: not where words alone are shown
+    Artist = Axes = Colormap = Any
+__all__ = ["Artist", "Axes", "Colormap"]  # of matplotlib, for annotations
 
 FONT = "DejaVu Sans"
 SHEET = Path(__file__).with_name("report.mplstyle")

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
-from rich.console import Console
-
 from px4fuse.ekf2.walk import Why
 from px4fuse.findings import by_root
 from px4fuse.report.aids import write_alone, write_appendix
 from px4fuse.report.cover import facts, write_finding
 from px4fuse.report.document import AidsDocument, Document
 from px4fuse.report.page import Page
-from px4fuse.report.screen import show
 from px4fuse.report.style import MUTED
 from px4fuse.report.why import write_why
 from px4fuse.report.words import verdict_notes, write_errors
-from px4fuse.request import Request
 
 MOST_FINDINGS = 4
 LEGEND = "Apart: ours - EKF2, RMS of position and velocity. NIS in the band: consistent."
@@ -24,27 +18,20 @@ LEGEND = "Apart: ours - EKF2, RMS of position and velocity. NIS in the band: con
 FACTS = ("Filter", "Position", "Placed", "Segment")
 
 
-def print_summary(
-    console: Console, document: Document, request: Request, report: object = None
-) -> None:
-    """Print the summary of one comparison.
+def summary(document: Document, report: object = None) -> Page:
+    """The summary of one comparison.
 
     Parameters
     ----------
-    console : Console
-        Standard output.
     document : Document
-    request : Request
-        As it was typed: the commands that are printed run.
     report : Path, optional
         Where the report was written.
     """
     analysis, page = document.analysis, Page()
-    for sentence in document.story:
+    for sentence in document.results.story:
         page.write(sentence)
-    show(console, page.blocks)
-    console.print()
-    log, page = analysis.flight.log, Page()
+    page.add("blank")
+    log = analysis.flight.log
     names = " + ".join([log.name, *(file.name for file in analysis.flight.inputs)])
     page.labelled("Log", f"{names}, {log.firmware}, {log.duration_s:.1f} s")
     for label, text in facts(document).items():
@@ -54,31 +41,23 @@ def print_summary(
     for note in (LEGEND, *verdict_notes(analysis)):
         page.write(note, colour=MUTED)
     why = analysis.why.get(analysis.main.axis.name)
-    is_told = isinstance(why, Why) and why.cause in document.story
+    is_told = isinstance(why, Why) and why.cause in document.results.story
     if why is not None and not is_told:
         write_why(page, why)
     write_appendix(page, document)
-    if not document.findings:
+    if not document.results.findings:
         page.write("No findings.")
-    groups = by_root(document.findings)
+    groups = by_root(document.results.findings)
     for group in groups[:MOST_FINDINGS]:
         write_finding(page, group)
     if (more := len(groups) - MOST_FINDINGS) > 0:
         page.write(f"and {more} more in the report" if report else f"and {more} more")
-    show(console, page.blocks, request)
+    return page
 
 
-def print_aids(console: Console, document: AidsDocument) -> None:
-    """Print the summary of a flight without a position source."""
+def aids_summary(document: AidsDocument) -> Page:
+    """The summary of a flight without a position source."""
     page, log = Page(), document.alone.flight.log
     page.labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
     write_alone(page, document)
-    show(console, page.blocks)
-
-
-def print_advice(console: Console, advice: Mapping[str, str], request: Request) -> None:
-    """Print labels and sentences, with the commands in them in full."""
-    page = Page()
-    for label, text in advice.items():
-        page.labelled(label, text)
-    show(console, page.blocks, request)
+    return page

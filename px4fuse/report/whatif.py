@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 
-from rich.console import Console
-
 from px4fuse.analysis import Counterfactual
 from px4fuse.ekf2.replay import HORIZONTAL
 from px4fuse.ekf2.whatif import DISTURBED_M, MOST_REJECTED, Summary
@@ -16,7 +14,6 @@ from px4fuse.flight import Unavailable
 from px4fuse.plain import number_words
 from px4fuse.report.document import WhatIfDocument
 from px4fuse.report.page import Page
-from px4fuse.report.screen import show
 from px4fuse.report.why import agreement_words, write_why
 
 SIZE = 8.0
@@ -155,26 +152,19 @@ def draw(document: WhatIfDocument) -> Iterator[Page]:
         "EKF2 replayed from the log by px4fuse's model of it, which is not PX4's own code: as "
         "flown, and with other parameters. All columns are judged over the same times.",
     )
-    page.labelled("Command", document.command)
+    page.labelled("Command", document.results.provenance.command)
     _tables(page, document.made_of)
     yield page
 
 
-def print_what_if(console: Console, made_of: Counterfactual) -> None:
-    """Print EKF2 as logged, as replayed and with other parameters, and a sweep where there is one.
-
-    Parameters
-    ----------
-    console : Console
-        Standard output.
-    made_of : Counterfactual
-    """
+def summary(made_of: Counterfactual) -> Page:
+    """EKF2 as logged, as replayed and with other parameters, and a sweep where there is one."""
     page = Page()
     if AISLE in made_of.why:
         write_why(page, made_of.why[AISLE])
     _tables(page, made_of)
     page.write("Replays are of px4fuse's model of EKF2, not of PX4's own code.")
-    show(console, page.blocks)
+    return page
 
 
 def _tables(page: Page, made_of: Counterfactual) -> None:

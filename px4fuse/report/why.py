@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,10 +17,7 @@ from px4fuse.plain import capital
 from px4fuse.report import marks
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page, halves
-from px4fuse.report.style import EKF2, EKF2_BAND, LINES, MUTED, OURS, OURS_BAND, curve
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from px4fuse.report.style import EKF2, EKF2_BAND, LINES, MUTED, OURS, OURS_BAND, Axes, curve
 
 TITLE = "Why EKF2 differs"
 LEAD = (

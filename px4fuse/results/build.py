@@ -12,11 +12,11 @@ from px4fuse.analysis import AidsAlone, Analysis, Counterfactual
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
-from px4fuse.findings import Finding
+from px4fuse.findings import find, find_aids
 from px4fuse.findings.story import story
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.record import written
-from px4fuse.request import AxisName, ComparisonRequest, WhatIfRequest
+from px4fuse.request import AxisName, ComparisonRequest, WhatIfRequest, command_line
 from px4fuse.results.comparison import AvailableTrack, ChosenSettings, Log, PositionSource
 from px4fuse.results.contract import (
     AIDS,
@@ -28,19 +28,16 @@ from px4fuse.results.contract import (
     TuningResults,
     WhatIfResults,
 )
-from px4fuse.results.model import Student, provenance, schema_of
+from px4fuse.results.model import NOBODY, Student, provenance, schema_of
 
 
 def results(
-    request: ComparisonRequest,
-    analysis: Analysis,
-    findings: tuple[Finding, ...],
-    student: Student,
-    command: str,
+    request: ComparisonRequest, analysis: Analysis, student: Student = NOBODY
 ) -> ComparisonResults:
     """Everything that the report says."""
+    findings = find(analysis)
     return ComparisonResults(
-        **_of_flight(COMPARISON, request, analysis, command),
+        **_of_flight(COMPARISON, request, analysis),
         axes={cast(AxisName, name): written(axis) for name, axis in analysis.axes.items()},
         horizontal=dict(analysis.horizontal),
         tuning=written(analysis.tuning),
@@ -60,11 +57,7 @@ def results(
 
 
 def aids_results(
-    request: ComparisonRequest,
-    alone: AidsAlone,
-    findings: tuple[Finding, ...],
-    student: Student,
-    command: str,
+    request: ComparisonRequest, alone: AidsAlone, student: Student = NOBODY
 ) -> AidsResults:
     """What ``px4fuse compare`` found on a flight without a position source."""
     return AidsResults(
@@ -72,10 +65,10 @@ def aids_results(
         request=request.recorded(),
         log=log_part(alone.flight),
         aids=dict(alone.aids),
-        findings=findings,
+        findings=find_aids(alone.aids),
         missing=(alone.lacking, *alone.flight.missing),
         student=student,
-        provenance=provenance(command),
+        provenance=provenance(command_line(request)),
     )
 
 
@@ -83,25 +76,21 @@ def tuning_results(
     request: ComparisonRequest,
     comparison: Comparison,
     tuned: Mapping[str, AxisTuning | Unavailable],
-    command: str,
 ) -> TuningResults:
     """What ``px4fuse tune`` found."""
-    begun = _of_flight("px4fuse-tuning", request, comparison, command)
+    begun = _of_flight("px4fuse-tuning", request, comparison, "tune")
     return TuningResults(**begun, tuning=written(tuned))
 
 
 def sync_results(
-    request: ComparisonRequest,
-    comparison: Comparison,
-    clock: ClockOffset | Unavailable,
-    command: str,
+    request: ComparisonRequest, comparison: Comparison, clock: ClockOffset | Unavailable
 ) -> SyncResults:
     """What ``px4fuse sync`` found."""
-    begun = _of_flight("px4fuse-sync", request, comparison, command)
+    begun = _of_flight("px4fuse-sync", request, comparison, "sync")
     return SyncResults(**begun, clock=written(clock))
 
 
-def whatif_results(request: WhatIfRequest, made_of: Counterfactual, command: str) -> WhatIfResults:
+def whatif_results(request: WhatIfRequest, made_of: Counterfactual) -> WhatIfResults:
     """What ``px4fuse whatif`` found."""
     found = made_of.whatif
     first = made_of.first
@@ -117,7 +106,7 @@ def whatif_results(request: WhatIfRequest, made_of: Counterfactual, command: str
         whatif=found.whatif[0] if first else None,
         sweep=found.whatif[first:],
         notes=found.notes,
-        provenance=provenance(command),
+        provenance=provenance(command_line(request)),
     )
 
 
@@ -127,7 +116,7 @@ def log_part(flight: Flight) -> Log:
 
 
 def _of_flight(
-    name: str, request: ComparisonRequest, comparison: Comparison, command: str
+    name: str, request: ComparisonRequest, comparison: Comparison, command: str | None = None
 ) -> dict[str, Any]:
     """What the results of every command on one flight's comparison have in common."""
     track, segment, settings = comparison.source, comparison.segment, comparison.settings
@@ -167,5 +156,5 @@ def _of_flight(
             end_s=segment.end_s,
             segment_reason=segment.reason,
         ),
-        "provenance": provenance(command),
+        "provenance": provenance(command_line(request, command)),
     }

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from msgspec import structs
 
-from px4fuse.findings import Finding
+from px4fuse.findings import find_loop
 from px4fuse.loop.loop import Loop
 from px4fuse.record import written
-from px4fuse.request import LoopRequest
+from px4fuse.request import EvaluationRequest, LoopRequest, command_line
 from px4fuse.results.contract import LOOP, EvaluationResults, GraphResults, LoopResults
-from px4fuse.results.model import Student, provenance, schema_of
+from px4fuse.results.model import NOBODY, Student, provenance, schema_of
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import SolvedGraph
 
 
-def loop_results(
-    request: LoopRequest, loop: Loop, findings: tuple[Finding, ...], student: Student, command: str
-) -> LoopResults:
+def loop_results(request: LoopRequest, loop: Loop, student: Student = NOBODY) -> LoopResults:
     """What ``px4fuse loop`` found."""
     return LoopResults(
         schema=schema_of(LOOP),
@@ -24,19 +22,19 @@ def loop_results(
         track=loop.odometry.trajectory.track(),
         references=tuple(reference.track() for reference in loop.references),
         loop=written(loop),
-        findings=findings,
+        findings=find_loop(loop),
         student=student,
-        provenance=provenance(command),
+        provenance=provenance(command_line(request)),
     )
 
 
-def evaluation_results(score: Evaluation, command: str) -> EvaluationResults:
+def evaluation_results(request: EvaluationRequest, score: Evaluation) -> EvaluationResults:
     """What ``px4fuse evaluate`` found."""
     return EvaluationResults(
         schema=schema_of("px4fuse-evaluation"),
         estimate=score.estimate.track(),
         reference=score.reference.track(),
-        provenance=provenance(command),
+        provenance=provenance(command_line(request)),
         **structs.asdict(written(score)),
     )
 

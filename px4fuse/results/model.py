@@ -46,6 +46,9 @@ class Student(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     answers: Answers | msgspec.UnsetType = msgspec.UNSET
 
 
+NOBODY = Student()
+
+
 class Provenance(Record, frozen=True):
     """Versions and the command line; nothing else of the machine is recorded.
 

@@ -19,7 +19,6 @@ from msgspec.structs import replace
 
 from px4fuse.errors import Px4FuseError, ResultsError, SettingsError
 from px4fuse.report.document import Document, LoopDocument
-from px4fuse.request import command_line
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json
 from px4fuse.results.model import LIBRARIES, Provenance
 from px4fuse.results.reading import one_line
@@ -134,10 +133,9 @@ def split_part(source: str) -> tuple[str, str]:
 
 def _compared(handed_in: ComparisonResults, place: _Place) -> Recomputed:
     from px4fuse.analysis import run  # noqa: PLC0415
-    from px4fuse.findings import find  # noqa: PLC0415
     from px4fuse.results.build import results  # noqa: PLC0415
 
-    recorded, person = handed_in.request, handed_in.student
+    recorded = handed_in.request
     joined = {file.role: file.sha256 for file in handed_in.log.joined}
     request = replace(recorded, log=str(place(recorded.log, handed_in.log.sha256, "the log")))
     if (mavlink := recorded.mavlink) is not None:
@@ -147,17 +145,15 @@ def _compared(handed_in: ComparisonResults, place: _Place) -> Recomputed:
         placed = place(position.path, joined.get("position"), "--position")
         request = replace(request, position=replace(position, path=str(placed)))
     analysis = run(request)
-    document = Document(analysis, find(analysis), person, command_line(recorded))
-    found = results(recorded, analysis, document.findings, person, document.command)
-    return Recomputed(found, partial(_drawn, document, to_json(found), handed_in.provenance))
+    document = Document(analysis, results(recorded, analysis, handed_in.student))
+    return Recomputed(document.results, partial(_drawn, document, handed_in.provenance))
 
 
 def _looped(handed_in: LoopResults, place: _Place) -> Recomputed:
     from px4fuse.analysis import run_loop  # noqa: PLC0415
-    from px4fuse.findings import find_loop  # noqa: PLC0415
     from px4fuse.results.build_trajectories import loop_results  # noqa: PLC0415
 
-    recorded, person = handed_in.request, handed_in.student
+    recorded = handed_in.request
     path, part = split_part(recorded.source)
     placed = place(path, handed_in.track.sha256, "the log")
     request = replace(recorded, source=f"{placed}{part}")
@@ -167,14 +163,15 @@ def _looped(handed_in: LoopResults, place: _Place) -> Recomputed:
         placed = place(path, sha256, "--reference")
         request = replace(request, reference=f"{placed}{part}")
     found = run_loop(request)
-    document = LoopDocument(found, find_loop(found), person, command_line(recorded))
-    made = loop_results(recorded, found, document.findings, person, document.command)
-    return Recomputed(made, partial(_drawn, document, to_json(made), handed_in.provenance))
+    document = LoopDocument(found, loop_results(recorded, found, handed_in.student))
+    return Recomputed(document.results, partial(_drawn, document, handed_in.provenance))
 
 
-def _drawn(document: Document | LoopDocument, text: str, versions: Provenance) -> bytes:
+def _drawn(document: Document | LoopDocument, versions: Provenance) -> bytes:
     """Draw the report with the versions that were recorded."""
     from px4fuse.report.pdf import render  # noqa: PLC0415
 
-    made = replace(versions, command=document.command)
-    return render(replaced(document, made=made), text)
+    made = replace(versions, command=document.results.provenance.command)
+    shown = replace(document.results, provenance=made)
+    drawn = replaced(document, results=shown)  # type: ignore[arg-type]
+    return render(drawn, to_json(document.results))

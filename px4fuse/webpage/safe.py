@@ -31,13 +31,18 @@ def clean(text: str, most: int = MAX_CHARACTERS) -> str:
     return HARMFUL.sub("\N{REPLACEMENT CHARACTER}", text)
 
 
-def cleaned(value: Any) -> Any:
-    """The same with every text in it clean; a picture in an address is not cut."""
+def cleaned(value: Any, most: int = MAX_CHARACTERS) -> Any:
+    """The same with every text in it clean, and numbers of numpy as Python's.
+
+    A picture in an address is not cut.
+    """
     if isinstance(value, str):
-        return clean(value, len(value) if value.startswith(PICTURE) else MAX_CHARACTERS)
+        return clean(value, len(value) if value.startswith(PICTURE) else most)
     if isinstance(value, dict):
-        return {name: cleaned(part) for name, part in value.items()}
-    return [cleaned(part) for part in value] if isinstance(value, list | tuple) else value
+        return {clean(str(name), most): cleaned(part, most) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [cleaned(part, most) for part in value]
+    return value.item() if hasattr(value, "item") else value
 
 
 def escaped(text: str) -> str:

@@ -337,17 +337,14 @@ def tried(target: Target, count: int, seed: int, folder: Path) -> Outcome:
 def pipeline(path: Path) -> object:
     """All of ``compare`` but the drawing: findings and results of a log."""
     from px4fuse.analysis import AidsAlone
-    from px4fuse.findings import find, find_aids
     from px4fuse.results.build import aids_results, results
     from px4fuse.results.contract import to_json
-    from px4fuse.results.model import Student
 
     request = ComparisonRequest(log=str(path))
     found = run_or_judge_aids(request)
-    student = Student()
     if isinstance(found, AidsAlone):
-        return to_json(aids_results(request, found, find_aids(found.aids), student, ""))
-    return to_json(results(request, found, find(found), student, ""))
+        return to_json(aids_results(request, found))
+    return to_json(results(request, found))
 
 
 def main() -> None:

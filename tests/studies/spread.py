@@ -28,11 +28,9 @@ from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.filter.settings import Settings
 from px4fuse.fleet.changes import number_changes
-from px4fuse.fleet.measures import Z95, Number, numbers
-from px4fuse.fleet.significance import SPREAD_TABLE
+from px4fuse.fleet.measures import SPREAD_TABLE, Z95, Number, numbers
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
-from px4fuse.results.model import Student
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
@@ -76,7 +74,7 @@ def fly(change: Change, seed: int) -> tuple[Numbers, Numbers]:
     request = ComparisonRequest(
         log=flight.log.name, sigma_a_m_s2=SETTINGS.sigma_a_m_s2, sigma_z_m=SETTINGS.sigma_z_m
     )
-    found = results(request, analysis, (), Student(), "")
+    found = results(request, analysis)
     return numbers(found, analysis), numbers(found)
 
 
