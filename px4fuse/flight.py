@@ -309,8 +309,7 @@ class AidLog:
 def at_times(steps: pd.Series[float], times: pd.Index[float]) -> Array:
     """Values of a step function at some times; before its first step that of the first."""
     at = np.clip(np.searchsorted(steps.index, times, side="right") - 1, 0, None)
-    values: Array = np.asarray(steps, dtype=np.float64)[at]
-    return values
+    return np.asarray(steps, dtype=np.float64)[at]
 
 
 @dataclass(frozen=True)

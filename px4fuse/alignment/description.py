@@ -8,17 +8,10 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import pandas as pd
 
+from px4fuse.alignment import tracks
 from px4fuse.alignment.fitting import MIN_CONCORDANCE, capped_rms
-from px4fuse.alignment.matching import GOOD_CONCORDANCE, Match, is_sound, is_turned
-from px4fuse.alignment.tracks import (
-    EKF2_POSITION,
-    IMU,
-    MIN_MOTION_M,
-    MIN_SAMPLES,
-    NoMatchError,
-    continuous_track,
-    placed_samples,
-)
+from px4fuse.alignment.matching import GOOD_CONCORDANCE, Match, Question, is_sound, is_turned
+from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError
 from px4fuse.arrays import Array
 from px4fuse.flight import Alignment, Flight, Unavailable
 
@@ -34,18 +27,16 @@ MAX_UNIX_DIFFERENCE_S = 60.0  # computers in a lab keep time better than this
 def describe(
     flight: Flight,
     file: PositionRecording,
-    samples: pd.DataFrame,
+    asked: Question,
     match: Match | None,
     frame_option: str | None,
     yaw_deg: float | Literal["auto"] | None,
     clock_offset_s: float | None,
 ) -> tuple[Alignment, pd.DataFrame]:
     """Alignment, with the reason for each of its parts, and the placed samples."""
-    start_to_boot_s = flight.log.boot_time_s - float(samples.index[0])
-    frame, auto = frame_option or file.frame or "", yaw_deg == "auto"
-    yaw_rad = 0.0 if yaw_deg is None or yaw_deg == "auto" else float(np.radians(yaw_deg))
+    samples, frame, auto = asked.samples, asked.frame or "", asked.yaw_rad is None
+    yaw_rad, lag_s = asked.yaw_rad or 0.0, asked.lag_s or 0.0
     yaw_sigma_deg = clock_sigma_s = correlation = None
-    lag_s = 0.0 if clock_offset_s is None else clock_offset_s - start_to_boot_s
     origin_m, reference = np.zeros(3), ""
     yaw_reason, clock_reason = "given with --position-yaw", "given with --clock-offset"
     if yaw_deg is None:
@@ -66,10 +57,10 @@ def describe(
             origin_m = match.fit.origin_m if reference == EKF2_POSITION else origin_m
         if clock_offset_s is None:
             lag_s, clock_sigma_s = match.clock.lag_s, match.clock.lag_sigma_s
-            clock_offset_s = lag_s + start_to_boot_s
+            clock_offset_s = lag_s + (flight.log.boot_time_s - float(samples.index[0]))
             clock_reason = f"matched with {reference}, so that a delay of that is part of it"
         correlation = float((np.exp(-1j * yaw_rad) * match.clock.coherence).real)
-    placed = placed_samples(samples, frame, yaw_rad, origin_m, lag_s)
+    placed = tracks.placed_samples(samples, frame, yaw_rad, origin_m, lag_s)
     compared = None if reference == IMU else _compare(flight, placed)
     if compared:
         reference, correlation = EKF2_POSITION, compared[1]
@@ -109,16 +100,16 @@ def _compare(flight: Flight, placed: pd.DataFrame) -> tuple[Array, float | None]
     if isinstance(flight.ekf2, Unavailable):
         return None
     try:
-        ekf2, known = continuous_track(flight.ekf2, placed).at(placed.index.to_numpy())
+        ekf2, known = tracks.continuous_track(flight.ekf2, placed).at(placed.index.to_numpy())
     except NoMatchError:
         return None
-    if np.count_nonzero(known) < MIN_SAMPLES:
+    if np.count_nonzero(known) < tracks.MIN_SAMPLES:
         return None
     ours = (placed["north_m"].to_numpy() + 1j * placed["east_m"].to_numpy())[known]
     theirs = (ekf2[:, 0] + 1j * ekf2[:, 1])[known]
     distance_m = np.abs(ours - theirs)
     ours, theirs = ours - np.mean(ours), theirs - np.mean(theirs)
-    moves = max(np.ptp(theirs.real), np.ptp(theirs.imag)) >= MIN_MOTION_M
+    moves = max(np.ptp(theirs.real), np.ptp(theirs.imag)) >= tracks.MIN_MOTION_M
     power = float(np.linalg.norm(ours) * np.linalg.norm(theirs))
     return distance_m, float(np.vdot(ours, theirs).real) / power if moves and power > 0.0 else None
 
@@ -142,11 +133,11 @@ def _other_height(flight: Flight, placed: pd.DataFrame) -> Iterator[str]:
         return
     down = flight.ekf2.state["down_m"]
     ours = placed["down_m"].loc[down.index[0] : down.index[-1]].dropna()
-    if len(ours) < MIN_SAMPLES:
+    if len(ours) < tracks.MIN_SAMPLES:
         return
     theirs = np.interp(ours.index, down.index, down)
     moved = min(np.ptp(np.percentile(ours, [2, 98])), np.ptp(theirs))
-    if moved >= MIN_MOTION_M and np.corrcoef(ours, theirs)[0, 1] <= -MIN_MIRRORED:
+    if moved >= tracks.MIN_MOTION_M and np.corrcoef(ours, theirs)[0, 1] <= -MIN_MIRRORED:
         yield (
             "The file's height runs against EKF2's (one rises where the other sinks): its z points "
             "the other way. Give another --position-frame."

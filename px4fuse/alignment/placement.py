@@ -89,10 +89,11 @@ def place(
         )
     yaw_rad = None if yaw_deg == "auto" else float(np.radians(yaw_deg or 0.0))
     try:
-        match = find_match(flight, Question(samples, frame or file.frame, yaw_rad, lag_s))
+        asked = Question(samples, frame or file.frame, yaw_rad, lag_s)
+        match = find_match(flight, asked)
     except NoMatchError as error:
         raise MissingDataError(f"{file.name}: {error}; {spans}", f"{error.remedy}.") from None
-    alignment, placed = describe(flight, file, samples, match, frame, yaw_deg, clock_offset_s)
+    alignment, placed = describe(flight, file, asked, match, frame, yaw_deg, clock_offset_s)
     how = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
     turned = f" turned by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
     track = PositionTrack(

@@ -82,7 +82,7 @@ def evaluate(
     """
     from px4fuse.loop.sources import file_name, read_source
     from px4fuse.report.evaluation import print_evaluation
-    from px4fuse.results.build_trajectories import evaluation_results
+    from px4fuse.results.build import evaluation_results
     from px4fuse.trajectory.evaluation import evaluate as score
 
     request = EvaluationRequest(

@@ -11,6 +11,7 @@ import click
 from px4fuse.cli.inputs import Named, comparison_request, json_option, recording_options
 from px4fuse.cli.outputs import finish, progress, result_files
 from px4fuse.plain import few_words
+from px4fuse.record import Unavailable
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
@@ -66,10 +67,10 @@ def _print(console: Console, inventory: Inventory, request: ComparisonRequest) -
     from px4fuse.request import command_line
 
     page = Page()
-    page.write(inventory.log.name, bold=True)
+    page.write(inventory.flight.log.name, bold=True)
     for label, text in _facts(inventory):
         page.labelled(label, text)
-    if inventory.log.senders:
+    if inventory.flight.log.senders:
         page.table(("sender", "what it is", "messages", "lost"), _senders(inventory), right=(2, 3))
     page.table(SOURCES_HEAD, list(_sources(inventory)), right=(2, 3, 4, 5))
     looks = {True: ("yes", GOOD), False: ("no", SEVERITY_COLOURS["warning"])}
@@ -81,7 +82,9 @@ def _print(console: Console, inventory: Inventory, request: ComparisonRequest) -
     lists = {
         "Next": [f"{one.remedy} ({'; '.join(one.improves)})" for one in inventory.advice],
         "Clocks": _clocks(inventory),
-        "Not used": [f"{one.name}, {one.count} messages: {one.reason}" for one in inventory.unused],
+        "Not used": [
+            f"{one.name}, {one.count} messages: {one.reason}" for one in inventory.flight.unused
+        ],
         "Notes": inventory.notes,
     }
     page = Page()
@@ -92,7 +95,7 @@ def _print(console: Console, inventory: Inventory, request: ComparisonRequest) -
 
 
 def _facts(inventory: Inventory) -> list[tuple[str, str]]:
-    log = inventory.log
+    log = inventory.flight.log
     size = f"{log.bytes / 1e6:.1f} MB" if log.bytes >= 1e5 else f"{log.bytes} bytes"
     version = log.firmware if log.firmware != "unknown" else f"{log.autopilot}, version unknown"
     git = "" if log.firmware_hash == "unknown" else f" (git {log.firmware_hash[:8]})"
@@ -111,7 +114,7 @@ def _facts(inventory: Inventory) -> list[tuple[str, str]]:
         facts.append(("Dropouts", words))
     facts += [
         (file.role.capitalize(), f"{file.name}, SHA-256 {file.sha256[:12]}")
-        for file in inventory.inputs
+        for file in inventory.flight.inputs
     ]
     return facts
 
@@ -122,16 +125,17 @@ def _duration(seconds: float) -> str:
 
 def _start(inventory: Inventory) -> str:
     if inventory.start_utc is None:
-        return f"from {inventory.log.boot_time_s:.1f} s after boot (no UTC in the log)"
+        return f"from {inventory.flight.log.boot_time_s:.1f} s after boot (no UTC in the log)"
     return f"from {inventory.start_utc[:19].replace('T', ' ')} UTC"
 
 
 def _flying(inventory: Inventory) -> str:
-    if inventory.airborne is None:
+    airborne = inventory.flight.airborne
+    if isinstance(airborne, Unavailable):
         return "unknown, no land detector"
-    if not inventory.airborne:
+    if not airborne:
         return "never, by the land detector"
-    spans = [f"{start:.1f} s to {end:.1f} s" for start, end in inventory.airborne]
+    spans = [f"{start:.1f} s to {end:.1f} s" for start, end in airborne]
     return few_words(spans, 3)
 
 
@@ -143,7 +147,7 @@ def _senders(inventory: Inventory) -> list[tuple[str, ...]]:
             f"{sender.messages}",
             "unknown" if sender.lost_share is None else f"{sender.lost_share:.1%}",
         )
-        for sender in inventory.log.senders
+        for sender in inventory.flight.log.senders
     ]
 
 
@@ -198,4 +202,4 @@ def _clocks(inventory: Inventory) -> list[str]:
             name = source.name if source.part == "position" else source.part
             on.setdefault(source.clock, {})[name] = None
     lines = [f"{clock}: {', '.join(parts)}" for clock, parts in on.items()]
-    return lines + [clock_words(clock) for clock in inventory.clocks]
+    return lines + [clock_words(clock) for clock in inventory.flight.clocks]

@@ -26,8 +26,12 @@ from px4fuse.fleet.significance import (
     spreads,
 )
 from px4fuse.report.changes import change_line
-from px4fuse.results.changes import (
+from px4fuse.results.contract import (
+    CHANGES,
+    AidsResults,
+    ChangeResults,
     Compared,
+    ComparisonResults,
     FindingChange,
     Judgement,
     NumberChange,
@@ -35,7 +39,6 @@ from px4fuse.results.changes import (
     TextChange,
     Which,
 )
-from px4fuse.results.contract import CHANGES, AidsResults, ChangeResults, ComparisonResults
 from px4fuse.results.model import provenance, schema_of
 
 # What stands first of the significant changes; and of these, causes before what they bring

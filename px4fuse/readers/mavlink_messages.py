@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from scipy import constants
 
-from px4fuse.arrays import Array
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
@@ -246,8 +246,7 @@ GLOBAL_STATE = Layout(
 )
 
 
-@dataclass(frozen=True)
-class FrameOfReference:
+class FrameOfReference(NamedTuple):
     """A MAV_FRAME: which component is north (or forward), east (right) and down, and its sign.
 
     ``body`` says whether it turns with the vehicle.
@@ -257,19 +256,6 @@ class FrameOfReference:
     order: tuple[int, int, int] = (0, 1, 2)
     signs: tuple[float, float, float] = (1.0, 1.0, 1.0)
     body: bool = False
-
-    @property
-    def as_is(self) -> bool:
-        """Whether it is NED (or FRD) already, and does not turn with the vehicle."""
-        return self == FrameOfReference(self.name)
-
-    def turn(self, vectors: Array) -> Array:
-        """Vectors of this frame in NED (or FRD), shape (n, 3)."""
-        return vectors[:, self.order] * self.signs
-
-    def permute(self, variances: Array) -> Array:
-        """Variances of this frame's components in NED (or FRD) order, shape (n, 3)."""
-        return variances[:, self.order]
 
 
 FRAMES_OF_REFERENCE: Mapping[int, FrameOfReference] = {

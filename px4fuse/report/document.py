@@ -11,7 +11,7 @@ from px4fuse.comparison.model import AxisComparison
 from px4fuse.findings import Finding
 from px4fuse.findings.story import story
 from px4fuse.flight import Unavailable
-from px4fuse.loop.loop import Loop
+from px4fuse.loop.model import Loop
 from px4fuse.results.model import Provenance, Student
 
 

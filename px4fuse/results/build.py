@@ -1,4 +1,4 @@
-"""Analysis → results: what ``compare``, ``tune`` and ``sync`` found, as the contract has it."""
+"""What a command found → results, as the contract has them."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import Finding
 from px4fuse.findings.story import story
 from px4fuse.flight import Flight, Unavailable
+from px4fuse.loop.model import Loop
 from px4fuse.record import written
-from px4fuse.request import AxisName, ComparisonRequest, WhatIfRequest
-from px4fuse.results.comparison import AvailableTrack, ChosenSettings, Log, PositionSource
-from px4fuse.results.contract import (
-    AIDS,
-    COMPARISON,
-    WHATIF,
-    AidsResults,
-    ComparisonResults,
-    SyncResults,
-    TuningResults,
-    WhatIfResults,
-)
+from px4fuse.request import ComparisonRequest, LoopRequest, WhatIfRequest
+from px4fuse.results import contract
+from px4fuse.results.contract import AvailableTrack, ChosenSettings, Log, PositionSource
 from px4fuse.results.model import Student, provenance, schema_of
+from px4fuse.trajectory.evaluation import Evaluation
+from px4fuse.trajectory.graph.analysis import SolvedGraph
+
+# Parts of an analysis that are written as they are
+_AS_FOUND = (
+    "axes", "horizontal", "tuning", "clock", "heading", "ekf2_replay", "why", "causes", "loop",
+    "notes", "missing",
+)  # fmt: skip
 
 
 def results(
@@ -37,24 +37,14 @@ def results(
     findings: tuple[Finding, ...],
     student: Student,
     command: str,
-) -> ComparisonResults:
+) -> contract.ComparisonResults:
     """Everything that the report says."""
-    return ComparisonResults(
-        **_of_flight(COMPARISON, request, analysis, command),
-        axes={cast(AxisName, name): written(axis) for name, axis in analysis.axes.items()},
-        horizontal=dict(analysis.horizontal),
-        tuning=written(analysis.tuning),
-        clock=written(analysis.clock),
-        heading=analysis.heading,
-        ekf2_replay=written(analysis.ekf2_replay),
-        why=written(analysis.why),
-        causes=analysis.causes,
+    return contract.ComparisonResults(
+        **_of_flight(contract.COMPARISON, request, analysis, command),
+        **{name: written(getattr(analysis, name)) for name in _AS_FOUND},
         aids={} if isinstance(analysis.aids, Unavailable) else dict(analysis.aids),
-        loop=written(analysis.loop),
         story=story(analysis, findings),
         findings=findings,
-        notes=analysis.notes,
-        missing=analysis.missing,
         student=student,
     )
 
@@ -65,10 +55,10 @@ def aids_results(
     findings: tuple[Finding, ...],
     student: Student,
     command: str,
-) -> AidsResults:
+) -> contract.AidsResults:
     """What ``px4fuse compare`` found on a flight without a position source."""
-    return AidsResults(
-        schema=schema_of(AIDS),
+    return contract.AidsResults(
+        schema=schema_of(contract.AIDS),
         request=request.recorded(),
         log=log_part(alone.flight),
         aids=dict(alone.aids),
@@ -84,10 +74,10 @@ def tuning_results(
     comparison: Comparison,
     tuned: Mapping[str, AxisTuning | Unavailable],
     command: str,
-) -> TuningResults:
+) -> contract.TuningResults:
     """What ``px4fuse tune`` found."""
     begun = _of_flight("px4fuse-tuning", request, comparison, command)
-    return TuningResults(**begun, tuning=written(tuned))
+    return contract.TuningResults(**begun, tuning=written(tuned))
 
 
 def sync_results(
@@ -95,18 +85,20 @@ def sync_results(
     comparison: Comparison,
     clock: ClockOffset | Unavailable,
     command: str,
-) -> SyncResults:
+) -> contract.SyncResults:
     """What ``px4fuse sync`` found."""
     begun = _of_flight("px4fuse-sync", request, comparison, command)
-    return SyncResults(**begun, clock=written(clock))
+    return contract.SyncResults(**begun, clock=written(clock))
 
 
-def whatif_results(request: WhatIfRequest, made_of: Counterfactual, command: str) -> WhatIfResults:
+def whatif_results(
+    request: WhatIfRequest, made_of: Counterfactual, command: str
+) -> contract.WhatIfResults:
     """What ``px4fuse whatif`` found."""
     found = made_of.whatif
     first = made_of.first
-    return WhatIfResults(
-        schema=schema_of(WHATIF),
+    return contract.WhatIfResults(
+        schema=schema_of(contract.WHATIF),
         request=request.recorded(),
         log=log_part(made_of.flight),
         agreement=found.agreement,
@@ -119,6 +111,38 @@ def whatif_results(request: WhatIfRequest, made_of: Counterfactual, command: str
         notes=found.notes,
         provenance=provenance(command),
     )
+
+
+def loop_results(
+    request: LoopRequest, loop: Loop, findings: tuple[Finding, ...], student: Student, command: str
+) -> contract.LoopResults:
+    """What ``px4fuse loop`` found."""
+    return contract.LoopResults(
+        schema=schema_of(contract.LOOP),
+        request=request.recorded(),
+        track=loop.odometry.trajectory.track(),
+        references=tuple(reference.track() for reference in loop.references),
+        loop=written(loop),
+        findings=findings,
+        student=student,
+        provenance=provenance(command),
+    )
+
+
+def evaluation_results(score: Evaluation, command: str) -> contract.EvaluationResults:
+    """What ``px4fuse evaluate`` found."""
+    return contract.EvaluationResults(
+        schema=schema_of("px4fuse-evaluation"),
+        estimate=score.estimate.track(),
+        reference=score.reference.track(),
+        provenance=provenance(command),
+        **msgspec.structs.asdict(written(score)),
+    )
+
+
+def graph_results(solved: SolvedGraph, command: str) -> contract.GraphResults:
+    """What ``px4fuse loop`` found about a pose graph; edges by the vertex numbers of the file."""
+    return contract.GraphResults(schema_of("px4fuse-graph"), written(solved), provenance(command))
 
 
 def log_part(flight: Flight) -> Log:

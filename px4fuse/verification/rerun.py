@@ -155,7 +155,7 @@ def _compared(handed_in: ComparisonResults, place: _Place) -> Recomputed:
 def _looped(handed_in: LoopResults, place: _Place) -> Recomputed:
     from px4fuse.analysis import run_loop  # noqa: PLC0415
     from px4fuse.findings import find_loop  # noqa: PLC0415
-    from px4fuse.results.build_trajectories import loop_results  # noqa: PLC0415
+    from px4fuse.results.build import loop_results  # noqa: PLC0415
 
     recorded, person = handed_in.request, handed_in.student
     path, part = split_part(recorded.source)
