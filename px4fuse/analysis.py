@@ -356,7 +356,7 @@ def run_loop(request: LoopRequest, progress: Progress = silent) -> Loop:
         A file cannot be read or lacks what was asked for, or a setting is out of range.
     """
     from px4fuse.loop.analysis import analyse  # noqa: PLC0415 (tune and sync have none)
-    from px4fuse.loop.sources import read_source  # noqa: PLC0415
+    from px4fuse.loop.tracks import read_source  # noqa: PLC0415
 
     _check_finite(start_s=request.start_s, end_s=request.end_s)
     progress(f"reading {shown(Path(request.source))}")

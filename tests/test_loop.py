@@ -21,7 +21,7 @@ from px4fuse.loop.analysis import analyse, loop_in
 from px4fuse.loop.corrections import BY_DISTANCE, PLAIN, SINGLE_LOOP
 from px4fuse.loop.model import Loop, OdometryNoise
 from px4fuse.loop.odometry import odometry_variances
-from px4fuse.loop.sources import LoopSource, read_source, split_part
+from px4fuse.loop.tracks import LoopSource, read_source, split_part
 from px4fuse.request import GivenClosure, Landing, LoopRequest
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.model import Kind, Trajectory

@@ -118,7 +118,7 @@ def loop(
     """
     from px4fuse.analysis import run_loop
     from px4fuse.findings import find_loop
-    from px4fuse.loop.sources import file_name, is_g2o, split_part
+    from px4fuse.loop.tracks import file_name, is_g2o, split_part
     from px4fuse.report.document import LoopDocument
     from px4fuse.report.loop import print_loop
     from px4fuse.results.build import loop_results
@@ -174,7 +174,7 @@ def _files(found: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]
 
 def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool | None) -> None:
     """Solve a pose graph from a file."""
-    from px4fuse.loop.sources import split_part
+    from px4fuse.loop.tracks import split_part
     from px4fuse.readers.g2o import g2o_text, read_g2o
     from px4fuse.report.loop import print_graph
     from px4fuse.results.build import graph_results

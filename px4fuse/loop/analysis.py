@@ -21,8 +21,7 @@ from px4fuse.loop.part import (
     part_of,
     true_end,
 )
-from px4fuse.loop.sources import LoopSource
-from px4fuse.loop.tracks import odometry_of, trajectory_of
+from px4fuse.loop.tracks import LoopSource, odometry_of, trajectory_of
 from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Trajectory, by_axis, cumulative_distance

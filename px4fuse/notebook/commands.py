@@ -15,7 +15,7 @@ from px4fuse.findings import find
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.model import Loop
-from px4fuse.loop.sources import LoopSource, read_source
+from px4fuse.loop.tracks import LoopSource, read_source
 from px4fuse.readers import read_log
 from px4fuse.request import (
     AUTO,

@@ -24,12 +24,12 @@ from px4fuse.flight import (
 from px4fuse.origin import GNSS, with_orientation
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import px4_positions
-from px4fuse.readers.layouts import Layout
+from px4fuse.readers.layouts import GLOBAL_COLUMNS, Layout
 from px4fuse.readers.mavlink_clocks import Mapped
 from px4fuse.readers.mavlink_recording import BOOT_CLOCK, RECEIPT_CLOCK, Address, Recording
 from px4fuse.readers.mavlink_senders import senders_of
 from px4fuse.readers.parts import attitude_of, orientation_of
-from px4fuse.readers.px4_positions import GLOBAL_COLUMNS, projected, unproject
+from px4fuse.readers.px4_positions import projected, unproject
 
 # A boot clock's stamp is no further from its receipt
 OWN_CLOCK_S = 5.0

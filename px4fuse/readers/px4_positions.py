@@ -27,6 +27,7 @@ from px4fuse.flight import (
 )
 from px4fuse.origin import with_orientation
 from px4fuse.readers import px4_topics as px4
+from px4fuse.readers.layouts import GLOBAL_COLUMNS
 from px4fuse.readers.parts import attitude_of, finite_rows, orientation_of
 from px4fuse.readers.px4_ekf2 import target_step_s
 from px4fuse.readers.px4_fixes import left_out_fixes, rebuilt_fixes
@@ -37,7 +38,6 @@ from px4fuse.recording import ClockMap
 MIN_TRACK_SAMPLES = 3
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h
 GPS_3D_FIX = 3
-GLOBAL_COLUMNS = ["latitude_deg", "longitude_deg", "altitude_m"]
 # Samples that are published within this of their measurement have no measured time of their own
 SAME_TIME_US = 100
 ARRIVAL_SHARE = 0.9
@@ -45,10 +45,6 @@ ARRIVAL_SHARE = 0.9
 HEIGHT_TOLERANCE_S = 0.05
 # Logged no faster than this, a receiver's positions were thinned: they give 5 to 20 a second
 THINNED_HZ = 4.0
-# Tracks that are read as they are logged
-LOGGED = (
-    "vehicle_visual_odometry", "vehicle_mocap_odometry", "estimator_visual_odometry_aligned",
-)  # fmt: skip
 AUTOPILOT_CLOCK = "autopilot boot clock (as PX4 mapped the sender's stamp)"
 
 
@@ -60,7 +56,7 @@ def read_positions(
     # of what EKF2 kept, a source that EKF2 took a heading from counts as an odometry
     turns = isinstance(fusing, pd.DataFrame) and bool((fusing["yaw"] > 0).any())
     found = [
-        *(_read_logged(topics, name) for name in LOGGED),
+        *(_read_logged(topics, name) for name in px4.LOGGED),
         _read_kept(topics, turns),
         _rebuild(topics, ekf2, turns),
         _read_gps(topics, ekf2),

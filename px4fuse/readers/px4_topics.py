@@ -22,12 +22,16 @@ from px4fuse.flight import (
 )
 from px4fuse.origin import ALIGNED, GNSS, KEPT, MOTION_CAPTURE, REBUILT, RECEIVED, Origin
 from px4fuse.readers.layouts import (
+    GLOBAL,
+    GLOBAL_COLUMNS,
+    GLOBAL_SCALE,
     POSE_DIAGONAL,
     POSITION_AND_VELOCITY,
     ROTATION_DIAGONAL,
     XYZ,
     Layout,
     elements,
+    fields,
 )
 
 IMU = (
@@ -95,8 +99,8 @@ TRUTH_LOCAL = (Layout("vehicle_local_position_groundtruth", POSITION_AND_VELOCIT
 TRUTH_GLOBAL = (
     Layout(
         "vehicle_global_position_groundtruth",
-        {"latitude_deg": "lat", "longitude_deg": "lon", "altitude_m": "alt"},
-        {"north_m_s": "vel_n", "east_m_s": "vel_e", "down_m_s": "vel_d"},
+        GLOBAL,
+        fields(VELOCITY_COLUMNS, "vel_n vel_e vel_d"),
     ),
 )
 TRUTH_ATTITUDE = (Layout("vehicle_attitude_groundtruth", elements(QUATERNION_COLUMNS, "q")),)
@@ -105,13 +109,14 @@ BAROMETER = (Layout("vehicle_air_data", {"altitude_m": "baro_alt_meter"}),)
 
 _GPS_OPTIONAL = {
     "eph_m": "eph", "epv_m": "epv", "fix_type": "fix_type", "utc_us": "time_utc_usec",
-    "published_us": "timestamp", "north_m_s": "vel_n_m_s", "east_m_s": "vel_e_m_s",
-    "down_m_s": "vel_d_m_s", "speed_accuracy_m_s": "s_variance_m_s",
+    "published_us": "timestamp", "speed_accuracy_m_s": "s_variance_m_s",
+    **fields(VELOCITY_COLUMNS, "vel_n_m_s vel_e_m_s vel_d_m_s"),
 }  # fmt: skip
+_VEHICLE_GNSS = _GPS_OPTIONAL | fields(VELOCITY_COLUMNS, "vel_north vel_east vel_down")
 ANTENNA_COLUMNS = ["antenna_forward_m", "antenna_right_m", "antenna_down_m"]
 
 
-def _of_receiver(**names: str) -> dict[str, str]:
+def _of_receiver(names: Mapping[str, str]) -> dict[str, str]:
     """Fields of the receiver's message inside another."""
     return {ours: f"receiver.{px4}" for ours, px4 in names.items()}
 
@@ -119,36 +124,17 @@ def _of_receiver(**names: str) -> dict[str, str]:
 GPS = (
     Layout(  # main of 2026
         "vehicle_gnss",
-        _of_receiver(latitude_deg="latitude", longitude_deg="longitude", altitude_m="altitude_msl"),
-        _of_receiver(
-            eph_m="eph",
-            epv_m="epv",
-            fix_type="fix_type",
-            utc_us="time_utc_usec",
-            published_us="timestamp",
-            north_m_s="vel_north",
-            east_m_s="vel_east",
-            down_m_s="vel_down",
-            speed_accuracy_m_s="speed_accuracy",
-        )
+        _of_receiver(fields(GLOBAL_COLUMNS, "latitude longitude altitude_msl")),
+        _of_receiver(_VEHICLE_GNSS | {"speed_accuracy_m_s": "speed_accuracy"})
         | elements(ANTENNA_COLUMNS, "antenna_offset"),
     ),
     Layout(  # v1.14
         "vehicle_gps_position",
-        {
-            "latitude_deg": "latitude_deg",
-            "longitude_deg": "longitude_deg",
-            "altitude_m": "altitude_msl_m",
-        },
+        fields(GLOBAL_COLUMNS, "latitude_deg longitude_deg altitude_msl_m"),
         _GPS_OPTIONAL
-        | dict(zip(ANTENNA_COLUMNS, (f"antenna_offset_{axis}" for axis in "xyz"), strict=True)),
+        | fields(ANTENNA_COLUMNS, "antenna_offset_x antenna_offset_y antenna_offset_z"),
     ),
-    Layout(  # v1.8 to v1.13
-        "vehicle_gps_position",
-        {"latitude_deg": "lat", "longitude_deg": "lon", "altitude_m": "alt"},
-        _GPS_OPTIONAL,
-        {"latitude_deg": 1e-7, "longitude_deg": 1e-7, "altitude_m": 1e-3},
-    ),
+    Layout("vehicle_gps_position", GLOBAL, _GPS_OPTIONAL, GLOBAL_SCALE),  # v1.8 to v1.13
 )
 
 FUSED_FIXES = (
@@ -240,6 +226,8 @@ _TRACKS = (
     ),
 )  # fmt: skip
 TRACKS: Mapping[str, TrackSource] = {track.name: track for track in _TRACKS}
+# Those of external vision and motion capture that are read as they are logged
+LOGGED = [name for name, track in TRACKS.items() if track.layouts and name != GPS_POSITION]
 TOPIC_ORIGINS = {name: track.origin for name, track in TRACKS.items()}
 # What has EKF2 fuse external vision; it starts on samples less than 0.2 s apart (ev_control.cpp)
 HOW_TO_FUSE: Mapping[str, str] = {
