@@ -261,7 +261,7 @@ def read_flight(request: ComparisonRequest, progress: Progress = silent) -> Flig
     flight = read_log(log, system=request.system if request.mavlink is None else None)
     # scipy.signal and scipy.ndimage cost a fifth of a second: only where something is placed
     if request.mavlink is not None:
-        from px4fuse.alignment import join  # noqa: PLC0415
+        from px4fuse.alignment.joining import join  # noqa: PLC0415
 
         other = read_log(Path(request.mavlink), system=request.system)
         if not other.log.format.startswith("MAVLink"):
@@ -274,7 +274,7 @@ def read_flight(request: ComparisonRequest, progress: Progress = silent) -> Flig
     position, offset = request.position, request.clock_offset_s
     if position is None:
         return flight
-    from px4fuse.alignment import place  # noqa: PLC0415
+    from px4fuse.alignment.placement import place  # noqa: PLC0415
     from px4fuse.readers.position_csv import read_position_csv  # noqa: PLC0415
 
     units = {"time_unit": position.time_unit, "length_unit": position.length_unit}

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -189,6 +189,13 @@ class PositionTrack:
     def aid(self, axis: str) -> Aid | None:
         """What EKF2 takes it as along an axis; None where EKF2 never fuses it."""
         return self.origin.aid if axis != "down" or self.barometer is None else BAROMETER
+
+    def about(self) -> dict[str, Any]:
+        """What is written of it, and of where it comes from, by the names in results."""
+        names = ("name", "kind", "passage", "description", "frame", "clock", "reconstructed",
+                 "topics", "log", "alignment")  # fmt: skip
+        whose = {name: self.origin if hasattr(self.origin, name) else self for name in names}
+        return {name: getattr(whose[name], name) for name in names}
 
     @property
     def rate_hz(self) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 
@@ -158,17 +158,10 @@ def _of_flight(
     origin, parameters = track.origin, comparison.flight.log.parameters
     placed_s = 0.0 if track.alignment is None else track.alignment.clock_offset_s
     source = PositionSource(
-        name=track.name,
-        kind=origin.kind,
-        passage=origin.passage,
+        **track.about(),
         ekf2_parameters={} if origin.aid is None else origin.aid.in_log(parameters),
-        description=track.description,
         reason=comparison.source_reason,
         rate_hz=track.rate_hz,
-        frame=cast(Any, track.frame),
-        clock=track.clock,
-        reconstructed=origin.reconstructed,
-        topics=track.topics,
         available=tuple(
             AvailableTrack(
                 one.name, one.origin.kind, one.origin.passage, len(one.samples), one.rate_hz
@@ -176,8 +169,6 @@ def _of_flight(
             for one in comparison.flight.positions
         ),
         not_in_log=tuple(part for part in comparison.missing if part.source),
-        log=track.log,
-        alignment=track.alignment,
     )
     used: dict[str, Any] = asdict(settings) | {"clock_offset_s": settings.clock_offset_s + placed_s}
     return {
