@@ -11,13 +11,7 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.errors import MissingDataError
-from px4fuse.flight import (
-    POSITION_COLUMNS,
-    Ekf2,
-    Flight,
-    Unavailable,
-    best_first,
-)
+from px4fuse.flight import POSITION_COLUMNS, Ekf2, Flight, Unavailable, best_first
 from px4fuse.readers.parts import missing_parts
 from px4fuse.recording import InputFile
 

@@ -32,13 +32,7 @@ from px4fuse.readers import parts
 from px4fuse.readers.mavlink_clocks import UNIX_FROM_S
 from px4fuse.readers.mavlink_frames import message_ids, read_frames
 from px4fuse.readers.mavlink_positions import pressure_altitude, read_positions, read_truth
-from px4fuse.readers.mavlink_recording import (
-    BOOT_CLOCK,
-    RECEIPT_CLOCK,
-    Recording,
-    settle_clocks,
-    unix_of_boot,
-)
+from px4fuse.readers.mavlink_recording import RECEIPT_CLOCK, Recording, settle_clocks, unix_of_boot
 from px4fuse.readers.px4_positions import barometer
 from px4fuse.readers.ulog_topics import NO_SELECTOR, dropped_note
 from px4fuse.recording import LogInfo, Unused
@@ -134,7 +128,7 @@ def _read_imu(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
             f"{layout.topic} holds {len(imu)} usable samples",
             "Check that the sensors ran while the link was recorded.",
         )
-    recording.came_from("imu", BOOT_CLOCK, layout.topic)
+    recording.came_from("imu", layout.topic)
     return imu
 
 
@@ -144,7 +138,7 @@ def _read_attitude(recording: Recording, remedy: str) -> pd.DataFrame | Unavaila
     if len(attitude) < 2:
         *some, last = (layout.topic for layout in messages.ATTITUDE)
         return Unavailable("attitude", f"no usable {', '.join(some)} or {last}", remedy)
-    recording.came_from("attitude", BOOT_CLOCK, layout.topic)
+    recording.came_from("attitude", layout.topic)
     return attitude
 
 
@@ -169,7 +163,7 @@ def _read_ekf2(
     state = samples[STATE_COLUMNS].dropna()
     if len(state) < 2:
         return Unavailable("EKF2", f"{message} holds no finite state", "Wait for EKF2 to start.")
-    recording.came_from("ekf2_state", BOOT_CLOCK, message)
+    recording.came_from("ekf2_state", message)
     notes = [f"EKF2's state is {message} as the autopilot sent it"]
     if autopilot != "PX4":
         notes.append(f"this is {autopilot}: what is called EKF2 here is its own estimator")
@@ -194,7 +188,7 @@ def _read_ekf2(
     if found.empty:
         variance = Unavailable("EKF2 variances", lacking, remedies["variance"])
     else:
-        recording.came_from("ekf2_variance", BOOT_CLOCK, message)
+        recording.came_from("ekf2_variance", message)
     inside = "MAVLink does not carry EKF2's"
     return Ekf2(
         state=state,
@@ -236,7 +230,7 @@ def _read_airborne(
     known = table["landed_state"] > 0
     if not np.any(known):
         return Unavailable("land detector", "no usable EXTENDED_SYS_STATE", remedy)
-    recording.came_from("airborne", RECEIPT_CLOCK, "EXTENDED_SYS_STATE")
+    recording.came_from("airborne", "EXTENDED_SYS_STATE", clock=RECEIPT_CLOCK)
     time_s = recording.receipt_boot_s(rows[known]) - recording.zero_s
     landed = pd.Series(table["landed_state"][known] == messages.LANDED, index=time_s)
     return parts.stretches_of_flight(landed, recording.duration_s)

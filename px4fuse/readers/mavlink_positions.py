@@ -218,7 +218,7 @@ def read_truth(
         if not samples[VELOCITY_COLUMNS].to_numpy().any():
             # not sent: a vehicle that never moves has no use for truth
             samples[VELOCITY_COLUMNS] = np.nan
-        recording.came_from("truth", RECEIPT_CLOCK, layout.topic)
+        recording.came_from("truth", layout.topic, clock=RECEIPT_CLOCK)
         origin = local_origin(recording) if positions and positions[0].origin.is_gnss else None
         state = pd.concat([projected(samples, origin), samples[VELOCITY_COLUMNS]], axis=1)
         return Truth(layout.topic, state[STATE_COLUMNS], attitude_of(samples))
@@ -229,5 +229,5 @@ def read_truth(
             "neither simulation truth nor motion capture is in the recording",
             remedies["truth"],
         )
-    recording.came_from("truth", captured.clock, *captured.topics)
+    recording.came_from("truth", *captured.topics, clock=captured.clock)
     return px4_positions.captured_truth(captured)

@@ -177,7 +177,7 @@ class Recording:
         on_boot = (stamp > 0.0) & ((stamp < UNIX_FROM_S) == (self.zero_s < UNIX_FROM_S))
         return np.asarray(np.where(on_boot, stamp, self.receipt_boot_s(rows)), dtype=np.float64)
 
-    def came_from(self, part: str, clock: str, *messages: str) -> None:
+    def came_from(self, part: str, *messages: str, clock: str = BOOT_CLOCK) -> None:
         """Note where a part of the flight came from."""
         self.streams[part] = Stream(messages, clock, self.frames.name)
 

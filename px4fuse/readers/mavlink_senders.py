@@ -11,13 +11,7 @@ from numpy.typing import NDArray
 from px4fuse.arrays import IntArray
 from px4fuse.errors import SettingsError
 from px4fuse.readers import mavlink_messages as messages
-from px4fuse.readers.mavlink_clocks import (
-    OTHER_SPEED,
-    Line,
-    Mapped,
-    map_clock,
-    tells_time,
-)
+from px4fuse.readers.mavlink_clocks import OTHER_SPEED, Line, Mapped, map_clock, tells_time
 from px4fuse.readers.mavlink_frames import Frames
 from px4fuse.readers.mavlink_recording import RESTART_S, Address, Recording, unix_of_boot
 from px4fuse.recording import ClockMap, Sender

@@ -22,15 +22,10 @@ from px4fuse.readers import parts
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.px4_ekf2 import read_ekf2
 from px4fuse.readers.px4_positions import GPS_3D_FIX, barometer, read_positions, read_truth
-from px4fuse.readers.ulog_topics import (
-    ACCELEROMETER_OFFSET_INVALID_US,
-    Topics,
-    dropped_note,
-    increasing,
-    read_topics,
-)
+from px4fuse.readers.ulog_topics import Topics, dropped_note, increasing, read_topics
 from px4fuse.recording import Unused
 
+ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
 # A message that is cut off and no more is no loss besides; a silent IMU is one from here on
 LEAST_LOST, LOST_FROM_S = 65_538, 0.2
 # A receiver's UTC outside these is not valid: PX4's own GPS_EPOCH_SECS (gps_helper.h), and 2100

@@ -45,7 +45,6 @@ RELEASE = 255
 NOTE_KEY = "px4fuse_note"
 # A gap longer than this in the IMU's stamps is no dropout: what lies beyond is another boot.
 MAX_DATA_GAP_S = 600.0
-ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
 # pyulog walks damaged bytes as though they were messages; these are what that can raise
 _PARSE_ERRORS = (
     ULogException, struct.error, IndexError, KeyError, ValueError, TypeError, AttributeError,
