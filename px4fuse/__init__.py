@@ -34,7 +34,7 @@ if _typing.TYPE_CHECKING:
     from px4fuse.fleet.run import batch as batch
     from px4fuse.flight import Flight as Flight
     from px4fuse.flight import Unavailable as Unavailable
-    from px4fuse.loop.loop import Loop as Loop
+    from px4fuse.loop.model import Loop as Loop
     from px4fuse.notebook.commands import close_loop as close_loop
     from px4fuse.notebook.commands import compare as compare
     from px4fuse.notebook.commands import evaluate as evaluate
@@ -65,7 +65,7 @@ _PUBLIC = {
     "fleet.changes": ("Changes", "diff"),
     "fleet.run": ("batch",),
     "flight": ("Flight", "Unavailable"),
-    "loop.loop": ("Loop",),
+    "loop.model": ("Loop",),
     "notebook.commands": ("close_loop", "compare", "evaluate", "explore", "report", "what_if"),
     "readers": ("read_log",),
     "readers.trajectory": ("read_trajectory",),

@@ -49,7 +49,7 @@ from px4fuse.reading import shown
 from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest
 
 if TYPE_CHECKING:
-    from px4fuse.loop.loop import Loop
+    from px4fuse.loop.model import Loop
 
 # Noises that the report states: those of a source once. Each axis by itself is for `px4fuse tune`
 REPORTED = (HORIZONTAL, "down")
@@ -261,7 +261,7 @@ def read_flight(request: ComparisonRequest, progress: Progress = silent) -> Flig
     flight = read_log(log, system=request.system if request.mavlink is None else None)
     # scipy.signal and scipy.ndimage cost a fifth of a second: only where something is placed
     if request.mavlink is not None:
-        from px4fuse.alignment import join  # noqa: PLC0415
+        from px4fuse.alignment.joining import join  # noqa: PLC0415
 
         other = read_log(Path(request.mavlink), system=request.system)
         if not other.log.format.startswith("MAVLink"):
@@ -274,7 +274,7 @@ def read_flight(request: ComparisonRequest, progress: Progress = silent) -> Flig
     position, offset = request.position, request.clock_offset_s
     if position is None:
         return flight
-    from px4fuse.alignment import place  # noqa: PLC0415
+    from px4fuse.alignment.placement import place  # noqa: PLC0415
     from px4fuse.readers.position_csv import read_position_csv  # noqa: PLC0415
 
     units = {"time_unit": position.time_unit, "length_unit": position.length_unit}
@@ -356,27 +356,15 @@ def run_loop(request: LoopRequest, progress: Progress = silent) -> Loop:
         A file cannot be read or lacks what was asked for, or a setting is out of range.
     """
     from px4fuse.loop.analysis import analyse  # noqa: PLC0415 (tune and sync have none)
-    from px4fuse.loop.model import OdometryNoise  # noqa: PLC0415
-    from px4fuse.loop.sources import read_source  # noqa: PLC0415
+    from px4fuse.loop.tracks import read_source  # noqa: PLC0415
 
     _check_finite(start_s=request.start_s, end_s=request.end_s)
     progress(f"reading {shown(Path(request.source))}")
-    system, landed, reference = request.system, request.landed_at, None
+    system, reference = request.system, None
     source = read_source(request.source, frame=request.frame, system=system)
     if request.reference is not None:
         reference = read_source(request.reference, default="truth", system=system).trajectory
-    return analyse(
-        source,
-        start_s=request.start_s,
-        end_s=request.end_s,
-        landed_at=None if landed is None else (landed.forward_m, landed.right_m, landed.turned_deg),
-        came_back=request.came_back,
-        closures=request.closures,
-        noise=OdometryNoise(request.position_drift_m, request.heading_drift_deg),
-        reference=reference,
-        spacing_m=request.key_frames_m,
-        progress=progress,
-    )
+    return analyse(source, request, reference, progress)
 
 
 @dataclass(frozen=True)

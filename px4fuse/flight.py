@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -190,6 +190,13 @@ class PositionTrack:
         """What EKF2 takes it as along an axis; None where EKF2 never fuses it."""
         return self.origin.aid if axis != "down" or self.barometer is None else BAROMETER
 
+    def about(self) -> dict[str, Any]:
+        """What is written of it, and of where it comes from, by the names in results."""
+        names = ("name", "kind", "passage", "description", "frame", "clock", "reconstructed",
+                 "topics", "log", "alignment")  # fmt: skip
+        whose = {name: self.origin if hasattr(self.origin, name) else self for name in names}
+        return {name: getattr(whose[name], name) for name in names}
+
     @property
     def rate_hz(self) -> float:
         """Samples per second between gaps (NaN with fewer than two samples)."""
@@ -309,8 +316,7 @@ class AidLog:
 def at_times(steps: pd.Series[float], times: pd.Index[float]) -> Array:
     """Values of a step function at some times; before its first step that of the first."""
     at = np.clip(np.searchsorted(steps.index, times, side="right") - 1, 0, None)
-    values: Array = np.asarray(steps, dtype=np.float64)[at]
-    return values
+    return np.asarray(steps, dtype=np.float64)[at]
 
 
 @dataclass(frozen=True)

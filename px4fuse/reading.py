@@ -110,12 +110,8 @@ def read_whole(
     content = b"" if size > limit_bytes else _read(path, size + 1, refuse, name)
     if len(content) > size:  # it grows, or is one of /proc, which say that they are empty
         content = _read(path, limit_bytes + 1, refuse, name)
-    if max(size, len(content)) > limit_bytes:
-        raise refuse(
-            f"{name}: {_megabytes(max(size, len(content)))} MB, more than the limit of "
-            f"{_megabytes(limit_bytes)} MB",
-            f"{smaller}.",
-        )
+    if (least := max(size, len(content))) > limit_bytes:
+        raise refuse(_too_large(name, least, limit_bytes), f"{smaller}.")
     if again is not None and not content:
         raise refuse(f"{name}: the file is empty", f"{again}.")
     return content
@@ -187,11 +183,7 @@ def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
             files = [file for file in files_below(path) if file.is_file()]
             files = [file for file in files if size_of(file, LogError) <= limit]
         elif (size := size_of(path, LogError)) > limit:
-            raise LogError(
-                f"{shown(path)}: {_megabytes(size)} MB, more than the limit of "
-                f"{_megabytes(limit)} MB",
-                f"{_LARGER_LOGS}.",
-            )
+            raise LogError(_too_large(shown(path), size, limit), f"{_LARGER_LOGS}.")
         else:
             files = [path]
         for file in files:
@@ -238,5 +230,6 @@ def _unreadable(
     return refuse(f"{name}: cannot be read ({reason}).", remedy)
 
 
-def _megabytes(size: int) -> str:
-    return f"{size / _BYTES_PER_MB:,.{0 if size >= 10 * _BYTES_PER_MB else 2}f}"
+def _too_large(name: str, *sizes: int) -> str:
+    size, limit = (f"{n / _BYTES_PER_MB:,.{0 if n >= 10 * _BYTES_PER_MB else 2}f}" for n in sizes)
+    return f"{name}: {size} MB, more than the limit of {limit} MB"

@@ -17,7 +17,8 @@ from flights import Estimator, Imu, Span, Uwb, aisle_flight, table, unavailable
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from px4fuse.alignment.placement import EKF2_POSITION, IMU, place
+from px4fuse.alignment.placement import place
+from px4fuse.alignment.tracks import EKF2_POSITION, IMU
 from px4fuse.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import (

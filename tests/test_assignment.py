@@ -25,8 +25,7 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.findings import find, find_loop
 from px4fuse.loop.analysis import analyse
-from px4fuse.loop.sources import LoopSource
-from px4fuse.loop.tracks import trajectory_of
+from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.simulation.mistakes import parse
 
 SECRET = b"a secret for tests"

@@ -37,8 +37,7 @@ from px4fuse.flight import Unavailable
 from px4fuse.report.changes import change_line, printed
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
-from px4fuse.results.changes import NumberChange
-from px4fuse.results.contract import to_json
+from px4fuse.results.contract import NumberChange, to_json
 from px4fuse.results.reading import read_results
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse

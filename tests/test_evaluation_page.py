@@ -17,7 +17,7 @@ from pypdf import PdfReader
 from scipy.spatial.transform import Rotation
 from trajectory_tools import flight, moved
 
-from px4fuse.loop.sources import read_source
+from px4fuse.loop.tracks import read_source
 from px4fuse.report.evaluation import (
     before_words,
     distance_words,

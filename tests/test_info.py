@@ -219,7 +219,7 @@ def test_a_log_that_stands_still_is_described(tmp_path):
     log["vehicle_visual_odometry"]["position"][:] = 0
     log["vehicle_land_detected"]["landed"][:] = 1
     inventory = inventory_of(log, tmp_path)
-    assert inventory.airborne == ()
+    assert inventory.flight.airborne == ()
     assert ability(inventory, "compare").possible
     assert "never, by the land detector" in info(tmp_path / "made.ulg")
 

@@ -19,11 +19,10 @@ from px4fuse.flight import Unavailable
 from px4fuse.lesson import ODOMETRY_M, loop_lines
 from px4fuse.loop.analysis import analyse, loop_in
 from px4fuse.loop.corrections import BY_DISTANCE, PLAIN, SINGLE_LOOP
-from px4fuse.loop.loop import Loop
-from px4fuse.loop.model import OdometryNoise
+from px4fuse.loop.model import Loop, OdometryNoise
 from px4fuse.loop.odometry import odometry_variances
-from px4fuse.loop.sources import LoopSource, read_source, split_part
-from px4fuse.request import GivenClosure
+from px4fuse.loop.tracks import LoopSource, read_source, split_part
+from px4fuse.request import GivenClosure, Landing, LoopRequest
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.model import Kind, Trajectory
 from px4fuse.trajectory.scores import Statistics
@@ -45,8 +44,12 @@ def sample_loop(sample: LoopSource) -> Loop:
     return analyse(sample, reference=read_source(str(SLAM)).trajectory)
 
 
+def loop_of(source: LoopSource, reference: Trajectory | None = None, **how: Any) -> Loop:
+    return analyse(source, LoopRequest(source="", **how), reference)
+
+
 def close_loop(trajectory: Trajectory, **how: Any) -> Loop:
-    return analyse(LoopSource(trajectory, None), **how)
+    return loop_of(LoopSource(trajectory, None), **how)
 
 
 def path(loop: Loop, way: Any) -> Any:
@@ -158,7 +161,7 @@ def test_without_a_known_heading_there_is_one_correction_by_distance(
     sample: LoopSource, sample_loop: Loop
 ) -> None:
     assert [part.name for part in sample_loop.reported[1:3]] == [PLAIN, BY_DISTANCE]
-    found = analyse(sample, landed_at=(0.0, 0.0, None))
+    found = loop_of(sample, landed_at=Landing(0.0, 0.0))
     assert isinstance(found.heading_error_deg, Unavailable)
     names = [part.name for part in found.reported]
     assert PLAIN in names
@@ -170,7 +173,7 @@ def test_without_a_known_heading_there_is_one_correction_by_distance(
 def test_a_tape_gives_what_the_truth_gives(sample: LoopSource, sample_loop: Loop) -> None:
     forward, right, _ = sample_loop.known_end.displacement  # its nose points along x
     heading = sample_loop.known_end.heading_change_deg
-    taped = analyse(sample, landed_at=(forward, right, heading))
+    taped = loop_of(sample, landed_at=Landing(forward, right, heading))
     # a tape does not see the height, which the truth has 0.16 m lower
     assert taped.closure_error_m == pytest.approx(sample_loop.closure_error_m, abs=0.03)
     assert taped.heading_error_deg == pytest.approx(sample_loop.heading_error_deg, abs=1e-6)
@@ -224,10 +227,9 @@ FALSE = GivenClosure(12.0, 2 * LAP_S + 35.0, 0.05)
 
 @pytest.mark.parametrize("seed", range(4))
 def test_one_false_closure_among_true_ones(seed: int) -> None:
-    noise = OdometryNoise()
-    truth, odometry = laps(3, seed, noise)
-    clean = close_loop(odometry, closures=TRUE, noise=noise, reference=truth)
-    fooled = close_loop(odometry, closures=(*TRUE, FALSE), noise=noise, reference=truth)
+    truth, odometry = laps(3, seed, OdometryNoise())
+    clean = close_loop(odometry, closures=TRUE, reference=truth)
+    fooled = close_loop(odometry, closures=(*TRUE, FALSE), reference=truth)
     assert all(judged.accepted for judged in clean.closures)
     *true, false = fooled.closures
     assert false.p < 0.001
@@ -249,11 +251,10 @@ def test_one_false_closure_among_true_ones(seed: int) -> None:
 
 def test_the_gate_accepts_true_landings_as_often_as_stated() -> None:
     """With the noise that the laps have, p is uniform: a third below a third, and so on."""
-    noise = OdometryNoise()
     p = []
     for seed in range(60):
-        _, odometry = laps(1, 100 + seed, noise)
-        p.append(close_loop(odometry, noise=noise).closures[0].p)
+        _, odometry = laps(1, 100 + seed, OdometryNoise())
+        p.append(close_loop(odometry).closures[0].p)
     assert min(p) > 0.001
     for share in (0.25, 0.5, 0.75):
         assert np.mean(np.array(p) < share) == pytest.approx(share, abs=0.2)
@@ -280,25 +281,23 @@ def test_a_landing_elsewhere_is_rejected_and_nothing_is_corrected() -> None:
 
 
 def test_the_heading_at_landing_counts_only_where_it_may_be_the_same() -> None:
-    noise = OdometryNoise()
-    _, odometry = laps(1, 4, noise)
-    turned = close_loop(odometry, noise=noise)  # it ends facing west
+    _, odometry = laps(1, 4, OdometryNoise())
+    turned = close_loop(odometry)  # it ends facing west
     assert isinstance(turned.heading_error_deg, Unavailable)
     assert turned.closures[0].degrees_of_freedom == 3
     quaternions = odometry.rotation.as_quat()
     quaternions[-1] = odometry.rotation[0].as_quat()
     same = replace(odometry, rotation=Rotation.from_quat(quaternions))
-    found = close_loop(same, noise=noise)
+    found = close_loop(same)
     assert found.heading_error_deg == pytest.approx(0.0, abs=1e-9)
     assert found.closures[0].degrees_of_freedom == 4
 
 
 def test_a_doubtful_closure_is_named() -> None:
     """Off by less than the drift could explain, but the others know better."""
-    noise = OdometryNoise()
-    _, odometry = laps(3, 5, noise)
+    _, odometry = laps(3, 5, OdometryNoise())
     wrong = GivenClosure(20.0, 21.5 + LAP_S, 0.05)  # 1.5 m further along the side
-    found = close_loop(odometry, closures=(*TRUE, wrong), noise=noise)
+    found = close_loop(odometry, closures=(*TRUE, wrong))
     assert found.closures[-1].accepted
     doubtful = [f for f in find_loop(found) if f.id == "loop_closure_doubtful"]
     assert len(doubtful) == 1
@@ -315,7 +314,7 @@ def test_dropping_most_closures_points_to_the_drift() -> None:
         position_m=np.vstack([np.zeros(3), np.cumsum(steps, axis=0)]),
         rotation=turn * odometry.rotation,
     )
-    found = close_loop(biased, closures=TRUE, noise=OdometryNoise(1.0, 1.0))
+    found = close_loop(biased, closures=TRUE, heading_drift_deg=1.0)
     assert "loop_drift_understated" in {finding.id for finding in find_loop(found)}
 
 
@@ -326,7 +325,7 @@ def test_an_assumed_landing_is_said_to_be_assumed(sample: LoopSource, sample_loo
     (finding,) = find_loop(found)
     assert (finding.id, finding.severity) == ("loop_end_assumed", "info")
     assert "--landed-at" in finding.remedy
-    assert find_loop(analyse(sample, landed_at=(0.0, 0.0, None))) == ()
+    assert find_loop(loop_of(sample, landed_at=Landing(0.0, 0.0))) == ()
 
 
 def test_reported_variances_count_where_they_grow() -> None:
@@ -364,15 +363,15 @@ def test_poses_between_key_frames_move_with_them(sample_loop: Loop) -> None:
 
 def test_times_of_a_file_in_unix_time_may_count_from_its_first_pose() -> None:
     source = read_source(str(SLAM))
-    relative = analyse(source, closures=(GivenClosure(3.0, 80.0, 0.3),))
+    relative = loop_of(source, closures=(GivenClosure(3.0, 80.0, 0.3),))
     start = float(source.trajectory.time_s[0])
-    stamped = analyse(source, closures=(GivenClosure(start + 3.0, start + 80.0, 0.3),))
+    stamped = loop_of(source, closures=(GivenClosure(start + 3.0, start + 80.0, 0.3),))
     assert relative.closures[1] == stamped.closures[1]
 
 
 def test_the_slam_file_is_levelled_and_closes_better_than_the_odometry() -> None:
     source = read_source(str(SLAM))
-    found = analyse(source, landed_at=(0.0, 0.0, None))
+    found = loop_of(source, landed_at=Landing(0.0, 0.0))
     assert found.odometry.trajectory.frame == "FRD"
     assert found.closure_error_m < 0.7  # it truly ended 0.4 m away
     height = found.odometry.trajectory.position_m[:, 2]
@@ -387,14 +386,14 @@ def test_the_slam_file_is_levelled_and_closes_better_than_the_odometry() -> None
         ({"closures": (GivenClosure(20.0, 50.0, 200.0),)}, "SIGMA 200 is outside"),
         ({"start_s": 500.0, "end_s": 600.0}, "too few"),
         ({"start_s": 96.0, "end_s": 98.0}, "too short for a loop"),
-        ({"spacing_m": 101.0}, "`key_frames_m` 101 is outside"),
+        ({"key_frames_m": 101.0}, "`key_frames_m` 101 is outside"),
     ],
 )
 def test_impossible_parts_and_closures_are_refused(
     sample: LoopSource, how: dict[str, Any], says: str
 ) -> None:
     with pytest.raises((TrajectoryError, SettingsError), match=says):
-        analyse(sample, **how)
+        loop_of(sample, **how)
 
 
 def test_a_part_of_a_log_is_named_after_a_colon(tmp_path: Path) -> None:

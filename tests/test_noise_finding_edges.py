@@ -41,8 +41,7 @@ from px4fuse.findings import Finding, hidden_errors, loops, noises, since
 from px4fuse.findings.causes import by_cause
 from px4fuse.findings.noises import _is_default
 from px4fuse.findings.story import story
-from px4fuse.loop.loop import Loop
-from px4fuse.loop.model import Closure
+from px4fuse.loop.model import Closure, Loop
 
 MOVING = source(samples=positions(np.arange(0.0, 120.0), np.arange(120.0)))
 HOVERING = source(samples=positions(np.arange(0.0, 120.0)))

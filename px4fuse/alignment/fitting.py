@@ -7,14 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from px4fuse.alignment.tracks import (
-    EKF2_POSITION,
-    IMU,
-    MIN_OVERLAP_S,
-    MIN_SAMPLES,
-    NoMatchError,
-    OwnTrack,
-)
+from px4fuse.alignment import tracks
+from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError, OwnTrack
 from px4fuse.arrays import Array, Complex
 from px4fuse.trajectory.correlation import autocovariance, moments
 from px4fuse.trajectory.offset import STEP_S
@@ -101,7 +95,7 @@ def correlation_peak(file: OwnTrack, reference: OwnTrack, yaw_rad: float | None)
     found = moments(file.horizontal_m, reference.horizontal_m, file.valid, reference.valid)
     count, covariance, power = found.count, found.covariance, found.power_a + found.power_b
     shorter = min(np.count_nonzero(file.valid), np.count_nonzero(reference.valid))
-    enough = count >= max(MIN_SAMPLES, min(MIN_OVERLAP_S / STEP_S, shorter / 2.0))
+    enough = count >= max(tracks.MIN_SAMPLES, min(tracks.MIN_OVERLAP_S / STEP_S, shorter / 2.0))
     if not enough.any():
         raise NoMatchError("too little is left between gaps to be matched")
     enough &= power > 1e-9 * np.max(power)  # else rounding errors correlate
@@ -151,7 +145,7 @@ def least_squares_fit(
     """
     start, known = reference.at(file.time_s + peak.lag_s)
     used = known & file.valid
-    if np.count_nonzero(used) < MIN_SAMPLES:
+    if np.count_nonzero(used) < tracks.MIN_SAMPLES:
         raise NoMatchError(
             f"{np.count_nonzero(used)} of the file's positions fall on the reference"
         )

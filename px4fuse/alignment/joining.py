@@ -11,13 +11,7 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.errors import MissingDataError
-from px4fuse.flight import (
-    POSITION_COLUMNS,
-    Ekf2,
-    Flight,
-    Unavailable,
-    best_first,
-)
+from px4fuse.flight import POSITION_COLUMNS, Ekf2, Flight, Unavailable, best_first
 from px4fuse.readers.parts import missing_parts
 from px4fuse.recording import InputFile
 
@@ -57,7 +51,7 @@ def join(flight: Flight, other: Flight) -> Flight:
             f"{_span(other)} on the autopilot's boot clock",
             "Give the recordings of one flight.",
         )
-    moved = _shifted(other, shift_s)
+    moved = later(other, shift_s)
     agreement = _agreement(flight, moved)
     taken: dict[str, Any] = {}
     streams = dict(flight.streams)
@@ -100,7 +94,7 @@ def _span(flight: Flight) -> str:
 
 
 def later(part: Any, shift_s: float) -> Any:
-    """A part of a flight counted from another time zero: its tables, and the times in its records.
+    """A flight, or a part, counted from another time zero: tables, and the times in its records.
 
     Parameters
     ----------
@@ -121,17 +115,10 @@ def later(part: Any, shift_s: float) -> Any:
         moved[name] = value + shift_s if name in TIMES else later(value, shift_s)
     if isinstance(part, Ekf2):
         moved["instances"] = tuple((time + shift_s, number) for time, number in part.instances)
+    if isinstance(part, Flight) and not isinstance(part.airborne, Unavailable):
+        spans = part.airborne
+        moved["airborne"] = tuple((start + shift_s, end + shift_s) for start, end in spans)
     return replace(part, **moved)
-
-
-def _shifted(flight: Flight, shift_s: float) -> Flight:
-    """The same flight counted from another time zero."""
-    parts = ("imu", "attitude", "positions", "ekf2", "truth", "modes")
-    airborne = flight.airborne
-    if not isinstance(airborne, Unavailable):
-        airborne = tuple((start + shift_s, end + shift_s) for start, end in airborne)
-    moved = {name: later(getattr(flight, name), shift_s) for name in parts}
-    return replace(flight, airborne=airborne, **moved)
 
 
 def _agreement(flight: Flight, other: Flight) -> str:

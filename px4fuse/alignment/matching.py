@@ -8,33 +8,9 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
-from px4fuse.alignment.fitting import (
-    MIN_CONCORDANCE,
-    RESIDUAL_FLOOR_M,
-    Fit,
-    Peak,
-    correlation_peak,
-    least_squares_fit,
-)
-from px4fuse.alignment.tracks import (
-    EKF2_POSITION,
-    FRAMES,
-    IMU,
-    MIN_MOTION_M,
-    MIN_OVERLAP_S,
-    NoMatchError,
-    OwnTrack,
-    band_passed,
-    continuous_track,
-    despiked,
-    ekf2_references,
-    file_track,
-    horizontal_range_m,
-    imu_references,
-    on_grid,
-    placed_samples,
-    without_edges,
-)
+from px4fuse.alignment import fitting, tracks
+from px4fuse.alignment.fitting import MIN_CONCORDANCE, RESIDUAL_FLOOR_M, Fit, Peak
+from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError, OwnTrack
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.trajectory.offset import RIVAL_RATIO, STEP_S
 
@@ -121,7 +97,8 @@ def find_match(flight: Flight, asked: Question) -> Match | None:
     sought = [f"`{name}`" for name, value in known.items() if value is None]
     reasons = []
     # what is all given is at most compared, for which the IMU's band says too little
-    for references in (ekf2_references, imu_references) if sought else (ekf2_references,):
+    every = (tracks.ekf2_references, tracks.imu_references)
+    for references in every if sought else every[:1]:
         try:
             match = _match(references(flight), asked)
             _check_match(match)
@@ -140,9 +117,9 @@ def _match(references: list[OwnTrack], asked: Question) -> Match:
     samples, frame, yaw_rad = asked.samples, asked.frame, asked.yaw_rad
     if samples.index[-1] - samples.index[0] > MAX_SPAN_S:
         raise NoMatchError("the file spans more than a day: cut it to the day of the flight")
-    if horizontal_range_m(file_track(samples, "ned")) < MIN_MOTION_M:
+    if tracks.horizontal_range_m(tracks.file_track(samples, "ned")) < tracks.MIN_MOTION_M:
         raise NoMatchError("the file hardly moves")
-    frames = (frame,) if frame else TURNABLE_FRAMES if yaw_rad is None else tuple(FRAMES)
+    frames = (frame,) if frame else TURNABLE_FRAMES if yaw_rad is None else tuple(tracks.FRAMES)
     matches = []
     for reference in references:
         name = reference.name
@@ -157,7 +134,7 @@ def _match(references: list[OwnTrack], asked: Question) -> Match:
         )
         better = ""
         if turned and frame and yaw_rad is not None:
-            others = {tried: fitted(tried, yaw_rad) for tried in FRAMES if tried != frame}
+            others = {tried: fitted(tried, yaw_rad) for tried in tracks.FRAMES if tried != frame}
             other, there = min(others.items(), key=lambda item: item[1].rms_m)
             fits_well = there.concordance >= GOOD_CONCORDANCE[name]
             better = other if fits_well and TURNED_RATIO * there.rms_m < fit.rms_m else ""
@@ -213,9 +190,10 @@ def _fitted_across_resets(flight: Flight, match: Match, asked: Question) -> Matc
     ekf2, clock = flight.ekf2, match.clock
     if match.reference.name == IMU or isinstance(ekf2, Unavailable) or not ekf2.resets:
         return match
-    placed = placed_samples(asked.samples, match.frame, clock.yaw_rad, clock.origin_m, clock.lag_s)
-    track, file = continuous_track(ekf2, placed), file_track(asked.samples, match.frame)
-    again = partial(least_squares_fit, file, track, clock_free=asked.lag_s is None)
+    samples, frame = asked.samples, match.frame
+    placed = tracks.placed_samples(samples, frame, clock.yaw_rad, clock.origin_m, clock.lag_s)
+    track, file = tracks.continuous_track(ekf2, placed), tracks.file_track(samples, frame)
+    again = partial(fitting.least_squares_fit, file, track, clock_free=asked.lag_s is None)
     free = again(match.free, None)
     fit = free if asked.yaw_rad is None else again(match.fit, asked.yaw_rad)
     return replace(match, reference=track, fit=fit, free=free)
@@ -223,12 +201,12 @@ def _fitted_across_resets(flight: Flight, match: Match, asked: Question) -> Matc
 
 def _best_fit(asked: Question, reference: OwnTrack, frame: str, yaw_rad: float | None) -> Fit:
     """Find the lag, unless it is given, then fit."""
-    file, lag_s = file_track(asked.samples, frame), asked.lag_s
-    coarse = on_grid(despiked(file))
+    file, lag_s = tracks.file_track(asked.samples, frame), asked.lag_s
+    coarse = tracks.on_grid(tracks.despiked(file))
     if reference.name == IMU:
-        if len(coarse.time_s) * STEP_S < MIN_OVERLAP_S:
+        if len(coarse.time_s) * STEP_S < tracks.MIN_OVERLAP_S:
             raise NoMatchError("the file is too short for a match with the IMU")
-        coarse = replace(coarse, position_m=band_passed(band_passed(coarse.position_m)))
-        file = coarse = without_edges(coarse)
-    peak = correlation_peak(coarse, reference, yaw_rad) if lag_s is None else Peak(lag_s)
-    return least_squares_fit(file, reference, peak, yaw_rad, clock_free=lag_s is None)
+        twice = tracks.band_passed(tracks.band_passed(coarse.position_m))
+        file = coarse = tracks.without_edges(replace(coarse, position_m=twice))
+    peak = fitting.correlation_peak(coarse, reference, yaw_rad) if lag_s is None else Peak(lag_s)
+    return fitting.least_squares_fit(file, reference, peak, yaw_rad, clock_free=lag_s is None)

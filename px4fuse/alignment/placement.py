@@ -12,25 +12,30 @@ reference: an EKF2 that was fed with late positions is late itself, and the cloc
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+import pandas as pd
 from msgspec import structs
 
-from px4fuse.alignment.description import describe
-from px4fuse.alignment.matching import Question, find_match
-from px4fuse.alignment.tracks import EKF2_POSITION, FRAMES, IMU, MIN_SAMPLES, NoMatchError
+from px4fuse.alignment import matching, tracks
+from px4fuse.alignment.fitting import MIN_CONCORDANCE, capped_rms
+from px4fuse.alignment.matching import Match, Question
+from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError
+from px4fuse.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
-from px4fuse.flight import Flight, PositionTrack
+from px4fuse.flight import Alignment, Flight, PositionTrack, Unavailable
 from px4fuse.origin import GIVEN_FILE
 from px4fuse.readers.parts import finite_rows
+from px4fuse.readers.position_csv import PositionRecording
 from px4fuse.recording import InputFile
 
-if TYPE_CHECKING:
-    from px4fuse.readers.position_csv import PositionRecording
-
-__all__ = ["EKF2_POSITION", "IMU", "place"]
+# Another lag whose residual is not larger by this factor can hardly be told apart
+NEAR_RESIDUAL = {EKF2_POSITION: 2.0, IMU: 1.4}  # the IMU's own noise leaves 1.4 to 1.7
+MIN_MIRRORED = 0.8  # correlation of the heights below minus which they run against each other
+MAX_UNIX_DIFFERENCE_S = 60.0  # computers in a lab keep time better than this
 
 
 def place(
@@ -70,9 +75,10 @@ def place(
     """
     _check_options(frame, yaw_deg, clock_offset_s)
     samples = finite_rows(file.samples, ["x_m", "y_m"])
-    if len(samples) < MIN_SAMPLES:
+    if len(samples) < tracks.MIN_SAMPLES:
         raise MissingDataError(
-            f"{file.name}: {len(samples)} positions are too few, at least {MIN_SAMPLES} are needed."
+            f"{file.name}: {len(samples)} positions are too few, at least {tracks.MIN_SAMPLES} are "
+            "needed."
         )
     start_s, end_s = float(samples.index[0]), float(samples.index[-1])
     boot_s = flight.log.boot_time_s
@@ -89,10 +95,11 @@ def place(
         )
     yaw_rad = None if yaw_deg == "auto" else float(np.radians(yaw_deg or 0.0))
     try:
-        match = find_match(flight, Question(samples, frame or file.frame, yaw_rad, lag_s))
+        asked = Question(samples, frame or file.frame, yaw_rad, lag_s)
+        match = matching.find_match(flight, asked)
     except NoMatchError as error:
         raise MissingDataError(f"{file.name}: {error}; {spans}", f"{error.remedy}.") from None
-    alignment, placed = describe(flight, file, samples, match, frame, yaw_deg, clock_offset_s)
+    alignment, placed = _describe(flight, file, asked, match, frame, yaw_deg, clock_offset_s)
     how = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
     turned = f" turned by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
     track = PositionTrack(
@@ -124,12 +131,190 @@ def place(
 def _check_options(
     frame: str | None, yaw_deg: float | str | None, clock_offset_s: float | None
 ) -> None:
-    if frame is not None and frame not in FRAMES:
+    if frame is not None and frame not in tracks.FRAMES:
         raise SettingsError(
-            f"`frame` {frame}: not a known frame", f"Choose from {', '.join(FRAMES)}."
+            f"`frame` {frame}: not a known frame", f"Choose from {', '.join(tracks.FRAMES)}."
         )
     if isinstance(yaw_deg, str) and yaw_deg != "auto":
         raise SettingsError(f"`yaw_deg` {yaw_deg}: give degrees, or auto.")
     for name, value in (("yaw_deg", yaw_deg), ("clock_offset_s", clock_offset_s)):
         if isinstance(value, float) and not np.isfinite(value):
             raise SettingsError(f"`{name}` {value:g} is not a finite number.")
+
+
+def _describe(
+    flight: Flight,
+    file: PositionRecording,
+    asked: Question,
+    match: Match | None,
+    frame_option: str | None,
+    yaw_deg: float | Literal["auto"] | None,
+    clock_offset_s: float | None,
+) -> tuple[Alignment, pd.DataFrame]:
+    """Alignment, with the reason for each of its parts, and the placed samples."""
+    samples, frame, auto = asked.samples, asked.frame or "", asked.yaw_rad is None
+    yaw_rad, lag_s = asked.yaw_rad or 0.0, asked.lag_s or 0.0
+    yaw_sigma_deg = clock_sigma_s = correlation = None
+    origin_m, reference = np.zeros(3), ""
+    yaw_reason, clock_reason = "given with --position-yaw", "given with --clock-offset"
+    if yaw_deg is None:
+        yaw_reason = "the file's frame is taken to be EKF2's"
+    frame_reason = "from the names of the file's columns"
+    if frame_option:
+        frame_reason = "given with --position-frame"
+    if match:
+        frame, reference = match.frame, match.reference.name
+        if not (frame_option or file.frame):
+            frame_reason = f"fits {reference} best; residuals: {match.misfits}"
+            if auto and frame == "enu":
+                frame_reason += "; nwu differs from enu only by the yaw, which was found"
+        if auto:
+            yaw_rad = match.fit.yaw_rad
+            yaw_sigma_deg = float(np.degrees(match.fit.yaw_sigma_rad or 0.0))
+            yaw_reason = f"matched with {reference}"
+            origin_m = match.fit.origin_m if reference == EKF2_POSITION else origin_m
+        if clock_offset_s is None:
+            lag_s, clock_sigma_s = match.clock.lag_s, match.clock.lag_sigma_s
+            clock_offset_s = lag_s + (flight.log.boot_time_s - float(samples.index[0]))
+            clock_reason = f"matched with {reference}, so that a delay of that is part of it"
+        correlation = float((np.exp(-1j * yaw_rad) * match.clock.coherence).real)
+    placed = tracks.placed_samples(samples, frame, yaw_rad, origin_m, lag_s)
+    compared = None if reference == IMU else _compare(flight, placed)
+    if compared:
+        reference, correlation = EKF2_POSITION, compared[1]
+    other = [] if auto else [*_other_frame(match, compared, yaw_rad)]
+    warnings = [
+        *(_match_warnings(match) if match else ()),
+        *([] if other else _poor_fit(match, compared, auto)),
+        *_unix_warnings(flight, file, clock_offset_s),
+    ]
+    if not (match and match.better_frame):
+        other += _other_height(flight, placed)
+    alignment = Alignment(
+        frame=frame,
+        frame_reason=frame_reason,
+        yaw_deg=float(np.degrees(yaw_rad)),
+        yaw_sigma_deg=yaw_sigma_deg,
+        yaw_reason=yaw_reason,
+        origin_m=(float(origin_m[0]), float(origin_m[1]), float(origin_m[2])),
+        clock_offset_s=float(clock_offset_s or 0.0),
+        clock_offset_sigma_s=clock_sigma_s,
+        clock_reason=clock_reason,
+        reference=reference,
+        correlation=correlation,
+        residual_rms_m=float(np.sqrt(np.mean(compared[0] ** 2) / 2.0)) if compared else None,
+        misplaced=tuple(other),
+        warnings=tuple(warnings),
+    )
+    return alignment, placed
+
+
+def _compare(flight: Flight, placed: pd.DataFrame) -> tuple[Array, float | None] | None:
+    """Distances (m) from EKF2 and correlation with it, horizontally.
+
+    The correlation is None where EKF2 hardly moves; all is None where it has no position at the
+    file's times.
+    """
+    if isinstance(flight.ekf2, Unavailable):
+        return None
+    try:
+        ekf2, known = tracks.continuous_track(flight.ekf2, placed).at(placed.index.to_numpy())
+    except NoMatchError:
+        return None
+    if np.count_nonzero(known) < tracks.MIN_SAMPLES:
+        return None
+    ours = (placed["north_m"].to_numpy() + 1j * placed["east_m"].to_numpy())[known]
+    theirs = (ekf2[:, 0] + 1j * ekf2[:, 1])[known]
+    distance_m = np.abs(ours - theirs)
+    ours, theirs = ours - np.mean(ours), theirs - np.mean(theirs)
+    moves = max(np.ptp(theirs.real), np.ptp(theirs.imag)) >= tracks.MIN_MOTION_M
+    power = float(np.linalg.norm(ours) * np.linalg.norm(theirs))
+    return distance_m, float(np.vdot(ours, theirs).real) / power if moves and power > 0.0 else None
+
+
+def _match_warnings(match: Match) -> Iterator[str]:
+    """What makes the match doubtful."""
+    name, fit = match.reference.name, match.clock
+    if fit.concordance < matching.GOOD_CONCORDANCE[name]:
+        yield f"The file follows the {name} only roughly (concordance {fit.concordance:.2f})."
+    if fit.rival_ratio < NEAR_RESIDUAL[name]:
+        yield (
+            f"A clock offset {fit.rival_s:+.1f} s from this one fits nearly as well, with a "
+            f"residual only {fit.rival_ratio:.1f} times as large: if this one is wrong, give "
+            "--clock-offset SECONDS."
+        )
+
+
+def _other_height(flight: Flight, placed: pd.DataFrame) -> Iterator[str]:
+    """Whether the file's height runs against EKF2's: then its frame is another one."""
+    if isinstance(flight.ekf2, Unavailable):
+        return
+    down = flight.ekf2.state["down_m"]
+    ours = placed["down_m"].loc[down.index[0] : down.index[-1]].dropna()
+    if len(ours) < tracks.MIN_SAMPLES:
+        return
+    theirs = np.interp(ours.index, down.index, down)
+    moved = min(np.ptp(np.percentile(ours, [2, 98])), np.ptp(theirs))
+    if moved >= tracks.MIN_MOTION_M and np.corrcoef(ours, theirs)[0, 1] <= -MIN_MIRRORED:
+        yield (
+            "The file's height runs against EKF2's (one rises where the other sinks): its z points "
+            "the other way. Give another --position-frame."
+        )
+
+
+def _unix_warnings(
+    flight: Flight, file: PositionRecording, clock_offset_s: float | None
+) -> Iterator[str]:
+    """Whether the file's UNIX clock is far from the log's: then it may be of another flight."""
+    start_s = flight.log.start_unix_s
+    if file.clock != "UNIX" or start_s is None or clock_offset_s is None:
+        return
+    apart_s = abs(flight.log.boot_time_s - clock_offset_s - start_s)
+    if apart_s >= MAX_UNIX_DIFFERENCE_S:
+        yield (
+            f"By their UNIX times file and log are {apart_s:.0f} s apart: is it the same flight? "
+            "Flights along one path match each other well."
+        )
+
+
+def _other_frame(
+    match: Match | None, compared: tuple[Array, float | None] | None, yaw_rad: float
+) -> Iterator[str]:
+    """Whether the file's frame is another one than EKF2's."""
+    if match is None:
+        return
+    name, turned = match.reference.name, match.turned
+    if compared:
+        rms_m = capped_rms(compared[0]) / np.sqrt(2.0)
+        turned = matching.is_sound(match.free, name) and matching.is_turned(rms_m, match.free, name)
+    if turned and match.better_frame:
+        yield (
+            f"The file does not fit the {name} as {match.frame}, but it does as "
+            f"{match.better_frame}: give --position-frame {match.better_frame}."
+        )
+    elif turned:
+        yaw = np.degrees(np.angle(np.exp(1j * (match.free.yaw_rad - yaw_rad))))
+        shift = np.hypot(*match.free.origin_m[:2])
+        how = f" and shifted by {shift:.1f} m" if compared else ""
+        yield (
+            f"The file's frame seems turned by {yaw:.1f}°{how} against the {name}: give "
+            "--position-yaw auto."
+        )
+
+
+def _poor_fit(
+    match: Match | None, compared: tuple[Array, float | None] | None, auto: bool
+) -> Iterator[str]:
+    """What cannot be told of the frame, or does not fit however it is turned."""
+    correlation = compared[1] if compared else None
+    if auto:
+        if match is not None and match.reference.name == IMU:
+            yield (
+                "The IMU tells the yaw to a few degrees only (1° to 6° off on simulated flights), "
+                "and not the origin of the file's frame, which was left at 0."
+            )
+    elif correlation is not None and correlation < MIN_CONCORDANCE[EKF2_POSITION]:
+        yield (
+            f"The file hardly follows the EKF2 position (correlation {correlation:.2f}): check "
+            "clock offset, frame and yaw."
+        )

@@ -113,8 +113,7 @@ def band_passed(position_m: Array) -> Array:
     """Band-pass without delay."""
     sos = butter(2, BAND_HZ, "bandpass", fs=1.0 / STEP_S, output="sos")
     padding = min(round(BAND_PADDING_S / STEP_S), len(position_m) - 1)
-    filtered: Array = sosfiltfilt(sos, position_m, axis=0, padlen=padding)
-    return filtered
+    return sosfiltfilt(sos, position_m, axis=0, padlen=padding)
 
 
 def without_edges(track: OwnTrack) -> OwnTrack:

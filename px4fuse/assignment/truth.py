@@ -19,8 +19,7 @@ from px4fuse.filter.model import COVARIANCES, matrix, noise, transition
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import Ekf2, Unavailable
 from px4fuse.loop.analysis import analyse
-from px4fuse.loop.sources import LoopSource
-from px4fuse.loop.tracks import trajectory_of
+from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.record import Record
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import MISTAKES as SIMULATED

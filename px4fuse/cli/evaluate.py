@@ -61,10 +61,10 @@ def evaluate(
     LOG:ekf2, LOG:kf (our filter) or LOG:truth. Writes a page (PDF) and the results (JSON); where
     --json names a file and -o none, only that.
     """
-    from px4fuse.loop.sources import file_name, read_source
+    from px4fuse.loop.tracks import file_name, read_source
     from px4fuse.report.evaluation import write_evaluation
     from px4fuse.report.page import Page
-    from px4fuse.results.build_trajectories import evaluation_results
+    from px4fuse.results.build import evaluation_results
     from px4fuse.trajectory.evaluation import evaluate as score
 
     request = EvaluationRequest(

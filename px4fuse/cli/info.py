@@ -11,6 +11,7 @@ import click
 from px4fuse.cli.inputs import Named, comparison_request, json_option, recording_options
 from px4fuse.cli.outputs import finish, progress, result_files
 from px4fuse.plain import few_words
+from px4fuse.record import Unavailable
 
 if TYPE_CHECKING:
     from px4fuse.inspect.inventory import Inventory, Source
@@ -62,10 +63,10 @@ def _page(inventory: Inventory, request: ComparisonRequest) -> Page:
     from px4fuse.request import command_line
 
     page = Page()
-    page.write(inventory.log.name, bold=True)
+    page.write(inventory.flight.log.name, bold=True)
     for label, text in _facts(inventory):
         page.labelled(label, text)
-    if inventory.log.senders:
+    if inventory.flight.log.senders:
         page.table(("sender", "what it is", "messages", "lost"), _senders(inventory), right=(2, 3))
     page.table(SOURCES_HEAD, list(_sources(inventory)), right=(2, 3, 4, 5))
     looks = {True: ("yes", GOOD), False: ("no", SEVERITY_COLOURS["warning"])}
@@ -77,7 +78,9 @@ def _page(inventory: Inventory, request: ComparisonRequest) -> Page:
     lists = {
         "Next": [f"{one.remedy} ({'; '.join(one.improves)})" for one in inventory.advice],
         "Clocks": _clocks(inventory),
-        "Not used": [f"{one.name}, {one.count} messages: {one.reason}" for one in inventory.unused],
+        "Not used": [
+            f"{one.name}, {one.count} messages: {one.reason}" for one in inventory.flight.unused
+        ],
         "Notes": inventory.notes,
     }
     for label, texts in lists.items():
@@ -87,7 +90,7 @@ def _page(inventory: Inventory, request: ComparisonRequest) -> Page:
 
 
 def _facts(inventory: Inventory) -> list[tuple[str, str]]:
-    log = inventory.log
+    log = inventory.flight.log
     size = f"{log.bytes / 1e6:.1f} MB" if log.bytes >= 1e5 else f"{log.bytes} bytes"
     version = log.firmware if log.firmware != "unknown" else f"{log.autopilot}, version unknown"
     git = "" if log.firmware_hash == "unknown" else f" (git {log.firmware_hash[:8]})"
@@ -106,7 +109,7 @@ def _facts(inventory: Inventory) -> list[tuple[str, str]]:
         facts.append(("Dropouts", words))
     facts += [
         (file.role.capitalize(), f"{file.name}, SHA-256 {file.sha256[:12]}")
-        for file in inventory.inputs
+        for file in inventory.flight.inputs
     ]
     return facts
 
@@ -117,16 +120,17 @@ def _duration(seconds: float) -> str:
 
 def _start(inventory: Inventory) -> str:
     if inventory.start_utc is None:
-        return f"from {inventory.log.boot_time_s:.1f} s after boot (no UTC in the log)"
+        return f"from {inventory.flight.log.boot_time_s:.1f} s after boot (no UTC in the log)"
     return f"from {inventory.start_utc[:19].replace('T', ' ')} UTC"
 
 
 def _flying(inventory: Inventory) -> str:
-    if inventory.airborne is None:
+    airborne = inventory.flight.airborne
+    if isinstance(airborne, Unavailable):
         return "unknown, no land detector"
-    if not inventory.airborne:
+    if not airborne:
         return "never, by the land detector"
-    spans = [f"{start:.1f} s to {end:.1f} s" for start, end in inventory.airborne]
+    spans = [f"{start:.1f} s to {end:.1f} s" for start, end in airborne]
     return few_words(spans, 3)
 
 
@@ -138,7 +142,7 @@ def _senders(inventory: Inventory) -> list[tuple[str, ...]]:
             f"{sender.messages}",
             "unknown" if sender.lost_share is None else f"{sender.lost_share:.1%}",
         )
-        for sender in inventory.log.senders
+        for sender in inventory.flight.log.senders
     ]
 
 
@@ -193,4 +197,4 @@ def _clocks(inventory: Inventory) -> list[str]:
             name = source.name if source.part == "position" else source.part
             on.setdefault(source.clock, {})[name] = None
     lines = [f"{clock}: {', '.join(parts)}" for clock, parts in on.items()]
-    return lines + [clock_words(clock) for clock in inventory.clocks]
+    return lines + [clock_words(clock) for clock in inventory.flight.clocks]

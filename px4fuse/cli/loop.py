@@ -22,7 +22,7 @@ from px4fuse.request import (
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
-    from px4fuse.loop.loop import Loop
+    from px4fuse.loop.model import Loop
 
 # Nobody's tape is longer
 MAX_LANDED_AT = 10_000.0
@@ -94,10 +94,10 @@ def loop(
     Writes a report (PDF) and its results as JSON, except of a pose graph.
     """
     from px4fuse.analysis import run_loop
-    from px4fuse.loop.sources import file_name, is_g2o, split_part
+    from px4fuse.loop.tracks import file_name, is_g2o, split_part
     from px4fuse.report.document import LoopDocument
     from px4fuse.report.loop import summary
-    from px4fuse.results.build_trajectories import loop_results
+    from px4fuse.results.build import loop_results
 
     person = inputs.read_person(given)
     for name, path in (("--tum", tum), ("--g2o", g2o)):
@@ -147,10 +147,10 @@ def _files(found: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]
 
 def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool | None) -> None:
     """Solve a pose graph from a file."""
-    from px4fuse.loop.sources import split_part
+    from px4fuse.loop.tracks import split_part
     from px4fuse.readers.g2o import g2o_text, read_g2o
     from px4fuse.report.loop import graph_summary
-    from px4fuse.results.build_trajectories import graph_results
+    from px4fuse.results.build import graph_results
     from px4fuse.trajectory.graph.analysis import analyse_graph
 
     path, part = split_part(str(source))

@@ -22,7 +22,7 @@ from px4fuse.findings.aids import find_in as find_in_aids
 from px4fuse.findings.causes import NAMES, by_cause
 from px4fuse.findings.loops import find_in
 from px4fuse.findings.model import SEVERITIES, Finding, Found, Severity, by_root
-from px4fuse.loop.loop import Loop
+from px4fuse.loop.model import Loop
 
 __all__ = [
     "NAMES", "SEVERITIES", "Finding", "Severity", "by_root", "find", "find_aids", "find_loop",

@@ -30,7 +30,7 @@ from px4fuse.findings.causes import CAUSE
 from px4fuse.findings.model import Finding, Found, finding, info
 from px4fuse.findings.since import cure_words, kind_of, since_words
 from px4fuse.flight import Unavailable
-from px4fuse.loop.loop import Loop
+from px4fuse.loop.model import Loop
 from px4fuse.plain import factor_words, number_words
 from px4fuse.trajectory.alignment import fit
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from px4fuse.analysis import Analysis
 from px4fuse.findings.model import Finding, Found, error, info, warning
-from px4fuse.loop.loop import Loop
-from px4fuse.loop.model import LANDING, Closure
+from px4fuse.loop.model import LANDING, Closure, Loop
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 
 MOST = 0.5  # of several closures more are true than false

@@ -30,7 +30,7 @@ from px4fuse.findings.model import Finding
 from px4fuse.findings.since import TOLD_BY, effect_words, kind_of, since_words
 from px4fuse.findings.source_positions import hardly_moved
 from px4fuse.flight import Unavailable
-from px4fuse.loop.loop import Loop
+from px4fuse.loop.model import Loop
 from px4fuse.plain import capital, excess_words, length_words
 
 MOST_SENTENCES = 3

@@ -20,8 +20,12 @@ from px4fuse.fleet import measures
 from px4fuse.fleet.inputs import DiffInput, Progress, read_inputs
 from px4fuse.fleet.measures import FALSE_DISCOVERY_RATE, LEAST_RATIO, Contrast, Number, at
 from px4fuse.report.changes import change_line
-from px4fuse.results.changes import (
+from px4fuse.results.contract import (
+    CHANGES,
+    AidsResults,
+    ChangeResults,
     Compared,
+    ComparisonResults,
     FindingChange,
     Judgement,
     NumberChange,
@@ -29,7 +33,6 @@ from px4fuse.results.changes import (
     TextChange,
     Which,
 )
-from px4fuse.results.contract import CHANGES, AidsResults, ChangeResults, ComparisonResults
 from px4fuse.results.model import provenance, schema_of
 
 # What stands first of the significant changes; and of these, causes before what they bring

@@ -12,8 +12,7 @@ from px4fuse.ekf2.aids import AidResult
 from px4fuse.findings import Finding
 from px4fuse.fleet.measures import at
 from px4fuse.record import Unavailable
-from px4fuse.results.comparison import Log
-from px4fuse.results.contract import ComparisonResults
+from px4fuse.results.contract import ComparisonResults, Log
 from px4fuse.spreadsheet import neutral
 
 DONE, NOT_JUDGED, FAILED = "done", "not judged", "failed"

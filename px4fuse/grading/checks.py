@@ -33,8 +33,7 @@ from px4fuse.grading.evidence import (
 from px4fuse.loop.model import Correction, LoopPart, Way
 from px4fuse.plain import capital, factor_words, length_words, p_words
 from px4fuse.record import Maybe, Share
-from px4fuse.results.comparison import ASKED
-from px4fuse.results.contract import ComparisonResults, LoopResults
+from px4fuse.results.contract import ASKED, ComparisonResults, LoopResults
 from px4fuse.trajectory.evaluation import Score
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 from px4fuse.verification.verification import is_number

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from typing import Any
 
@@ -30,11 +30,13 @@ from px4fuse.flight import (
 )
 from px4fuse.inspect.tables import NO_POSITION, absent
 from px4fuse.plain import capital, plain
-from px4fuse.recording import ClockMap, InputFile, LogInfo, Stream, Unused
+from px4fuse.recording import Stream
 from px4fuse.request import with_options
 
 SCHEMA_NAME = "px4fuse-info"
 SCHEMA_VERSION = "1.0"
+# What is told of a flight as it is
+OF_FLIGHT = ("log", "airborne", "clocks", "missing", "unused", "inputs")
 # How a part is named for a person, by its name in Flight.streams
 PARTS = {
     "imu": "IMU",
@@ -144,41 +146,30 @@ class Inventory:
 
     Attributes
     ----------
-    log : LogInfo
+    flight : Flight
+        With EKF2's innovations of the position that compare takes.
     start_utc : str or None
         ISO 8601, of time zero.
-    airborne : tuple of (float, float), or None
-        Stretches of flight (s); None where the log has no land detector.
     sources : tuple of Source
         Every part of the flight, every position track, best first.
     source_reason : str
         Why compare takes its position source, or why it finds none.
     segment : Segment or None
         What compare would analyse.
-    clocks : tuple of ClockMap
     abilities : tuple of Ability
     advice : tuple of Advice
         Most important first, each remedy once.
-    missing : tuple of Unavailable
-        What was looked for and not found.
-    unused : tuple of Unused
-    inputs : tuple of InputFile
     notes : tuple of str
         What the reader had to do, and what EKF2 means here.
     """
 
-    log: LogInfo
+    flight: Flight
     start_utc: str | None
-    airborne: tuple[tuple[float, float], ...] | None
     sources: tuple[Source, ...]
     source_reason: str
     segment: Segment | None
-    clocks: tuple[ClockMap, ...]
     abilities: tuple[Ability, ...]
     advice: tuple[Advice, ...]
-    missing: tuple[Unavailable, ...]
-    unused: tuple[Unused, ...]
-    inputs: tuple[InputFile, ...]
     notes: tuple[str, ...]
 
 
@@ -204,18 +195,13 @@ def take_inventory(flight: Flight) -> Inventory:
     log = flight.log
     cut = log.ends_in_flight and not log.damage
     return Inventory(
-        log=log,
+        flight=flight,
         start_utc=_utc(log.start_unix_s),
-        airborne=None if isinstance(flight.airborne, Unavailable) else flight.airborne,
         sources=tuple(_sources(flight, compared, reason)),
         source_reason=reason,
         segment=None if compared is None else compared.segment,
-        clocks=flight.clocks,
         abilities=tuple(_abilities(flight, compared, reason)),
         advice=_advice(flight, compared, remedy),
-        missing=flight.missing,
-        unused=flight.unused,
-        inputs=flight.inputs,
         notes=(
             *log.damage,
             *(("the log ends in flight: the landing is not in it",) if cut else ()),
@@ -228,7 +214,12 @@ def take_inventory(flight: Flight) -> Inventory:
 
 def to_plain(inventory: Inventory) -> dict[str, Any]:
     """The inventory for JSON: what is not known is absent."""
-    data: dict[str, Any] = plain(inventory)
+    found = {field.name: getattr(inventory, field.name) for field in fields(inventory)}
+    flight: Flight = found.pop("flight")
+    logged = {name: getattr(flight, name) for name in OF_FLIGHT}
+    if isinstance(flight.airborne, Unavailable):
+        del logged["airborne"]
+    data: dict[str, Any] = plain(logged | found)
     return {"schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION}, **data}
 
 

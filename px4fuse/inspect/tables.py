@@ -96,22 +96,7 @@ def description(flight: Flight) -> dict[str, Any]:
         "schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION},
         "log": flight.log,
         "streams": flight.streams,
-        "positions": [
-            {
-                "table": table,
-                "name": track.name,
-                "kind": track.origin.kind,
-                "passage": track.origin.passage,
-                "description": track.description,
-                "frame": track.frame,
-                "clock": track.clock,
-                "reconstructed": track.origin.reconstructed,
-                "topics": track.topics,
-                "log": track.log,
-                "alignment": track.alignment,
-            }
-            for table, track in _named_tracks(flight)
-        ],
+        "positions": [{"table": table, **track.about()} for table, track in _named_tracks(flight)],
         "ekf2": {"gate": ekf2.gate, "notes": ekf2.notes} if isinstance(ekf2, Ekf2) else None,
         "clocks": flight.clocks,
         "missing": tuple(dict.fromkeys((*absent(flight), *flight.missing))),

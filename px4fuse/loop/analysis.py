@@ -11,8 +11,7 @@ from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.flight import Flight, Truth, Unavailable
 from px4fuse.loop.closure import key_frame_spacing_m, key_frames, upright
 from px4fuse.loop.corrections import by_distance, judge, score_all, solve_all
-from px4fuse.loop.loop import Loop
-from px4fuse.loop.model import LANDING, KnownEnd, OdometryNoise
+from px4fuse.loop.model import LANDING, KnownEnd, Loop, OdometryNoise
 from px4fuse.loop.odometry import Claim, pose_graph
 from px4fuse.loop.part import (
     assumed_end,
@@ -22,9 +21,8 @@ from px4fuse.loop.part import (
     part_of,
     true_end,
 )
-from px4fuse.loop.sources import LoopSource
-from px4fuse.loop.tracks import odometry_of, trajectory_of
-from px4fuse.request import GivenClosure
+from px4fuse.loop.tracks import LoopSource, odometry_of, trajectory_of
+from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Trajectory, by_axis, cumulative_distance
 
@@ -41,43 +39,30 @@ MOST = 100.0
 
 def analyse(
     source: LoopSource,
-    *,
-    start_s: float | None = None,
-    end_s: float | None = None,
-    landed_at: tuple[float, float, float | None] | None = None,
-    came_back: bool = True,
-    closures: tuple[GivenClosure, ...] = (),
-    noise: OdometryNoise | None = None,
+    request: LoopRequest | None = None,
     reference: Trajectory | None = None,
-    spacing_m: float | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Loop:
     """Measure and correct the loop of a trajectory or of a flight.
 
     Parameters
     ----------
-    start_s, end_s : float, optional
-        Override take-off and landing.
-    landed_at : tuple of forward_m, right_m and heading change (degrees or None), optional
-        Where it landed, measured from the place and heading of take-off; by default the truth in
-        the log where there is one, else the place of take-off.
-    came_back : bool
-        False where the landing closes no loop.
-    closures : tuple of GivenClosure
-        Times as the trajectory counts; where those are UNIX time, small ones count from the
-        first pose.
-    noise : OdometryNoise, optional
+    source : LoopSource
+        What was read.
+    request : LoopRequest, optional
+        How it is measured; its times are as the trajectory counts, where those are UNIX time small
+        ones count from the first pose. Where it does not say where the vehicle landed, that is the
+        truth in the log where there is one, else the place of take-off.
     reference : Trajectory, optional
         Scored against, besides the truth in the log.
-    spacing_m : float, optional
-        Between key frames; by default a fiftieth of the extent, 0.02 to 0.5 m.
 
     Raises
     ------
     TrajectoryError, SettingsError
         The part is too short, a closure lies outside it, or a number is out of range.
     """
-    noise = noise or OdometryNoise()
+    request = request or LoopRequest(source=source.trajectory.name)
+    noise = OdometryNoise(request.position_drift_m, request.heading_drift_deg)
     _within("position_drift_m", noise.position_m, 1e-4)
     _within("heading_drift_deg", noise.heading_deg, 1e-4)
     trajectory, flight = source.trajectory, source.flight
@@ -86,24 +71,25 @@ def analyse(
     def stamp(time_s: float) -> float:
         return time_s + zero_s if abs(time_s) < SMALLEST_STAMP_S else time_s
 
-    start = None if start_s is None else stamp(start_s)
-    end = None if end_s is None else stamp(end_s)
+    given = (request.start_s, request.end_s)
+    start, end = (None if time_s is None else stamp(time_s) for time_s in given)
     segment, at_rest = chosen_part(flight, trajectory, start, end)
     truth = None if flight is None or trajectory.kind == "truth" else truth_of(flight)
     whole = upright(trajectory)
     path = part_of(whole, segment, at_rest)
-    real = truth if came_back and landed_at is None else None
+    real = truth if request.came_back and request.landed_at is None else None
     by_truth = None if real is None else true_end(path, real, segment, at_rest)
-    known = _known_end(path, landed_at, came_back, by_truth)
+    known = _known_end(path, request, by_truth)
     claims: list[Claim] = [
         (GivenClosure(stamp(one.time_1_s), stamp(one.time_2_s), one.sigma_m), None)
-        for one in closures
+        for one in request.closures
     ]
     for closure, _ in claims:
         _check(closure, path)
     if not isinstance(known, Unavailable):
         claims.insert(0, (GivenClosure(segment.start_s, segment.end_s, known.sigma_m), known))
-    spacing = key_frame_spacing_m(path.position_m) if spacing_m is None else spacing_m
+    spacing = request.key_frames_m
+    spacing = key_frame_spacing_m(path.position_m) if spacing is None else spacing
     frames, distance = _key_frames(path, spacing)
     graph, nodes, statement = pose_graph(path, frames, claims, noise)
     notes = [*whole.notes, statement]
@@ -152,17 +138,14 @@ def analyse(
 
 
 def _known_end(
-    path: Trajectory,
-    landed_at: tuple[float, float, float | None] | None,
-    came_back: bool,
-    by_truth: KnownEnd | str | None,
+    path: Trajectory, request: LoopRequest, by_truth: KnownEnd | str | None
 ) -> KnownEnd | Unavailable:
     """Where it really ended: as measured, else by the truth in the log, else where it began."""
-    if landed_at is not None:
-        if not came_back:
+    if request.landed_at is not None:
+        if not request.came_back:
             raise SettingsError("`landed_at` and `came_back` exclude each other", "Leave one out.")
-        return measured_end(path, *landed_at)
-    if not came_back:
+        return measured_end(path, request.landed_at)
+    if not request.came_back:
         return Unavailable(
             "misclosure", "the vehicle is not said to have come back", "Leave out --open."
         )

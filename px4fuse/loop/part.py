@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from msgspec import structs
 from scipy.spatial.transform import Rotation
 
 from px4fuse.errors import SettingsError, TrajectoryError
@@ -12,6 +13,7 @@ from px4fuse.filter.signals import Segment
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.closure import DOWN, heading_change_rad
 from px4fuse.loop.model import KnownEnd
+from px4fuse.request import Landing
 from px4fuse.trajectory.model import MIN_POSES, Trajectory, by_axis
 
 # Poses on the ground are averaged over this long, if they stay within this far of each other
@@ -120,18 +122,9 @@ def assumed_end(path: Trajectory) -> KnownEnd:
     )
 
 
-def measured_end(
-    path: Trajectory, forward_m: float, right_m: float, turned_deg: float | None
-) -> KnownEnd:
-    """Where the vehicle landed, measured with a tape from the place where it took off.
-
-    Parameters
-    ----------
-    forward_m, right_m : float
-        Along its nose at take-off, and to the right of it.
-    turned_deg : float or None
-        How far it was turned, clockwise.
-    """
+def measured_end(path: Trajectory, landed: Landing) -> KnownEnd:
+    """Where the vehicle landed, measured with a tape from the place where it took off."""
+    forward_m, right_m, turned_deg = structs.astuple(landed)
     heading = 0.0
     if path.rotation is not None:
         nose = path.rotation[0].apply([1.0, 0.0, 0.0])

@@ -1,7 +1,9 @@
-"""Trajectories out of a flight: its odometry, EKF2, our filter, and the truth."""
+"""Trajectories from files of their own, or out of a flight: odometry, EKF2, our filter, truth."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
@@ -11,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.projection import continuous_state
-from px4fuse.errors import MissingDataError
+from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import (
     AXIS_NAMES,
@@ -25,11 +27,17 @@ from px4fuse.flight import (
     Truth,
     Unavailable,
 )
+from px4fuse.readers import read_log
 from px4fuse.readers.parts import finite_rows
+from px4fuse.readers.text_table import text_of
+from px4fuse.readers.trajectory import read_trajectory
+from px4fuse.reading import read_head, shown
 from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
 
 Part = Literal["vio", "ekf2", "kf", "truth"]
 PARTS: tuple[Part, ...] = get_args(Part)
+_HEAD_BYTES = 4096
+_G2O = (b"VERTEX_", b"EDGE_", b"FIX")
 
 
 def odometry_of(flight: Flight) -> PositionTrack | Unavailable:
@@ -147,3 +155,117 @@ def _whole(samples: pd.DataFrame, columns: list[str]) -> Array | None:
     if not set(columns) <= set(samples.columns) or samples[columns].isna().to_numpy().any():
         return None
     return samples[columns].to_numpy(np.float64)
+
+
+@dataclass(frozen=True)
+class LoopSource:
+    """A trajectory and, where it is part of one, the flight."""
+
+    trajectory: Trajectory
+    flight: Flight | None
+
+
+def file_name(source: Path) -> str:
+    """What a source is called in a file name: ``flight_vio`` of ``flight.ulg:vio``."""
+    path, part = split_part(str(source))
+    return path.stem if part is None else f"{path.stem}_{part}"
+
+
+def split_part(argument: str) -> tuple[Path, Part | None]:
+    """File and part of ``FILE`` or ``LOG:vio``, ``LOG:ekf2``, ``LOG:kf``, ``LOG:truth``.
+
+    Raises
+    ------
+    TrajectoryError
+        What follows the colon is no part.
+    """
+    whole = Path(argument)
+    path, colon, part = argument.rpartition(":")
+    if whole.exists() or not colon:
+        return whole, None
+    if part in PARTS:
+        return Path(path), part
+    if Path(path).is_file():
+        raise TrajectoryError(
+            f"{shown(Path(path))}:{part}: {part!r} is not a part of a flight",
+            f"Choose from {', '.join(PARTS)}.",
+        )
+    return whole, None
+
+
+def _is_text(head: bytes) -> bool:
+    """Whether a file that begins like this is text, and so no flight log."""
+    return bool(head) and text_of(head) is not None
+
+
+def is_g2o(path: Path) -> bool:
+    """Whether a file is a pose graph in g2o's format.
+
+    Raises
+    ------
+    TrajectoryError
+        It cannot be read.
+    """
+    head = read_head(path, _HEAD_BYTES, TrajectoryError)
+    return _is_text(head) and any(line.strip().startswith(_G2O) for line in head.splitlines())
+
+
+def read_source(
+    argument: str,
+    *,
+    default: Part | None = None,
+    frame: Frame | None = None,
+    system: int | None = None,
+) -> LoopSource:
+    """Read a trajectory from a file, or a part of a flight log.
+
+    Parameters
+    ----------
+    argument : str
+        As :func:`split_part` takes it.
+    default : Part, optional
+        Part of a log that is taken where none is named; by default its odometry, or EKF2's track
+        where it has none.
+    frame : Frame, optional
+        What a file's axes are, where that is known better than its reader can tell.
+    system : int, optional
+        MAVLink system id.
+
+    Raises
+    ------
+    TrajectoryError, LogError, MissingDataError
+        It cannot be read, or lacks the part.
+    SettingsError
+        A flight log states its frame.
+    """
+    path, part = split_part(argument)
+    head = read_head(path, _HEAD_BYTES, TrajectoryError)
+    if not head:
+        raise TrajectoryError(f"{shown(path)}: the file is empty", "Copy or export it again.")
+    if is_g2o(path):
+        raise TrajectoryError(
+            f"{shown(path)}: a pose graph, not a trajectory",
+            f"Solve it with px4fuse loop {shown(path)}.",
+        )
+    if _is_text(head):
+        if part is not None:
+            raise TrajectoryError(
+                f"{shown(path)}: a trajectory file has no part {part!r}", "Leave it out."
+            )
+        trajectory = read_trajectory(path)
+        return LoopSource(trajectory if frame is None else replace(trajectory, frame=frame), None)
+    if frame is not None:
+        raise SettingsError(
+            f"`frame` {frame.lower()} is for trajectory files; {shown(path)} is a flight log, "
+            "which states its frame",
+            "Leave `frame` out.",
+        )
+    flight = read_log(path, system=system)
+    chosen = part or default
+    if chosen is None:
+        odometry, chosen = odometry_of(flight), "vio"
+        if isinstance(odometry, Unavailable):
+            chosen = "ekf2"
+            if isinstance(flight.ekf2, Unavailable):
+                raise MissingDataError(f"{flight.log.name}: {odometry.reason}", odometry.remedy)
+    return LoopSource(trajectory_of(flight, chosen), flight)

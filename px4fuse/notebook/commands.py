@@ -14,9 +14,8 @@ from px4fuse.errors import MissingDataError, OutputError, SettingsError
 from px4fuse.findings import find
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.analysis import analyse
-from px4fuse.loop.loop import Loop
-from px4fuse.loop.model import OdometryNoise
-from px4fuse.loop.sources import LoopSource, read_source
+from px4fuse.loop.model import Loop
+from px4fuse.loop.tracks import LoopSource, read_source
 from px4fuse.readers import read_log
 from px4fuse.request import (
     AUTO,
@@ -28,6 +27,8 @@ from px4fuse.request import (
     GivenClosure,
     HeightName,
     InputName,
+    Landing,
+    LoopRequest,
     PositionFile,
     SourceKind,
     WhatIfRequest,
@@ -207,15 +208,19 @@ def close_loop(
         LoopSource(source, None)
         if isinstance(source, Trajectory)
         else read_source(str(source), frame=frame),
-        start_s=start_s,
-        end_s=end_s,
-        landed_at=None if landed_at is None else (*landed_at, None)[:3],
-        came_back=came_back,
-        closures=tuple(closures),
-        noise=OdometryNoise(position_drift_m, heading_drift_deg),
-        reference=None if reference is None else _reference(reference),
-        spacing_m=key_frames_m,
-        progress=progress,
+        LoopRequest(
+            source=str(source),
+            start_s=start_s,
+            end_s=end_s,
+            landed_at=None if landed_at is None else Landing(*landed_at),
+            came_back=came_back,
+            closures=tuple(closures),
+            position_drift_m=position_drift_m,
+            heading_drift_deg=heading_drift_deg,
+            key_frames_m=key_frames_m,
+        ),
+        None if reference is None else _reference(reference),
+        progress,
     )
 
 

@@ -18,7 +18,7 @@ from px4fuse.ekf2.whatif import WhatIf
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.flight import Flight, Unavailable
-from px4fuse.loop.loop import Loop
+from px4fuse.loop.model import Loop
 from px4fuse.notebook.tables import EKF2, tracks, variants
 from px4fuse.report.clock import draw_curve
 from px4fuse.report.evaluation import AXES, draw_ape, draw_path, over_time, views

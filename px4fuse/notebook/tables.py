@@ -30,7 +30,7 @@ from px4fuse.flight import (
     Unavailable,
     sample_rate,
 )
-from px4fuse.loop.loop import Loop
+from px4fuse.loop.model import Loop
 from px4fuse.record import Record, written
 from px4fuse.report.evaluation import interval_words, summary
 from px4fuse.report.loop import closure_words

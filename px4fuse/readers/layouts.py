@@ -39,7 +39,20 @@ def elements(names: list[str], of: str, at: Iterable[int] = range(100)) -> dict[
     return {name: f"{of}[{index}]" for name, index in zip(names, at, strict=False)}
 
 
-XYZ = dict(zip(POSITION_COLUMNS, "xyz", strict=True))
-POSITION_AND_VELOCITY = XYZ | dict(zip(VELOCITY_COLUMNS, ("vx", "vy", "vz"), strict=True))
+def fields(columns: list[str], names: str) -> dict[str, str]:
+    """Columns of some fields, whose names are separated by blanks.
+
+    >>> fields(["north_m", "east_m"], "x y")
+    {'north_m': 'x', 'east_m': 'y'}
+    """
+    return dict(zip(columns, names.split(), strict=True))
+
+
+XYZ, VELOCITY = fields(POSITION_COLUMNS, "x y z"), fields(VELOCITY_COLUMNS, "vx vy vz")
+POSITION_AND_VELOCITY = XYZ | VELOCITY
+GLOBAL_COLUMNS = ["latitude_deg", "longitude_deg", "altitude_m"]
+GLOBAL = fields(GLOBAL_COLUMNS, "lat lon alt")
+# As integers
+GLOBAL_SCALE = dict(zip(GLOBAL_COLUMNS, (1e-7, 1e-7, 1e-3), strict=True))
 # Where the diagonal stands in the row-major upper triangle of a 6×6 matrix: x, y, z, and rotations
 POSE_DIAGONAL, ROTATION_DIAGONAL = (0, 6, 11), (15, 18, 20)

@@ -27,32 +27,12 @@ from px4fuse.flight import (
     Unavailable,
 )
 from px4fuse.readers import mavlink_messages as messages
+from px4fuse.readers import mavlink_senders as senders
+from px4fuse.readers import parts
 from px4fuse.readers.mavlink_clocks import UNIX_FROM_S
 from px4fuse.readers.mavlink_frames import message_ids, read_frames
 from px4fuse.readers.mavlink_positions import pressure_altitude, read_positions, read_truth
-from px4fuse.readers.mavlink_recording import (
-    BOOT_CLOCK,
-    RECEIPT_CLOCK,
-    Recording,
-    settle_clocks,
-    unix_of_boot,
-)
-from px4fuse.readers.mavlink_senders import (
-    choose_autopilot,
-    clock_maps,
-    describe_senders,
-    map_senders,
-)
-from px4fuse.readers.parts import (
-    BEYOND_IMU,
-    cut_off,
-    ends_in_flight,
-    finite_rows,
-    missing_parts,
-    stretches_of_flight,
-    stretches_of_modes,
-    with_attitude,
-)
+from px4fuse.readers.mavlink_recording import RECEIPT_CLOCK, Recording, settle_clocks, unix_of_boot
 from px4fuse.readers.px4_positions import barometer
 from px4fuse.readers.ulog_topics import NO_SELECTOR, dropped_note
 from px4fuse.recording import LogInfo, Unused
@@ -87,21 +67,22 @@ def read_mavlink(path: Path, system: int | None = None) -> Flight:
         No autopilot in it has that system id.
     """
     frames = read_frames(path)
-    address, autopilot = choose_autopilot(frames, system)
+    address, autopilot = senders.choose_autopilot(frames, system)
     recording = settle_clocks(frames, address)
-    mapped = map_senders(recording)
+    mapped = senders.map_senders(recording)
     parameters = _read_parameters(recording, autopilot)
     remedies, replay = messages.remedies_of(autopilot)
     imu = _read_imu(recording, remedies["imu"])
     attitude = _read_attitude(recording, remedies["attitude"])
     ekf2 = _read_ekf2(recording, parameters, autopilot, remedies, replay)
-    positions, missing_positions = read_positions(
-        recording, mapped, remedies["position"], _gnss_delay_s(parameters, autopilot)
-    )
+    # other autopilots do not tell by how much they take a fix to be older than its stamp
+    known = settings_in_force(parameters, GNSS_POS) if autopilot == "PX4" else {}
+    delay_s = 1e-3 * known.get(GNSS_POS.delay, 0.0)
+    positions, missing_positions = read_positions(recording, mapped, remedies["position"], delay_s)
     truth = read_truth(recording, positions, remedies)
     airborne = _read_airborne(recording, remedies["landed"])
-    in_flight = ends_in_flight(airborne, recording.duration_s)
-    end = (cut_off("frame", recording.duration_s, in_flight),) if frames.in_frame else ()
+    in_flight = parts.ends_in_flight(airborne, recording.duration_s)
+    end = (parts.cut_off("frame", recording.duration_s, in_flight),) if frames.in_frame else ()
     return Flight(
         log=structs.replace(
             _describe(recording, parameters, autopilot),
@@ -116,22 +97,15 @@ def read_mavlink(path: Path, system: int | None = None) -> Flight:
         airborne=airborne,
         barometer=barometer(pressure_altitude(recording.read(messages.PRESSURE)["pressure_hpa"])),
         modes=_read_modes(recording) if autopilot == "PX4" else messages.NO_MODES,
-        missing=(*missing_parts(imu, attitude, ekf2, truth), *missing_positions),
+        missing=(*parts.missing_parts(imu, attitude, ekf2, truth), *missing_positions),
         streams=MappingProxyType(recording.streams),
-        clocks=clock_maps(recording, mapped),
+        clocks=senders.clock_maps(recording, mapped),
         unused=tuple(
             Unused(name, count, reason)
             for name, reason in messages.UNUSED.items()
             if (count := int(np.count_nonzero(frames.message_id == message_ids()[name])))
         ),
     )
-
-
-def _gnss_delay_s(parameters: Mapping[str, float], autopilot: str) -> float:
-    """By which EKF2 takes a fix to be older than its stamp; other autopilots do not tell."""
-    if autopilot != "PX4":
-        return 0.0
-    return 1e-3 * settings_in_force(parameters, GNSS_POS)[GNSS_POS.delay]
 
 
 def _read_imu(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
@@ -147,24 +121,24 @@ def _read_imu(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
         rows = rows[table["id"] == np.bincount(table["id"]).argmax()]
     del table
     imu = recording.read(layout, rows)
-    imu = finite_rows(imu, imu.columns.tolist(), BEYOND_IMU)
+    imu = parts.finite_rows(imu, imu.columns.tolist(), parts.BEYOND_IMU)
     if len(imu) < 2:
         return Unavailable(
             "IMU",
             f"{layout.topic} holds {len(imu)} usable samples",
             "Check that the sensors ran while the link was recorded.",
         )
-    recording.came_from("imu", BOOT_CLOCK, layout.topic)
+    recording.came_from("imu", layout.topic)
     return imu
 
 
 def _read_attitude(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
     layout = max(messages.ATTITUDE, key=lambda layout: len(recording.rows(layout.topic)))
-    attitude = with_attitude(recording.read(layout))[QUATERNION_COLUMNS]
+    attitude = parts.with_attitude(recording.read(layout))[QUATERNION_COLUMNS]
     if len(attitude) < 2:
         *some, last = (layout.topic for layout in messages.ATTITUDE)
         return Unavailable("attitude", f"no usable {', '.join(some)} or {last}", remedy)
-    recording.came_from("attitude", BOOT_CLOCK, layout.topic)
+    recording.came_from("attitude", layout.topic)
     return attitude
 
 
@@ -189,7 +163,7 @@ def _read_ekf2(
     state = samples[STATE_COLUMNS].dropna()
     if len(state) < 2:
         return Unavailable("EKF2", f"{message} holds no finite state", "Wait for EKF2 to start.")
-    recording.came_from("ekf2_state", BOOT_CLOCK, message)
+    recording.came_from("ekf2_state", message)
     notes = [f"EKF2's state is {message} as the autopilot sent it"]
     if autopilot != "PX4":
         notes.append(f"this is {autopilot}: what is called EKF2 here is its own estimator")
@@ -214,7 +188,7 @@ def _read_ekf2(
     if found.empty:
         variance = Unavailable("EKF2 variances", lacking, remedies["variance"])
     else:
-        recording.came_from("ekf2_variance", BOOT_CLOCK, message)
+        recording.came_from("ekf2_variance", message)
     inside = "MAVLink does not carry EKF2's"
     return Ekf2(
         state=state,
@@ -256,10 +230,10 @@ def _read_airborne(
     known = table["landed_state"] > 0
     if not np.any(known):
         return Unavailable("land detector", "no usable EXTENDED_SYS_STATE", remedy)
-    recording.came_from("airborne", RECEIPT_CLOCK, "EXTENDED_SYS_STATE")
+    recording.came_from("airborne", "EXTENDED_SYS_STATE", clock=RECEIPT_CLOCK)
     time_s = recording.receipt_boot_s(rows[known]) - recording.zero_s
     landed = pd.Series(table["landed_state"][known] == messages.LANDED, index=time_s)
-    return stretches_of_flight(landed, recording.duration_s)
+    return parts.stretches_of_flight(landed, recording.duration_s)
 
 
 def _read_modes(recording: Recording) -> tuple[FlightMode, ...] | Unavailable:
@@ -274,7 +248,7 @@ def _read_modes(recording: Recording) -> tuple[FlightMode, ...] | Unavailable:
         for mode in modes.tolist()
     ]
     time_s = recording.receipt_boot_s(rows) - recording.zero_s
-    return stretches_of_modes(pd.Series(names, index=time_s), recording.duration_s)
+    return parts.stretches_of_modes(pd.Series(names, index=time_s), recording.duration_s)
 
 
 def _read_parameters(recording: Recording, autopilot: str) -> MappingProxyType[str, float]:
@@ -330,7 +304,7 @@ def _describe(
         dropped=dict(sorted(recording.dropped.items())),
         autopilot=autopilot,
         start_unix_s=_start_unix_s(recording),
-        senders=describe_senders(recording),
+        senders=senders.describe_senders(recording),
         vehicle=vehicle,
         bytes_read=len(frames.content) - frames.bad_bytes,
     )

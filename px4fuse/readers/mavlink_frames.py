@@ -256,19 +256,13 @@ def _without_overlap(start: Integers, end: Integers) -> tuple[Integers, Integers
     """
     if not np.any(start[1:] < end[:-1]):
         return start, end
-    keep, reached = [], 0
-    for row, begin in enumerate(start):
-        follows = begin in (reached, reached + STAMP)
-        if begin >= reached and (follows or not _any_of((reached, reached + STAMP), start)):
+    keep, reached, starts = [], 0, {*start.tolist()}
+    for row, begin in enumerate(start.tolist()):
+        next_to = {reached, reached + STAMP}
+        if begin >= reached and (begin in next_to or next_to.isdisjoint(starts)):
             keep.append(row)
             reached = int(end[row])
     return start[keep], end[keep]
-
-
-def _any_of(values: tuple[int, ...], increasing: Integers) -> bool:
-    """Whether one of some values is among increasing ones."""
-    at = np.searchsorted(increasing[:-1], values)
-    return bool(np.any(increasing[at] == values))
 
 
 def _candidates(

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from scipy import constants
 
-from px4fuse.arrays import Array
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
@@ -27,12 +27,17 @@ from px4fuse.flight import (
 )
 from px4fuse.origin import MOTION_CAPTURE, RECEIVED, Origin
 from px4fuse.readers.layouts import (
+    GLOBAL,
+    GLOBAL_COLUMNS,
+    GLOBAL_SCALE,
     POSE_DIAGONAL,
     POSITION_AND_VELOCITY,
     ROTATION_DIAGONAL,
+    VELOCITY,
     XYZ,
     Layout,
     elements,
+    fields,
 )
 
 AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
@@ -107,9 +112,7 @@ def remedies_of(autopilot: str) -> tuple[Mapping[str, str], Unavailable]:
 
 
 _IMU_COLUMNS = SPECIFIC_FORCE_COLUMNS + ANGULAR_RATE_COLUMNS
-_IMU_FIELDS = dict(
-    zip(_IMU_COLUMNS, ("xacc", "yacc", "zacc", "xgyro", "ygyro", "zgyro"), strict=True)
-)
+_IMU_FIELDS = fields(_IMU_COLUMNS, "xacc yacc zacc xgyro ygyro zgyro")
 # milli-g and mrad/s
 _MILLI = dict(zip(_IMU_COLUMNS, [constants.g * 1e-3] * 3 + [1e-3] * 3, strict=True))
 IMU = (
@@ -153,17 +156,14 @@ ACCURACY = Layout(
     "ESTIMATOR_STATUS", {"horizontal_m": "pos_horiz_accuracy", "vertical_m": "pos_vert_accuracy"}
 )
 
-_DEGREES = {"latitude_deg": 1e-7, "longitude_deg": 1e-7}
 # Simulation truth; ArduPilot's SIMSTATE has no height and no velocity
 TRUTH = (
     Layout(
         "HIL_STATE_QUATERNION",
-        {"latitude_deg": "lat", "longitude_deg": "lon", "altitude_m": "alt"}
-        | dict(zip(VELOCITY_COLUMNS, ("vx", "vy", "vz"), strict=True))
-        | elements(QUATERNION_COLUMNS, "attitude_quaternion"),
-        scale={**_DEGREES, "altitude_m": 1e-3, **dict.fromkeys(VELOCITY_COLUMNS, 1e-2)},
+        GLOBAL | VELOCITY | elements(QUATERNION_COLUMNS, "attitude_quaternion"),
+        scale=GLOBAL_SCALE | dict.fromkeys(VELOCITY_COLUMNS, 1e-2),
     ),
-    Layout("SIMSTATE", {"latitude_deg": "lat", "longitude_deg": "lng"}, scale=_DEGREES),
+    Layout("SIMSTATE", fields(GLOBAL_COLUMNS[:2], "lat lng"), scale=GLOBAL_SCALE),
 )
 
 
@@ -227,27 +227,21 @@ POSITION_INPUTS = (
 GNSS_INPUTS = tuple(
     Layout(
         message,
-        {"latitude_deg": "lat", "longitude_deg": "lon", "altitude_m": "alt"}
-        | {"fix_type": "fix_type", "eph_m": "h_acc", "epv_m": "v_acc"},
-        scale={**_DEGREES, "altitude_m": 1e-3, "eph_m": 1e-3, "epv_m": 1e-3},
+        GLOBAL | {"fix_type": "fix_type", "eph_m": "h_acc", "epv_m": "v_acc"},
+        scale=GLOBAL_SCALE | {"eph_m": 1e-3, "epv_m": 1e-3},
     )
     for message in ("GPS_RAW_INT", "GPS2_RAW")
 )
 PRESSURE = Layout("SCALED_PRESSURE", {"pressure_hpa": "press_abs"})
 ORIGIN = Layout(
     "GPS_GLOBAL_ORIGIN",
-    {"latitude_deg": "latitude", "longitude_deg": "longitude", "altitude_m": "altitude"},
-    scale={**_DEGREES, "altitude_m": 1e-3},
+    fields(GLOBAL_COLUMNS, "latitude longitude altitude"),
+    scale=GLOBAL_SCALE,
 )
-GLOBAL_STATE = Layout(
-    "GLOBAL_POSITION_INT",
-    {"latitude_deg": "lat", "longitude_deg": "lon", "altitude_m": "alt"},
-    scale={**_DEGREES, "altitude_m": 1e-3},
-)
+GLOBAL_STATE = Layout("GLOBAL_POSITION_INT", GLOBAL, scale=GLOBAL_SCALE)
 
 
-@dataclass(frozen=True)
-class FrameOfReference:
+class FrameOfReference(NamedTuple):
     """A MAV_FRAME: which component is north (or forward), east (right) and down, and its sign.
 
     ``body`` says whether it turns with the vehicle.
@@ -257,19 +251,6 @@ class FrameOfReference:
     order: tuple[int, int, int] = (0, 1, 2)
     signs: tuple[float, float, float] = (1.0, 1.0, 1.0)
     body: bool = False
-
-    @property
-    def as_is(self) -> bool:
-        """Whether it is NED (or FRD) already, and does not turn with the vehicle."""
-        return self == FrameOfReference(self.name)
-
-    def turn(self, vectors: Array) -> Array:
-        """Vectors of this frame in NED (or FRD), shape (n, 3)."""
-        return vectors[:, self.order] * self.signs
-
-    def permute(self, variances: Array) -> Array:
-        """Variances of this frame's components in NED (or FRD) order, shape (n, 3)."""
-        return variances[:, self.order]
 
 
 FRAMES_OF_REFERENCE: Mapping[int, FrameOfReference] = {

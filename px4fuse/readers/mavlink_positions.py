@@ -22,31 +22,14 @@ from px4fuse.flight import (
     best_first,
 )
 from px4fuse.origin import GNSS, with_orientation
-from px4fuse.readers.layouts import Layout
+from px4fuse.readers import mavlink_messages as messages
+from px4fuse.readers import px4_positions
+from px4fuse.readers.layouts import GLOBAL_COLUMNS, Layout
 from px4fuse.readers.mavlink_clocks import Mapped
-from px4fuse.readers.mavlink_messages import (
-    FRAMES_OF_REFERENCE,
-    GLOBAL_STATE,
-    GNSS_INPUTS,
-    ORIGIN,
-    POSITION_INPUTS,
-    STATES,
-    TRUTH,
-    PositionInput,
-)
 from px4fuse.readers.mavlink_recording import BOOT_CLOCK, RECEIPT_CLOCK, Address, Recording
 from px4fuse.readers.mavlink_senders import senders_of
 from px4fuse.readers.parts import attitude_of, orientation_of
-from px4fuse.readers.px4_positions import (
-    GLOBAL_COLUMNS,
-    GPS_3D_FIX,
-    MIN_TRACK_SAMPLES,
-    captured_truth,
-    clean_positions,
-    motion_capture,
-    projected,
-    unproject,
-)
+from px4fuse.readers.px4_positions import projected, unproject
 
 # A boot clock's stamp is no further from its receipt
 OWN_CLOCK_S = 5.0
@@ -69,12 +52,12 @@ def read_positions(
         By which the autopilot takes a fix to be older than its stamp.
     """
     found: list[PositionTrack | Unavailable] = []
-    for message in dict.fromkeys(source.message for source in POSITION_INPUTS):
+    for message in dict.fromkeys(source.message for source in messages.POSITION_INPUTS):
         senders = senders_of(recording, message)
         tracks = [
             track
             for sender in senders
-            for source in POSITION_INPUTS
+            for source in messages.POSITION_INPUTS
             if source.message == message
             for track in _read_track(recording, source, sender, mapped[sender], remedy, senders)
         ]
@@ -86,14 +69,18 @@ def read_positions(
                 source=message,
             )
         ]
-    found += [track for layout in GNSS_INPUTS if (track := _read_gnss(recording, layout, delay_s))]
+    found += [
+        track
+        for layout in messages.GNSS_INPUTS
+        if (track := _read_gnss(recording, layout, delay_s))
+    ]
     missing = tuple(part for part in found if isinstance(part, Unavailable))
     return best_first(part for part in found if isinstance(part, PositionTrack)), missing
 
 
 def _read_track(
     recording: Recording,
-    source: PositionInput,
+    source: messages.PositionInput,
     sender: Address,
     clock: Mapped,
     remedy: str,
@@ -116,13 +103,13 @@ def _read_track(
     frame = "NED"
     if "frame_id" in samples and len(samples):
         # one frame per track: that of the last sample, as PX4 would have used it
-        reference = FRAMES_OF_REFERENCE.get(int(samples["frame_id"].iloc[-1]))
+        reference = messages.FRAMES_OF_REFERENCE.get(int(samples["frame_id"].iloc[-1]))
         frame = "unknown" if reference is None else reference.name
     if source.drops_covariance:
         samples[POSITION_VARIANCE_COLUMNS + ROTATION_VARIANCE_COLUMNS] = np.nan
     orientation = orientation_of(samples)
-    samples = clean_positions(samples, POSITION_COLUMNS)
-    if len(samples) < MIN_TRACK_SAMPLES:
+    samples = px4_positions.clean_positions(samples, POSITION_COLUMNS)
+    if len(samples) < px4_positions.MIN_TRACK_SAMPLES:
         reason = f"{len(samples)} finite samples are too few"
         return (Unavailable(f"position source {name}", reason, remedy, source=name),)
     statement = clock.statement
@@ -158,18 +145,18 @@ def _read_gnss(recording: Recording, layout: Layout, delay_s: float) -> Position
     if len(rows) and np.median(np.abs(receipt_s - boot_s)) > OWN_CLOCK_S:
         boot_s = receipt_s  # UNIX time, or the recording has no boot clock
     fixes = recording.read(layout, rows, boot_s - delay_s)
-    fixes = fixes[fixes["fix_type"] >= GPS_3D_FIX]
-    if len(fixes) < MIN_TRACK_SAMPLES:
+    fixes = fixes[fixes["fix_type"] >= px4_positions.GPS_3D_FIX]
+    if len(fixes) < px4_positions.MIN_TRACK_SAMPLES:
         return None
     samples = projected(fixes, local_origin(recording))
     accuracy = fixes[["eph_m", "eph_m", "epv_m"]].set_axis(POSITION_VARIANCE_COLUMNS, axis=1) ** 2
     return PositionTrack(
         name=layout.topic,
         origin=structs.replace(
-            GNSS, automatic=bool(recording.read(GLOBAL_STATE)["latitude_deg"].any())
+            GNSS, automatic=bool(recording.read(messages.GLOBAL_STATE)["latitude_deg"].any())
         ),
         description="GNSS position",
-        samples=clean_positions(samples.join(accuracy), POSITION_COLUMNS),
+        samples=px4_positions.clean_positions(samples.join(accuracy), POSITION_COLUMNS),
         frame="NED",
         clock=f"{BOOT_CLOCK}, less {1e3 * delay_s:g} ms",
         topics=(layout.topic,),
@@ -189,13 +176,14 @@ def local_origin(recording: Recording) -> tuple[float, float, float] | None:
 
     As it is sent, or else by its global and its local position.
     """
-    sent = recording.read(ORIGIN).dropna()
+    sent = recording.read(messages.ORIGIN).dropna()
     if len(sent):
         latitude, longitude, altitude = sent[GLOBAL_COLUMNS].iloc[-1]
         return float(latitude), float(longitude), float(altitude)
+    state = recording.read(messages.STATES[-1])[POSITION_COLUMNS]
     both = pd.merge_asof(
-        recording.read(GLOBAL_STATE), recording.read(STATES[-1])[POSITION_COLUMNS],
-        left_index=True, right_index=True, direction="nearest", tolerance=SAME_STATE_S,  # type: ignore[arg-type]
+        recording.read(messages.GLOBAL_STATE), state, left_index=True, right_index=True,
+        direction="nearest", tolerance=SAME_STATE_S,  # type: ignore[arg-type]
     ).dropna()  # fmt: skip
     both = both[both["latitude_deg"] != 0.0]
     if both.empty:
@@ -218,9 +206,9 @@ def read_truth(
     the time of receipt is taken, and no local position, so it is projected about its own first
     sample, where the simulated vehicle was put, or about the autopilot's origin where GNSS is.
     """
-    for layout in TRUTH:
+    for layout in messages.TRUTH:
         rows = recording.rows(layout.topic)
-        if len(rows) < MIN_TRACK_SAMPLES:
+        if len(rows) < px4_positions.MIN_TRACK_SAMPLES:
             continue
         samples = recording.read(layout, rows, recording.receipt_boot_s(rows))
         samples = samples.dropna(subset=GLOBAL_COLUMNS[:2])
@@ -230,16 +218,16 @@ def read_truth(
         if not samples[VELOCITY_COLUMNS].to_numpy().any():
             # not sent: a vehicle that never moves has no use for truth
             samples[VELOCITY_COLUMNS] = np.nan
-        recording.came_from("truth", RECEIPT_CLOCK, layout.topic)
+        recording.came_from("truth", layout.topic, clock=RECEIPT_CLOCK)
         origin = local_origin(recording) if positions and positions[0].origin.is_gnss else None
         state = pd.concat([projected(samples, origin), samples[VELOCITY_COLUMNS]], axis=1)
         return Truth(layout.topic, state[STATE_COLUMNS], attitude_of(samples))
-    captured = motion_capture(positions, "ATT_POS_MOCAP")
+    captured = px4_positions.motion_capture(positions, "ATT_POS_MOCAP")
     if captured is None:
         return Unavailable(
             "ground truth",
             "neither simulation truth nor motion capture is in the recording",
             remedies["truth"],
         )
-    recording.came_from("truth", captured.clock, *captured.topics)
-    return captured_truth(captured)
+    recording.came_from("truth", *captured.topics, clock=captured.clock)
+    return px4_positions.captured_truth(captured)

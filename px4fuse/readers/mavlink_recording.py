@@ -177,7 +177,7 @@ class Recording:
         on_boot = (stamp > 0.0) & ((stamp < UNIX_FROM_S) == (self.zero_s < UNIX_FROM_S))
         return np.asarray(np.where(on_boot, stamp, self.receipt_boot_s(rows)), dtype=np.float64)
 
-    def came_from(self, part: str, clock: str, *messages: str) -> None:
+    def came_from(self, part: str, *messages: str, clock: str = BOOT_CLOCK) -> None:
         """Note where a part of the flight came from."""
         self.streams[part] = Stream(messages, clock, self.frames.name)
 
@@ -206,17 +206,18 @@ def _in_ned(samples: pd.DataFrame) -> pd.DataFrame:
     made[VELOCITY_VARIANCE_COLUMNS + orientation] = np.nan
     used = {*samples["frame_id"].unique(), *samples["child_frame_id"].unique()}
     for number in used & FRAMES_OF_REFERENCE.keys():
-        frame = FRAMES_OF_REFERENCE[number]
-        own = samples[(samples["frame_id"] == number) & (not frame.body)]
-        made.loc[own.index, POSITION_COLUMNS] = frame.turn(own[POSITION_COLUMNS].to_numpy())
-        variance = frame.permute(own[POSITION_VARIANCE_COLUMNS].to_numpy())
+        _, order, signs, turns = FRAMES_OF_REFERENCE[number]
+        own = samples[(samples["frame_id"] == number) & (not turns)]
+        position = own[POSITION_COLUMNS].to_numpy()[:, order]
+        variance = own[POSITION_VARIANCE_COLUMNS].to_numpy()[:, order]
+        made.loc[own.index, POSITION_COLUMNS] = position * signs
         made.loc[own.index, POSITION_VARIANCE_COLUMNS] = variance
-        if frame.as_is:
+        if min(signs) > 0.0:
             made.loc[own.index, orientation] = own[orientation]
-        moving = samples[(samples["child_frame_id"] == number) & (turned | (not frame.body))]
-        speed = frame.turn(moving[VELOCITY_COLUMNS].to_numpy())
-        spread = frame.permute(moving[VELOCITY_VARIANCE_COLUMNS].to_numpy())
-        if frame.body and len(moving):
+        moving = samples[(samples["child_frame_id"] == number) & (turned | (not turns))]
+        speed = moving[VELOCITY_COLUMNS].to_numpy()[:, order] * signs
+        spread = moving[VELOCITY_VARIANCE_COLUMNS].to_numpy()[:, order]
+        if turns and len(moving):
             quaternion = moving[QUATERNION_COLUMNS].to_numpy(copy=True)
             rotation = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
             speed = np.einsum("nij,nj->ni", rotation, speed)

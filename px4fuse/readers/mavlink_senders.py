@@ -10,23 +10,9 @@ from numpy.typing import NDArray
 
 from px4fuse.arrays import IntArray
 from px4fuse.errors import SettingsError
-from px4fuse.readers.mavlink_clocks import (
-    OTHER_SPEED,
-    Line,
-    Mapped,
-    map_clock,
-    tells_time,
-)
+from px4fuse.readers import mavlink_messages as messages
+from px4fuse.readers.mavlink_clocks import OTHER_SPEED, Line, Mapped, map_clock, tells_time
 from px4fuse.readers.mavlink_frames import Frames
-from px4fuse.readers.mavlink_messages import (
-    AUTOPILOT_COMPONENT,
-    AUTOPILOTS,
-    GROUND_STATION,
-    NO_AUTOPILOT,
-    OWN_MESSAGES,
-    POSITION_INPUTS,
-    VEHICLE_TYPES,
-)
 from px4fuse.readers.mavlink_recording import RESTART_S, Address, Recording, unix_of_boot
 from px4fuse.recording import ClockMap, Sender
 
@@ -63,7 +49,7 @@ def _counts(frames: Frames, rows: IntArray | slice = slice(None)) -> list[tuple[
 
 
 def _flies(kind: int, autopilot: int) -> bool:
-    return autopilot != NO_AUTOPILOT and kind != GROUND_STATION
+    return autopilot != messages.NO_AUTOPILOT and kind != messages.GROUND_STATION
 
 
 def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
@@ -77,13 +63,15 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
     counts = dict(_counts(frames))
     vehicles = _vehicles(frames)
     flying = [s for s in counts if s in vehicles and _flies(*vehicles[s])]
-    own = dict(_counts(frames, np.concatenate([frames.rows(name) for name in OWN_MESSAGES])))
+    own = dict(
+        _counts(frames, np.concatenate([frames.rows(name) for name in messages.OWN_MESSAGES]))
+    )
     # a companion may call itself an autopilot; one without a heartbeat is known by what it sends,
     # or else by its component
     candidates = [s for s in flying if s in own] or [s for s in own if s not in vehicles] or flying
-    candidates = candidates or [s for s in counts if s[1] == AUTOPILOT_COMPONENT]
+    candidates = candidates or [s for s in counts if s[1] == messages.AUTOPILOT_COMPONENT]
     # nor need it have been heard itself
-    candidates = candidates or [(s[0], AUTOPILOT_COMPONENT) for s in counts]
+    candidates = candidates or [(s[0], messages.AUTOPILOT_COMPONENT) for s in counts]
     if system is not None:
         candidates = [address for address in {*flying, *candidates} if address[0] == system]
         if not candidates:
@@ -93,7 +81,7 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
                 f"in the file: {have}."
             )
     best = max(candidates, key=lambda address: counts.get(address, 0))
-    name = AUTOPILOTS.get(vehicles[best][1]) if best in vehicles else None
+    name = messages.AUTOPILOTS.get(vehicles[best][1]) if best in vehicles else None
     return best, name or "unknown autopilot"
 
 
@@ -107,8 +95,8 @@ def senders_of(recording: Recording, message: str) -> list[Address]:
 
 def map_senders(recording: Recording) -> dict[Address, Mapped]:
     """Clock of every sender of an external position."""
-    messages = {source.message for source in POSITION_INPUTS}
-    found = {s for message in messages for s in senders_of(recording, message)}
+    named = {source.message for source in messages.POSITION_INPUTS}
+    found = {s for message in named for s in senders_of(recording, message)}
     unix = unix_of_boot(recording)
     return {sender: _map_sender(recording, sender, unix) for sender in sorted(found)}
 
@@ -116,7 +104,7 @@ def map_senders(recording: Recording) -> dict[Address, Mapped]:
 def _map_sender(recording: Recording, sender: Address, unix: Line | None) -> Mapped:
     frames = recording.frames
     stamps, received = [], []
-    for source in POSITION_INPUTS:
+    for source in messages.POSITION_INPUTS:
         rows = recording.rows(source.message, sender)
         stamps.append(frames.table(source.message, rows)[source.stamp] * 1e-6)
         received.append(recording.received_s[rows])
@@ -186,9 +174,9 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
         word = "no heartbeat"
         if address in vehicles:
             kind, autopilot = vehicles[address]
-            word = VEHICLE_TYPES.get(kind, f"type {kind}")
-            if autopilot != NO_AUTOPILOT:
-                word = f"{AUTOPILOTS.get(autopilot, 'autopilot')} {word}"
+            word = messages.VEHICLE_TYPES.get(kind, f"type {kind}")
+            if autopilot != messages.NO_AUTOPILOT:
+                word = f"{messages.AUTOPILOTS.get(autopilot, 'autopilot')} {word}"
         lost, chosen = _lost_share(frames, address), address == recording.address
         described.append(Sender(*address, word, count, lost, chosen))
     return tuple(described)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 
@@ -35,15 +37,17 @@ def missing_parts(
     return tuple(part for part in parts if isinstance(part, Unavailable))
 
 
+def stretches(steps: pd.Series, end_s: float) -> list[tuple[float, float, Any]]:
+    """Stretches in which a step function of time keeps its value: start and end (s), value."""
+    changes = steps[steps.ne(steps.shift())]
+    starts = np.maximum.accumulate(np.maximum(changes.index.to_numpy(), 0.0)).tolist()
+    every = zip(starts, [*starts[1:], end_s], changes, strict=True)
+    return [(start, end, value) for start, end, value in every if end > start]
+
+
 def stretches_of_flight(landed: pd.Series, duration_s: float) -> tuple[tuple[float, float], ...]:
     """Stretches (s) in which a step function of time says "not landed" (0 or False)."""
-    changes = landed[landed.ne(landed.shift())]
-    ends = [*changes.index[1:], duration_s]
-    return tuple(
-        (max(float(start), 0.0), float(end))
-        for start, end, value in zip(changes.index, ends, changes, strict=True)
-        if not value and end > max(start, 0.0)
-    )
+    return tuple((start, end) for start, end, on in stretches(landed, duration_s) if not on)
 
 
 def ends_in_flight(
@@ -66,13 +70,7 @@ def cut_off(part: str, duration_s: float, in_flight: bool) -> str:
 
 def stretches_of_modes(names: pd.Series, end_s: float) -> tuple[FlightMode, ...]:
     """Stretches (s) of a step function of time whose values are names of flight modes."""
-    changes = names[names.ne(names.shift())]
-    starts = np.maximum.accumulate(np.maximum(changes.index.to_numpy(), 0.0))
-    return tuple(
-        FlightMode(float(start), float(end), name)
-        for start, end, name in zip(starts, [*starts[1:], end_s], changes, strict=True)
-        if end > start
-    )
+    return tuple(FlightMode(*stretch) for stretch in stretches(names, end_s))
 
 
 def finite_rows(samples: pd.DataFrame, columns: list[str], limit: float = DAMAGED) -> pd.DataFrame:
@@ -104,8 +102,7 @@ def orientation_of(samples: pd.DataFrame) -> pd.DataFrame | None:
     if len(found) < 2 or (quaternions == quaternions.iloc[0]).to_numpy().all():
         return None
     variances = found[ROTATION_VARIANCE_COLUMNS]
-    oriented: pd.DataFrame = found.assign(**variances.where(variances > 0))
-    return oriented
+    return found.assign(**variances.where(variances > 0))
 
 
 def attitude_of(samples: pd.DataFrame | None) -> pd.DataFrame | None:

@@ -134,15 +134,8 @@ class _Table:
         return texts.dropna(how="all")
 
 
-@dataclass(frozen=True)
-class _Choice:
-    """Which columns are read, by index."""
-
-    time: int
-    position: tuple[int | None, ...]
-    sigma: tuple[int | None, ...]
-    frame: str | None
-    time_words: str
+# Columns of position or sigma, by index
+_Columns = tuple[int | None, ...]
 
 
 def read_position_csv(
@@ -182,10 +175,10 @@ def read_position_csv(
     told = _resolve(table, columns or ())
     texts = table.texts([*told, *(at for at, m in enumerate(meanings) if m.kind)])
     numbers = texts.apply(pd.to_numeric, errors="coerce").astype(np.float64)
-    choice = _choose(table, meanings, told, numbers)
-    axes = [at for at in choice.position if at is not None]
+    time, position, sigma, frame, time_words = _choose(table, meanings, told, numbers)
+    axes = [at for at in position if at is not None]
     # 1e999 reads as infinity
-    is_usable = np.isfinite(numbers[choice.time])
+    is_usable = np.isfinite(numbers[time])
     is_usable &= (numbers[axes].abs() < MAX_COORDINATE).all(axis=1)
     if missing := int(np.count_nonzero(~is_usable)):
         notes.insert(0, f"{_count(missing)} dropped: without a usable time or position")
@@ -194,8 +187,8 @@ def read_position_csv(
         if tags[1:]:
             notes.append(f"several tags ({', '.join(map(quote, tags[:2]))}): keep those of one")
     numbers = numbers[is_usable]
-    ticks = numbers[choice.time].to_numpy()
-    named = meanings[choice.time].unit
+    ticks = numbers[time].to_numpy()
+    named = meanings[time].unit
     unit, unit_words = _time_unit(ticks, named if named in TIME_UNITS else "", time_unit)
     seconds = ticks / round(1.0 / TIME_UNITS[unit])
     usable = np.flatnonzero(np.abs(seconds) < UNIX_END_S)
@@ -219,8 +212,7 @@ def read_position_csv(
         )
     scales, length_words = _length_units(numbers, axes, meanings, length_unit)
     samples = pd.DataFrame(np.nan, index=numbers.index, columns=SAMPLE_COLUMNS)
-    sources = (*choice.position, *choice.sigma)
-    for column, index in zip(SAMPLE_COLUMNS, sources, strict=True):
+    for column, index in zip(SAMPLE_COLUMNS, (*position, *sigma), strict=True):
         if index is not None:
             samples[column] = numbers[index] * scales[index]
     samples = samples.where(np.isfinite(samples))
@@ -230,7 +222,7 @@ def read_position_csv(
         samples[SIGMA_COLUMNS] = samples[SIGMA_COLUMNS].mask(wrong)
     is_unix = UNIX_START_S <= float(np.median(numbers.index)) < UNIX_END_S
     clock: Literal["UNIX", "local"] = "UNIX" if is_unix else "local"
-    names = choice.frame.upper() if choice.frame else "x, y, z"
+    names = frame.upper() if frame else "x, y, z"
     height = "" if len(axes) == 3 else " without height"
     return PositionRecording(
         name=table.file,
@@ -238,14 +230,14 @@ def read_position_csv(
         size_bytes=len(content),
         samples=samples,
         clock=clock,
-        frame=choice.frame,
+        frame=frame,
         dropped=dropped,
         detected=(
             f"table: {_SEPARATORS[table.separator]} between columns, header in line "
             f"{table.header_line}",
-            f"time: {choice.time_words}, {clock} clock, in {unit_words}",
-            f"position: {table.label(*choice.position)} as {names}{height}, in {length_words}",
-            f"sigma: {table.label(*choice.sigma) or 'none'}",
+            f"time: {time_words}, {clock} clock, in {unit_words}",
+            f"position: {table.label(*position)} as {names}{height}, in {length_words}",
+            f"sigma: {table.label(*sigma) or 'none'}",
         ),
         notes=tuple(notes),
     )
@@ -353,10 +345,11 @@ def _resolve(table: _Table, columns: tuple[str, ...]) -> list[int]:
 
 def _choose(
     table: _Table, meanings: Sequence[Meaning], told: list[int], numbers: pd.DataFrame
-) -> _Choice:
-    """Choose the columns: those that the option tells, else by name.
+) -> tuple[int, _Columns, _Columns, str | None, str]:
+    """Columns of time, position and sigma, the frame, and the words on the time.
 
-    Of several times that of measurement goes before that of recording, if it is filled.
+    They are those that the option tells, else by name. Of several times that of measurement goes
+    before that of recording, if it is filled.
     """
     if told:
         time, words = told[0], table.label(told[0])
@@ -364,7 +357,7 @@ def _choose(
         found = find_position(
             [m if at in told[1:4] else Meaning() for at, m in enumerate(meanings)]
         )
-        position: tuple[int | None, ...] = (*told[1:4], None)[:3]
+        position: _Columns = (*told[1:4], None)[:3]
         frame, position = found if found and {*found[1]} == {*position} else (None, position)
     else:
         times = [at for at, column in enumerate(meanings) if column.kind == "time"]
@@ -379,7 +372,7 @@ def _choose(
     if position[2] is not None and numbers[position[2]].isna().all():
         position = (*position[:2], None)
     sigma = (told[4],) * 3 if len(told) > 4 else find_sigma(meanings, frame)
-    return _Choice(time, position, sigma, frame, words)
+    return time, position, sigma, frame, words
 
 
 def _time_unit(ticks: Array, named: str, option: str | None) -> tuple[str, str]:

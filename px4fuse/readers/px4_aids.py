@@ -1,12 +1,12 @@
 """What a ULog has of every aid that EKF2 can fuse: innovations, their variance, what was fused.
 
 Source: PX4-Autopilot ``EKF2.cpp`` (PublishInnovations, PublishAidSourceStatus), v1.8 to main; the
-topics and fields are rows of :mod:`px4fuse.readers.px4_aid_sources`.
+topics and fields are rows of :data:`px4fuse.readers.px4_topics.SOURCES`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -14,15 +14,9 @@ import pandas as pd
 
 from px4fuse.ekf2_parameters import AIDS
 from px4fuse.flight import AidLog, at_times
+from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.layouts import Layout
-from px4fuse.readers.px4_aid_sources import (
-    FLAG_ALWAYS_SET,
-    SOURCES,
-    STATUS,
-    STATUS_FLAGS,
-    WITH_OBSERVATION,
-    AidSource,
-)
+from px4fuse.readers.px4_topics import STATUS, STATUS_FLAGS, AidSource
 from px4fuse.readers.ulog_topics import Topics
 
 # innovations and variances are logged by separate rate limiters, up to one interval of the default
@@ -39,7 +33,7 @@ def read_aids(topics: Topics, meant: Mapping[str, pd.Series[float]]) -> dict[str
     came of it. The others repeat a value until the next one, which counts once.
     """
     found = {}
-    for name, source in SOURCES.items():
+    for name, source in px4.SOURCES.items():
         told = meant.get(name)
         log = _own_topic(topics, name, source, told)
         # an aid that was never meant to be fused stands at its last value, or is another's
@@ -56,19 +50,19 @@ def intentions(topics: Topics) -> dict[str, pd.Series[float]]:
     By its flags, or else by the bits of the older topic.
     """
     meant, tables = {}, topics.of(STATUS_FLAGS)
-    named = {flag for source in SOURCES.values() for group in source.flags for flag in group}
+    named = {flag for source in px4.SOURCES.values() for group in source.flags for flag in group}
     known = sorted(named.intersection(*tables)) if tables else []
     if known:
         flags = topics.of_primary(Layout(STATUS_FLAGS, dict(zip(known, known, strict=True))),
                                   step=True)  # fmt: skip
-        for name, source in SOURCES.items():
+        for name, source in px4.SOURCES.items():
             group = next((group for group in source.flags if {*group} <= {*known}), None)
             if group is not None:
                 meant[name] = flags[list(group)].max(axis=1)
     layout = Layout(STATUS, {"bits": "control_mode_flags"})
     if not known and topics.find((layout,)) is not None:
         bits = topics.of_primary(layout, step=True)["bits"].dropna()
-        for name, source in SOURCES.items():
+        for name, source in px4.SOURCES.items():
             if source.bit is not None:
                 on = bits.to_numpy().astype(np.int64) >> source.bit & 1
                 meant[name] = pd.Series(on.astype(float), index=bits.index)
@@ -82,10 +76,10 @@ def _own_topic(
     count = len(source.axes)
     at = [""] if count == 1 else [f"[{number}]" for number in range(count)]
     columns = {
-        f"{ours}_{axis}": px4 + element
+        f"{ours}_{axis}": theirs + element
         for axis, element in zip(source.axes, at, strict=True)
-        for ours, px4 in (
-            *((("observation", "observation"),) if name in WITH_OBSERVATION else ()),
+        for ours, theirs in (
+            *((("observation", "observation"),) if name in px4.WITH_OBSERVATION else ()),
             ("innovation", "innovation"), ("variance", "innovation_variance"),
             ("noise", "observation_variance"), ("ratio", "test_ratio"),
         )
@@ -96,10 +90,9 @@ def _own_topic(
     if topics.find((layout,)) is None:
         return None
     frame = topics.of_primary(layout).dropna()
-    if meant is not None and name in FLAG_ALWAYS_SET:
+    if meant is not None and name in px4.FLAG_ALWAYS_SET:
         frame["fused"] = at_times(meant, frame.index)
-    frame = frame[(frame[[f"variance_{axis}" for axis in source.axes]] > 0.0).all(axis=1)]
-    return _log((layout.topic,), source, frame, meant) if len(frame) else None
+    return _log((layout.topic,), source, frame, meant)
 
 
 def _snapshots(
@@ -108,14 +101,16 @@ def _snapshots(
     """An aid by the topics that hold the last value of every aid."""
     gauss = name == "mag_heading" and any("cs_mag" in one for one in topics.of(STATUS_FLAGS))
     layouts = [] if gauss or not source.fields else [
-        (Layout("estimator_innovations", _columns("innovation", source, source.fields)),
-         Layout("estimator_innovation_variances", _columns("variance", source, source.fields)))
+        tuple(
+            Layout(topic, _columns(what, source, source.fields))
+            for topic, what in zip(px4.INNOVATIONS, ("innovation", "variance"), strict=True)
+        )
     ]  # fmt: skip
     if source.before:
-        both = _columns("innovation", source, source.before) | _columns(
-            "variance", source, [_variance(field) for field in source.before]
-        )
-        layouts.append((Layout("ekf2_innovations", both),) * 2)
+        both = _columns("innovation", source, source.before)
+        squares = (field.replace("innov", "innov_var") for field in source.before)
+        both |= _columns("variance", source, squares)
+        layouts.append((Layout(px4.OLD_INNOVATIONS, both),) * 2)
     for values, variances in layouts:
         if topics.find((values,)) is None or topics.find((variances,)) is None:
             continue
@@ -126,15 +121,12 @@ def _snapshots(
                 frame, topics.of_primary(variances).dropna(), left_index=True, right_index=True,
                 direction="nearest", tolerance=JOIN_TOLERANCE_S,  # type: ignore[arg-type]
             )  # fmt: skip
-        before = len(frame)
-        frame = frame.dropna()
-        left_out = before - len(frame)
-        frame = frame[(frame[[f"variance_{axis}" for axis in source.axes]] > 0.0).all(axis=1)]
+        left_out = len(frame) - len(frame := frame.dropna())
         if meant is not None:
             frame = frame[at_times(meant, frame.index) > 0.0]
-        if len(frame):
-            used = tuple(dict.fromkeys((values.topic, variances.topic)))
-            return replace(_log(used, source, frame, meant), left_out=left_out)
+        used = tuple(dict.fromkeys((values.topic, variances.topic)))
+        if (log := _log(used, source, frame, meant, left_out)) is not None:
+            return log
     return None
 
 
@@ -145,23 +137,19 @@ def _fresh(frame: pd.DataFrame) -> pd.DataFrame:
     return known[first.ne(first.shift()) & (first != 0.0)]
 
 
-def _columns(name: str, source: AidSource, fields: tuple[str, ...] | list[str]) -> dict[str, str]:
+def _columns(name: str, source: AidSource, fields: Iterable[str]) -> dict[str, str]:
     return {f"{name}_{axis}": field for axis, field in zip(source.axes, fields, strict=True)}
 
 
-def _variance(field: str) -> str:
-    """Field of ``ekf2_innovations`` with the variance of another.
-
-    >>> _variance("flow_innov[1]"), _variance("heading_innov")
-    ('flow_innov_var[1]', 'heading_innov_var')
-    """
-    return field.replace("innov", "innov_var")
-
-
 def _log(
-    topics: tuple[str, ...], source: AidSource, frame: pd.DataFrame, meant: pd.Series[float] | None
-) -> AidLog:
-    """The record, with the sign that everyone else gives an innovation."""
-    innovations = [f"innovation_{axis}" for axis in source.axes]
-    return AidLog(topics, source.axes, frame.assign(**{one: -frame[one] for one in innovations}),
-                  meant)  # fmt: skip
+    topics: tuple[str, ...],
+    source: AidSource,
+    frame: pd.DataFrame,
+    meant: pd.Series[float] | None,
+    left_out: int = 0,
+) -> AidLog | None:
+    """The record of what has a variance, with the sign that everyone else gives an innovation."""
+    frame = frame[(frame[[f"variance_{axis}" for axis in source.axes]] > 0.0).all(axis=1)]
+    turned = {one: -frame[one] for one in _columns("innovation", source, source.axes)}
+    made = AidLog(topics, source.axes, frame.assign(**turned), meant, left_out=left_out)
+    return made if len(frame) else None

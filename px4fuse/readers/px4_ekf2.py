@@ -37,9 +37,9 @@ from px4fuse.flight import (
 )
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.layouts import Layout, elements
-from px4fuse.readers.px4_aid_sources import STATUS, STATUS_FLAGS
 from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S, intentions, read_aids
 from px4fuse.readers.px4_innovations import innovations_of
+from px4fuse.readers.px4_topics import STATUS, STATUS_FLAGS
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 
 VISION = "vehicle_visual_odometry"
@@ -82,11 +82,14 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         return Unavailable(
             "EKF2", "vehicle_local_position holds no finite sample", "Wait until EKF2 has started."
         )
+    topics.came_from("ekf2_state", px4.LOCAL_POSITION[0].topic)
     meant = intentions(topics)
     fusing = _fusing(topics, meant)
     gate = settings_in_force(parameters)[EV_POS.gate]
     aids = read_aids(topics, meant)
     innovations, innovation_topics = innovations_of(aids, fusing, gate)
+    if innovation_topics:
+        topics.came_from("ekf2_innovations", *innovation_topics)
     notes = [
         f"{topic} has no time of measurement in this release: EKF2's innovations carry the time of "
         "their publication, up to 0.2 s later"
@@ -101,9 +104,12 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     ]
     step_s = _step_s(topics)
     delayed = _read_delayed(topics, step_s)
+    variance = _variance(delayed)
+    if not isinstance(variance, Unavailable):
+        topics.came_from("ekf2_variance", _state_vector(topics)[0])
     return Ekf2(
         state=state,
-        variance=_variance(delayed),
+        variance=variance,
         innovations=innovations,
         innovation_topics=innovation_topics,
         fusing=fusing,
@@ -117,20 +123,6 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         record=_read_record(topics, delayed, local, meant, step_s),
         aids=aids,
     )
-
-
-def ekf2_topics(topics: Topics, ekf2: Ekf2 | Unavailable) -> Mapping[str, tuple[str, ...]]:
-    """Topics behind each part that is there, by the part's name in ``Flight.streams``."""
-    if isinstance(ekf2, Unavailable):
-        return {}
-    return {
-        "ekf2_state": tuple(layout.topic for layout in px4.LOCAL_POSITION),
-        "ekf2_variance": ()
-        if isinstance(ekf2.variance, Unavailable)
-        else (_state_vector(topics)[0],),
-        "ekf2_innovations": ekf2.innovation_topics,
-        "ekf2_fusing": () if isinstance(ekf2.fusing, Unavailable) else (_flags_topic(topics),),
-    }
 
 
 def _state_vector(topics: Topics) -> tuple[str, int]:
@@ -278,15 +270,11 @@ def _fusing(topics: Topics, meant: Mapping[str, pd.Series[float]]) -> pd.DataFra
             px4.DEFAULT_PROFILE,
         )
     frame = pd.DataFrame({group: meant[aid] for group, aid in vision.items()}).dropna()
+    topic = STATUS_FLAGS if topics.instances(STATUS_FLAGS) else STATUS
     if frame.empty:
-        return Unavailable(
-            "EKF2 fusion flags", f"{_flags_topic(topics)} holds no usable sample", "Record again."
-        )
+        return Unavailable("EKF2 fusion flags", f"{topic} holds no usable sample", "Record again.")
+    topics.came_from("ekf2_fusing", topic)
     return frame
-
-
-def _flags_topic(topics: Topics) -> str:
-    return STATUS_FLAGS if topics.instances(STATUS_FLAGS) else STATUS
 
 
 def read_resets(local: pd.DataFrame) -> tuple[Reset, ...]:

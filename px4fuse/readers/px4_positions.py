@@ -27,23 +27,17 @@ from px4fuse.flight import (
 )
 from px4fuse.origin import with_orientation
 from px4fuse.readers import px4_topics as px4
+from px4fuse.readers.layouts import GLOBAL_COLUMNS
 from px4fuse.readers.parts import attitude_of, finite_rows, orientation_of
 from px4fuse.readers.px4_ekf2 import target_step_s
 from px4fuse.readers.px4_fixes import left_out_fixes, rebuilt_fixes
 from px4fuse.readers.px4_innovations import fuses
-from px4fuse.readers.px4_topics import (
-    ANTENNA_COLUMNS,
-    GPS_POSITION,
-    KEPT_OBSERVATION,
-    RECONSTRUCTION,
-)
 from px4fuse.readers.ulog_topics import Topics
 from px4fuse.recording import ClockMap
 
 MIN_TRACK_SAMPLES = 3
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h
 GPS_3D_FIX = 3
-GLOBAL_COLUMNS = ["latitude_deg", "longitude_deg", "altitude_m"]
 # Samples that are published within this of their measurement have no measured time of their own
 SAME_TIME_US = 100
 ARRIVAL_SHARE = 0.9
@@ -51,10 +45,6 @@ ARRIVAL_SHARE = 0.9
 HEIGHT_TOLERANCE_S = 0.05
 # Logged no faster than this, a receiver's positions were thinned: they give 5 to 20 a second
 THINNED_HZ = 4.0
-# Tracks that are read as they are logged
-LOGGED = (
-    "vehicle_visual_odometry", "vehicle_mocap_odometry", "estimator_visual_odometry_aligned",
-)  # fmt: skip
 AUTOPILOT_CLOCK = "autopilot boot clock (as PX4 mapped the sender's stamp)"
 
 
@@ -66,7 +56,7 @@ def read_positions(
     # of what EKF2 kept, a source that EKF2 took a heading from counts as an odometry
     turns = isinstance(fusing, pd.DataFrame) and bool((fusing["yaw"] > 0).any())
     found = [
-        *(_read_logged(topics, name) for name in LOGGED),
+        *(_read_logged(topics, name) for name in px4.LOGGED),
         _read_kept(topics, turns),
         _rebuild(topics, ekf2, turns),
         _read_gps(topics, ekf2),
@@ -161,7 +151,7 @@ def _arrival(topics: Topics, topic: str) -> ClockMap | None:
 def _read_kept(topics: Topics, turns: bool) -> PositionTrack | Unavailable:
     layout = topics.find(px4.AID_OBSERVATION_HORIZONTAL)
     if layout is None:
-        return _unavailable(KEPT_OBSERVATION, f"no topic {KEPT_OBSERVATION} in the log")
+        return _unavailable(px4.KEPT_OBSERVATION, f"no topic {px4.KEPT_OBSERVATION} in the log")
     samples, used = topics.of_primary(layout), [layout.topic]
     notes: tuple[str, ...] = ()
     vertical = topics.find(px4.AID_OBSERVATION_VERTICAL)
@@ -172,7 +162,7 @@ def _read_kept(topics: Topics, turns: bool) -> PositionTrack | Unavailable:
     # update period (estimator_interface.cpp)
     samples = _later(samples, _delay_s(topics) + 0.5 * target_step_s(topics))
     return _track(
-        topics, KEPT_OBSERVATION, samples, tuple(used),
+        topics, px4.KEPT_OBSERVATION, samples, tuple(used),
         turns=turns, needed=POSITION_COLUMNS[:2], notes=notes,
     )  # fmt: skip
 
@@ -212,7 +202,7 @@ def _rebuild(topics: Topics, ekf2: Ekf2 | Unavailable, turns: bool) -> PositionT
     that; without the source's own stamps nothing better is known.
     """
     if isinstance(ekf2, Unavailable):
-        return _unavailable(RECONSTRUCTION, "no EKF2 output")
+        return _unavailable(px4.RECONSTRUCTION, "no EKF2 output")
     tracks = {}
     for axis, column in zip(AXIS_NAMES, POSITION_COLUMNS, strict=True):
         innovations = ekf2.innovations[axis]
@@ -221,13 +211,13 @@ def _rebuild(topics: Topics, ekf2: Ekf2 | Unavailable, turns: bool) -> PositionT
                 innovations.index, ekf2.state.index, ekf2.state[column], left=np.nan, right=np.nan
             )
     if not {"north_m", "east_m"} <= tracks.keys():
-        return _unavailable(RECONSTRUCTION, "EKF2 fused no horizontal external vision position")
+        return _unavailable(px4.RECONSTRUCTION, "EKF2 fused no horizontal external vision position")
     samples = pd.DataFrame({name: tracks[name] for name in POSITION_COLUMNS[:2]})
     notes: tuple[str, ...] = ()
     if "down_m" in tracks:
         samples, notes = _with_height(samples, tracks["down_m"].to_frame("down_m"))
     return _track(
-        topics, RECONSTRUCTION, _later(samples, _delay_s(topics)),
+        topics, px4.RECONSTRUCTION, _later(samples, _delay_s(topics)),
         ("vehicle_local_position", *ekf2.innovation_topics),
         turns=turns, needed=POSITION_COLUMNS[:2], notes=notes,
         clock=f"EKF2's time plus {EV_POS.delay}; late by up to one interval of the source",
@@ -309,12 +299,12 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     """
     layout = topics.find(px4.GPS)
     if layout is None:
-        return _unavailable(GPS_POSITION, f"no topic {GPS_POSITION} in the log")
+        return _unavailable(px4.GPS_POSITION, f"no topic {px4.GPS_POSITION} in the log")
     gps = topics.frame(layout)
     if "fix_type" in gps:
         gps = gps[gps["fix_type"] >= GPS_3D_FIX]
     if gps.empty:
-        return _unavailable(GPS_POSITION, "the receiver never had a 3D fix")
+        return _unavailable(px4.GPS_POSITION, "the receiver never had a 3D fix")
     parameters = topics.ekf2_parameters
     published_s = (gps["published_us"].to_numpy() - topics.zero_us) * 1e-6
     own = GNSS_MODE in parameters and bool(np.any(published_s - gps.index > SAME_TIME_US * 1e-6))
@@ -352,10 +342,10 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
             "estimator_aid_src_gnss_pos, their heights are interpolated",
         )
     more: dict[str, Any] = {}
-    if set(ANTENNA_COLUMNS) <= set(gps.columns):  # since v1.17 of each receiver
-        more["place_m"] = tuple(gps[ANTENNA_COLUMNS].iloc[-1].tolist())
+    if set(px4.ANTENNA_COLUMNS) <= set(gps.columns):  # since v1.17 of each receiver
+        more["place_m"] = tuple(gps[px4.ANTENNA_COLUMNS].iloc[-1].tolist())
     found = _track(
-        topics, GPS_POSITION, samples, (layout.topic,), clock=clock, notes=notes,
+        topics, px4.GPS_POSITION, samples, (layout.topic,), clock=clock, notes=notes,
         velocity=samples[VELOCITY_COLUMNS + VELOCITY_VARIANCE_COLUMNS], age_s=delay_ms * 1e-3,
         **more,
     )  # fmt: skip

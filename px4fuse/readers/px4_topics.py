@@ -22,12 +22,16 @@ from px4fuse.flight import (
 )
 from px4fuse.origin import ALIGNED, GNSS, KEPT, MOTION_CAPTURE, REBUILT, RECEIVED, Origin
 from px4fuse.readers.layouts import (
+    GLOBAL,
+    GLOBAL_COLUMNS,
+    GLOBAL_SCALE,
     POSE_DIAGONAL,
     POSITION_AND_VELOCITY,
     ROTATION_DIAGONAL,
     XYZ,
     Layout,
     elements,
+    fields,
 )
 
 IMU = (
@@ -95,8 +99,8 @@ TRUTH_LOCAL = (Layout("vehicle_local_position_groundtruth", POSITION_AND_VELOCIT
 TRUTH_GLOBAL = (
     Layout(
         "vehicle_global_position_groundtruth",
-        {"latitude_deg": "lat", "longitude_deg": "lon", "altitude_m": "alt"},
-        {"north_m_s": "vel_n", "east_m_s": "vel_e", "down_m_s": "vel_d"},
+        GLOBAL,
+        fields(VELOCITY_COLUMNS, "vel_n vel_e vel_d"),
     ),
 )
 TRUTH_ATTITUDE = (Layout("vehicle_attitude_groundtruth", elements(QUATERNION_COLUMNS, "q")),)
@@ -105,13 +109,14 @@ BAROMETER = (Layout("vehicle_air_data", {"altitude_m": "baro_alt_meter"}),)
 
 _GPS_OPTIONAL = {
     "eph_m": "eph", "epv_m": "epv", "fix_type": "fix_type", "utc_us": "time_utc_usec",
-    "published_us": "timestamp", "north_m_s": "vel_n_m_s", "east_m_s": "vel_e_m_s",
-    "down_m_s": "vel_d_m_s", "speed_accuracy_m_s": "s_variance_m_s",
+    "published_us": "timestamp", "speed_accuracy_m_s": "s_variance_m_s",
+    **fields(VELOCITY_COLUMNS, "vel_n_m_s vel_e_m_s vel_d_m_s"),
 }  # fmt: skip
+_VEHICLE_GNSS = _GPS_OPTIONAL | fields(VELOCITY_COLUMNS, "vel_north vel_east vel_down")
 ANTENNA_COLUMNS = ["antenna_forward_m", "antenna_right_m", "antenna_down_m"]
 
 
-def _of_receiver(**names: str) -> dict[str, str]:
+def _of_receiver(names: Mapping[str, str]) -> dict[str, str]:
     """Fields of the receiver's message inside another."""
     return {ours: f"receiver.{px4}" for ours, px4 in names.items()}
 
@@ -119,36 +124,17 @@ def _of_receiver(**names: str) -> dict[str, str]:
 GPS = (
     Layout(  # main of 2026
         "vehicle_gnss",
-        _of_receiver(latitude_deg="latitude", longitude_deg="longitude", altitude_m="altitude_msl"),
-        _of_receiver(
-            eph_m="eph",
-            epv_m="epv",
-            fix_type="fix_type",
-            utc_us="time_utc_usec",
-            published_us="timestamp",
-            north_m_s="vel_north",
-            east_m_s="vel_east",
-            down_m_s="vel_down",
-            speed_accuracy_m_s="speed_accuracy",
-        )
+        _of_receiver(fields(GLOBAL_COLUMNS, "latitude longitude altitude_msl")),
+        _of_receiver(_VEHICLE_GNSS | {"speed_accuracy_m_s": "speed_accuracy"})
         | elements(ANTENNA_COLUMNS, "antenna_offset"),
     ),
     Layout(  # v1.14
         "vehicle_gps_position",
-        {
-            "latitude_deg": "latitude_deg",
-            "longitude_deg": "longitude_deg",
-            "altitude_m": "altitude_msl_m",
-        },
+        fields(GLOBAL_COLUMNS, "latitude_deg longitude_deg altitude_msl_m"),
         _GPS_OPTIONAL
-        | dict(zip(ANTENNA_COLUMNS, (f"antenna_offset_{axis}" for axis in "xyz"), strict=True)),
+        | fields(ANTENNA_COLUMNS, "antenna_offset_x antenna_offset_y antenna_offset_z"),
     ),
-    Layout(  # v1.8 to v1.13
-        "vehicle_gps_position",
-        {"latitude_deg": "lat", "longitude_deg": "lon", "altitude_m": "alt"},
-        _GPS_OPTIONAL,
-        {"latitude_deg": 1e-7, "longitude_deg": 1e-7, "altitude_m": 1e-3},
-    ),
+    Layout("vehicle_gps_position", GLOBAL, _GPS_OPTIONAL, GLOBAL_SCALE),  # v1.8 to v1.13
 )
 
 FUSED_FIXES = (
@@ -240,6 +226,8 @@ _TRACKS = (
     ),
 )  # fmt: skip
 TRACKS: Mapping[str, TrackSource] = {track.name: track for track in _TRACKS}
+# Those of external vision and motion capture that are read as they are logged
+LOGGED = [name for name, track in TRACKS.items() if track.layouts and name != GPS_POSITION]
 TOPIC_ORIGINS = {name: track.origin for name, track in TRACKS.items()}
 # What has EKF2 fuse external vision; it starts on samples less than 0.2 s apart (ev_control.cpp)
 HOW_TO_FUSE: Mapping[str, str] = {
@@ -266,6 +254,99 @@ AID_OBSERVATION_VERTICAL = (
     ),
 )
 
+# What EKF2 fuses: msg/EstimatorAidSource{1,2,3}d.msg, EstimatorInnovations.msg,
+# EstimatorStatusFlags.msg, EstimatorStatus.msg, and EKF2.cpp (PublishInnovations)
+_NED, _HORIZONTAL, _XYZ = ("north", "east", "down"), ("north", "east"), ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class AidSource:
+    """Where releases log an aid.
+
+    Attributes
+    ----------
+    axes : tuple of str
+        Of its innovations, in PX4's order.
+    fields : tuple of str
+        Of ``estimator_innovations`` and ``_variances``, by axis; empty where they have none.
+    before : tuple of str
+        Of ``ekf2_innovations`` (v1.8 to v1.10), to which ``_var`` is added for the variance.
+    flags : tuple of tuple of str
+        Of ``estimator_status_flags``: the first group that the log has tells, by any of its flags,
+        whether EKF2 means to fuse the aid.
+    bit : int or None
+        The same of ``estimator_status.control_mode_flags``.
+    """
+
+    axes: tuple[str, ...]
+    fields: tuple[str, ...] = ()
+    before: tuple[str, ...] = ()
+    flags: tuple[tuple[str, ...], ...] = ()
+    bit: int | None = None
+
+
+def _of(name: str, count: int, first: int = 0) -> tuple[str, ...]:
+    """Elements of an array field."""
+    return tuple(f"{name}[{first + number}]" for number in range(count))
+
+
+_GPS = (("cs_gnss_pos",), ("cs_gps",))
+_GPS_VELOCITY = (("cs_gnss_vel",), ("cs_gps",))
+SOURCES: Mapping[str, AidSource] = {
+    "gnss_pos": AidSource(
+        _HORIZONTAL, _of("gps_hpos", 2), _of("vel_pos_innov", 2, 3), _GPS, 2
+    ),
+    "gnss_vel": AidSource(
+        _NED, (*_of("gps_hvel", 2), "gps_vvel"), _of("vel_pos_innov", 3), _GPS_VELOCITY, 2
+    ),
+    "gnss_hgt": AidSource(
+        ("down",), ("gps_vpos",), ("vel_pos_innov[5]",), (("cs_gps_hgt",),), 11
+    ),
+    "gnss_yaw": AidSource(
+        ("yaw",), ("heading",), ("heading_innov",), (("cs_gnss_yaw",), ("cs_gps_yaw",)), 22
+    ),
+    "ev_pos": AidSource(
+        _HORIZONTAL, _of("ev_hpos", 2), _of("vel_pos_innov", 2, 3), (("cs_ev_pos",),), 12
+    ),
+    "ev_vel": AidSource(_NED, (*_of("ev_hvel", 2), "ev_vvel"), (), (("cs_ev_vel",),), 24),
+    "ev_hgt": AidSource(("down",), ("ev_vpos",), ("vel_pos_innov[5]",), (("cs_ev_hgt",),), 14),
+    "ev_yaw": AidSource(("yaw",), ("heading",), ("heading_innov",), (("cs_ev_yaw",),), 13),
+    "baro_hgt": AidSource(
+        ("down",), ("baro_vpos",), ("vel_pos_innov[5]",), (("cs_baro_hgt",),), 9
+    ),
+    "rng_hgt": AidSource(
+        ("down",), ("rng_vpos",), ("vel_pos_innov[5]",),
+        (("cs_rng_hgt", "cs_rng_terrain"), ("cs_rng_hgt",)), 10,
+    ),
+    "optical_flow": AidSource(
+        ("x", "y"), _of("flow", 2), _of("flow_innov", 2),
+        (("cs_opt_flow", "cs_opt_flow_terrain"), ("cs_opt_flow",)), 3,
+    ),
+    "mag": AidSource(
+        _XYZ, _of("mag_field", 3), _of("mag_innov", 3),
+        (("cs_mag", "cs_mag_hdg", "cs_mag_3d"), ("cs_mag_3d",)), 5,
+    ),
+    # where there is a flag cs_mag, "heading" is the largest component of the field, in gauss
+    "mag_heading": AidSource(("yaw",), ("heading",), ("heading_innov",), (("cs_mag_hdg",),), 4),
+    "airspeed": AidSource(("x",), ("airspeed",), ("airspeed_innov",), (("cs_fuse_aspd",),), 19),
+    "sideslip": AidSource(("y",), ("beta",), ("beta_innov",), (("cs_fuse_beta",),), 15),
+    "drag": AidSource(("x", "y"), _of("drag", 2), _of("drag_innov", 2), (("cs_wind",),), 8),
+    "gravity": AidSource(_XYZ, _of("gravity", 3), (), (("cs_gravity_vector",),)),
+    "aux_vel": AidSource(_HORIZONTAL, _of("aux_hvel", 2)),
+    "aux_global_position": AidSource(_HORIZONTAL, (), (), (("cs_aux_gpos",),)),
+    "fake_pos": AidSource(
+        _HORIZONTAL, (), (), (("cs_fake_pos", "cs_valid_fake_pos"), ("cs_fake_pos",))
+    ),
+}  # fmt: skip
+# Releases whose rows say "fused" whether it was or not (v1.15, v1.16): the control bit tells
+FLAG_ALWAYS_SET = ("gravity", "drag")
+# Their observation is a position in EKF2's frame (that of GNSS is latitude and longitude)
+WITH_OBSERVATION = ("ev_pos", "ev_hgt")
+STATUS_FLAGS, STATUS = "estimator_status_flags", "estimator_status"
+# Every aid in one topic: innovations and variances, before v1.12 both
+INNOVATIONS = "estimator_innovations", "estimator_innovation_variances"
+OLD_INNOVATIONS = "ekf2_innovations"
+
 # What bears on position and is not used, and why
 UNUSED: Mapping[str, str] = {
     "sensor_uwb": "one range and two angles per message, not a position: send the position that "
@@ -283,4 +364,6 @@ def topics() -> list[str]:
         AID_OBSERVATION_VERTICAL, *(track.layouts for track in _TRACKS),
     )  # fmt: skip
     named = {layout.topic for group in groups for layout in group}
-    return sorted(named | UNUSED.keys() | {*ESTIMATOR_STATES, MAGNETOMETER[0][0]})
+    named |= {f"estimator_aid_src_{name}" for name in SOURCES}
+    of_aids = {STATUS_FLAGS, STATUS, *INNOVATIONS, OLD_INNOVATIONS}
+    return sorted(named | UNUSED.keys() | of_aids | {*ESTIMATOR_STATES, MAGNETOMETER[0][0]})

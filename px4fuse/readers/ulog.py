@@ -18,29 +18,14 @@ from px4fuse.flight import (
     Truth,
     Unavailable,
 )
+from px4fuse.readers import parts
 from px4fuse.readers import px4_topics as px4
-from px4fuse.readers.parts import (
-    BEYOND_IMU,
-    cut_off,
-    ends_in_flight,
-    finite_rows,
-    missing_parts,
-    stretches_of_flight,
-    stretches_of_modes,
-    with_attitude,
-)
-from px4fuse.readers.px4_ekf2 import ekf2_topics, read_ekf2
+from px4fuse.readers.px4_ekf2 import read_ekf2
 from px4fuse.readers.px4_positions import GPS_3D_FIX, barometer, read_positions, read_truth
-from px4fuse.readers.ulog_topics import (
-    ACCELEROMETER_OFFSET_INVALID_US,
-    AT_MEASUREMENT,
-    Topics,
-    dropped_note,
-    increasing,
-    read_topics,
-)
-from px4fuse.recording import Stream, Unused
+from px4fuse.readers.ulog_topics import Topics, dropped_note, increasing, read_topics
+from px4fuse.recording import Unused
 
+ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
 # A message that is cut off and no more is no loss besides; a silent IMU is one from here on
 LEAST_LOST, LOST_FROM_S = 65_538, 0.2
 # A receiver's UTC outside these is not valid: PX4's own GPS_EPOCH_SECS (gps_helper.h), and 2100
@@ -61,10 +46,11 @@ def read_ulog(path: Path) -> Flight:
 def to_flight(topics: Topics) -> Flight:
     """Make a flight of the topics of a log."""
     running = "Check that the logger ran while the sensors did."
-    imu = _enough(_read_imu(topics), "IMU", px4.IMU[0].topic, running)
+    imu = _enough(topics, _read_imu(topics), "IMU", px4.IMU[0].topic, running)
     logged = topics.read(px4.ATTITUDE)
     attitude = _enough(
-        None if logged is None else with_attitude(logged),
+        topics,
+        None if logged is None else parts.with_attitude(logged),
         "attitude",
         px4.ATTITUDE[0].topic,
         "Check that the estimator ran while the logger did.",
@@ -72,20 +58,15 @@ def to_flight(topics: Topics) -> Flight:
     ekf2 = read_ekf2(topics)
     positions, missing_positions = read_positions(topics, ekf2)
     truth = read_truth(topics, positions, ekf2)
+    if isinstance(truth, Truth):
+        topics.came_from("truth", truth.name)
     airborne = _read_airborne(topics)
     air = topics.read(px4.BAROMETER)
-    in_flight = ends_in_flight(airborne, topics.log.duration_s)
+    in_flight = parts.ends_in_flight(airborne, topics.log.duration_s)
     dropped = tuple(
         dropped_note(count, topic, "zero or go back")
         for (topic, _), count in sorted(topics.dropped.items())
     )
-    used = {
-        "imu": () if isinstance(imu, Unavailable) else (px4.IMU[0].topic,),
-        "attitude": () if isinstance(attitude, Unavailable) else (px4.ATTITUDE[0].topic,),
-        **ekf2_topics(topics, ekf2),
-        "truth": (truth.name,) if isinstance(truth, Truth) else (),
-        "airborne": () if isinstance(airborne, Unavailable) else (px4.LAND_DETECTED[0].topic,),
-    }
     return Flight(
         log=structs.replace(
             topics.log,
@@ -105,8 +86,8 @@ def to_flight(topics: Topics) -> Flight:
         barometer=None
         if air is None
         else barometer(air["altitude_m"], topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3),
-        missing=(*missing_parts(imu, attitude, ekf2, truth), *missing_positions),
-        streams={part: _stream(topics, part, names) for part, names in used.items() if names},
+        missing=(*parts.missing_parts(imu, attitude, ekf2, truth), *missing_positions),
+        streams=topics.streams,
         unused=tuple(
             Unused(name, len(table["timestamp"]), reason)
             for name, reason in px4.UNUSED.items()
@@ -120,7 +101,7 @@ def _lost(topics: Topics, imu: pd.DataFrame | Unavailable, in_flight: bool) -> t
     framing, log = topics.framing, topics.log
     said = []
     if framing.in_message:
-        said.append(cut_off("message", log.duration_s, in_flight))
+        said.append(parts.cut_off("message", log.duration_s, in_flight))
     if framing.lost_bytes > LEAST_LOST * framing.in_message:
         steps = np.array([]) if isinstance(imu, Unavailable) else np.diff(imu.index.to_numpy())
         silent_s = float(steps[steps > LOST_FROM_S].sum())
@@ -131,13 +112,6 @@ def _lost(topics: Topics, imu: pd.DataFrame | Unavailable, in_flight: bool) -> t
             f"({framing.lost_bytes / log.bytes:.2%}) could not be read, {where}{missing}"
         )
     return tuple(said)
-
-
-def _stream(topics: Topics, part: str, names: tuple[str, ...]) -> Stream:
-    # sensor_combined has no timestamp_sample: its timestamp is the gyro's, to which _read_imu adds
-    # the accelerometer's offset
-    clock = AT_MEASUREMENT if part == "imu" else topics.clock(names[0])
-    return Stream(names, clock, topics.log.name)
 
 
 def _start_unix(topics: Topics) -> float | None:
@@ -153,13 +127,14 @@ def _start_unix(topics: Topics) -> float | None:
 
 
 def _enough(
-    samples: pd.DataFrame | None, what: str, topic: str, remedy: str
+    topics: Topics, samples: pd.DataFrame | None, what: str, topic: str, remedy: str
 ) -> pd.DataFrame | Unavailable:
     """The usable samples of a topic, or why there are none."""
     if samples is None:
         return Unavailable(what, f"no topic {topic}", px4.DEFAULT_PROFILE)
     if len(samples) < 2:
         return Unavailable(what, f"{topic} holds {len(samples)} usable samples", remedy)
+    topics.came_from(what.lower(), topic)
     return samples
 
 
@@ -174,7 +149,7 @@ def _read_imu(topics: Topics) -> pd.DataFrame | None:
         keep = increasing(time_us.astype(np.int64) + topics.zero_us)
         imu = imu.iloc[keep].set_axis(pd.Index(time_us[keep] * 1e-6, name="time_s"))
     columns = SPECIFIC_FORCE_COLUMNS + ANGULAR_RATE_COLUMNS
-    return finite_rows(imu[columns], columns, BEYOND_IMU)
+    return parts.finite_rows(imu[columns], columns, parts.BEYOND_IMU)
 
 
 def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavailable:
@@ -186,7 +161,8 @@ def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavaila
             "no usable topic vehicle_land_detected",
             "Record with SDLOG_PROFILE bit 0 (default), or give --start and --end.",
         )
-    return stretches_of_flight(detected["landed"], topics.log.duration_s)
+    topics.came_from("airborne", px4.LAND_DETECTED[0].topic)
+    return parts.stretches_of_flight(detected["landed"], topics.log.duration_s)
 
 
 def _read_modes(topics: Topics) -> tuple[FlightMode, ...] | Unavailable:
@@ -195,4 +171,4 @@ def _read_modes(topics: Topics) -> tuple[FlightMode, ...] | Unavailable:
         return MODES_NOT_LOGGED
     states = status["nav_state"].dropna()
     names = states.map(lambda state: px4.NAV_STATES.get(int(state), f"mode {state:.0f}"))
-    return stretches_of_modes(names, topics.log.duration_s)
+    return parts.stretches_of_modes(names, topics.log.duration_s)

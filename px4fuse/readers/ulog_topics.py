@@ -27,12 +27,12 @@ from pyulog.exceptions import ULogException
 from px4fuse.arrays import IntArray
 from px4fuse.ekf2_parameters import REPORTED
 from px4fuse.errors import LogError
+from px4fuse.plain import few_words
 from px4fuse.readers.layouts import Layout
-from px4fuse.readers.px4_aid_sources import aid_topics
 from px4fuse.readers.px4_topics import IMU, SELECTOR, topics
 from px4fuse.readers.ulog_framing import Framing, whole_messages
 from px4fuse.reading import read_log_bytes, shown
-from px4fuse.recording import Dropout, LogInfo
+from px4fuse.recording import Dropout, LogInfo, Stream
 
 _MICROSECOND = 1e-6
 # A measurement time stamp further than this from its publication is not on the boot clock
@@ -40,15 +40,11 @@ _MICROSECOND = 1e-6
 MAX_PUBLICATION_LAG_S = 10.0
 # Samples outside the data window by more than this are stale leftovers of an earlier boot phase.
 WINDOW_MARGIN_S = 2.0
-# What a time stamp of a topic says, see measurement_time_us
-AT_MEASUREMENT = "autopilot boot clock, at measurement"
-AT_PUBLICATION = "autopilot boot clock, at publication"
 RELEASE = 255
 # An info message in which a log says of itself what whoever reads it must know
 NOTE_KEY = "px4fuse_note"
 # A gap longer than this in the IMU's stamps is no dropout: what lies beyond is another boot.
 MAX_DATA_GAP_S = 600.0
-ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
 # pyulog walks damaged bytes as though they were messages; these are what that can raise
 _PARSE_ERRORS = (
     ULogException, struct.error, IndexError, KeyError, ValueError, TypeError, AttributeError,
@@ -80,6 +76,8 @@ class Topics:
         Every EKF2_ parameter, by PX4 name; ``log`` holds only those that enter the results.
     framing : Framing
         How much of the file is whole messages.
+    streams : dict
+        Where each part of the flight came from; :meth:`came_from` fills it.
     """
 
     log: LogInfo
@@ -88,6 +86,7 @@ class Topics:
     dropped: dict[tuple[str, int], int]
     ekf2_parameters: Mapping[str, float] = field(default_factory=dict)
     framing: Framing = field(default_factory=lambda: Framing(b""))
+    streams: dict[str, Stream] = field(default_factory=dict)
 
     def instances(self, topic: str) -> list[int]:
         """Instances of a topic that hold data, in order."""
@@ -188,13 +187,15 @@ class Topics:
         joined = pd.concat(parts).sort_index()
         return joined[~joined.index.duplicated()]
 
-    def clock(self, topic: str) -> str:
-        """Which moment the times of a topic's samples are."""
-        measured = any(
+    def came_from(self, part: str, *topics: str) -> None:
+        """Note where a part of the flight came from, and which moment its times are."""
+        # of sensor_combined the stamp is the gyro's, to which the accelerometer's offset is added
+        measured = part == "imu" or any(
             np.any(measurement_time_us(table) != table["timestamp"].astype(np.int64))
-            for table in self.of(topic)
+            for table in self.of(topics[0])
         )
-        return AT_MEASUREMENT if measured else AT_PUBLICATION
+        clock = f"autopilot boot clock, at {'measurement' if measured else 'publication'}"
+        self.streams[part] = Stream(topics, clock, self.log.name)
 
     def window(self, frame: pd.DataFrame) -> pd.DataFrame:
         """Drop what lies outside the span of the data by more than the margin."""
@@ -269,7 +270,7 @@ def read_topics(path: Path) -> Topics:
     """
     name, content = shown(path), read_log_bytes(path)
     chatter = io.StringIO()
-    wanted = sorted({*topics(), *aid_topics()})
+    wanted = topics()
     framing = whole_messages(content)
     whole = framing.content
     try:
@@ -291,7 +292,7 @@ def read_topics(path: Path) -> Topics:
         )
     if not tables:
         names = sorted({topic for topic, _ in placed})
-        notes += (f"none of its topics is one that px4fuse uses (it holds {_listed(names)})",)
+        notes += (f"none of its topics is one that px4fuse uses (it holds {few_words(names, 5)})",)
     if NOTE_KEY in ulog.msg_info_dict:
         notes += (_text(ulog.msg_info_dict, NOTE_KEY, ""),)
     zero_us, end_us = _data_span(placed, name)
@@ -363,11 +364,6 @@ def _data_span(
         f"{name}: every time stamp in it is zero, so nothing can be placed in time",
         "The logger ran before the clock did; record again.",
     )
-
-
-def _listed(names: list[str]) -> str:
-    most = 5
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if names[most:] else "")
 
 
 def _text(info: dict[str, Any], key: str, otherwise: str) -> str:

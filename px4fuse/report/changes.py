@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from px4fuse.plain import number_words
 from px4fuse.report.page import Cell, Page, words
 from px4fuse.report.style import GOOD, MUTED, SEVERITY_COLOURS
-from px4fuse.results.changes import NumberChange
-from px4fuse.results.contract import ChangeResults
+from px4fuse.results.contract import ChangeResults, NumberChange
 
 COLOURS = {"worse": SEVERITY_COLOURS["error"], "better": GOOD}
 SIZE = 7.6

@@ -9,7 +9,7 @@ from px4fuse.analysis import AidsAlone, Analysis, Counterfactual
 from px4fuse.comparison.events import Events, happened
 from px4fuse.comparison.model import AxisComparison
 from px4fuse.flight import Unavailable
-from px4fuse.loop.loop import Loop
+from px4fuse.loop.model import Loop
 from px4fuse.results.contract import AidsResults, ComparisonResults, LoopResults, WhatIfResults
 from px4fuse.results.model import Student
 

@@ -12,8 +12,7 @@ from px4fuse.flight import Unavailable
 from px4fuse.loop import corrections
 from px4fuse.loop.analysis import SMALLEST_STAMP_S
 from px4fuse.loop.corrections import SINGLE_LOOP
-from px4fuse.loop.loop import Loop
-from px4fuse.loop.model import LANDING, Closure, CorrectedPath
+from px4fuse.loop.model import LANDING, Closure, CorrectedPath, Loop
 from px4fuse.plain import capital, p_words
 from px4fuse.report import style
 from px4fuse.report.cover import write_finding

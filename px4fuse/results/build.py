@@ -1,10 +1,10 @@
-"""Analysis → results: what ``compare``, ``tune`` and ``sync`` found, as the contract has it."""
+"""What a command found → results, as the contract has them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 
@@ -12,56 +12,52 @@ from px4fuse.analysis import AidsAlone, Analysis, Counterfactual
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
-from px4fuse.findings import find, find_aids
+from px4fuse.findings import find, find_aids, find_loop
 from px4fuse.findings.story import story
 from px4fuse.flight import Flight, Unavailable
+from px4fuse.loop.model import Loop
 from px4fuse.record import written
-from px4fuse.request import AxisName, ComparisonRequest, WhatIfRequest, command_line
-from px4fuse.results.comparison import AvailableTrack, ChosenSettings, Log, PositionSource
-from px4fuse.results.contract import (
-    AIDS,
-    COMPARISON,
-    WHATIF,
-    AidsResults,
-    ComparisonResults,
-    SyncResults,
-    TuningResults,
-    WhatIfResults,
+from px4fuse.request import (
+    ComparisonRequest,
+    EvaluationRequest,
+    LoopRequest,
+    WhatIfRequest,
+    command_line,
 )
+from px4fuse.results import contract
+from px4fuse.results.contract import AvailableTrack, ChosenSettings, Log, PositionSource
 from px4fuse.results.model import NOBODY, Student, provenance, schema_of
+from px4fuse.trajectory.evaluation import Evaluation
+from px4fuse.trajectory.graph.analysis import SolvedGraph
+
+# Parts of an analysis that are written as they are
+_AS_FOUND = (
+    "axes", "horizontal", "tuning", "clock", "heading", "ekf2_replay", "why", "causes", "loop",
+    "notes", "missing",
+)  # fmt: skip
 
 
 def results(
     request: ComparisonRequest, analysis: Analysis, student: Student = NOBODY
-) -> ComparisonResults:
+) -> contract.ComparisonResults:
     """Everything that the report says."""
     findings = find(analysis)
-    return ComparisonResults(
-        **_of_flight(COMPARISON, request, analysis),
-        axes={cast(AxisName, name): written(axis) for name, axis in analysis.axes.items()},
-        horizontal=dict(analysis.horizontal),
-        tuning=written(analysis.tuning),
-        clock=written(analysis.clock),
-        heading=analysis.heading,
-        ekf2_replay=written(analysis.ekf2_replay),
-        why=written(analysis.why),
-        causes=analysis.causes,
+    return contract.ComparisonResults(
+        **_of_flight(contract.COMPARISON, request, analysis),
+        **{name: written(getattr(analysis, name)) for name in _AS_FOUND},
         aids={} if isinstance(analysis.aids, Unavailable) else dict(analysis.aids),
-        loop=written(analysis.loop),
         story=story(analysis, findings),
         findings=findings,
-        notes=analysis.notes,
-        missing=analysis.missing,
         student=student,
     )
 
 
 def aids_results(
     request: ComparisonRequest, alone: AidsAlone, student: Student = NOBODY
-) -> AidsResults:
+) -> contract.AidsResults:
     """What ``px4fuse compare`` found on a flight without a position source."""
-    return AidsResults(
-        schema=schema_of(AIDS),
+    return contract.AidsResults(
+        schema=schema_of(contract.AIDS),
         request=request.recorded(),
         log=log_part(alone.flight),
         aids=dict(alone.aids),
@@ -76,26 +72,26 @@ def tuning_results(
     request: ComparisonRequest,
     comparison: Comparison,
     tuned: Mapping[str, AxisTuning | Unavailable],
-) -> TuningResults:
+) -> contract.TuningResults:
     """What ``px4fuse tune`` found."""
     begun = _of_flight("px4fuse-tuning", request, comparison, "tune")
-    return TuningResults(**begun, tuning=written(tuned))
+    return contract.TuningResults(**begun, tuning=written(tuned))
 
 
 def sync_results(
     request: ComparisonRequest, comparison: Comparison, clock: ClockOffset | Unavailable
-) -> SyncResults:
+) -> contract.SyncResults:
     """What ``px4fuse sync`` found."""
     begun = _of_flight("px4fuse-sync", request, comparison, "sync")
-    return SyncResults(**begun, clock=written(clock))
+    return contract.SyncResults(**begun, clock=written(clock))
 
 
-def whatif_results(request: WhatIfRequest, made_of: Counterfactual) -> WhatIfResults:
+def whatif_results(request: WhatIfRequest, made_of: Counterfactual) -> contract.WhatIfResults:
     """What ``px4fuse whatif`` found."""
     found = made_of.whatif
     first = made_of.first
-    return WhatIfResults(
-        schema=schema_of(WHATIF),
+    return contract.WhatIfResults(
+        schema=schema_of(contract.WHATIF),
         request=request.recorded(),
         log=log_part(made_of.flight),
         agreement=found.agreement,
@@ -108,6 +104,38 @@ def whatif_results(request: WhatIfRequest, made_of: Counterfactual) -> WhatIfRes
         notes=found.notes,
         provenance=provenance(command_line(request)),
     )
+
+
+def loop_results(
+    request: LoopRequest, loop: Loop, student: Student = NOBODY
+) -> contract.LoopResults:
+    """What ``px4fuse loop`` found."""
+    return contract.LoopResults(
+        schema=schema_of(contract.LOOP),
+        request=request.recorded(),
+        track=loop.odometry.trajectory.track(),
+        references=tuple(reference.track() for reference in loop.references),
+        loop=written(loop),
+        findings=find_loop(loop),
+        student=student,
+        provenance=provenance(command_line(request)),
+    )
+
+
+def evaluation_results(request: EvaluationRequest, score: Evaluation) -> contract.EvaluationResults:
+    """What ``px4fuse evaluate`` found."""
+    return contract.EvaluationResults(
+        schema=schema_of("px4fuse-evaluation"),
+        estimate=score.estimate.track(),
+        reference=score.reference.track(),
+        provenance=provenance(command_line(request)),
+        **msgspec.structs.asdict(written(score)),
+    )
+
+
+def graph_results(solved: SolvedGraph, command: str) -> contract.GraphResults:
+    """What ``px4fuse loop`` found about a pose graph; edges by the vertex numbers of the file."""
+    return contract.GraphResults(schema_of("px4fuse-graph"), written(solved), provenance(command))
 
 
 def log_part(flight: Flight) -> Log:
@@ -123,17 +151,10 @@ def _of_flight(
     origin, parameters = track.origin, comparison.flight.log.parameters
     placed_s = 0.0 if track.alignment is None else track.alignment.clock_offset_s
     source = PositionSource(
-        name=track.name,
-        kind=origin.kind,
-        passage=origin.passage,
+        **track.about(),
         ekf2_parameters={} if origin.aid is None else origin.aid.in_log(parameters),
-        description=track.description,
         reason=comparison.source_reason,
         rate_hz=track.rate_hz,
-        frame=cast(Any, track.frame),
-        clock=track.clock,
-        reconstructed=origin.reconstructed,
-        topics=track.topics,
         available=tuple(
             AvailableTrack(
                 one.name, one.origin.kind, one.origin.passage, len(one.samples), one.rate_hz
@@ -141,8 +162,6 @@ def _of_flight(
             for one in comparison.flight.positions
         ),
         not_in_log=tuple(part for part in comparison.missing if part.source),
-        log=track.log,
-        alignment=track.alignment,
     )
     used: dict[str, Any] = asdict(settings) | {"clock_offset_s": settings.clock_offset_s + placed_s}
     return {

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
@@ -25,17 +25,13 @@ from px4fuse.filter.consistency import HorizontalNis
 from px4fuse.filter.heading import HeadingError
 from px4fuse.filter.tuning import Tuned
 from px4fuse.findings import Finding
+from px4fuse.flight import Alignment
 from px4fuse.loop.model import LoopPart
-from px4fuse.record import Maybe, Record, Span, Unavailable
-from px4fuse.request import AxisName, ComparisonRequest, LoopRequest, WhatIfRequest
-from px4fuse.results.changes import (
-    Compared,
-    FindingChange,
-    NumberChange,
-    TextChange,
-)
-from px4fuse.results.comparison import ChosenSettings, Log, PositionSource
-from px4fuse.results.model import VERSION, Provenance, Schema, Student
+from px4fuse.origin import Passage, PositionKind
+from px4fuse.record import Count, Maybe, Positive, Record, Sha256, Share, Span, Unavailable
+from px4fuse.recording import ClockMap, InputFile, LogInfo
+from px4fuse.request import AxisName, ComparisonRequest, InputName, LoopRequest, WhatIfRequest
+from px4fuse.results.model import VERSION, Provenance, Schema, Student, Version
 from px4fuse.trajectory.evaluation import Score
 from px4fuse.trajectory.graph.analysis import Graph
 from px4fuse.trajectory.model import Track
@@ -45,6 +41,142 @@ LOOP = "px4fuse-loop"
 WHATIF = "px4fuse-whatif"
 AIDS = "px4fuse-aids"
 CHANGES = "px4fuse-changes"
+
+
+class Log(LogInfo, frozen=True, kw_only=True):
+    """The recording, the files that were read beside it, and the clocks that were mapped."""
+
+    joined: tuple[InputFile, ...]
+    clocks: tuple[ClockMap, ...]
+
+
+class AvailableTrack(Record, frozen=True):
+    """A position track of the flight."""
+
+    name: str
+    kind: PositionKind
+    passage: Passage
+    samples: Count
+    rate_hz: Positive | None = None
+
+
+class PositionSource(Record, frozen=True, kw_only=True):
+    """The position that both filters are judged by.
+
+    ``kind`` and ``passage`` say where it comes from and how it got into the flight,
+    ``ekf2_parameters`` what the log has of EKF2's parameters for it, by PX4 name and in PX4's
+    units; ``log`` is the file that it was read from.
+    """
+
+    name: str
+    kind: PositionKind
+    passage: Passage
+    ekf2_parameters: Mapping[str, float]
+    description: str
+    reason: str
+    rate_hz: Positive
+    frame: Literal["NED", "FRD", "unknown"]
+    clock: str
+    reconstructed: bool
+    topics: tuple[str, ...]
+    available: tuple[AvailableTrack, ...]
+    not_in_log: tuple[Unavailable, ...]
+    log: str
+    alignment: Alignment | None = None
+
+
+class ChosenSettings(Record, frozen=True, kw_only=True):
+    """Settings of the filter; ``clock_offset_s`` was added to the source's time stamps."""
+
+    sigma_a_m_s2: Positive
+    sigma_z_m: Positive
+    dt_s: Positive
+    input: InputName
+    start_s: float
+    end_s: float
+    segment_reason: str
+    clock_offset_s: float
+
+
+# Field of Tuned that says what each setting of the filter should be
+ASKED = {"sigma_a_m_s2": "filter_sigma_a_m_s2", "sigma_z_m": "sigma_z_m"}
+
+
+Which = Literal["A", "B"]
+Status = Literal[
+    "significant", "within chance", "not tested", "differs", "same", "only in A", "only in B"
+]
+Judgement = Literal["better", "worse", "changed", ""]
+
+
+class Compared(Record, frozen=True, kw_only=True):
+    """One of the two: what was given, and the flight that it is of."""
+
+    given: str
+    kind: Literal["log", "report", "results"]
+    log: str
+    log_sha256: Sha256
+    px4fuse: Version
+
+
+class NumberChange(Record, frozen=True, kw_only=True):
+    """One number of both.
+
+    Attributes
+    ----------
+    path : str
+        Where it stands in the results of both: ``axes.aisle.filters.ekf2.nis_mean``.
+    label, unit : str
+    a, b : float
+        Absent where only the other one has it.
+    a_interval, b_interval : (float, float)
+        95 %; absent where there is none.
+    scale : {"ratio", "difference"}
+        What ``change`` is: b/a or b - a.
+    change : float
+        Absent where it is a ratio to zero.
+    change_interval : (float, float)
+        95 %, with what two flights with the same equipment are apart by.
+    q : float
+        p-value of "no change", corrected for the number of tests.
+    status : str
+        "significant", "within chance" or "not tested" between two flights; "differs" or "same"
+        between two settings of one flight, where nothing is left to chance.
+    judgement : {"better", "worse", "changed", ""}
+        "changed" where B is neither; "" where the change is not significant.
+    """
+
+    path: str
+    label: str
+    unit: str
+    a: float | None = None
+    b: float | None = None
+    a_interval: Span | None = None
+    b_interval: Span | None = None
+    scale: Literal["ratio", "difference"]
+    change: float | None = None
+    change_interval: Span | None = None
+    q: Share | None = None
+    status: Status
+    judgement: Judgement = ""
+
+
+class TextChange(Record, frozen=True):
+    """A setting, a parameter of PX4 or a fact about the flight that is not the same."""
+
+    kind: Literal["setting", "parameter", "flight"]
+    what: str
+    a: str
+    b: str
+
+
+class FindingChange(Record, frozen=True):
+    """A finding that only one of the two has."""
+
+    id: str
+    severity: Literal["error", "warning", "info"]
+    message: str
+    only_in: Which
 
 
 class _OfFlight(Record, frozen=True):

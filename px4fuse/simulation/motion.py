@@ -18,7 +18,6 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import SettingsError
 from px4fuse.simulation.mistakes import Mistakes
 from px4fuse.simulation.scenario import CORNER_S, START_STOP_S, Scenario
-from px4fuse.trajectory.graph.lie import cross
 
 # On the ground before take-off and after landing
 GROUND_S = 6.0
@@ -239,7 +238,7 @@ def attitude(state: State) -> Attitude:
     n_rate += state.yaw_rate_rad_s[:, None] * np.stack([-zz * c, -zz * s, zx * c + zy * s], axis=1)
     n_size = np.sqrt(np.einsum("ij,ij->i", n, n))
     y = n / n_size[:, None]
-    x = cross(y, z)
+    x = np.cross(y, z)
     # from dR/dt = R [ω]×
     rate = np.stack(
         [

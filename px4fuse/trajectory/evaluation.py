@@ -20,22 +20,12 @@ from px4fuse.display import Shown
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight import Unavailable
 from px4fuse.record import Maybe, Record
+from px4fuse.trajectory import scores
 from px4fuse.trajectory.alignment import AlignmentKind, Transform, fit, umeyama
 from px4fuse.trajectory.association import Association, Method, associate
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 from px4fuse.trajectory.offset import TimeOffset, clock_difference, estimate_time_offset
-from px4fuse.trajectory.scores import (
-    Delta,
-    Interval,
-    PairwiseError,
-    RelativeError,
-    Statistics,
-    default_deltas,
-    relative_error,
-    rmse_interval,
-    rotations_of,
-    statistics,
-)
+from px4fuse.trajectory.scores import Delta, Interval, RelativeError, Statistics
 
 MAX_SCALE_ERROR = 0.1
 MIN_COVERAGE = 0.5
@@ -107,7 +97,7 @@ class Evaluation(Shown, Score, frozen=True, kw_only=True, eq=False):
     """
 
     written_as = Score
-    rpe: tuple[PairwiseError, ...]
+    rpe: tuple[scores.PairwiseError, ...]
     estimate: Trajectory
     reference: Trajectory
     time_s: Array
@@ -173,16 +163,16 @@ def evaluate(
         aligned = replace(aligned, rotation=aligned.rotation * body)
     distance = cumulative_distance(y.position_m)
     error = np.linalg.norm(aligned.position_m - y.position_m, axis=1)
-    both = rotations_of(aligned, y, "ATE of the rotation")
+    both = scores.rotations_of(aligned, y, "ATE of the rotation")
     rotation_error: Array | None = None
     rotation: Maybe[Statistics]
     if isinstance(both, Unavailable):
         rotation = both
     else:
         rotation_error = np.degrees((both[0].inv() * both[1]).magnitude())
-        rotation = statistics(rotation_error)
+        rotation = scores.statistics(rotation_error)
     if rpe_deltas is None:
-        rpe_deltas = default_deltas(distance, x.time_s)
+        rpe_deltas = scores.default_deltas(distance, x.time_s)
     return Evaluation(
         estimate=estimate,
         reference=reference,
@@ -191,8 +181,10 @@ def evaluate(
         transform=transform,
         association=matched,
         time_offset=offset,
-        ate=AbsoluteError(statistics(error), rmse_interval(error, "ATE"), rotation),
-        rpe=tuple(relative_error(aligned, y, delta, all_pairs=all_pairs) for delta in rpe_deltas),
+        ate=AbsoluteError(scores.statistics(error), scores.rmse_interval(error, "ATE"), rotation),
+        rpe=tuple(
+            scores.relative_error(aligned, y, delta, all_pairs=all_pairs) for delta in rpe_deltas
+        ),
         time_s=x.time_s,
         distance_m=distance,
         unaligned_m=x.position_m,

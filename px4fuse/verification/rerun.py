@@ -151,7 +151,7 @@ def _compared(handed_in: ComparisonResults, place: _Place) -> Recomputed:
 
 def _looped(handed_in: LoopResults, place: _Place) -> Recomputed:
     from px4fuse.analysis import run_loop  # noqa: PLC0415
-    from px4fuse.results.build_trajectories import loop_results  # noqa: PLC0415
+    from px4fuse.results.build import loop_results  # noqa: PLC0415
 
     recorded = handed_in.request
     path, part = split_part(recorded.source)

@@ -30,8 +30,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.findings import find, find_loop
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.analysis import analyse, loop_in
-from px4fuse.loop.sources import LoopSource
-from px4fuse.loop.tracks import trajectory_of
+from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario, scenario_of

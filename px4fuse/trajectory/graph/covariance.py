@@ -10,14 +10,8 @@ from scipy.special import chdtrc
 from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import TrajectoryError
 from px4fuse.record import Count, NotNegative, Record, Share
-from px4fuse.trajectory.graph import lie
-from px4fuse.trajectory.graph.model import (
-    PoseGraph,
-    observed_directions,
-    odometry_chain,
-    odometry_steps,
-    unit_diagonal,
-)
+from px4fuse.trajectory.graph import lie, model
+from px4fuse.trajectory.graph.model import PoseGraph
 
 # Chance that the gate rejects a closure that is true
 GATE_ALPHA = 0.001
@@ -80,7 +74,7 @@ def gate(graph: PoseGraph, edge_indices: Sequence[int] | IntArray) -> list[GateR
     tested = np.asarray(edge_indices, dtype=np.intp)
     if not len(tested):
         return []
-    chain = odometry_chain(graph, tested)
+    chain = model.odometry_chain(graph, tested)
     a, b = graph.first[tested], graph.second[tested]
     low, high = int(min(a.min(), b.min())), int(max(a.max(), b.max()))
     used = chain[low:high]
@@ -92,7 +86,7 @@ def gate(graph: PoseGraph, edge_indices: Sequence[int] | IntArray) -> list[GateR
             "alone does not tell how well the closure fits",
             "Add the edge, or test shorter closures.",
         )
-    poses = lie.chain(odometry_steps(graph, used))
+    poses = lie.chain(model.odometry_steps(graph, used))
     carry = lie.adjoint(poses[1:])
     worlds = carry @ _covariances(graph, used) @ carry.transpose(0, 2, 1)  # in the axes of low
     total = np.concatenate([np.zeros((1, *worlds.shape[1:])), np.cumsum(worlds, axis=0)])
@@ -111,12 +105,12 @@ def gate(graph: PoseGraph, edge_indices: Sequence[int] | IntArray) -> list[GateR
 
 def _tested(graph: PoseGraph, edge: int, residual: Array, covariance: Array) -> GateResult:
     ends = int(graph.ids[graph.first[edge]]), int(graph.ids[graph.second[edge]])
-    directions, variance = observed_directions(graph.information[edge])
+    directions, variance = model.observed_directions(graph.information[edge])
     freedom = len(variance)
     seen = directions.T @ residual
     spread = directions.T @ covariance @ directions + np.diag(variance)
     known = freedom and np.isfinite(spread).all()
-    if not known or np.linalg.eigvalsh(unit_diagonal(spread)[1])[0] <= _SINGULAR:
+    if not known or np.linalg.eigvalsh(model.unit_diagonal(spread)[1])[0] <= _SINGULAR:
         raise TrajectoryError(
             f"The closure from vertex {ends[0]} to {ends[1]} cannot be tested: it has no "
             "information, or odometry is too uncertain for the digits that numbers have",
@@ -129,7 +123,7 @@ def _tested(graph: PoseGraph, edge: int, residual: Array, covariance: Array) -> 
 
 def _covariances(graph: PoseGraph, used: IntArray) -> Array:
     """Covariances of odometry edges in the axes of the later pose."""
-    scale, scaled = unit_diagonal(graph.information[used])
+    scale, scaled = model.unit_diagonal(graph.information[used])
     whole = np.linalg.eigvalsh(scaled)[:, 0] > 1e-12
     if not np.all(whole):
         edge = used[int(np.argmin(whole))]
@@ -144,5 +138,4 @@ def _covariances(graph: PoseGraph, used: IntArray) -> Array:
     # (Z exp(r))^-1 = Z^-1 exp(-Ad(Z) r)
     turn = lie.adjoint(graph.measurements[used[back]])
     covariance[back] = turn @ covariance[back] @ turn.transpose(0, 2, 1)
-    made: Array = covariance
-    return made
+    return covariance

@@ -10,15 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array
 from px4fuse.errors import TrajectoryError
-from px4fuse.trajectory.graph import lie
-from px4fuse.trajectory.graph.model import (
-    FROM_CHORDAL,
-    PoseGraph,
-    composed,
-    cost,
-    odometry_chain,
-    require_connected,
-)
+from px4fuse.trajectory.graph import lie, model
+from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.system import BlockSystem
 
 
@@ -45,11 +38,11 @@ def initialise(graph: PoseGraph) -> PoseGraph:
     TrajectoryError
         If the graph falls into parts, or its edges do not determine its poses.
     """
-    if np.any(odometry_chain(graph) < 0):
+    if np.any(model.odometry_chain(graph) < 0):
         return _chordal(graph)
-    started = composed(graph)
+    started = model.composed(graph)
     try:
-        return min(started, _chordal(graph), key=cost)
+        return min(started, _chordal(graph), key=model.cost)
     except TrajectoryError:  # rotations that only odometry tells
         return started
 
@@ -64,7 +57,7 @@ def _chordal(graph: PoseGraph) -> PoseGraph:
     """
     d = graph.dimension
     spin = np.trace(graph.information[:, d:, d:], axis1=1, axis2=2)
-    require_connected(graph, spin > 0.0, "edges that tell a rotation")
+    model.require_connected(graph, spin > 0.0, "edges that tell a rotation")
     held = graph.first == 0, graph.second == 0
     system = BlockSystem(graph.first, graph.second, len(graph), d)
     measured = lie.rotation_matrix(graph.measurements)
@@ -98,7 +91,7 @@ def _chordal(graph: PoseGraph) -> PoseGraph:
     else:
         poses = np.column_stack([position, Rotation.from_matrix(rotation).as_quat()])
     poses[0] = graph.poses[0]
-    return replace(graph, poses=poses, initialised=FROM_CHORDAL)
+    return replace(graph, poses=poses, initialised=model.FROM_CHORDAL)
 
 
 def _solved(system: BlockSystem, matrix: sparse.csc_array[np.float64], right: Array) -> Array:

@@ -36,15 +36,6 @@ def wrap(angle: Array) -> Array:
     return np.pi - (np.pi - angle) % (2.0 * np.pi)
 
 
-def cross(a: Array, b: Array) -> Array:
-    """Cross product of vectors, shapes (..., 3); several times as fast as ``numpy.cross``."""
-    made = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    made[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
-    made[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
-    made[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return made
-
-
 def rotation_matrix(pose: Array) -> Array:
     """Rotation of poses as a matrix.
 
@@ -121,8 +112,8 @@ def exp(tangent: Array) -> Array:
         return np.stack([s * x - c * y, c * x + s * y, theta], axis=-1)
     rho, phi = tangent[..., :3], tangent[..., 3:]
     theta = np.linalg.norm(phi, axis=-1)[..., None]
-    turned = cross(phi, rho)
-    position = rho + _a(theta) * turned + _b(theta) * cross(phi, turned)
+    turned = np.cross(phi, rho)
+    position = rho + _a(theta) * turned + _b(theta) * np.cross(phi, turned)
     return np.concatenate([position, Rotation.from_rotvec(phi).as_quat()], axis=-1)
 
 
@@ -140,9 +131,9 @@ def log(pose: Array) -> Array:
         cotangent = 1.0 - theta * theta * _c(np.abs(theta))
         return np.stack([cotangent * x + half * y, cotangent * y - half * x, theta], axis=-1)
     position, phi = pose[..., :3], _turn(pose).as_rotvec()
-    turned = cross(phi, position)
+    turned = np.cross(phi, position)
     theta = np.linalg.norm(phi, axis=-1)[..., None]
-    rho = position - 0.5 * turned + _c(theta) * cross(phi, turned)
+    rho = position - 0.5 * turned + _c(theta) * np.cross(phi, turned)
     return np.concatenate([rho, phi], axis=-1)
 
 
@@ -229,14 +220,12 @@ def _turn(pose: Array) -> Rotation:
 
 
 def _outer(a: Array, b: Array) -> Array:
-    made: Array = a[..., :, None] * b[..., None, :]
-    return made
+    return a[..., :, None] * b[..., None, :]
 
 
 def _a(theta: Array) -> Array:
     """(1 - cos theta) / theta^2."""
-    made: Array = 0.5 * np.sinc(theta / (2.0 * np.pi)) ** 2
-    return made
+    return 0.5 * np.sinc(theta / (2.0 * np.pi)) ** 2
 
 
 def _b(theta: Array) -> Array:
@@ -257,5 +246,4 @@ def _c_slope(theta: Array) -> Array:
     t = np.where(theta < SMALL, 1.0, theta)
     g_slope = 0.5 / np.tan(0.5 * t) - 0.25 * t / np.sin(0.5 * t) ** 2
     exact = -(g_slope + 2.0 * (1.0 - 0.5 * t / np.tan(0.5 * t)) / t) / t**3
-    made: Array = np.where(theta < SMALL, polyval(theta * theta, _C_SLOPE), exact)
-    return made
+    return np.where(theta < SMALL, polyval(theta * theta, _C_SLOPE), exact)

@@ -14,14 +14,8 @@ from px4fuse.arrays import Array, BoolArray
 from px4fuse.display import brief
 from px4fuse.errors import TrajectoryError
 from px4fuse.record import Count, NotNegative, Record
-from px4fuse.trajectory.graph import lie
-from px4fuse.trajectory.graph.model import (
-    PoseGraph,
-    Residuals,
-    ranks,
-    require_connected,
-    residuals,
-)
+from px4fuse.trajectory.graph import lie, model
+from px4fuse.trajectory.graph.model import PoseGraph, Residuals
 from px4fuse.trajectory.graph.system import BlockSystem
 
 Robust = Literal["none", "dcs", "gnc"]
@@ -139,10 +133,10 @@ def solve(
         If the graph has no edges, falls into parts, has a number that is not finite, or if ``gnc``
         sets aside every edge to some of its poses.
     """
-    require_connected(graph, np.ones(len(graph.first), dtype=bool), "the edges")
+    model.require_connected(graph, np.ones(len(graph.first), dtype=bool), "the edges")
     doubtful = ~graph.successive if loops is None else loops
     problem = _GraphProblem(graph)
-    start = residuals(graph, graph.poses)
+    start = model.residuals(graph, graph.poses)
     cost_initial = 0.5 * float(np.sum(start.chi2))
     if not np.isfinite(cost_initial):
         raise TrajectoryError(
@@ -225,7 +219,7 @@ class _GraphProblem:
         promised = 0.0 if step is None else 0.5 * float(np.sum(step * (damping * step - gradient)))
         if step is None or promised < 0.0:
             return None, 0.0
-        return residuals(self.graph, lie.compose(state.poses, lie.exp(step))), promised
+        return model.residuals(self.graph, lie.compose(state.poses, lie.exp(step))), promised
 
     def _linearise(
         self, state: Residuals, weights: Array
@@ -261,7 +255,7 @@ def _gnc(
     problem: _GraphProblem, start: Residuals, plain: _Descent, doubtful: BoolArray
 ) -> tuple[_Descent, Array]:
     """Truncated least squares over the doubtful edges, from two starts."""
-    freedom = ranks(problem.graph.information)
+    freedom = model.ranks(problem.graph.information)
     bound = np.full(len(doubtful), np.inf)
     price = np.zeros(len(doubtful))
     told = doubtful & (freedom > 0)
@@ -285,7 +279,7 @@ def _gnc(
         spent += trial.iterations
         if (cost := priced(trial.state, again)) < lowest:
             lowest, run, weights = cost, trial, again
-    require_connected(problem.graph, weights > 0.0, "the edges that gnc did not set aside")
+    model.require_connected(problem.graph, weights > 0.0, "the edges that gnc did not set aside")
     return _Descent(run.state, run.cost, spent, run.converged), weights
 
 

@@ -149,5 +149,4 @@ def _order(first: IntArray, second: IntArray, poses: int) -> IntArray:
     # Diagonally dominant, so that elimination is along the diagonal in any order
     degree: Array = np.asarray(links.sum(axis=1)).ravel()
     dominant = sparse.csc_array(sparse.diags_array(degree + 1.0) - links)
-    place: IntArray = factorise(dominant, "MMD_AT_PLUS_A").perm_c.astype(np.intp)
-    return place
+    return factorise(dominant, "MMD_AT_PLUS_A").perm_c.astype(np.intp)
