@@ -197,6 +197,7 @@ def said(tmp_path: Path, *rows: str, head: str = "id,item,points,comment"):
     return read_overrides(path)
 
 
+TWO_OF_ONE = {"1.pdf": graded("", 4.0, 6.0, student_id="1")}
 TWO = {"1.pdf": graded("", 4.0, 6.0, student_id="1"), "2.pdf": graded("", 1.0, student_id="2")}
 
 
@@ -232,6 +233,16 @@ def test_more_points_than_there_are_are_told_and_not_given(tmp_path) -> None:
     )
 
 
+def test_a_second_row_on_the_same_is_told_and_not_taken(tmp_path) -> None:
+    rows = said(tmp_path, "1,A,9,", "1,a,2,", "01,total,12,", "1,Total,3,")
+    (ada, _), notes = laid_out(TWO, overrides=rows)
+    assert (ada.counting.points, ada.total) == (15.0, 3.0)
+    assert notes == (
+        "overrides.csv: 1 has 'A' from another row already.",
+        "overrides.csv: 01 has 'total' from another row already.",
+    )
+
+
 def test_pending_points_do_not_count_until_the_instructor_says_so(tmp_path) -> None:
     files = {"1.pdf": graded("", 4.0, student_id="1", pending="Run 0.1.1.")}
     (ada, _), _ = laid_out(files, overrides=said(tmp_path, "1,A,9,"))
@@ -244,6 +255,8 @@ def test_who_handed_in_nothing_can_be_given_points(tmp_path) -> None:
     (_, grace), notes = laid_out({}, overrides=said(tmp_path, "2,Total,5,Shown in class."))
     assert (grace.total, notes) == (5.0, ())
     assert "Shown in class." in returned_text(grace)
+    (_, grace), notes = laid_out(TWO_OF_ONE, overrides=said(tmp_path, "2,total,50,"))
+    assert (grace.total, len(notes)) == (None, 1)
 
 
 def test_a_semicolon_table_with_decimal_commas_is_read(tmp_path) -> None:
@@ -257,6 +270,7 @@ def test_a_semicolon_table_with_decimal_commas_is_read(tmp_path) -> None:
         ("1,A,abc,", "row 2: points 'abc': give a number from 0 up"),
         ("1,A,-1,", "give a number"),
         ("1,A,nan,", "give a number"),
+        ("1,A,1_5,", "give a number"),
         ("1,,5,", "and an item or total"),
         ("1,A,5,\n1,A,6,", "stands there twice"),
     ],

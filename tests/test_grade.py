@@ -155,6 +155,9 @@ def test_only_what_changed_is_done_again(handed_in, tmp_path) -> None:
     for record in (output / "records").glob("*.json"):
         record.write_text('{"made_with": {"verdict": 3}}')
     assert reused() == 2
+    (output / "overrides (1).csv").write_text("id,item,points,comment\n")
+    again = grade([handed_in], [], read_rubric(None), output)
+    assert "overrides (1).csv: not read; only overrides.csv is." in again.notes
 
 
 @pytest.mark.usefixtures("at_once", "drawn_once")

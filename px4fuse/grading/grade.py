@@ -24,6 +24,7 @@ from px4fuse.grading.roster import Register, people_of_key
 from px4fuse.grading.rubric import Rubric
 from px4fuse.grading.scoring import assess, refused
 from px4fuse.reading import files_by_sha256, max_log_bytes
+from px4fuse.results.reading import one_line
 from px4fuse.verification.model import Refused, Verdict
 from px4fuse.verification.workers import Failed, run_bounded
 
@@ -102,6 +103,8 @@ def grade(
     overrides = read_overrides(output / NAME)
     for sheet in course.worksheets:
         grade_column(sheet, course.column)
+    unread = sorted(one.name for one in output.glob("overrides*") if one.name != NAME)
+    renamed = [f"{one_line(name, 80)}: not read; only {NAME} is." for name in unread]
     found, notes = submissions.collect(paths)
     register = register_of(course, key)
     records = output / RECORDS
@@ -109,7 +112,7 @@ def grade(
     entries, unknown = class_entries(graded, found, register, course, overrides)
     name = title or rubric.title or "Class"
     written, more = write_class(entries, register, course, name, output, processes)
-    return GradeOutcome(entries, (*notes, *unknown, *more), reused, written)
+    return GradeOutcome(entries, (*notes, *renamed, *unknown, *more), reused, written)
 
 
 def register_of(course: Course, key: AnswerKey | None) -> Register:

@@ -15,9 +15,11 @@ from typing import TYPE_CHECKING, Annotated, Literal, Union
 import msgspec
 from msgspec import Meta
 
+from px4fuse.assignment.key import folded
 from px4fuse.errors import SettingsError
 from px4fuse.grading import checks  # noqa: F401 - the kinds of items
 from px4fuse.grading.evidence import RubricItem, Text
+from px4fuse.grading.overrides import TOTAL
 from px4fuse.reading import read_text
 from px4fuse.results.reading import one_line
 
@@ -69,10 +71,12 @@ class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     )
 
     def __post_init__(self) -> None:
-        titles = [item.title for item in self.items]
-        for title in titles:
-            if titles.count(title) > 1:
-                raise ValueError(f"two items have the title {title!r}; give each its own")
+        seen = {TOTAL}
+        for item in self.items:
+            if folded(item.title) in seen:
+                whose = "that of the sum" if folded(item.title) == TOTAL else "another item's"
+                raise ValueError(f"the title {item.title!r} is {whose}; give each its own")
+            seen.add(folded(item.title))
 
 
 def rubric_text() -> str:

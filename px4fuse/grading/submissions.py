@@ -40,8 +40,8 @@ MAX_DIRECTORY_BYTES = 4_000_000
 # Of all that is in one zip file, whose entries may share their bytes; and of the zip files in it
 MAX_TOTAL_BYTES = 4_000_000_000
 MAX_INNER_BYTES = 500_000_000
-# Of a zip file that a student handed in
-MAX_PDFS = 50
+# Of a zip file that a student handed in, and of an export of a class in a folder
+MAX_PDFS, MAX_CLASS_PDFS = 50, 500
 # PDFs are compressed inside; what still shrinks a hundred times is empty
 MAX_RATIO = 100
 MAX_NAME = 200
@@ -145,10 +145,16 @@ class _Search:
                 if place.depth:  # a student set the clock of what is in a zip file in another one
                     inner = replace(inner, entry=f"{place.entry}{_INSIDE}{name}", time=place.time)
                 self.take(inner, partial(_unpacked, archive, name))
+        new = [*self.found.items()][before:]
         students = place.depth or origin_of(place.name).platform
-        if students and len(self.found) - before > MAX_PDFS:  # the class would wait for them
+        export = not students and any(origin_of(one.name).platform for _, one in new)
+        most = MAX_CLASS_PDFS if export else MAX_PDFS
+        if place.inside and len(new) > most:  # the class would wait for them
             self.found = dict([*self.found.items()][:before])
-            raise _EntryError(f"it holds more than {MAX_PDFS} PDFs, and is of one student.")
+            raise _EntryError(
+                f"it holds more than {most} PDFs; give it itself, not its folder, if it is the "
+                "class's."
+            )
 
 
 def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, ...]]:
