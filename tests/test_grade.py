@@ -18,11 +18,11 @@ from forgery import forged, with_results
 from pypdf import PdfReader, PdfWriter
 
 from px4fuse.assignment.key import Answer, AnswerKey
+from px4fuse.assignment.roster import file_names
 from px4fuse.cli import cli
 from px4fuse.cli.outputs import Interrupted
 from px4fuse.grading.grade import GradeOutcome, grade
 from px4fuse.grading.model import Entry, Graded
-from px4fuse.grading.names import file_names
 from px4fuse.grading.rubric import read_rubric
 from px4fuse.reading import files_by_sha256
 from px4fuse.verification import pages

@@ -9,6 +9,7 @@ from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 
+from px4fuse.assignment.roster import distinct, file_names
 from px4fuse.assignment.sheet import Sheet, read_sheet
 from px4fuse.grading import exports
 from px4fuse.grading.anonymous import hidden_words
@@ -17,7 +18,6 @@ from px4fuse.grading.class_table import csv_text
 from px4fuse.grading.entries import Course
 from px4fuse.grading.feedback import returned_text
 from px4fuse.grading.model import Entry
-from px4fuse.grading.names import distinct, file_names
 from px4fuse.grading.overrides import NAME, TEMPLATE
 from px4fuse.grading.records import HANDED_IN, RECORDS, REDRAWN, file_of
 from px4fuse.grading.roster import Register

@@ -6,12 +6,11 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from px4fuse.assignment.key import folded
+from px4fuse.assignment.key import folded, only_place, same_id
 from px4fuse.assignment.sheet import read_sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.class_table import decimal
 from px4fuse.grading.model import Entry, Override
-from px4fuse.grading.roster import only_place, same_id
 from px4fuse.results.reading import cleaned, one_line
 
 NAME = "overrides.csv"

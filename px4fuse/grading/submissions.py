@@ -19,9 +19,9 @@ from functools import partial
 from pathlib import Path
 from typing import IO
 
+from px4fuse.assignment.roster import distinct
 from px4fuse.errors import SettingsError
 from px4fuse.grading.model import Submission
-from px4fuse.grading.names import distinct
 from px4fuse.grading.platforms import (
     METADATA,
     ExportOrigin,
@@ -183,7 +183,7 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
     for path in paths:
         for file, name in _files(path, search.notes):
             inside = f"{name}/" if path.is_dir() else ""
-            search.take(_Place(file, "", name, inside), partial(_opened, file))
+            search.take(_Place(file, "", name, inside), partial(io.FileIO, file))
     notes = search.notes
     if search.others:
         notes.append(f"Files passed over that are not PDFs: {search.others}.")
@@ -219,10 +219,6 @@ def read(submission: Submission) -> bytes | Refused:
     except _UNREADABLE as error:
         return Refused(f"{one_line(submission.name, MAX_NAME)}: {_why(error)}")
     return content
-
-
-def _opened(file: Path) -> IO[bytes]:
-    return file.open("rb")
 
 
 def _is_metadata(name: str) -> bool:
