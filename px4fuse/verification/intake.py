@@ -139,7 +139,19 @@ def attached_results(pdf: bytes, name: str) -> Results:
     try:
         _check_file(pdf)
         with pypdf.apply_configuration(**_PYPDF_LIMITS):
-            return _results(pdf)
+            # strict: a file that needs repair is read differently by every program
+            reader = pypdf.PdfReader(
+                io.BytesIO(pdf), strict=True, xref_stream_maximum_entries=10 * MAX_OBJECTS
+            )
+            if reader.is_encrypted:
+                raise ResultsError(_LOCKED)
+            if not 0 < len(reader.pages) <= MAX_PAGES:
+                raise ResultsError(f"a PDF without pages, or with more than {MAX_PAGES}.")
+            contents = _walk(reader)
+            if contents.found:
+                found = ", ".join(sorted(contents.found))
+                raise ResultsError(f"it contains {found}; no report does.")
+            return read_results(_attachment(contents), f"{RESULTS_NAME} in it")
     except ResultsError as refusal:
         reason, remedy = refusal.reason, refusal.remedy
     except (LimitReachedError, RecursionError, MemoryError):
@@ -147,21 +159,6 @@ def attached_results(pdf: bytes, name: str) -> Results:
     except BROKEN:
         reason = _LOCKED if b"/Encrypt" in pdf else _DAMAGED
     raise ResultsError(f"{one_line(name, 200)}: {reason}", remedy)
-
-
-def _results(pdf: bytes) -> Results:
-    # strict: a file that needs repair is read differently by every program
-    reader = pypdf.PdfReader(
-        io.BytesIO(pdf), strict=True, xref_stream_maximum_entries=10 * MAX_OBJECTS
-    )
-    if reader.is_encrypted:
-        raise ResultsError(_LOCKED)
-    if not 0 < len(reader.pages) <= MAX_PAGES:
-        raise ResultsError(f"a PDF without pages, or with more than {MAX_PAGES}.")
-    contents = _walk(reader)
-    if contents.found:
-        raise ResultsError(f"it contains {', '.join(sorted(contents.found))}; no report does.")
-    return read_results(_attachment(contents), f"{RESULTS_NAME} in it")
 
 
 def _check_file(pdf: bytes) -> None:
