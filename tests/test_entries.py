@@ -12,6 +12,7 @@ from exchange import replace
 from px4fuse.answers import Answers, Claim
 from px4fuse.assignment.roster import Person
 from px4fuse.errors import SettingsError
+from px4fuse.grading.class_page import _boxes
 from px4fuse.grading.entries import Course, class_entries
 from px4fuse.grading.feedback import returned_text
 from px4fuse.grading.lateness import due_time, late_rule
@@ -207,7 +208,10 @@ def test_the_instructors_word_is_the_last(tmp_path) -> None:
         "2,total,3,", "3,total,1,", "1,C,1,", '2,B,2,"x"',
     )  # fmt: skip
     (ada, grace), notes = laid_out(TWO, overrides=rows)
-    assert ada.overrides == {"A": Override(9.5, "A good idea."), "total": Override(8.0, "Agreed.")}
+    assert ada.overrides == {
+        "A": Override(9.5, "A good idea."), "total": Override(8.0, "Agreed."),
+        "": Override(None, "Come and\nsee me."),
+    }  # fmt: skip
     assert (ada.counting.points, ada.total, grace.total) == (15.5, 8.0, 3.0)
     assert notes == (
         "overrides.csv: 1 has no item 'C'.",
@@ -241,6 +245,18 @@ def test_a_second_row_on_the_same_is_told_and_not_taken(tmp_path) -> None:
         "overrides.csv: 1 has 'A' from another row already.",
         "overrides.csv: 01 has 'total' from another row already.",
     )
+
+
+def test_what_was_said_comes_back_from_the_class_page(tmp_path) -> None:
+    """Also of who handed in nothing: the download replaces the file."""
+    rows = said(tmp_path, "1,A,9.5,Good.", "1,,,Come.", "1,total,8,Agreed.", "2,total,5,Shown.")
+    entries, notes = laid_out({"1.pdf": TWO["1.pdf"]}, overrides=rows)
+    again: dict[str, dict[str, Override]] = {}
+    for _, _, owner, boxes, kept in map(_boxes, entries):
+        for item, points, comment in (*((a, c, d) for a, _, c, d in boxes), *kept):
+            if points is not None or comment:
+                again.setdefault(owner, {})[item] = Override(points, comment)
+    assert (again, notes) == (rows, ())
 
 
 def test_pending_points_do_not_count_until_the_instructor_says_so(tmp_path) -> None:

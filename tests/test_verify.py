@@ -272,6 +272,7 @@ STRUCTURE: dict[str, tuple[Change, str]] = {
         ),
         "numbers differ",
     ),
+    "a step of a millisecond": (put(0.001, "request", "dt_s"), "cannot verify"),
     "no request": (without("request"), "numbers differ"),
     "another command": (put("tune", "request", "command"), "numbers differ"),
     "an unknown setting": (put(1, "request", "please"), "numbers differ"),
