@@ -83,8 +83,8 @@ def own_flags(results: Reported, handed_out: bool = False) -> Iterator[str]:
     arrived = [one.name for one in source.available if one.passage == "as it arrived"]
     if arrived and source.passage != "as it arrived":
         yield (
-            f"The positions are those {source.passage} ({source.name}), while {arrived[0]} is in "
-            "the log (--position-source)."
+            f"The positions are not those that arrived ({arrived[0]}) but {source.name} "
+            f"({source.passage})."
         )
     for name, label in (("sigma_z_m", "SIGMA_Z"), ("sigma_a_m_s2", "SIGMA_A")):
         chosen = getattr(settings, name)
