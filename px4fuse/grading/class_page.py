@@ -144,9 +144,8 @@ def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str], veil: Veil)
     few = f"{count} flag{'s' if count > 1 else ''}" if count else ""
     file = one.submission if one and not entry.pseudonym else ""
     late_s = entry.late_s or 0.0
-    late = f"{late_s / 3600.0:.1f} h late" if late_s >= 3600.0 else ""
-    if 0.0 < late_s < 3600.0:
-        late = f"{math.ceil(late_s / 60.0)} min late"
+    minutes = f"{math.ceil(late_s / 60.0)} min late" if late_s else ""
+    late = f"{late_s / 3600.0:.1f} h late" if late_s >= 3600.0 else minutes
     points = {item.title: item.points for item in one.items} if one else {}
     held = one.numbers if one else {}
     cells = (

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Union
 import msgspec
 from msgspec import Meta
 
-from px4fuse.assignment.key import folded
+from px4fuse.assignment.roster import distinct
 from px4fuse.errors import SettingsError
 from px4fuse.grading import checks  # noqa: F401 - the kinds of items
 from px4fuse.grading.evidence import RubricItem, Text
@@ -71,12 +71,11 @@ class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     )
 
     def __post_init__(self) -> None:
-        seen = {TOTAL}
-        for item in self.items:
-            if folded(item.title) in seen:
-                whose = "that of the sum" if folded(item.title) == TOTAL else "another item's"
-                raise ValueError(f"the title {item.title!r} is {whose}; give each its own")
-            seen.add(folded(item.title))
+        titles = [TOTAL, *(item.title for item in self.items)]
+        for title, apart in zip(titles, distinct(titles), strict=True):
+            if title != apart:
+                whose = "that of the sum" if title.casefold() == TOTAL else "another item's"
+                raise ValueError(f"the title {title!r} is {whose}; give each its own")
 
 
 def rubric_text() -> str:
