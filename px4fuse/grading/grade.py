@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from px4fuse.assignment.key import AnswerKey
-from px4fuse.assignment.roster import people_of_sheet, person_of_row
+from px4fuse.assignment.roster import Person, people_of_sheet, person_of_row
 from px4fuse.grading import submissions
 from px4fuse.grading.entries import Course, class_entries
 from px4fuse.grading.exports import grade_column, kind_of
@@ -20,7 +20,7 @@ from px4fuse.grading.model import Entry, Graded, Submission
 from px4fuse.grading.outputs import write_class
 from px4fuse.grading.overrides import NAME, read_overrides
 from px4fuse.grading.records import RECORDS, verified
-from px4fuse.grading.roster import Register, people_of_key
+from px4fuse.grading.roster import Register
 from px4fuse.grading.rubric import Rubric
 from px4fuse.grading.scoring import assess, refused
 from px4fuse.reading import files_by_sha256, max_log_bytes
@@ -118,7 +118,8 @@ def grade(
 def register_of(course: Course, key: AnswerKey | None) -> Register:
     """Who is in the class, with what all worksheets know of them."""
     listed = [people_of_sheet(sheet) for sheet in course.worksheets]
-    people = course.roster or (people_of_key(key) if key else next(iter(listed), ()))
+    handed_out = tuple(Person(one.student_id, one.name) for one in key.answers) if key else ()
+    people = course.roster or handed_out or next(iter(listed), ())
     register = Register(people)
     for others in listed:
         register.add(others)

@@ -7,14 +7,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from datetime import datetime
 
-from px4fuse.assignment.key import AnswerKey, folded, only_place, same_id
+from px4fuse.assignment.key import folded, only_place, same_id
 from px4fuse.assignment.roster import Person
 from px4fuse.grading.platforms import ExportOrigin
-
-
-def people_of_key(key: AnswerKey) -> tuple[Person, ...]:
-    """The students of an answer key."""
-    return tuple(Person(answer.student_id, answer.name) for answer in key.answers)
 
 
 class Register:

@@ -288,24 +288,14 @@ def same_words(one: str, other: str, alike: NumbersAlike) -> bool:
 
 
 def _rounding(pairs: Sequence[tuple[float, float]]) -> NumbersAlike:
-    """Whether two printed numbers may be one number rounded on two machines.
-
-    They may where they are neighbours in their last digit, and a recorded number and its
-    recomputed twin lie on the two sides of the edge between them.
-    """
+    """Whether two printed numbers are a recorded number and its recomputed twin, each rounded."""
 
     def alike(one: str, other: str) -> bool:
-        if _decimals(one) != _decimals(other):
-            return False
-        step = 10.0 ** -_decimals(one)
-        low, high = sorted((float(one), float(other)))
-        if abs(high - low - step) > 1e-6 * step:
-            return False
-        edge = (low + high) / 2.0
-        return any(
-            min(values) <= edge * (1.0 + 1e-12) and max(values) >= edge * (1.0 - 1e-12)
+        decimals, printed = _decimals(one), (float(one), float(other))
+        return decimals == _decimals(other) and any(
+            printed == (round(abs(a) * scale, decimals), round(abs(b) * scale, decimals))
             for scale in PRINTED_SCALES
-            for values in ([abs(a) * scale, abs(b) * scale] for a, b in pairs)
+            for a, b in pairs
         )
 
     return alike
