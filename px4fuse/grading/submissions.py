@@ -138,10 +138,7 @@ class _Search:
         most = MAX_CLASS_PDFS if export else MAX_PDFS
         if inside and len(new) > most:  # the class would wait for them
             self.found = dict([*self.found.items()][:before])
-            raise _EntryError(
-                f"it holds more than {most} PDFs; give it itself, not its folder, if it is the "
-                "class's."
-            )
+            raise _EntryError(f"it holds more than {most} PDFs; give it itself if it is a class's.")
 
 
 def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, ...]]:

@@ -141,9 +141,7 @@ def _compared(handed_in: ComparisonResults, place: _Place) -> Recomputed:
 
     recorded, person = handed_in.request, handed_in.student
     if recorded.dt_s < MIN_DT_S:
-        raise ResultsError(
-            f"DT is shorter than {MIN_DT_S:g} s, which takes too long to repeat", ASK
-        )
+        raise ResultsError(f"DT is below {MIN_DT_S:g} s, which takes too long to repeat", ASK)
     joined = {file.role: file.sha256 for file in handed_in.log.joined}
     request = replace(recorded, log=str(place(recorded.log, handed_in.log.sha256, "the log")))
     if (mavlink := recorded.mavlink) is not None:
