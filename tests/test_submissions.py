@@ -218,7 +218,7 @@ def test_a_student_hands_in_no_more_than_fifty(tmp_path):
     [
         ("{}.pdf", 51, False),
         ("Doe_{}_assignsubmission_file_/r.pdf", 60, True),
-        ("Doe_{}_assignsubmission_file_/r.pdf", 501, False),
+        ("Doe_{}_assignsubmission_file_/r.pdf", 201, False),
     ],
 )
 def test_a_zip_in_a_folder_may_be_a_students(tmp_path, form, count, taken):

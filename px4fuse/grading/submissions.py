@@ -41,7 +41,7 @@ MAX_DIRECTORY_BYTES = 4_000_000
 MAX_TOTAL_BYTES = 4_000_000_000
 MAX_INNER_BYTES = 500_000_000
 # Of a zip file that a student handed in, and of an export of a class in a folder
-MAX_PDFS, MAX_CLASS_PDFS = 50, 500
+MAX_PDFS, MAX_CLASS_PDFS = 50, 200
 # PDFs are compressed inside; what still shrinks a hundred times is empty
 MAX_RATIO = 100
 MAX_NAME = 200
