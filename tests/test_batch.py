@@ -305,6 +305,7 @@ def test_what_ends_a_run_keeps_what_is_done(flights, undisturbed, tmp_path, monk
         assert len(set(pd.read_parquet(tmp_path / "fleet.parquet")["name"])) == 1
     # what is no file of rows is done again
     (tmp_path / "rows" / f"{'0' * 64}.json").write_bytes(b"{}")
+    (tmp_path / "rows" / "folder.json").mkdir()
     again = command(flights, "-o", tmp_path)
     assert "3 logs: 3 done; 1 as before" in again.output
     assert_same(pd.read_parquet(tmp_path / "fleet.parquet"), undisturbed)

@@ -411,9 +411,12 @@ def test_points_and_words_of_the_instructor_are_downloaded_as_a_table(page: Brow
         " points.value = '7.5'; words.value = '=1+1, \"well\"';"
         " words.dispatchEvent(new Event('input')); })()"
     )
+    leave = "window.dispatchEvent(new Event('beforeunload', { cancelable: true }))"
+    assert not page.ask(leave)  # the browser asks whether to leave what is not saved
     page.click("#save")
     made = str(page.ask_later("window.table"))
     rows = list(csv.reader(io.StringIO(made.removeprefix("\ufeff"))))
+    assert page.ask(leave)
     assert rows[0] == ["id", "item", "points", "comment"]
     assert ["1007", "total", "7.5", '\'=1+1, "well"'] in rows
     assert ["'" + FORMULA, BREAKOUT, "", MARKUP] in rows  # what was said before stays

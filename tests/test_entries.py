@@ -12,6 +12,7 @@ from exchange import replace
 from px4fuse.answers import Answers, Claim
 from px4fuse.assignment.roster import Person
 from px4fuse.errors import SettingsError
+from px4fuse.grading.class_page import _boxes
 from px4fuse.grading.entries import Course, class_entries
 from px4fuse.grading.feedback import returned_text
 from px4fuse.grading.lateness import due_time, late_rule
@@ -197,6 +198,7 @@ def said(tmp_path: Path, *rows: str, head: str = "id,item,points,comment"):
     return read_overrides(path)
 
 
+TWO_OF_ONE = {"1.pdf": graded("", 4.0, 6.0, student_id="1")}
 TWO = {"1.pdf": graded("", 4.0, 6.0, student_id="1"), "2.pdf": graded("", 1.0, student_id="2")}
 
 
@@ -206,7 +208,10 @@ def test_the_instructors_word_is_the_last(tmp_path) -> None:
         "2,total,3,", "3,total,1,", "1,C,1,", '2,B,2,"x"',
     )  # fmt: skip
     (ada, grace), notes = laid_out(TWO, overrides=rows)
-    assert ada.overrides == {"A": Override(9.5, "A good idea."), "total": Override(8.0, "Agreed.")}
+    assert ada.overrides == {
+        "A": Override(9.5, "A good idea."), "total": Override(8.0, "Agreed."),
+        "": Override(None, "Come and\nsee me."),
+    }  # fmt: skip
     assert (ada.counting.points, ada.total, grace.total) == (15.5, 8.0, 3.0)
     assert notes == (
         "overrides.csv: 1 has no item 'C'.",
@@ -232,6 +237,28 @@ def test_more_points_than_there_are_are_told_and_not_given(tmp_path) -> None:
     )
 
 
+def test_a_second_row_on_the_same_is_told_and_not_taken(tmp_path) -> None:
+    rows = said(tmp_path, "1,A,9,", "1,a,2,", "01,total,12,", "1,Total,3,")
+    (ada, _), notes = laid_out(TWO, overrides=rows)
+    assert (ada.counting.points, ada.total) == (15.0, 3.0)
+    assert notes == (
+        "overrides.csv: 1 has 'A' from another row already.",
+        "overrides.csv: 01 has 'total' from another row already.",
+    )
+
+
+def test_what_was_said_comes_back_from_the_class_page(tmp_path) -> None:
+    """Also of who handed in nothing: the download replaces the file."""
+    rows = said(tmp_path, "1,A,9.5,Good.", "1,,,Come.", "1,total,8,Agreed.", "2,total,5,Shown.")
+    entries, notes = laid_out({"1.pdf": TWO["1.pdf"]}, overrides=rows)
+    again: dict[str, dict[str, Override]] = {}
+    for _, _, owner, boxes, kept in map(_boxes, entries):
+        for item, points, comment in (*((a, c, d) for a, _, c, d in boxes), *kept):
+            if points is not None or comment:
+                again.setdefault(owner, {})[item] = Override(points, comment)
+    assert (again, notes) == (rows, ())
+
+
 def test_pending_points_do_not_count_until_the_instructor_says_so(tmp_path) -> None:
     files = {"1.pdf": graded("", 4.0, student_id="1", pending="Run 0.1.1.")}
     (ada, _), _ = laid_out(files, overrides=said(tmp_path, "1,A,9,"))
@@ -244,6 +271,8 @@ def test_who_handed_in_nothing_can_be_given_points(tmp_path) -> None:
     (_, grace), notes = laid_out({}, overrides=said(tmp_path, "2,Total,5,Shown in class."))
     assert (grace.total, notes) == (5.0, ())
     assert "Shown in class." in returned_text(grace)
+    (_, grace), notes = laid_out(TWO_OF_ONE, overrides=said(tmp_path, "2,total,50,"))
+    assert (grace.total, len(notes)) == (None, 1)
 
 
 def test_a_semicolon_table_with_decimal_commas_is_read(tmp_path) -> None:
@@ -257,6 +286,7 @@ def test_a_semicolon_table_with_decimal_commas_is_read(tmp_path) -> None:
         ("1,A,abc,", "row 2: points 'abc': give a number from 0 up"),
         ("1,A,-1,", "give a number"),
         ("1,A,nan,", "give a number"),
+        ("1,A,1_5,", "give a number"),
         ("1,,5,", "and an item or total"),
         ("1,A,5,\n1,A,6,", "stands there twice"),
     ],

@@ -18,11 +18,11 @@ from forgery import forged, with_results
 from pypdf import PdfReader, PdfWriter
 
 from px4fuse.assignment.key import Answer, AnswerKey
+from px4fuse.assignment.roster import file_names
 from px4fuse.cli import cli
 from px4fuse.cli.outputs import Interrupted
 from px4fuse.grading.grade import GradeOutcome, grade
 from px4fuse.grading.model import Entry, Graded
-from px4fuse.grading.names import file_names
 from px4fuse.grading.rubric import read_rubric
 from px4fuse.reading import files_by_sha256
 from px4fuse.verification import pages
@@ -155,6 +155,9 @@ def test_only_what_changed_is_done_again(handed_in, tmp_path) -> None:
     for record in (output / "records").glob("*.json"):
         record.write_text('{"made_with": {"verdict": 3}}')
     assert reused() == 2
+    (output / "overrides (1).csv").write_text("id,item,points,comment\n")
+    again = grade([handed_in], [], read_rubric(None), output)
+    assert "overrides (1).csv: not read; only overrides.csv is." in again.notes
 
 
 @pytest.mark.usefixtures("at_once", "drawn_once")

@@ -18,7 +18,7 @@ from PIL import Image
 from pypdf import PdfReader, PdfWriter
 
 from px4fuse.flight import Unavailable
-from px4fuse.grading.sheets import draw_sheets
+from px4fuse.grading.outputs import draw_sheets
 from px4fuse.verification.pages import (
     COVER,
     MAX_PICTURE_BYTES,

@@ -74,7 +74,9 @@ BAD = {
     "zero on the good side": (NUMBER + "at_most = 2\nzero_at = 1", "zero_at beyond"),
     "zero on the other good side": (NUMBER + "at_least = 0\nzero_at = 1", "zero_at beyond"),
     "nothing required": (ITEM + 'check = "consistent"\naxes = []', "length >= 1"),
-    "two alike": (NOTES + NOTES, "two items have the title 'T'"),
+    "but for capitals": (NOTES + NOTES.replace("T", "t"), "the title 't' is another item's"),
+    "as the sum": (NOTES.replace("T", "Total"), "the title 'Total' is that of the sum"),
+    "two alike": (NOTES + NOTES, "the title 'T' is another item's"),
     "too many": (NOTES * 101, "length <= 100"),
     "others' log": ('others_log = "maybe"\n' + NOTES, "`$.others_log`"),
 }

@@ -379,6 +379,9 @@ class TestTextFlags:
         ({"settings__input": "zero"}, ("IMU",)),
         ({"axes": {"down": EXAMPLE["axes"]["down"]}}, ("vertical",)),
         ({"log__hardware": HARDWARE}, ("simulate",)),
+        ({"settings__sigma_z_m": 100.0}, ("SIGMA_Z 100 is far from",)),
+        ({"settings__sigma_a_m_s2": 0.001}, ("SIGMA_A 0.001 is far from",)),
+        ({"source__passage": "kept by EKF2"}, ("kept by EKF2",)),
     ],
 )
 def test_what_stands_out_in_one_report(values, said):

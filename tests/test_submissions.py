@@ -203,7 +203,7 @@ def test_a_student_hands_in_no_more_than_fifty(tmp_path):
         write(tmp_path / "unpacked" / name, PDF)
     found, (note,) = collect([tmp_path / "unpacked"])
     assert len(found) == 2
-    assert "all.zip: passed over: it holds more than 50 PDFs, and is of one student." in note
+    assert "all.zip: passed over: it holds more than 50 PDFs; give it itself" in note
     # a zip file in a zip file holds no others that are read
     one["Doe_2_assignsubmission_file_/all.zip"] = zipped({f"{n}.pdf": PDF for n in range(51)})
     found, (note,) = collect([write(tmp_path / "export.zip", zipped(one))])
@@ -211,6 +211,22 @@ def test_a_student_hands_in_no_more_than_fifty(tmp_path):
     # a class has more
     class_ = {f"N_{n}_assignsubmission_file_/r.pdf": PDF for n in range(80)}
     assert len(collect([write(tmp_path / "class.zip", zipped(class_))])[0]) == 80
+
+
+@pytest.mark.parametrize(
+    ("form", "count", "taken"),
+    [
+        ("{}.pdf", 51, False),
+        ("Doe_{}_assignsubmission_file_/r.pdf", 60, True),
+        ("Doe_{}_assignsubmission_file_/r.pdf", 201, False),
+    ],
+)
+def test_a_zip_in_a_folder_may_be_a_students(tmp_path, form, count, taken):
+    many = zipped({form.format(n): PDF for n in range(count)})
+    path = write(tmp_path / "in" / "all.zip", many)
+    write(tmp_path / "in" / "r.pdf", PDF)
+    assert len(collect([tmp_path / "in"])[0]) == (1 + count if taken else 1)
+    assert len(collect([path])[0]) == count
 
 
 def test_nothing_there(tmp_path):

@@ -239,8 +239,8 @@ def changed(results: dict[str, Any], path: tuple[Any, ...]) -> dict[str, Any]:
 @pytest.mark.parametrize("path", KINDS, ids=lambda path: ".".join(map(str, path)))
 def test_a_changed_leaf_of_the_results(aisle: Base, path: tuple[Any, ...]) -> None:
     found = compare_results(changed(aisle.results, path), to_plain(aisle.again.results))
-    (difference,) = found.differences
-    assert difference.path.replace("[0]", ".0").startswith(".".join(map(str, path)))
+    difference = found.differences[0]  # where there was none, a list has places of its own
+    assert difference.path.startswith(".".join(map(str, path)))
 
 
 def without(*path: Any) -> Change:
@@ -272,6 +272,7 @@ STRUCTURE: dict[str, tuple[Change, str]] = {
         ),
         "numbers differ",
     ),
+    "a step of a millisecond": (put(0.001, "request", "dt_s"), "cannot verify"),
     "no request": (without("request"), "numbers differ"),
     "another command": (put("tune", "request", "command"), "numbers differ"),
     "an unknown setting": (put(1, "request", "please"), "numbers differ"),

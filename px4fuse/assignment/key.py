@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import unicodedata
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta
@@ -13,6 +14,7 @@ from px4fuse.assignment.truth import FormTruth
 from px4fuse.errors import SettingsError
 from px4fuse.reading import read_text
 
+T = TypeVar("T")
 # A thousand students take two million
 MAX_KEY_BYTES = 20_000_000
 MAX_STUDENTS = 1000
@@ -95,15 +97,12 @@ class AnswerKey(msgspec.Struct, frozen=True):
 
         Leading zeros, which spreadsheets take away, may be missing where that is unambiguous.
         """
-        wanted = folded(student_id)
-        if not wanted:
-            return None
-        for answer in self.answers:
-            if folded(answer.student_id) == wanted:
-                return answer
-        bare = wanted.lstrip("0")
-        close = [a for a in self.answers if bare and folded(a.student_id).lstrip("0") == bare]
-        return close[0] if len(close) == 1 else None
+        looks: tuple[Callable[[Answer], bool], ...] = (
+            lambda one: folded(one.student_id) == folded(student_id) != "",
+            lambda one: same_id(one.student_id, student_id),
+        )
+        place = only_place(self.answers, looks)
+        return None if place is None else self.answers[place]
 
     def of_log(self, sha256: str) -> Answer | None:
         """The answer for a log."""
@@ -113,6 +112,25 @@ class AnswerKey(msgspec.Struct, frozen=True):
 def folded(text: str) -> str:
     """Id or name for comparison: one spelling per character, case and outer spaces ignored."""
     return unicodedata.normalize("NFKC", text).strip().casefold()
+
+
+def only_place(those: Sequence[T], looks: Iterable[Callable[[T], bool]]) -> int | None:
+    """Where the one stands that fits, by the first way of looking by which exactly one does."""
+    for look in looks:
+        places = [place for place, one in enumerate(those) if look(one)]
+        if len(places) == 1:
+            return places[0]
+    return None
+
+
+def same_id(one: str, other: str) -> bool:
+    """Whether two ids are the same; spreadsheets take away leading zeros.
+
+    >>> same_id("0042", "42"), same_id("S1", "s1 "), same_id("", "")
+    (True, True, False)
+    """
+    one, other = folded(one), folded(other)
+    return bool(one) and (one == other or one.lstrip("0") == other.lstrip("0") != "")
 
 
 def key_text(key: AnswerKey) -> str:

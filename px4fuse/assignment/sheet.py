@@ -119,7 +119,7 @@ def read_sheet(path: Path) -> Sheet:
     # quoted cells may hold any of them
     separator = max(SEPARATORS, key=re.sub(r'"[^"]*"', "", header).count)
     try:
-        reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
+        reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
         lines = [(reader.line_num, cells) for cells in reader]
     except csv.Error as error:
         raise SettingsError(f"{path}: not a CSV file ({error}).") from error

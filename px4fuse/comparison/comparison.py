@@ -34,6 +34,7 @@ from px4fuse.comparison.projection import (
 from px4fuse.filter.consistency import GATE_SIGMA, HorizontalNis, assess, assess_horizontal
 from px4fuse.filter.kalman import Replay, replay, state_at, variance_at
 from px4fuse.filter.settings import Settings
+from px4fuse.filter.signals import Axis
 from px4fuse.flight import RECORD_NOT_LOGGED, Ekf2, Flight, Unavailable, sample_rate
 
 STATE = ("position_m", "velocity_m_s")
@@ -64,9 +65,11 @@ def compare(
 
 
 def compare_prepared(
-    prepared: Comparison, progress: Callable[[str], None] = lambda _: None
+    prepared: Comparison,
+    progress: Callable[[str], None] = lambda _: None,
+    replayed: Callable[[Axis, Settings], Replay] = replay,
 ) -> Comparison:
-    """:func:`compare`, with what it begins with made."""
+    """:func:`compare`, with what it begins with made; ``replayed`` runs the filter."""
     notes, ekf2 = list(prepared.notes), prepared.flight.ekf2
     if isinstance(ekf2, Ekf2):
         state, statement = continuous_state(ekf2, prepared.source, prepared.segment)
@@ -77,7 +80,7 @@ def compare_prepared(
         ekf2 = ekf2 if same else replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
     progress(", ".join(line.name for line in prepared.lines))
     axes = {
-        line.name: _compare_axis(prepared, ekf2, replay(line, prepared.settings))
+        line.name: _compare_axis(prepared, ekf2, replayed(line, prepared.settings))
         for line in prepared.lines
     }
     both: dict[FilterName, HorizontalNis | None] = {

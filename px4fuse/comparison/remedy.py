@@ -11,12 +11,14 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.comparison import compare_prepared
 from px4fuse.comparison.model import AgainstTruth, Comparison
+from px4fuse.comparison.preparation import prepare
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.whatif import Summary, what_if
 from px4fuse.ekf2_parameters import EV_POS, PARAMETERS, Aid
 from px4fuse.filter.clock import ClockOffset
+from px4fuse.filter.quick import quick_replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -219,7 +221,7 @@ def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, f
     segment, before = comparison.segment, errors_m(comparison)
     if len(before) < len(names):
         return None
-    again = compare(
+    prepared = prepare(
         comparison.flight,
         changed,
         axes=tuple(names),
@@ -228,7 +230,7 @@ def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, f
         start_s=segment.start_s,
         end_s=segment.end_s,
     )
-    after = errors_m(again)
+    after = errors_m(compare_prepared(prepared, replayed=quick_replay))
     return (math.hypot(*before), math.hypot(*after)) if len(after) == len(names) else None
 
 

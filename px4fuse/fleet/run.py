@@ -239,8 +239,8 @@ def kept_in(folder: Path, px4fuse: str, settings: str) -> Iterator[Kept]:
     for file in sorted((folder / "rows").glob("*.json")):
         try:
             kept = msgspec.json.decode(file.read_bytes(), type=Kept)
-        except msgspec.MsgspecError:  # not ours, or of another px4fuse: the log is done again
-            continue
+        except (OSError, msgspec.MsgspecError):
+            continue  # not ours, or of another px4fuse: the log is done again
         if (kept.px4fuse, kept.settings) == (px4fuse, settings):
             yield kept
 

@@ -144,9 +144,8 @@ def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str], veil: Veil)
     few = f"{count} flag{'s' if count > 1 else ''}" if count else ""
     file = one.submission if one and not entry.pseudonym else ""
     late_s = entry.late_s or 0.0
-    late = f"{late_s / 3600.0:.1f} h late" if late_s >= 3600.0 else ""
-    if 0.0 < late_s < 3600.0:
-        late = f"{math.ceil(late_s / 60.0)} min late"
+    minutes = f"{math.ceil(late_s / 60.0)} min late" if late_s else ""
+    late = f"{late_s / 3600.0:.1f} h late" if late_s >= 3600.0 else minutes
     points = {item.title: item.points for item in one.items} if one else {}
     held = one.numbers if one else {}
     cells = (
@@ -159,12 +158,11 @@ def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str], veil: Veil)
         *(frame.figure(points.get(name)) for name in items),
         *(frame.figure(held.get(name)) for name in numbers),
     )
-    if one is None:
-        nothing = (frame.listed("Missing", ["Nothing was handed in."]), _comment(entry))
-        return Row(cells, tuple(_tags(entry)), tuple(map(veil.of_part, nothing)))
-    details = map(veil.of_part, _details(entry, one))
-    boxes = () if entry.pseudonym else (_boxes(entry, one),)
-    return Row(cells, tuple(_tags(entry)), (*details, *boxes), _beside(entry, one))
+    nothing = (frame.listed("Missing", ["Nothing was handed in."]), _comment(entry))
+    details = map(veil.of_part, _details(entry, one) if one else nothing)
+    boxes = () if entry.pseudonym else (_boxes(entry),)
+    beside = _beside(entry, one) if one else ()
+    return Row(cells, tuple(_tags(entry)), (*details, *boxes), beside)
 
 
 def _comment(entry: Entry) -> Part:
@@ -215,9 +213,14 @@ def _points(entry: Entry) -> Cell:
     return Cell(text, entry.total, ", ".join(said), "", share)
 
 
-def _boxes(entry: Entry, one: Graded) -> Part:
-    """Points and a comment for what only the instructor scores, and for the whole."""
-    by_hand = {item.title: item.of for item in one.items if item.by_hand} | {TOTAL: entry.of}
+def _boxes(entry: Entry) -> Part:
+    """Points and a comment for what only the instructor scores, and for the whole.
+
+    With all else that overrides.csv says, since the download takes its place.
+    """
+    one = entry.counting
+    by_hand = {item.title: item.of for item in (one.items if one else ()) if item.by_hand}
+    by_hand[TOTAL] = entry.of
     said = {title: entry.overrides.get(title, Override()) for title in by_hand}
     rows = [(title, by_hand[title], own.points, own.comment) for title, own in said.items()]
     kept = [
@@ -225,8 +228,8 @@ def _boxes(entry: Entry, one: Graded) -> Part:
         for title, own in entry.overrides.items()
         if title not in by_hand
     ]
-    kept += [("", None, entry.comment)] if entry.comment else []
-    return frame.boxes("Your points and words", entry.student_id or one.submission, rows, kept)
+    owner = entry.student_id or (one.submission if one else "")
+    return frame.boxes("Your points and words", owner, rows, kept)
 
 
 def _beside(entry: Entry, one: Graded) -> tuple[Part, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -62,8 +63,9 @@ def number(value: float | None) -> str:
 
 
 def decimal(text: str) -> float | None:
-    """A number as people type it in tables, also with a comma; None for anything else."""
-    try:
-        return float(text.replace(",", "."))
-    except ValueError:
-        return None
+    """A number as people type it in tables, also with a comma; None for anything else.
+
+    >>> decimal("12,5"), decimal("1_5"), decimal("nan")
+    (12.5, None, None)
+    """
+    return float(text.replace(",", ".")) if re.fullmatch(r"[+-]?\d+([.,]\d*)?", text) else None

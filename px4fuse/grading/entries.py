@@ -244,7 +244,7 @@ def _settled(
     return replace(
         entry,
         counting=one,
-        overrides={title: each for title, each in said.items() if title},
+        overrides=said,
         comment="\n".join(filter(None, (said.get("", Override()).comment, final.comment))),
         total=total if final.points is None else final.points,
         of=one.of if one else most,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal
@@ -21,6 +21,7 @@ from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, t
 from px4fuse.results.reading import one_line
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.rerun import log_sha256
+from px4fuse.verification.verification import flattened
 
 MAX_QUOTE = 160
 # Lists are cut where a comment would become longer than a sentence
@@ -158,21 +159,6 @@ class Evidence:
             for _, reason in values_at(self.values, ".".join((*steps[:end], "reason"))):
                 return f" ({text_of(reason).rstrip('.')})"
         return NOT_BOTH if HORIZONTAL in path else ""
-
-
-def flattened(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Paths and values of what is no mapping and no list, keys joined by dots.
-
-    >>> [*flattened({"a": {"b.c": [1, 2]}})]
-    [('a.b.c.0', 1), ('a.b.c.1', 2)]
-    """
-    if isinstance(value, list | tuple):
-        value = dict(enumerate(value))
-    if not isinstance(value, Mapping):
-        yield path, value
-        return
-    for key, part in value.items():
-        yield from flattened(part, f"{path}.{key}" if path else f"{key}")
 
 
 def values_at(values: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:

@@ -17,6 +17,7 @@ from operator import attrgetter
 from typing import Any
 
 from px4fuse.assignment.key import folded
+from px4fuse.filter.tuning import Tuned
 from px4fuse.grading.model import Graded
 from px4fuse.plain import few_words
 from px4fuse.results.contract import LoopResults, Reported, to_plain
@@ -28,6 +29,8 @@ from px4fuse.simulation import flights
 SAME_NUMBERS, NEARLY = 3, 0.02
 # A hand-picked part of the flight below this share leaves most of it out
 HAND_PICKED = 0.5
+# A setting so many times larger or smaller than what the data ask for has another reason
+NO_REASON = 30.0
 SHOWN = 4
 # Words in a row by which two texts are compared: of two written apart a few per cent are the same,
 # of a copy with an error in every fifth word two in five
@@ -76,6 +79,19 @@ def own_flags(results: Reported, handed_out: bool = False) -> Iterator[str]:
     without_imu = any(finding.id == "input_unavailable" for finding in results.findings)
     if settings.input == "zero" and not without_imu:
         yield "The IMU was not used (--input zero)."
+    source = results.source
+    arrived = [one.name for one in source.available if one.passage == "as it arrived"]
+    if arrived and source.passage != "as it arrived":
+        yield (
+            f"The positions are not those that arrived ({arrived[0]}) but {source.name} "
+            f"({source.passage})."
+        )
+    for name, label in (("sigma_z_m", "SIGMA_Z"), ("sigma_a_m_s2", "SIGMA_A")):
+        chosen = getattr(settings, name)
+        tuned = (one for one in results.tuning.values() if isinstance(one, Tuned))
+        wanted = [asked for one in tuned if (asked := getattr(one, name))]
+        if wanted and not min(wanted) / NO_REASON < chosen < NO_REASON * max(wanted):
+            yield f"{label} {chosen:g} is far from what the data ask for ({wanted[0]:.3g})."
     if results.log.hardware == flights.HARDWARE and not handed_out:
         yield "The log was made by px4fuse simulate: no vehicle flew."
 
@@ -126,6 +142,8 @@ COMMON: tuple[tuple[str, Callable[[Graded], object], Callable[[Graded], str]], .
 def class_flags(graded: Sequence[Graded]) -> Mapping[str, Sequence[str]]:
     """What stands out between the reports of a class: sentences, by names of submissions."""
     found: dict[str, list[str]] = defaultdict(list)
+    named = {one.submission: _name(one) for one in graded}
+    files = {name: _line(name) for name in named}
     for said, pairs in (
         *((said, _same(graded, what, whose)) for said, what, whose in COMMON),
         ("The form has the numbers of {}.", _copied_forms(graded)),
@@ -134,20 +152,23 @@ def class_flags(graded: Sequence[Graded]) -> Mapping[str, Sequence[str]]:
         others: dict[str, list[str]] = defaultdict(list)
         for pair in pairs:
             for one, other in (pair[:2], pair[1::-1]):
-                how = pair[2] or _line(other.submission)
-                others[one.submission].append(f"{_name(other)} ({how})")
-        for name, named in others.items():
-            found[name].append(said.format(few_words(named, SHOWN, "; ")))
+                name = other.submission
+                others[one.submission].append(f"{named[name]} ({pair[2] or files[name]})")
+        for name, those in others.items():
+            found[name].append(said.format(few_words(those, SHOWN, "; ")))
     return found
 
 
 def _same(
     graded: Sequence[Graded], what: Callable[[Graded], object], whose: Callable[[Graded], str]
 ) -> Pairs:
-    known = [(one, what(one), whose(one)) for one in graded]
-    for (one, mine, me), (other, theirs, they) in combinations(known, 2):
-        if mine and mine == theirs and me != they:
-            yield one, other, ""
+    alike: dict[object, list[Graded]] = defaultdict(list)
+    for one in graded:
+        alike[what(one)].append(one)
+    for key, those in alike.items():
+        for one, other in combinations(those if key else (), 2):
+            if whose(one) != whose(other):
+                yield one, other, ""
 
 
 def _copied_forms(graded: Sequence[Graded]) -> Pairs:

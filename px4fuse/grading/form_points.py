@@ -240,56 +240,47 @@ def cures(wrong: Wrong, truth: FormTruth) -> tuple[Cure, ...]:
     back = -high, -low
     factors = 100.0 / (100.0 + high), 100.0 / (100.0 + low)
     after, before = (until_s - 1.0, until_s + 15.0), (from_s - 15.0, from_s + 1.0)
-    rows: tuple[tuple[str, str, tuple[float, float], float], ...] = (
-        ("clock-offset", "--clock-offset", back, 1.0),
-        ("clock-offset", "correct the stamps at the sender", back, 1.0),
-        ("clock-offset", "EKF2_EV_DELAY", (1e3 * low, 1e3 * high), float(size > 0.0)),
-        ("clock-drift", "synchronise the clocks before take-off", ANY, 1.0),
-        ("clock-drift", "--clock-offset", ANY, 0.5),
-        ("clock-jump", "synchronise the clocks before take-off", ANY, 1.0),
-        ("clock-jump", "--start", after, 1.0),
-        ("nlos", "line of sight and link", ANY, 1.0),
-        ("nlos", "EKF2_EVP_GATE", ANY, 0.5),
-        ("dropout", "line of sight and link", ANY, 1.0),
-        ("dropout", "--start", after, 1.0),
-        ("dropout", "--end", before, 1.0),
-        ("imu-dropout", "log at a higher rate", ANY, 0.5),
-        ("imu-dropout", "--start", after, 1.0),
-        ("imu-dropout", "--end", before, 1.0),
-        ("decimate", "send positions more often", (5.0, math.inf), 1.0),
-        ("decimate", "line of sight and link", ANY, 0.5),
-        ("r-scale", "EKF2_EVP_NOISE", noise, 1.0),
-        ("r-scale", "report the true variance", noise, 1.0),
-        ("yaw", "--position-yaw", back, 1.0),
-        ("yaw", "turn the positions at the sender", back, 1.0),
-        ("yaw", "survey the anchors", ANY, 1.0),
-        ("scale", "multiply the positions at the sender", factors, 1.0),
-        ("scale", "survey the anchors", ANY, 1.0),
-        ("jump", "one set of anchors", ANY, 1.0),
-        ("jump", "--start", after, 1.0),
-        ("jump", "--end", before, 1.0),
-        ("smoothed", "switch the smoothing off", ANY, 1.0),
-        ("smoothed", "--clock-offset", back, 1.0 / 3.0),
-        ("slow-error", "line of sight and link", ANY, 1.0),
-        ("slow-error", "report the true variance", ANY, 0.5),
-        ("heading", "calibrate the compass", ANY, 1.0),
-        ("heading", "--position-yaw", back, 0.5),
-        ("accel-bias", "calibrate the accelerometer", ANY, 1.0),
-        ("vibration", "balance the propellers", ANY, 1.0),
-        ("vibration", "--sigma-a", ANY, 0.5),
-        ("imu-rate", "log at a higher rate", (2.0 * size, math.inf), 1.0),
-        ("imu-rate", "SDLOG_PROFILE", ANY, 0.5),
-        ("no-motion", "fly several passes", ANY, 1.0),
-        ("open-end", "--open", ANY, 1.0),
-        ("open-end", "--landed-at", (low, high), 1.0),
-        ("no-vvo", "SDLOG_PROFILE", (129.0, 255.0), 1.0),
-        ("ekf2-noise", "EKF2_EVP_NOISE", noise, 1.0),
-        ("ekf2-delay", "EKF2_EV_DELAY", (0.0, 20.0), 1.0),
-        ("ekf2-gate", "EKF2_EVP_GATE", (3.0, 10.0), 1.0),
-        ("ekf2-gate", "EKF2_EVP_NOISE", ANY, 1.0 / 3.0),
-        ("ekf2-off", "EKF2_EV_CTRL", (1.0, 15.0), 1.0),
-    )
-    return tuple(row[1:] for row in rows if row[0] == wrong.kind)
+    # of each kind what cures it best stands first
+    rows: tuple[tuple[str, tuple[float, float], Mapping[str, float]], ...] = (
+        ("synchronise the clocks before take-off", ANY, {"clock-drift": 1.0, "clock-jump": 1.0}),
+        ("switch the smoothing off", ANY, {"smoothed": 1.0}),
+        ("--clock-offset", back, {"clock-offset": 1.0, "smoothed": 1.0 / 3.0}),
+        ("--clock-offset", ANY, {"clock-drift": 0.5}),
+        ("correct the stamps at the sender", back, {"clock-offset": 1.0}),
+        ("EKF2_EV_DELAY", (1e3 * low, 1e3 * high), {"clock-offset": float(size > 0.0)}),
+        ("EKF2_EV_DELAY", (0.0, 20.0), {"ekf2-delay": 1.0}),
+        ("send positions more often", (5.0, 1e3), {"decimate": 1.0}),
+        (
+            "line of sight and link", ANY,
+            {"nlos": 1.0, "dropout": 1.0, "slow-error": 1.0, "decimate": 0.5},
+        ),
+        ("one set of anchors", ANY, {"jump": 1.0}),
+        ("--start", after, dict.fromkeys(("clock-jump", "dropout", "imu-dropout", "jump"), 1.0)),
+        ("--end", before, dict.fromkeys(("dropout", "imu-dropout", "jump"), 1.0)),
+        ("log at a higher rate", (2.0 * size, 1e4), {"imu-rate": 1.0}),
+        ("log at a higher rate", ANY, {"imu-dropout": 0.5}),
+        ("EKF2_EVP_GATE", (3.0, 10.0), {"ekf2-gate": 1.0}),
+        ("EKF2_EVP_GATE", ANY, {"nlos": 0.5}),
+        ("EKF2_EVP_NOISE", noise, {"ekf2-noise": 1.0, "r-scale": 1.0}),
+        ("EKF2_EVP_NOISE", ANY, {"ekf2-gate": 1.0 / 3.0}),
+        ("report the true variance", noise, {"r-scale": 1.0}),
+        ("report the true variance", ANY, {"slow-error": 0.5}),
+        ("calibrate the compass", ANY, {"heading": 1.0}),
+        ("--position-yaw", back, {"yaw": 1.0, "heading": 0.5}),
+        ("turn the positions at the sender", back, {"yaw": 1.0}),
+        ("multiply the positions at the sender", factors, {"scale": 1.0}),
+        ("survey the anchors", ANY, {"yaw": 1.0, "scale": 1.0}),
+        ("calibrate the accelerometer", ANY, {"accel-bias": 1.0}),
+        ("balance the propellers", ANY, {"vibration": 1.0}),
+        ("--sigma-a", ANY, {"vibration": 0.5}),
+        ("SDLOG_PROFILE", (129.0, 255.0), {"no-vvo": 1.0}),
+        ("SDLOG_PROFILE", ANY, {"imu-rate": 0.5}),
+        ("fly several passes", ANY, {"no-motion": 1.0}),
+        ("--open", ANY, {"open-end": 1.0}),
+        ("--landed-at", (low, high), {"open-end": 1.0}),
+        ("EKF2_EV_CTRL", (1.0, 15.0), {"ekf2-off": 1.0}),
+    )  # fmt: skip
+    return tuple((name, to, of[wrong.kind]) for name, to, of in rows if wrong.kind in of)
 
 
 def _verdicts(answers: Answers, truth: FormTruth) -> float:
@@ -315,7 +306,8 @@ def _did(answers: Answers, truth: FormTruth) -> float:
 
 def _quantities(answers: Answers, truth: FormTruth) -> float:
     """Mean share of the numbers that can be known."""
-    known = sum(one is not None for one in truth.quantities)
+    # an empty list is right on most flights of some kinds, and says nothing
+    known = sum(one not in (None, ()) for one in truth.quantities)
     pairs = zip(answers.quantities, truth.quantities, strict=False)
     return sum(_quantity(*pair) for pair in pairs) / max(known, 1)
 
@@ -323,7 +315,7 @@ def _quantities(answers: Answers, truth: FormTruth) -> float:
 def _quantity(given: Quantified, known: Quantified) -> float:
     if isinstance(given, tuple) and isinstance(known, tuple):
         off = len(set(given) ^ set(known))
-        return (1.0, 0.5)[off] if off < 2 and (known or not off) else 0.0
+        return (1.0, 0.5)[off] if off < 2 and set(given) & set(known) else 0.0
     if isinstance(given, float | int) and isinstance(known, float | int):
         for within, share in ((FULL_WITHIN, 1.0), (HALF_WITHIN, 0.5)):
             if abs(given - known) <= within * abs(known):

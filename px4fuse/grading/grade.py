@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from px4fuse.assignment.key import AnswerKey
-from px4fuse.assignment.roster import people_of_sheet, person_of_row
+from px4fuse.assignment.roster import Person, people_of_sheet, person_of_row
 from px4fuse.grading import submissions
 from px4fuse.grading.entries import Course, class_entries
 from px4fuse.grading.exports import grade_column, kind_of
@@ -20,10 +20,11 @@ from px4fuse.grading.model import Entry, Graded, Submission
 from px4fuse.grading.outputs import write_class
 from px4fuse.grading.overrides import NAME, read_overrides
 from px4fuse.grading.records import RECORDS, verified
-from px4fuse.grading.roster import Register, people_of_key
+from px4fuse.grading.roster import Register
 from px4fuse.grading.rubric import Rubric
 from px4fuse.grading.scoring import assess, refused
 from px4fuse.reading import files_by_sha256, max_log_bytes
+from px4fuse.results.reading import one_line
 from px4fuse.verification.model import Refused, Verdict
 from px4fuse.verification.workers import Failed, run_bounded
 
@@ -102,6 +103,8 @@ def grade(
     overrides = read_overrides(output / NAME)
     for sheet in course.worksheets:
         grade_column(sheet, course.column)
+    unread = sorted(one.name for one in output.glob("overrides*") if one.name != NAME)
+    renamed = [f"{one_line(name, 80)}: not read; only {NAME} is." for name in unread]
     found, notes = submissions.collect(paths)
     register = register_of(course, key)
     records = output / RECORDS
@@ -109,13 +112,14 @@ def grade(
     entries, unknown = class_entries(graded, found, register, course, overrides)
     name = title or rubric.title or "Class"
     written, more = write_class(entries, register, course, name, output, processes)
-    return GradeOutcome(entries, (*notes, *unknown, *more), reused, written)
+    return GradeOutcome(entries, (*notes, *renamed, *unknown, *more), reused, written)
 
 
 def register_of(course: Course, key: AnswerKey | None) -> Register:
     """Who is in the class, with what all worksheets know of them."""
     listed = [people_of_sheet(sheet) for sheet in course.worksheets]
-    people = course.roster or (people_of_key(key) if key else next(iter(listed), ()))
+    handed_out = tuple(Person(one.student_id, one.name) for one in key.answers) if key else ()
+    people = course.roster or handed_out or next(iter(listed), ())
     register = Register(people)
     for others in listed:
         register.add(others)

@@ -168,7 +168,7 @@ class Entry:
     deduction : float
         Points taken off for being late, from the sum over the items.
     overrides : mapping
-        What the instructor says, by the title of an item or "total".
+        What the instructor says, by the title of an item, "total", or "" for all of it.
     comment : str
         The instructor's own words on all of it.
     total : float or None

@@ -6,12 +6,11 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from px4fuse.assignment.key import folded
+from px4fuse.assignment.key import folded, only_place, same_id
 from px4fuse.assignment.sheet import read_sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.class_table import decimal
 from px4fuse.grading.model import Entry, Override
-from px4fuse.grading.roster import only_place, same_id
 from px4fuse.results.reading import cleaned, one_line
 
 NAME = "overrides.csv"
@@ -74,6 +73,7 @@ def matched(
     notes : tuple of str
     """
     said: list[dict[str, Override]] = [{} for _ in entries]
+    whole = max((one.of for entry in entries for one in entry.files), default=MOST)
     notes = []
     for student, rows in overrides.items():
         place = _place(entries, student)
@@ -82,12 +82,14 @@ def matched(
             continue
         one = entries[place].counting
         most = {item.title: item.of for item in one.items} if one else {}
-        most |= {TOTAL: one.of if one else MOST, "": MOST}
+        most |= {TOTAL: one.of if one else whole, "": MOST}
         titles = {folded(title): title for title in most}
         for item, override in rows.items():
             title, wrong = titles.get(folded(item)), ""
             if title is None:
                 wrong = f"has no item {one_line(item, 60)!r}"
+            elif title in said[place]:
+                wrong = f"has {title or 'a comment on all'!r} from another row already"
             elif (override.points or 0.0) > most[title]:
                 wrong = f"cannot have more than {most[title]:g} points of {one_line(title, 60)!r}"
             else:

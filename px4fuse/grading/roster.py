@@ -3,21 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from datetime import datetime
-from typing import TypeVar
 
-from px4fuse.assignment.key import AnswerKey, folded
+from px4fuse.assignment.key import folded, only_place, same_id
 from px4fuse.assignment.roster import Person
 from px4fuse.grading.platforms import ExportOrigin
-
-T = TypeVar("T")
-
-
-def people_of_key(key: AnswerKey) -> tuple[Person, ...]:
-    """The students of an answer key."""
-    return tuple(Person(answer.student_id, answer.name) for answer in key.answers)
 
 
 class Register:
@@ -65,27 +57,8 @@ class Register:
         return self.place(origin.person) if origin.platform else None
 
 
-def only_place(those: Sequence[T], looks: Iterable[Callable[[T], bool]]) -> int | None:
-    """Where the one stands that fits, by the first way of looking by which exactly one does."""
-    for look in looks:
-        places = [place for place, one in enumerate(those) if look(one)]
-        if len(places) == 1:
-            return places[0]
-    return None
-
-
 def _same(known: str, said: str) -> bool:
     return folded(known) == folded(said) != ""
-
-
-def same_id(one: str, other: str) -> bool:
-    """Whether two ids are the same; spreadsheets take away leading zeros.
-
-    >>> same_id("0042", "42"), same_id("S1", "s1 "), same_id("", "")
-    (True, True, False)
-    """
-    one, other = folded(one), folded(other)
-    return bool(one) and (one == other or one.lstrip("0") == other.lstrip("0") != "")
 
 
 def same_name(one: str, other: str) -> bool:

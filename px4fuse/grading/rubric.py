@@ -15,9 +15,11 @@ from typing import TYPE_CHECKING, Annotated, Literal, Union
 import msgspec
 from msgspec import Meta
 
+from px4fuse.assignment.roster import distinct
 from px4fuse.errors import SettingsError
 from px4fuse.grading import checks  # noqa: F401 - the kinds of items
 from px4fuse.grading.evidence import RubricItem, Text
+from px4fuse.grading.overrides import TOTAL
 from px4fuse.reading import read_text
 from px4fuse.results.reading import one_line
 
@@ -69,10 +71,11 @@ class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     )
 
     def __post_init__(self) -> None:
-        titles = [item.title for item in self.items]
-        for title in titles:
-            if titles.count(title) > 1:
-                raise ValueError(f"two items have the title {title!r}; give each its own")
+        titles = [TOTAL, *(item.title for item in self.items)]
+        for title, apart in zip(titles, distinct(titles), strict=True):
+            if title != apart:
+                whose = "that of the sum" if title.casefold() == TOTAL else "another item's"
+                raise ValueError(f"the title {title!r} is {whose}; give each its own")
 
 
 def rubric_text() -> str:

@@ -19,9 +19,9 @@ from functools import partial
 from pathlib import Path
 from typing import IO
 
+from px4fuse.assignment.roster import distinct
 from px4fuse.errors import SettingsError
 from px4fuse.grading.model import Submission
-from px4fuse.grading.names import distinct
 from px4fuse.grading.platforms import (
     METADATA,
     ExportOrigin,
@@ -40,8 +40,8 @@ MAX_DIRECTORY_BYTES = 4_000_000
 # Of all that is in one zip file, whose entries may share their bytes; and of the zip files in it
 MAX_TOTAL_BYTES = 4_000_000_000
 MAX_INNER_BYTES = 500_000_000
-# Of a zip file that a student handed in
-MAX_PDFS = 50
+# Of a zip file that a student handed in, and of an export of a class in a folder
+MAX_PDFS, MAX_CLASS_PDFS = 50, 200
 # PDFs are compressed inside; what still shrinks a hundred times is empty
 MAX_RATIO = 100
 MAX_NAME = 200
@@ -76,52 +76,39 @@ def _why(error: Exception) -> str:
     return f"it cannot be read ({why})."
 
 
-@dataclass(frozen=True)
-class _Place:
-    """Where a file lies: itself, or an entry of a zip file; and what is known of it.
-
-    ``inside`` is what names of files in it begin with, ``depth`` in how many zip files it lies.
-    """
-
-    file: Path
-    entry: str
-    name: str
-    inside: str
-    time: datetime | None = None
-    depth: int = 0
-
-
 @dataclass
 class _Search:
     """What a search has met: PDFs by where they are, people of Gradescope, and what it says."""
 
-    found: dict[tuple[Path, str], _Place] = field(default_factory=dict)
+    found: dict[tuple[Path, str], Submission] = field(default_factory=dict)
     people: dict[str, ExportOrigin] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     others: int = 0
 
-    def take(self, place: _Place, opened: Callable[[], IO[bytes]]) -> None:
+    def take(self, place: Submission, inside: str, opened: Callable[[], IO[bytes]]) -> None:
         """Look at a file by what its name says it is.
 
-        Whatever is wrong with a zip file is a note and ends no search.
+        Whatever is wrong with a zip file is a note and ends no search. ``inside`` is what names of
+        files in it begin with.
         """
         end = place.name.lower()[-4:]
         if end == ".pdf":
             self.found.setdefault((place.file, place.entry), place)
-        elif place.depth >= MAX_DEPTH or (end != ".zip" and not _is_metadata(place.name)):
+        elif _depth(place) >= MAX_DEPTH or (end != ".zip" and not _is_metadata(place.name)):
             self.others += 1
         else:
             try:
                 with opened() as stream:
                     if end == ".zip":
-                        self._take_zip(place, stream)
+                        self._take_zip(place, inside, stream)
                     else:
                         text = stream.read(MAX_BYTES).decode("utf-8", errors="replace")
                         self.people |= gradescope_metadata(text)
             except _UNREADABLE as error:
                 self.notes.append(f"{_shown(place.name)}: passed over: {_why(error)}")
 
-    def _take_zip(self, place: _Place, stream: IO[bytes]) -> None:
+    def _take_zip(self, place: Submission, inside: str, stream: IO[bytes]) -> None:
+        depth = _depth(place)
         with _archive(stream) as archive:
             entries = [one for one in archive.infolist() if not one.is_dir()]
             # zipfile gives no more than the declared size
@@ -140,15 +127,18 @@ class _Search:
                     continue
                 if label.lower().endswith(".zip") and (left := left - one.file_size) < 0:
                     raise _EntryError("it holds too many zip files.")
-                whole = place.inside + label
-                inner = _Place(place.file, name, whole, f"{whole}/", _time(one), place.depth + 1)
-                if place.depth:  # a student set the clock of what is in a zip file in another one
+                whole = inside + label
+                inner = Submission(place.file, name, whole, _time(one))
+                if depth:  # a student set the clock of what is in a zip file in another one
                     inner = replace(inner, entry=f"{place.entry}{_INSIDE}{name}", time=place.time)
-                self.take(inner, partial(_unpacked, archive, name))
-        students = place.depth or origin_of(place.name).platform
-        if students and len(self.found) - before > MAX_PDFS:  # the class would wait for them
+                self.take(inner, f"{whole}/", partial(_unpacked, archive, name))
+        new = [*self.found.items()][before:]
+        students = depth or origin_of(place.name).platform
+        export = not students and any(origin_of(one.name).platform for _, one in new)
+        most = MAX_CLASS_PDFS if export else MAX_PDFS
+        if inside and len(new) > most:  # the class would wait for them
             self.found = dict([*self.found.items()][:before])
-            raise _EntryError(f"it holds more than {MAX_PDFS} PDFs, and is of one student.")
+            raise _EntryError(f"it holds more than {most} PDFs; give it itself if it is a class's.")
 
 
 def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, ...]]:
@@ -177,7 +167,7 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
     for path in paths:
         for file, name in _files(path, search.notes):
             inside = f"{name}/" if path.is_dir() else ""
-            search.take(_Place(file, "", name, inside), partial(_opened, file))
+            search.take(Submission(file, "", name), inside, partial(io.FileIO, file))
     notes = search.notes
     if search.others:
         notes.append(f"Files passed over that are not PDFs: {search.others}.")
@@ -193,7 +183,7 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
         (one.file if one.entry else None, name) for one, name in zip(order, names, strict=True)
     ]
     made = (
-        Submission(one.file, one.entry, name, one.time, origin)
+        replace(one, name=name, origin=origin)
         for one, name, origin in zip(order, names, origins_of(exports, search.people), strict=True)
     )
     return tuple(made), tuple(notes)
@@ -215,8 +205,9 @@ def read(submission: Submission) -> bytes | Refused:
     return content
 
 
-def _opened(file: Path) -> IO[bytes]:
-    return file.open("rb")
+def _depth(place: Submission) -> int:
+    """In how many zip files it lies."""
+    return place.entry.count(_INSIDE) + bool(place.entry)
 
 
 def _is_metadata(name: str) -> bool:

@@ -138,14 +138,10 @@ def _look(document: Any, page: int) -> Look | Unavailable:
         sheet = document[page]
         # 72 dpi: a pixel per point
         grey = np.asarray(rendered(sheet, sheet.get_size()[0]).convert("L"), dtype=np.float32)
-        return Look(tuple(_text(sheet).split()), grey / 255.0)
+        text = sheet.get_textpage().get_text_range()[:MAX_PAGE_TEXT]
+        return Look(tuple(cleaned(text.replace("\r\n", "\n")).split()), grey / 255.0)
     except FAILURES as error:
         return undrawn(error)
-
-
-def _text(sheet: Any) -> str:
-    text: str = sheet.get_textpage().get_text_range()
-    return cleaned(text[:MAX_PAGE_TEXT].replace("\r\n", "\n"))
 
 
 def _differences(

@@ -26,6 +26,8 @@ from px4fuse.verification.model import Refused
 
 ASK = "Ask how the report was made, and for the log and all files that it was made from."
 NOT_OURS = "the recorded request is not one that px4fuse can have made"
+# A flight of ten minutes has 60,000 steps of it, which take half a minute
+MIN_DT_S = 0.01
 _Place = Callable[[str, str | None, str], Path]
 
 
@@ -136,6 +138,8 @@ def _compared(handed_in: ComparisonResults, place: _Place) -> Recomputed:
     from px4fuse.results.build import results  # noqa: PLC0415
 
     recorded = handed_in.request
+    if recorded.dt_s < MIN_DT_S:
+        raise ResultsError(f"DT is below {MIN_DT_S:g} s, which takes too long to repeat", ASK)
     joined = {file.role: file.sha256 for file in handed_in.log.joined}
     request = replace(recorded, log=str(place(recorded.log, handed_in.log.sha256, "the log")))
     if (mavlink := recorded.mavlink) is not None:

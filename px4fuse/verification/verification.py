@@ -202,13 +202,7 @@ def _other_machine(theirs: Provenance, ours: Provenance) -> tuple[str, ...]:
 
 
 def compare_results(recorded: Mapping[str, Any], recomputed: Mapping[str, Any]) -> Numbers:
-    """Compare every value of two results.
-
-    Parameters
-    ----------
-    recorded : mapping
-        A stranger's; followed only as far as the other one goes.
-    """
+    """Compare every value of two results, of which the first is a stranger's."""
     command = str(recomputed["provenance"]["command"])
     # everything rests on an offset or placement that was estimated
     everywhere = "auto" in command.split() or "--position" in command.split()
@@ -216,9 +210,11 @@ def compare_results(recorded: Mapping[str, Any], recomputed: Mapping[str, Any]) 
     pairs: list[tuple[float, float]] = []
     others: list[tuple[str, Any, Any]] = []
     compared = 0
-    for path, theirs, ours in _leaves("", recorded, recomputed):
+    handed_in, made = dict(flattened(recorded)), dict(flattened(recomputed))
+    for path in {**made, **handed_in}:
         if path.startswith(MACHINE):
             continue
+        theirs, ours = handed_in.get(path, _ABSENT), made.get(path, _ABSENT)
         compared += 1
         if not (is_number(theirs) and is_number(ours)):
             others.append((path, theirs, ours))
@@ -239,16 +235,19 @@ def compare_results(recorded: Mapping[str, Any], recomputed: Mapping[str, Any]) 
 _ABSENT = object()
 
 
-def _leaves(path: str, theirs: Any, ours: Any) -> Iterator[tuple[str, Any, Any]]:
-    """Values side by side; a branch that one of them lacks, or that is a value there, is one."""
-    if isinstance(ours, list | tuple) and isinstance(theirs, list | tuple):
-        theirs, ours = ({f"[{i}]": v for i, v in enumerate(one)} for one in (theirs, ours))
-    if not (isinstance(ours, Mapping) and isinstance(theirs, Mapping)):
-        yield path, theirs, ours
+def flattened(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Paths and values of what is no mapping and no list, keys joined by dots.
+
+    >>> [*flattened({"a": {"b.c": [1, 2]}})]
+    [('a.b.c.0', 1), ('a.b.c.1', 2)]
+    """
+    if isinstance(value, list | tuple):
+        value = dict(enumerate(value))
+    if not isinstance(value, Mapping):
+        yield path, value
         return
-    for name in {**ours, **theirs}:
-        below = f"{path}.{name}" if path and not name.startswith("[") else f"{path}{name}"
-        yield from _leaves(below, theirs.get(name, _ABSENT), ours.get(name, _ABSENT))
+    for key, part in value.items():
+        yield from flattened(part, f"{path}.{key}" if path else f"{key}")
 
 
 def is_number(value: object) -> bool:
@@ -289,24 +288,14 @@ def same_words(one: str, other: str, alike: NumbersAlike) -> bool:
 
 
 def _rounding(pairs: Sequence[tuple[float, float]]) -> NumbersAlike:
-    """Whether two printed numbers may be one number rounded on two machines.
-
-    They may where they are neighbours in their last digit, and a recorded number and its
-    recomputed twin lie on the two sides of the edge between them.
-    """
+    """Whether two printed numbers are a recorded number and its recomputed twin, each rounded."""
 
     def alike(one: str, other: str) -> bool:
-        if _decimals(one) != _decimals(other):
-            return False
-        step = 10.0 ** -_decimals(one)
-        low, high = sorted((float(one), float(other)))
-        if abs(high - low - step) > 1e-6 * step:
-            return False
-        edge = (low + high) / 2.0
-        return any(
-            min(values) <= edge * (1.0 + 1e-12) and max(values) >= edge * (1.0 - 1e-12)
+        decimals, printed = _decimals(one), (float(one), float(other))
+        return decimals == _decimals(other) and any(
+            printed == (round(abs(a) * scale, decimals), round(abs(b) * scale, decimals))
             for scale in PRINTED_SCALES
-            for values in ([abs(a) * scale, abs(b) * scale] for a, b in pairs)
+            for a, b in pairs
         )
 
     return alike
@@ -324,10 +313,4 @@ def _decimals(number: str) -> int:
 
 def _shown(value: Any) -> str:
     """A value on one line."""
-    if value is _ABSENT:
-        return "absent"
-    if isinstance(value, Mapping):
-        return f"an object with {len(value)} entries"
-    if isinstance(value, list | tuple):
-        return f"a list of {len(value)}"
-    return one_line(str(value), SHOWN_TEXT)
+    return "absent" if value is _ABSENT else one_line(str(value), SHOWN_TEXT)

@@ -133,7 +133,9 @@ def run_bounded(
                             continue
                         worker.job = waiting.pop()
                     worker.deadline = time.monotonic() + timeout_s
-                    _send(worker, jobs)
+                    # a process that died in between shows at the next look at its pipe
+                    with suppress(BrokenPipeError, ConnectionResetError):
+                        worker.pipe.send(jobs[worker.job])
                 elif time.monotonic() >= worker.deadline:
                     limit = timeout_s if worker.ready else START_S
                     failed = Failed(f"it took longer than {limit:g} s and was ended.")
@@ -154,12 +156,6 @@ def bounded(
     work = run_bounded(function, [job], timeout_s=timeout_s, memory_bytes=memory_bytes)
     with closing(work):
         return next(work)[1]
-
-
-def _send(worker: _Worker, jobs: Sequence[Any]) -> None:
-    # a process that died in between shows at the next look at its pipe
-    with suppress(BrokenPipeError, ConnectionResetError):
-        worker.pipe.send(jobs[worker.job])
 
 
 def _received(worker: _Worker) -> tuple[bool, Any]:

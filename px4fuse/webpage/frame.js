@@ -108,6 +108,7 @@
   };
   // What is typed in boxes, by whom it is about and its name; it leaves the page as a download only
   const typed = new Map();
+  let unsaved = false;
   const boxes = (owner, lines, kept) => {
     const made = make("div", "", "boxes");
     for (const [name, most, points, words] of lines) {
@@ -123,6 +124,7 @@
         field.addEventListener("input", () => {
           typed.set(owner + "\u0000" + name, [owner, name, number.value, text.value]);
           at("save").hidden = false;
+          unsaved = true;
         });
       }
     }
@@ -362,6 +364,7 @@
     KEYS[event.key]();
   });
   document.querySelector(".controls").addEventListener("submit", (event) => event.preventDefault());
+  window.addEventListener("beforeunload", (event) => unsaved && event.preventDefault());
   at("text").addEventListener("input", filter);
   at("all").addEventListener("click", clear);
   at("save").addEventListener("click", () => {
@@ -369,6 +372,7 @@
     link.href = URL.createObjectURL(new Blob([tableOfBoxes()], { type: "text/csv" }));
     link.download = "overrides.csv";
     link.click();
+    unsaved = false;
     URL.revokeObjectURL(link.href);
   });
   at("back").addEventListener("click", () => turn(Math.max(first - size, 0)));
