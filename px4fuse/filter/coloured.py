@@ -58,7 +58,8 @@ class Smoothing:
     correlation : float
         Of the noise of successive positions; 0 where there is no low pass.
     lag_s : float
-        By how much positions come behind the motion: its time constant.
+        By how much positions come behind a steady motion, Δt ρ / (1 - ρ): less than the time
+        constant, by about half an interval.
     gain_nats : float
         Log-likelihood above that of no low pass, with the stamps as they are or moved.
     sigma_z_m : float
@@ -172,7 +173,8 @@ def hanging_together(
     (score, before), tau_s = undone(log_tau), float(np.exp(log_tau))
     if score < plain:
         correlation = float(np.exp(-np.median(np.diff(time)) / tau_s))
-        smooth = Smoothing(correlation, tau_s, plain - score, before.sigma_z_m)
+        lag_s = float(np.median(np.diff(time))) * correlation / (1.0 - correlation)
+        smooth = Smoothing(correlation, lag_s, plain - score, before.sigma_z_m)
     return smooth, Coloured(
         tau_s=slow.noises.tau_s,
         slow_m=slow.noises.slow_m,

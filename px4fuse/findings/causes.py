@@ -140,6 +140,7 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
         f"ekf2_variance_understated:{ELSEWHERE}", f"aid_starved:{SENSOR}",
     ),
     "source_jumps": (
+        f"kf_variance_understated:{OUTLIERS}", f"kf_variance_understated:{ELSEWHERE}",
         f"errors_larger_than_claimed:{ELSEWHERE}", f"ekf2_variance_understated:{ELSEWHERE}",
         f"ekf2_variance_understated:{OUTLIERS}", "ekf2_rejecting", "ekf2_resets",
         f"aid_starved:{SENSOR}", "ekf2_heading_wrong",
@@ -168,7 +169,7 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
         "source_smoothed", "source_coloured", "source_jumps", "source_scale_wrong",
         "source_axes_unequal", "source_noise_changes", "source_clock_offset",
         "source_clock_changes", "ekf2_ev_delay_wrong", "source_outliers", *_FITTED,
-        "errors_larger_than_claimed",
+        "source_variance_wrong", "errors_larger_than_claimed",
     ),
     "source_not_logged": ("source_decimated",),
     "source_gap": ("ekf2_fusion_interrupted", f"errors_larger_than_claimed:{ELSEWHERE}"),
