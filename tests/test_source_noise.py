@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from px4fuse.findings import Finding, find
 from px4fuse.findings.causes import SETTINGS
 from px4fuse.findings.source_noise import detect, levels
 from px4fuse.flight import POSITION_COLUMNS, Truth, Unavailable
+from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.scenario import Scenario
 
@@ -155,6 +157,17 @@ def test_a_low_pass_lags_by_less_than_its_time_constant() -> None:
     """By Δt ρ / (1 - ρ) behind a steady motion."""
     found = told(judged(SMOOTH, 5.0))["source_smoothed"]
     assert found.evidence["lag_s"] == pytest.approx(0.2 / (np.exp(0.2 / 0.5) - 1.0), abs=0.06)
+
+
+@pytest.mark.reallogs
+def test_a_low_pass_is_no_slow_error_of_late_stamps(shared_logs: Path) -> None:
+    """Both fit this flight as well, and the second has two numbers more."""
+    log = shared_logs / "simulated" / "v1.16.1_aisle_nominal.ulg"
+    flight = read_log(log)
+    smooth = partial(errors.low_pass, tau_s=0.3)
+    flight = errors.laid_over(flight, errors.truth_of(log, flight), smooth, 5.0, 8)
+    found = told(explain(compare(flight, RIGHT, axes=("north", "east"))))
+    assert set(found) == {"source_smoothed"}
 
 
 def test_a_filter_that_outliers_pull_is_no_noisy_part() -> None:

@@ -45,6 +45,9 @@ LOOK_SCALES = np.geomspace(0.7, 1.6, 12)
 LOOK_MEASUREMENTS = 1000
 # What it must find for more to be done, and what more must find: less is chance
 LOOK_NATS, LEAST_NATS = 0.5, 2.0
+# What a slow error with a clock offset must explain beyond a low pass, whose lag is its own: 1 for
+# each of its two further numbers (Akaike 1974)
+OFFSET_NATS = 2.0
 # Time constants of a low pass, and how near in ln τ is near enough
 LOW_PASS_S, LOG_TAU_STEP = (0.02, 3.0), 0.05
 
@@ -85,7 +88,8 @@ class Coloured:
     gain_nats : float
         Log-likelihood above that of white noise alone.
     lag_nats : float
-        What a low pass, which lags, explains beyond that.
+        What a low pass, which lags, explains beyond that, :data:`OFFSET_NATS` more where the slow
+        error asks for a clock offset besides.
     """
 
     tau_s: float
@@ -152,8 +156,8 @@ def hanging_together(
     neither = Unavailable(what, "its errors do not hang together", "")
     if least - found < LOOK_NATS:
         return smooth, neither
-    white, slow = (
-        min((_most_likely(moved, at, start) for at in offsets), key=_score)
+    (white, _), (slow, late_s) = (
+        min(((_most_likely(moved, at, start), at) for at in offsets), key=lambda e: _score(e[0]))
         for start in (noises, begin)
     )
     plain, alone, found = _score(white), white.noises, _score(slow)
@@ -180,7 +184,7 @@ def hanging_together(
         slow_m=slow.noises.slow_m,
         white_m=slow.noises.sigma_z_m,
         gain_nats=plain - found,
-        lag_nats=found - score,
+        lag_nats=found - score + (OFFSET_NATS if late_s else 0.0),
     )
 
 

@@ -131,9 +131,6 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
     # R describes none of these three
     "source_coloured": (*_FITTED, "source_variance_wrong", "errors_larger_than_claimed"),
     "source_axes_unequal": (*_OURS, "source_outliers", "source_variance_wrong"),
-    "source_noise_changes": (
-        *_OURS, "source_outliers", "source_variance_wrong", "source_coloured",
-    ),
     "ekf2_heading_wrong": (
         f"errors_larger_than_claimed:{FRAME}", f"kf_variance_understated:{FRAME}",
         f"errors_larger_than_claimed:{ELSEWHERE}", "sigma_a_small", f"aid_understated:{SENSOR}",
@@ -146,6 +143,11 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
         f"aid_starved:{SENSOR}", "ekf2_heading_wrong",
     ),
     "source_scale_wrong": (f"errors_larger_than_claimed:{ELSEWHERE}",),
+    # a jump and a scale are judged by one noise throughout
+    "source_noise_changes": (
+        *_OURS, "source_outliers", "source_variance_wrong", "source_coloured", "source_jumps",
+        "source_scale_wrong",
+    ),
     "accelerometer_bias": (
         f"errors_larger_than_claimed:{ELSEWHERE}", f"errors_larger_than_claimed:{ACCELEROMETER}",
         f"kf_variance_understated:{ACCELEROMETER}", "sigma_a_small",
