@@ -44,6 +44,16 @@ def test_the_table_has_inner_causes_before_outer_ones() -> None:
         assert inner <= set(causes[:at])
 
 
+def test_where_the_noise_changes_a_jump_and_a_scale_follow_from_it() -> None:
+    """Both are judged by one noise; what a jump brings with it stays behind it."""
+    names = ("source_noise_changes", "source_jumps", "source_scale_wrong", "ekf2_resets")
+    found = by_cause(map(one, names))
+    assert {each.id: each.caused_by for each in found} == {
+        "source_noise_changes": None, "source_jumps": "source_noise_changes",
+        "source_scale_wrong": "source_noise_changes", "ekf2_resets": "source_jumps",
+    }  # fmt: skip
+
+
 def test_consequences_of_consequences_are_told_too() -> None:
     found = by_cause(
         [

@@ -126,7 +126,8 @@ def test_a_clean_flight_has_no_causes_beyond_noise() -> None:
     [
         ("accel-bias=0.4", "accelerometer_bias", "error", {"bias_m_s2": (0.4, 0.1)}),
         ("scale=25%", "source_scale_wrong", "error", {"scale": (1.25, 0.1)}),
-        ("smoothed=0.5", "source_smoothed", "error", {"lag_s": (0.5, 0.1)}),
+        # less than the time constant, by half an interval
+        ("smoothed=0.5", "source_smoothed", "error", {"lag_s": (0.41, 0.1)}),
         ("jump=1,40s", "source_jumps", "error", {"size_m": (1.0, 0.3), "count": (1.0, 0.0)}),
         ("decimate=2Hz", "source_thinned", "error", {"source_rate_hz": (5.0, 0.1)}),
         ("r-scale=0.25", "source_variance_wrong", "error", {"variance_factor": (0.25, 0.05)}),

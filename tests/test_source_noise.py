@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,9 @@ from px4fuse.filter.fitting import Noises
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding, find
 from px4fuse.findings.causes import SETTINGS
-from px4fuse.findings.source_noise import detect
+from px4fuse.findings.source_noise import detect, levels
 from px4fuse.flight import POSITION_COLUMNS, Truth, Unavailable
+from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.scenario import Scenario
 
@@ -30,15 +32,23 @@ NEW = {"source_coloured", "source_repeats", "source_axes_unequal", "source_noise
 
 
 @cache
-def judged(model: errors.Model, rate_hz: float = 10.0, seed: int = 1) -> Analysis:
-    """A simulated flight whose positions have errors of the study's models, without EKF2."""
+def judged(
+    model: errors.Model, rate_hz: float = 10.0, seed: int = 1, truth_for: float | None = None
+) -> Analysis:
+    """A simulated flight whose positions have errors of the study's models, without EKF2.
+
+    With its truth where there is a SIGMA_Z (m) to try for that.
+    """
     flight = simulate_flight(Scenario(seed=seed, passes=5, ekf2=False))
     assert isinstance(flight.truth, Truth)
     truth = flight.truth.samples[POSITION_COLUMNS].dropna()
     known = CubicSpline(truth.index.to_numpy(), truth.to_numpy())
-    flight = errors.laid_over(flight, known, model, rate_hz, seed)
-    return explain(compare(replace(flight, truth=Unavailable("truth", "", "")), RIGHT,
-                           axes=("north", "east")))  # fmt: skip
+    flight, chosen = errors.laid_over(flight, known, model, rate_hz, seed), RIGHT
+    if truth_for is None:
+        flight = replace(flight, truth=Unavailable("truth", "", ""))
+    else:
+        chosen = Settings(0.27, truth_for)
+    return explain(compare(flight, chosen, axes=("north", "east")))
 
 
 def told(analysis: Analysis) -> dict[str, Finding]:
@@ -123,6 +133,48 @@ def test_outliers_and_a_jump_are_none_of_them() -> None:
         found = told(judged(model))
         assert name in found
         assert not NEW & set(found)
+
+
+@pytest.mark.parametrize(
+    ("model", "sigma_z_m", "denied"),
+    [(partial(errors.coloured, tau_s=20.0), 0.10, True), (errors.white, 0.14, False)],
+)
+def test_what_no_innovation_shows_asks_for_no_smaller_noise(
+    model: errors.Model, sigma_z_m: float, denied: bool
+) -> None:
+    """Innovations ask for 0.7 of SIGMA_Z in both; slow errors make up the rest in one."""
+    analysis = judged(model, truth_for=sigma_z_m)
+    tried = [each for each in analysis.causes if "sigma_z_m" in each.change and each.of == "nis"]
+    assert {each.axis for each in tried} == {"north", "east"}
+    assert all(each.denied_by_truth == denied for each in tried)
+    assert all(each.change["sigma_z_m"] == pytest.approx(0.7 * sigma_z_m, rel=0.05)
+               for each in tried)  # fmt: skip
+    if denied:
+        assert told(analysis).keys() <= {"errors_larger_than_claimed"}
+
+
+def test_a_low_pass_lags_by_less_than_its_time_constant() -> None:
+    """By Δt ρ / (1 - ρ) behind a steady motion."""
+    found = told(judged(SMOOTH, 5.0))["source_smoothed"]
+    assert found.evidence["lag_s"] == pytest.approx(0.2 / (np.exp(0.2 / 0.5) - 1.0), abs=0.06)
+
+
+@pytest.mark.reallogs
+def test_a_low_pass_is_no_slow_error_of_late_stamps(shared_logs: Path) -> None:
+    """Both fit this flight as well, and the second has two numbers more."""
+    log = shared_logs / "simulated" / "v1.16.1_aisle_nominal.ulg"
+    flight = read_log(log)
+    smooth = partial(errors.low_pass, tau_s=0.3)
+    flight = errors.laid_over(flight, errors.truth_of(log, flight), smooth, 5.0, 8)
+    found = told(explain(compare(flight, RIGHT, axes=("north", "east"))))
+    assert set(found) == {"source_smoothed"}
+
+
+def test_a_filter_that_outliers_pull_is_no_noisy_part() -> None:
+    """At 2 Hz most innovations of 13 s are large, since outliers lead the filter away."""
+    analysis = judged(partial(errors.with_outliers, share=0.05), 2.0, seed=13)
+    assert {"source_outliers"} == set(told(analysis))
+    assert list(levels(analysis)) == []
 
 
 def test_too_few_and_no_imu_are_said() -> None:

@@ -64,6 +64,8 @@ Of = Literal["nis", "nees", "apart"]
 Change = Mapping[str, float]
 # Squared errors of so many times what is claimed are beyond it: twice σ; clean flights stay below 3
 NEES_LARGE = 4.0
+# Beyond it a smaller noise is wrong where the errors are larger than claimed as it is
+NEES_DENIES = 2.0
 # Mean NIS above which the innovations themselves say so
 CONTENT_NIS = 1.5
 # Of the logarithm, and as far above 1 as below
@@ -239,7 +241,7 @@ def _tried(changed: _Changed, result: AxisComparison, of: Of) -> list[Interventi
     """All candidates alone; where the best leaves the number outside its band, with the others."""
     statement, candidates = result.filters[changed.owner], changed.candidates(result, of)
     truth = statement.truth
-    before = None if isinstance(truth, Unavailable) else truth.nees_position_mean
+    before = nees = None if isinstance(truth, Unavailable) else truth.nees_position_mean
     if of == "nis" and isinstance(statement, FilterSummary):
         before = statement.nis_mean
     if before is None:
@@ -253,12 +255,13 @@ def _tried(changed: _Changed, result: AxisComparison, of: Of) -> list[Interventi
         after, count = found
         low, high = nis_band(count) if of == "nis" else (0.0, NEES_LARGE)
         claimed = changed.number(result, "nees", change) if deniable else None
+        most = NEES_DENIES if nees is not None and nees > 1.0 else NEES_LARGE
         return [
             Intervention(
                 of=of, filter=changed.owner, axis=result.axis.name, change=change, before=before,
                 after=after, explains=1.0 - float(np.log(after) / np.log(before)),
                 brings_into_band=low <= after <= high,
-                denied_by_truth=claimed is not None and claimed[0] >= NEES_LARGE,
+                denied_by_truth=claimed is not None and claimed[0] >= most,
             )
         ]  # fmt: skip
 

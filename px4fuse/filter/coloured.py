@@ -45,6 +45,9 @@ LOOK_SCALES = np.geomspace(0.7, 1.6, 12)
 LOOK_MEASUREMENTS = 1000
 # What it must find for more to be done, and what more must find: less is chance
 LOOK_NATS, LEAST_NATS = 0.5, 2.0
+# What a slow error with a clock offset must explain beyond a low pass, whose lag is its own: 1 for
+# each of its two further numbers (Akaike 1974)
+OFFSET_NATS = 2.0
 # Time constants of a low pass, and how near in ln τ is near enough
 LOW_PASS_S, LOG_TAU_STEP = (0.02, 3.0), 0.05
 
@@ -58,7 +61,8 @@ class Smoothing:
     correlation : float
         Of the noise of successive positions; 0 where there is no low pass.
     lag_s : float
-        By how much positions come behind the motion: its time constant.
+        By how much positions come behind a steady motion, Δt ρ / (1 - ρ): less than the time
+        constant, by about half an interval.
     gain_nats : float
         Log-likelihood above that of no low pass, with the stamps as they are or moved.
     sigma_z_m : float
@@ -84,7 +88,8 @@ class Coloured:
     gain_nats : float
         Log-likelihood above that of white noise alone.
     lag_nats : float
-        What a low pass, which lags, explains beyond that.
+        What a low pass, which lags, explains beyond that, :data:`OFFSET_NATS` more where the slow
+        error asks for a clock offset besides.
     """
 
     tau_s: float
@@ -151,8 +156,8 @@ def hanging_together(
     neither = Unavailable(what, "its errors do not hang together", "")
     if least - found < LOOK_NATS:
         return smooth, neither
-    white, slow = (
-        min((_most_likely(moved, at, start) for at in offsets), key=_score)
+    (white, _), (slow, late_s) = (
+        min(((_most_likely(moved, at, start), at) for at in offsets), key=lambda e: _score(e[0]))
         for start in (noises, begin)
     )
     plain, alone, found = _score(white), white.noises, _score(slow)
@@ -172,13 +177,14 @@ def hanging_together(
     (score, before), tau_s = undone(log_tau), float(np.exp(log_tau))
     if score < plain:
         correlation = float(np.exp(-np.median(np.diff(time)) / tau_s))
-        smooth = Smoothing(correlation, tau_s, plain - score, before.sigma_z_m)
+        lag_s = float(np.median(np.diff(time))) * correlation / (1.0 - correlation)
+        smooth = Smoothing(correlation, lag_s, plain - score, before.sigma_z_m)
     return smooth, Coloured(
         tau_s=slow.noises.tau_s,
         slow_m=slow.noises.slow_m,
         white_m=slow.noises.sigma_z_m,
         gain_nats=plain - found,
-        lag_nats=found - score,
+        lag_nats=found - score + (OFFSET_NATS if late_s else 0.0),
     )
 
 

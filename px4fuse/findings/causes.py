@@ -131,20 +131,23 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
     # R describes none of these three
     "source_coloured": (*_FITTED, "source_variance_wrong", "errors_larger_than_claimed"),
     "source_axes_unequal": (*_OURS, "source_outliers", "source_variance_wrong"),
-    "source_noise_changes": (
-        *_OURS, "source_outliers", "source_variance_wrong", "source_coloured",
-    ),
     "ekf2_heading_wrong": (
         f"errors_larger_than_claimed:{FRAME}", f"kf_variance_understated:{FRAME}",
         f"errors_larger_than_claimed:{ELSEWHERE}", "sigma_a_small", f"aid_understated:{SENSOR}",
         f"ekf2_variance_understated:{ELSEWHERE}", f"aid_starved:{SENSOR}",
     ),
     "source_jumps": (
+        f"kf_variance_understated:{OUTLIERS}", f"kf_variance_understated:{ELSEWHERE}",
         f"errors_larger_than_claimed:{ELSEWHERE}", f"ekf2_variance_understated:{ELSEWHERE}",
         f"ekf2_variance_understated:{OUTLIERS}", "ekf2_rejecting", "ekf2_resets",
         f"aid_starved:{SENSOR}", "ekf2_heading_wrong",
     ),
     "source_scale_wrong": (f"errors_larger_than_claimed:{ELSEWHERE}",),
+    # a jump and a scale are judged by one noise throughout
+    "source_noise_changes": (
+        *_OURS, "source_outliers", "source_variance_wrong", "source_coloured", "source_jumps",
+        "source_scale_wrong",
+    ),
     "accelerometer_bias": (
         f"errors_larger_than_claimed:{ELSEWHERE}", f"errors_larger_than_claimed:{ACCELEROMETER}",
         f"kf_variance_understated:{ACCELEROMETER}", "sigma_a_small",
@@ -168,7 +171,7 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
         "source_smoothed", "source_coloured", "source_jumps", "source_scale_wrong",
         "source_axes_unequal", "source_noise_changes", "source_clock_offset",
         "source_clock_changes", "ekf2_ev_delay_wrong", "source_outliers", *_FITTED,
-        "errors_larger_than_claimed",
+        "source_variance_wrong", "errors_larger_than_claimed",
     ),
     "source_not_logged": ("source_decimated",),
     # what contradicts EKF2 from then on is rejected

@@ -36,6 +36,7 @@ from px4fuse.trajectory.alignment import fit
 
 NEES_ERROR = 16.0  # errors four times as large as σ
 SMALL_NIS = 0.5  # innovations are 30 % smaller than claimed
+OWN_ERROR = 0.7  # times: of EKF2's mean square error half is its own
 FRAME_SHARE = 0.5  # of the error: what is left is less than what turning took away
 FILTERS: Mapping[FilterName, str] = {"kf": "our filter", "ekf2": "EKF2"}
 REMEDIES = {
@@ -46,7 +47,8 @@ REMEDIES = {
     "ekf2": "Our filter errs less with the same source, so the error is EKF2's own: look at the "
     "delay that it takes the source to have, at its heading, and at what else it fuses.",
     "shared": "Look for an error that source and filter share: the clock (px4fuse sync LOG), a "
-    "source that smooths its positions, its scale, the survey of the anchors.",
+    "source that smooths its positions, slow errors (reflections, geometry of the anchors), its "
+    "scale, the survey of the anchors.",
     "gnss": "Look for an error that receiver and filter share: the age of a fix (px4fuse sync "
     "LOG), slow errors of reception, EKF2's heading, a wrong lever arm of the antenna.",
 }
@@ -120,7 +122,9 @@ def larger(analysis: Analysis, hidden: list[Hidden]) -> Finding:
             )
     small = worst.statement.nis_mean < SMALL_NIS
     words = "; ".join(said) + "."
-    alone = all(one.owner == "ekf2" for one in hidden)
+    ours = analysis.axes[worst.axis].filters["kf"].truth
+    less = isinstance(ours, AgainstTruth) and ours.position_rmse_m < OWN_ERROR * worst.rmse_m
+    alone = less and all(one.owner == "ekf2" for one in hidden)
     shared = "gnss" if analysis.source.origin.is_gnss else "shared"
     remedy = REMEDIES["drift" if drifts else "ekf2" if alone else shared]
     known = filter(None, (causes[worst.owner], *causes.values()))

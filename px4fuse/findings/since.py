@@ -91,7 +91,9 @@ def cure_words(analysis: Analysis, cause: Intervention) -> str:
     """What to do about a cause."""
     parts, change = [], dict(cause.change)
     if change.pop(OUTLIERS, None):
-        parts.append("remove the outliers (line of sight, anchor survey), raise no noise")
+        gnss = analysis.source.origin.is_gnss
+        where = "place of the antenna" if gnss else "line of sight, anchor survey"
+        parts.append(f"remove the outliers ({where}) rather than raise a noise for them")
     if change.pop(FORWARD, None) is not None:
         parts.append("calibrate the accelerometer and the level horizon")
         change.pop(RIGHT)

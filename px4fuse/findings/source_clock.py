@@ -114,7 +114,9 @@ def delay(analysis: Analysis, clock: ClockOffset) -> Found:
     low_ms, high_ms = (-1e3 * end for end in reversed(clock.interval_s))
     asked, more = f"the data ask for {round(asked_ms)} ms", ""
     ends = f"{round(low_ms)} to {round(high_ms)}"
-    if asked_ms < 0.0:
+    if low_ms <= 0.0 <= high_ms:
+        asked, ends = "the data ask for none", f"{ends} ms"
+    elif asked_ms < 0.0:
         asked = f"the stamps are early by {round(-asked_ms)} ms"
         ends, more = f"{round(-high_ms)} to {round(-low_ms)}", ", for which there is no delay"
     yield warning(

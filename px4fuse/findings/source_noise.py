@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from px4fuse.analysis import Analysis
+from px4fuse.arrays import Array, BoolArray
 from px4fuse.filter.coloured import Coloured
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.signals import within
@@ -26,6 +27,7 @@ MIN_REPEATS = 10
 UNEQUAL = 1.5  # times in σ, the larger axis over the smaller
 UNEQUAL_NIS = 1.7  # times in NIS before the noises of each axis are sought
 LEVELS = 2.0  # times in σ, the noisier part over the quieter
+LEVELS_UNPULLED = 1.5  # times in σ, where no outlier is fused
 LEVELS_ERROR = 4.0  # times in σ
 WINDOWS, MIN_WINDOW = 12, 25  # of the flight, and measurements in each
 
@@ -131,22 +133,28 @@ def levels(analysis: Analysis) -> Found:
     # not known where a third looks like outliers
     sigma_a: float | None = chosen.sigma_a_m_s2
     sigma_z: float | None = chosen.sigma_z_m
+    outlier_time_s = np.zeros(0)
     if isinstance(tuned, AxisTuning):
         sigma_a, sigma_z = tuned.filter_sigma_a.value, tuned.sigma_z.value
+        outlier_time_s = tuned.outlier_time_s
     lines = [analysis.axes[name].axis for name in ("north", "east") if name in analysis.axes]
     if sigma_a is None or sigma_z is None or len(lines) < 2:
         return
-    # with the noises that the data ask for: others would make the innovations grow and shrink
-    made = [innovations(preintegrate(line, chosen), sigma_a, sigma_z) for line in lines]
-    normalised = np.stack([nu / np.sqrt(s) for nu, s in made])
-    time = lines[0].measurement_time_s[-normalised.shape[1] :]
+    legs = [preintegrate(line, chosen) for line in lines]
+    time = lines[0].measurement_time_s[-len(legs[0].measurement_m) :]
     if len(time) < WINDOWS * MIN_WINDOW // 2:
         return
     count = min(WINDOWS, len(time) // MIN_WINDOW)
     edges = np.linspace(0, len(time), count + 1).astype(int)
-    # each axis by its own size, so that unequal axes are no change
-    scale = np.median(np.abs(normalised), axis=1, keepdims=True)
-    sizes = np.abs(normalised) / scale
+
+    def sized(skip: BoolArray | None) -> Array:
+        # with the noises that the data ask for: others would make the innovations grow and shrink
+        made = [innovations(each, sigma_a, sigma_z, skip) for each in legs]
+        normalised = np.abs([nu / np.sqrt(s) for nu, s in made])
+        # each axis by its own size, so that unequal axes are no change
+        return np.asarray(normalised / np.median(normalised, axis=1, keepdims=True))
+
+    sizes = sized(None)
     sigma = np.array([np.median(sizes[:, low:high]) for low, high in pairwise(edges)])
     loud = sigma > np.sqrt(sigma.min() * sigma.max())
     begins = int(np.argmax(loud))
@@ -155,8 +163,12 @@ def levels(analysis: Analysis) -> Found:
         return  # no single part
     quiet = np.ones(len(time), bool)
     quiet[edges[begins] : edges[ends]] = False
-    ratio = float(np.median(sizes[:, ~quiet]) / np.median(sizes[:, quiet]))
-    if ratio < LEVELS:
+    # an outlier that is fused makes those after it large too
+    ratio, unpulled = (
+        float(np.median(each[:, ~quiet]) / np.median(each[:, quiet]))
+        for each in (sizes, sized(np.isin(time, outlier_time_s)))
+    )
+    if ratio < LEVELS or unpulled < LEVELS_UNPULLED:
         return
     start, end = float(time[edges[begins]]), float(time[edges[ends] - 1])
     yield (error if ratio >= LEVELS_ERROR else warning)(

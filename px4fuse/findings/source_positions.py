@@ -28,7 +28,7 @@ from px4fuse.plain import factor_words
 MOTION_RANGE_M = 0.5  # 5 to 95 %; a hovering drone with 0.1 m UWB stays below
 NOISE_RANGE = 1.25 * 3.29  # of white noise's σ from 5 to 95 %, with a quarter for chance
 SECOND_DIFFERENCE = 6.0**0.5 / 1.4826  # their median size over σ
-GAIN_NATS = 12.0  # a likelihood ratio of 160,000; clean flights have 0 to 2
+GAIN_NATS = 6.0  # a likelihood ratio of 400; clean flights have 0 to 2
 LAG_NATS = 1.0  # a low pass e times as likely as a slow error, which has one number more
 LAG_S = 0.05  # at 1 m/s half of a good UWB's noise
 LAG_ERROR_S = 0.10  # at 1 m/s a good UWB's noise
@@ -205,8 +205,13 @@ def stated_variance(analysis: Analysis) -> Found:
     if reported.empty or noise is None or low is None or high is None:
         return
     sigma = float(np.sqrt(reported.to_numpy().mean(axis=1)).mean())
-    factor = (sigma / noise) ** 2
+    factor, more = (sigma / noise) ** 2, ""
     size = max(factor, 1.0 / factor)
+    if factor > 1.0:  # slow errors, which R has to cover too, show in no innovation
+        if (error_m := _error_m(analysis)) is None:
+            more = ", unless slow errors, which no innovation shows, are the rest"
+        elif sigma**2 < REPORTED * error_m**2:
+            return
     if size >= REPORTED and not low <= sigma <= high:
         yield finding(
             "error" if size >= REPORTED_ERROR else "warning",
@@ -214,12 +219,24 @@ def stated_variance(analysis: Analysis) -> Found:
             f"{source.name} reports a standard deviation of {sigma:.3g} m, and its noise is "
             f"{noise:.3g} m",
             f" (95 % {low:.3g} to {high:.3g}): the variance that it sends is {factor_words(size)} "
-            f"times too {'small' if factor < 1.0 else 'large'}. EKF2 takes R from it "
+            f"times too {'small' if factor < 1.0 else 'large'}{more}. EKF2 takes R from it "
             "(EKF2_EV_NOISE_MD 0), though never less than EKF2_EVP_NOISE.",
             f"Correct it at the sender: a variance of {noise**2:.2g} m², or set EKF2_EV_NOISE_MD "
             f"to 1 and EKF2_EVP_NOISE to {noise:.2g}.",
             {"reported_sigma_m": sigma, "sigma_z_m": noise, "variance_factor": factor},
         )
+
+
+def _error_m(analysis: Analysis) -> float | None:
+    """Root mean square of the positions' own errors along an axis (m); None without a truth."""
+    squares = []
+    for result in (analysis.axes[name] for name in ("north", "east") if name in analysis.axes):
+        if isinstance(result.truth, Unavailable):
+            return None
+        true, axis = result.truth["position_m"].dropna(), result.axis
+        at = np.interp(axis.measurement_time_s, true.index, true, left=np.nan, right=np.nan)
+        squares.append(np.nanmean((axis.measurement_m - at) ** 2))
+    return float(np.sqrt(np.mean(squares))) if squares else None
 
 
 def motion_range_m(comparison: Comparison) -> float:
