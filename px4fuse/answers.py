@@ -51,6 +51,7 @@ MISTAKES: Mapping[str, tuple[str, Mapping[str, float]]] = {
     "smoothed": ("the positions are low-pass filtered with this time constant", _S),
     "slow-error": ("a further error of the positions changes slowly: multipath", _M),
     "heading": ("EKF2's heading is too large by this: a disturbed compass", _DEG),
+    "mag": ("the field at the magnetometer changes in flight by this: a current", {"gauss": 1.0}),
     "accel-bias": ("the accelerometer's forward axis reads too much by this", _A),
     "vibration": ("the accelerometer is this much noisier", _A),
     "imu-rate": ("the IMU is logged at this rate only", _HZ),
@@ -342,7 +343,7 @@ RANGES: Mapping[str, tuple[float, float]] = {
     "accel-bias": (-20.0, 20.0), "vibration": (0.0, 50.0), "imu-rate": (0.0, 8000.0),
     "decimate": (0.0, 1000.0), "r-scale": (0.0, 1e6), "open-end": (0.0, 1000.0),
     "vio-drift": (0.0, 100.0), "ekf2-noise": (0.0, 100.0), "ekf2-delay": (-5.0, 5.0),
-    "ekf2-gate": (0.0, 1000.0), "clock-drift": (-1e5, 1e5),
+    "ekf2-gate": (0.0, 1000.0), "clock-drift": (-1e5, 1e5), "mag": (-10.0, 10.0),
 }  # fmt: skip
 
 

@@ -16,22 +16,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from patience import patience
-from ulog_tools import (
-    Log,
-    make_log,
-    position,
-    seconds_of,
-    selector,
-    stamps,
-    take,
-    topic,
-)
+from ulog_tools import Log, make_log, position, seconds_of, selector, stamps, take, topic
 
 from px4fuse.cli import main
 from px4fuse.comparison.preparation import choose_segment, choose_source
 from px4fuse.errors import LogError, Px4FuseError
 from px4fuse.filter.signals import make_axes
 from px4fuse.flight import Flight, Unavailable
+from px4fuse.inspect.inventory import take_inventory
 from px4fuse.readers import ULOG_MAGIC, read_log
 
 
@@ -132,6 +124,9 @@ def test_a_log_of_topics_that_are_none_of_ours(tmp_path):
     assert flight.streams == {}
     assert flight.log.duration_s == pytest.approx(1.9)
     assert any("battery_status" in note for note in flight.log.notes)
+    inventory = take_inventory(flight)
+    assert all(row.unavailable for row in inventory.sources)
+    assert not any(ability.possible for ability in inventory.abilities)
     with pytest.raises(Px4FuseError, match=r"no external position .* SDLOG_PROFILE to 129"):
         choose_source(flight)
 
@@ -163,9 +158,6 @@ def test_a_release_number_of_another_type(tmp_path, key):
     path.write_bytes(content[: at - 3] + new + content[at + 1 + len(old) :])
     flight = outcome(path)
     assert len(flight.imu) == 100
-
-
-# ---- cut and damaged files --------------------------------------------------------------------
 
 
 # ---- logs without a part ----------------------------------------------------------------------
@@ -323,15 +315,10 @@ def test_not_a_number_here_and_there(tmp_path):
     log = make_log("v1.16", 2.0)
     log["sensor_combined"]["accelerometer_m_s2"][[10, 20], 1] = np.nan
     log["vehicle_attitude"]["q"][7, 3] = np.nan
+    log["vehicle_attitude"]["q"][:5] = 0.0
     log["vehicle_local_position"]["vx"][4] = np.nan
     flight = read_of(log, tmp_path)
-    assert (len(flight.imu), len(flight.attitude), len(flight.ekf2.state)) == (198, 39, 19)
-
-
-def test_quaternions_of_zeros_are_no_attitude(tmp_path):
-    log = make_log("v1.16", 2.0)
-    log["vehicle_attitude"]["q"][:5] = 0.0
-    assert len(read_of(log, tmp_path).attitude) == 35
+    assert (len(flight.imu), len(flight.attitude), len(flight.ekf2.state)) == (198, 34, 19)
 
 
 @pytest.mark.parametrize("parameter", ["EKF2_EV_DELAY", "EKF2_EVP_GATE"])

@@ -28,7 +28,6 @@ from px4fuse.fleet.changes import changes
 from px4fuse.fleet.inputs import DiffInput
 from px4fuse.results.build import results as build
 from px4fuse.results.contract import ComparisonResults
-from px4fuse.results.model import Student
 from px4fuse.results.reading import read_results
 
 pytestmark = pytest.mark.usefixtures("analysed_once")
@@ -88,7 +87,7 @@ def results(sample_log, analysis) -> dict[str, Shown]:
 
 def results_of(analysis: px4fuse.Analysis) -> ComparisonResults:
     request = px4fuse.ComparisonRequest(log="aisle_uwb.ulg", sigma_z_m=0.2)
-    return build(request, analysis, px4fuse.find(analysis), Student(), "px4fuse compare")
+    return build(request, analysis)
 
 
 NAMES = ["Analysis", *(part.__name__ for part in Shown.__subclasses__())]

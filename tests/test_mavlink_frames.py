@@ -42,7 +42,7 @@ PARSABLE = [
     for path in sorted((SHARED_LOGS / "mavlink").glob("*"))
     if path.suffix in (".tlog", ".rlog", ".raw")
 ]
-LONG_BYTES = 2_000_000
+LONG_BYTES = 500_000
 ATTITUDE = message("ATTITUDE", time_boot_ms=1000, roll=0.1, pitch=-0.2, yaw=1.5)
 MANY_BYTES = 5_000_000
 # What one frame may cost beside its bytes: offsets, header fields, time of receipt, and what is
@@ -421,9 +421,8 @@ def short_frames(rng: np.random.Generator, total: int, ids: list[int], *, v1: bo
 
 @pytest.mark.parametrize(
     ("ids", "v1"),
-    [([0], True), ([0], False), ([0, 102, 331, 111], False), (sorted(
-        kind.id for kind in MESSAGES.values() if kind.id < 60_000), False)],
-    ids=["shortest", "heartbeats", "positions", "all"],
+    [([0], True), (sorted(kind.id for kind in MESSAGES.values() if kind.id < 60_000), False)],
+    ids=["shortest", "all"],
 )  # fmt: skip
 def test_shortest_frames_of_random_senders_cost_a_bounded_amount_each(tmp_path, ids, v1):
     path = tmp_path / "hostile.raw"

@@ -40,7 +40,7 @@ from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
-SEED, COUNT = 5, 10
+SEED, COUNT = 5, 6
 
 
 # ------------------------------------------------------------------ what is drawn
@@ -90,7 +90,7 @@ def ours(flight: Flight, **settings: float) -> Any:
     return judged(flight, **settings).main.filters["kf"]
 
 
-LEVELS_AND_SEEDS = [(1, 1), (2, 2), (3, 3)]
+LEVELS_AND_SEEDS = [(1, 1), (3, 3)]
 
 
 def trick(mistake: str) -> Trick:
@@ -235,11 +235,11 @@ def said(page: Browser, name: str) -> str:
     return str(page.ask(f"document.getElementById({json.dumps(name)}).textContent"))
 
 
-def test_ten_flights_with_right_and_wrong_answers(browser: Browser, quiz: Path) -> None:
+def test_flights_with_right_and_wrong_answers(browser: Browser, quiz: Path) -> None:
     page, told = show(browser, quiz), keys(quiz)
     points = 0
     for number, key in enumerate(told):
-        assert said(page, "quiz-title") == f"Flight {number + 1} of 10"
+        assert said(page, "quiz-title") == f"Flight {number + 1} of {COUNT}"
         assert "truth" not in said(page, "live")
         assert said(page, "found") == "Not told yet."
         assert page.ask("document.getElementById('quiz-told').textContent") == ""
@@ -267,14 +267,14 @@ def test_ten_flights_with_right_and_wrong_answers(browser: Browser, quiz: Path) 
         assert "from the truth" in said(page, "live")
         assert key["story"][0] in said(page, "found")
         assert page.ask("[...document.querySelectorAll('[name=choice]')].every((b) => b.disabled)")
-        if number < 9:
+        if number < COUNT - 1:
             renewed(page, "#quiz-next")
-    assert said(page, "quiz-score") == f"{points} of 10 right: the set is done"
+    assert said(page, "quiz-score") == f"{points} of {COUNT} right: the set is done"
     assert page.ask("document.getElementById('quiz-next').hidden")
     assert page.complaints() == []
     assert page.requests() <= {"file", "data", "blob"}
     renewed(page, "#quiz-again")
-    assert said(page, "quiz-title") == "Flight 1 of 10"
+    assert said(page, "quiz-title") == f"Flight 1 of {COUNT}"
     assert said(page, "quiz-score") == ""
 
 

@@ -70,7 +70,7 @@ def test_without_an_aid_from_a_time_on(sample_log: Path) -> None:
         assert said["replayed"][axis]["position_rmse_to_truth_m"] < 0.1
         assert 0.02 < said["whatif"][axis]["nis_mean"] < 4.0
     assert error_of(said["whatif"]) > 1.0
-    (note,) = [one for one in said["notes"] if one.startswith("without ev_pos from 100 s on")]
+    (note,) = [one for one in said["notes"] if one.startswith("Without ev_pos from 100 s on")]
     assert "EKF2 itself gives its position up" in note
 
 

@@ -43,6 +43,7 @@ DID: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "jump": ((), ("followed the wrong positions",)),
     "slow-error": (("followed the wrong positions",), ()),
     "heading": ((), ("followed the positions",)),
+    "mag": ((), ("rejected the bad samples", "followed the positions")),
     "smoothed": (("followed the wrong positions",), ("fused at the wrong time",)),
     "ekf2-delay": (("fused at the wrong time",), ()),
     "ekf2-off": (("never fused",), ()),
@@ -152,11 +153,11 @@ def _wrong(
             from_s, *_, until_s = truth["outlier_time_s"] * 2
         case "heading":
             from_s = given["heading_at_s"]
-        case "dropout" | "imu-dropout" | "jump":
+        case "dropout" | "imu-dropout" | "jump" | "mag":
             share = 2.0 / 3.0 if name == "jump" else 0.5
             from_s = given[sizes[1]]
             from_s = start_s + share * (end_s - start_s) if from_s is None else from_s
-            until_s = None if name == "jump" else from_s + abs(size)
+            until_s = None if name in ("jump", "mag") else from_s + abs(size)
     return Wrong(name, size, low, high, from_s, until_s)
 
 

@@ -40,7 +40,7 @@ EFFECTS: Mapping[str, frozenset[str]] = {
 SHOWS: Mapping[str, tuple[str, ...]] = {
     "clock": ("clock-offset", "clock-drift", "clock-jump", "smoothed"),
     "innovations": ("nlos", "dropout", "decimate", "r-scale", "jump", "smoothed", "slow-error",
-                    "accel-bias", "vibration", "ekf2-noise", "ekf2-gate", "ekf2-off"),
+                    "accel-bias", "vibration", "ekf2-noise", "ekf2-gate", "ekf2-off", "mag"),
     "map": ("yaw", "heading", "scale", "jump", "no-motion", "open-end"),
     "parameters": ("decimate", "r-scale", "imu-rate", "no-vvo", "ekf2-noise", "ekf2-delay",
                    "ekf2-gate", "ekf2-off"),
@@ -265,7 +265,7 @@ def cures(wrong: Wrong, truth: FormTruth) -> tuple[Cure, ...]:
         ("EKF2_EVP_NOISE", ANY, {"ekf2-gate": 1.0 / 3.0}),
         ("report the true variance", noise, {"r-scale": 1.0}),
         ("report the true variance", ANY, {"slow-error": 0.5}),
-        ("calibrate the compass", ANY, {"heading": 1.0}),
+        ("calibrate the compass", ANY, {"heading": 1.0, "mag": 1.0}),
         ("--position-yaw", back, {"yaw": 1.0, "heading": 0.5}),
         ("turn the positions at the sender", back, {"yaw": 1.0}),
         ("multiply the positions at the sender", factors, {"scale": 1.0}),
