@@ -20,6 +20,7 @@ from px4fuse.ekf2_parameters import AIDS
 from px4fuse.errors import MissingDataError
 from px4fuse.findings import find_aids
 from px4fuse.findings.aids import find_in
+from px4fuse.findings.causes import CAUSE, CHANGE, SENSOR
 from px4fuse.flight import AidLog, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_innovations import innovations_of
@@ -198,6 +199,11 @@ def test_an_aid_that_changes_in_flight_is_told_with_the_time() -> None:
     assert (told.id, told.severity, told.evidence["axis"]) == ("aid_changed", "warning", "east")
     # what is our filter's source too is judged beside it
     assert not [*find_in({"gnss_vel": found}, "gnss_pos")]
+    # and so is one that was rejected from then on
+    rejected = replace(found, verdict="starved")
+    (starved,) = find_in({"gnss_vel": rejected}, "gnss_pos")
+    assert starved.evidence[CAUSE] == SENSOR
+    assert next(find_in({"mag": rejected}, "gnss_pos")).evidence[CAUSE] == CHANGE
     little = log.samples.copy()
     little.loc[35.0:, "innovation_east"] -= 0.2
     assert judged(replace(log, samples=little)).axes["east"].change is None

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import click
 
 from px4fuse.cli import inputs, outputs
-from px4fuse.cli.compare import SEVERITIES
+from px4fuse.cli.compare import SEVERITIES, Severity
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.fleet import TIMEOUT_S
 
@@ -64,7 +64,7 @@ def batch(
     scheduler: str | None,
     baseline: Path | None,
     junit: Path | None,
-    fail_on: Literal["failed", "worse", "error", "warning", "info"] | None,
+    fail_on: Literal["failed", "worse", Severity] | None,
     **given: Any,
 ) -> None:
     """Compare many logs, as px4fuse compare does each, into one table.

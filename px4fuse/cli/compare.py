@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import click
 
@@ -12,7 +12,8 @@ from px4fuse.cli import inputs, outputs
 from px4fuse.request import settings_name
 from px4fuse.writing import STANDARD_OUTPUT
 
-SEVERITIES = ("error", "warning", "info")
+Severity = Literal["error", "warning", "info"]
+SEVERITIES = get_args(Severity)
 
 
 @click.command()
@@ -32,7 +33,7 @@ def compare(
     log: Path,
     output: Path | None,
     json_path: Path | None,
-    fail_on: Literal["error", "warning", "info"] | None,
+    fail_on: Severity | None,
     checks: bool,
     **given: Any,
 ) -> None:

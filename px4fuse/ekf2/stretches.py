@@ -10,6 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 import pandas as pd
+from scipy.linalg import block_diag
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.display import brief
@@ -270,16 +271,34 @@ def _with_field(stretch: Stretch, record: FusionRecord, at: int, step_s: float) 
     start, frame = record.delayed.iloc[at], record.field_gauss
     stamps = frame.index.to_numpy()
     age_s = record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
-    step = np.searchsorted(stretch.time_s, stamps - age_s - 1e-9)
-    inside = (step > 0) & (step < len(stretch.time_s))
-    fields = [*EARTH_FIELD_COLUMNS, *BODY_FIELD_COLUMNS]
     weight = max(FIELD_HZ * float(np.median(np.diff(stamps))), 1.0)
     gauss = frame.drop(columns="fused_3d").to_numpy()
+    fields = np.asarray(start[[*EARTH_FIELD_COLUMNS, *BODY_FIELD_COLUMNS]])
+    variance = np.asarray(start[DELAYED_VARIANCE_COLUMNS[-6:]])
+    return with_field(stretch, stamps - age_s, gauss, weight, fields, variance)
+
+
+def with_field(
+    stretch: Stretch, taken_s: Array, gauss: Array, weight: float, fields: Array, variance: Array
+) -> Stretch:
+    """The same stretch with the fields of earth and body among its states, uncorrelated with them.
+
+    Parameters
+    ----------
+    taken_s, gauss : ndarray, shape (m,) and (m, 3)
+        Samples of the magnetometer (body FRD), by the time that EKF2 takes them to be of.
+    weight : float
+        Samples that EKF2 had for each.
+    fields, variance : ndarray, shape (6,)
+        At the start, of earth (NED) and body.
+    """
+    step = np.searchsorted(stretch.time_s, taken_s - 1e-9)
+    inside = (step > 0) & (step < len(stretch.time_s))
     return replace(
         stretch,
-        state=np.concatenate([stretch.state, start[fields]]),
-        variance=np.concatenate([stretch.variance, start[DELAYED_VARIANCE_COLUMNS[-6:]]]),
-        correlation=np.eye(len(stretch.state) + len(fields)),
+        state=np.concatenate([stretch.state, fields]),
+        variance=np.concatenate([stretch.variance, variance]),
+        correlation=block_diag(stretch.correlation, np.eye(len(fields))),
         field=Field(step[inside], gauss[inside], weight),
     )
 

@@ -77,6 +77,19 @@ def spread(covariance: Symmetric[T], dt_s: T) -> Symmetric[T]:
     return p00 + 2.0 * dt_s * p01 + dt_s**2 * p11, p01 + dt_s * p11, p11
 
 
+def predict(
+    position: T, velocity: T, covariance: Symmetric[T], acceleration: T, density: T, dt_s: T
+) -> tuple[T, T, Symmetric[T]]:
+    """X = Fx + Ba, P = FPFᵀ + Q: position, velocity and covariance after ``dt_s``.
+
+    ``density`` (m²/s³) is what Q adds to the velocity's variance per second, SIGMA_A² · DT.
+    """
+    (p00, p01, p11), (q00, q01, q11) = spread(covariance, dt_s), noise(dt_s)
+    after = p00 + density * q00, p01 + density * q01, p11 + density * q11
+    position, velocity = move(position, velocity, acceleration, dt_s)
+    return position, velocity, after
+
+
 def update(
     position: T, velocity: T, covariance: Symmetric[T], measured: T, variance: T
 ) -> tuple[tuple[T, T, T, T], tuple[T, T, Symmetric[T]]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from px4fuse.filter.kalman import Replay, as_replay
-from px4fuse.filter.model import INITIAL_COVARIANCE, move, noise, spread, update
+from px4fuse.filter.model import INITIAL_COVARIANCE, predict, update
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.filter.steps import timeline
@@ -35,14 +35,11 @@ def quick_replay(axis: Axis, settings: Settings) -> Replay:
         line.measurement[1:].tolist(),
         strict=True,
     ):
-        # x = Fx + Bu, P = FPFᵀ + Q
-        p, v = move(p, v, a, dt)
-        (p00, p01, p11), (q00, q01, q11) = spread(covariance, dt), noise(dt)
-        covariance = p00, _, p11 = p00 + q * q00, p01 + q * q01, p11 + q * q11
+        p, v, covariance = predict(p, v, covariance, a, q, dt)
         if measurement >= 0:
             z = measured_m[measurement]
             told, after = update(p, v, covariance, z, r)
-            updates.append((z, *told, p, p00, p11))
+            updates.append((z, *told, p, covariance[0], covariance[2]))
             p, v, covariance = after
         states.append((p, v, *covariance))
     return as_replay(axis, settings, line, states, updates)

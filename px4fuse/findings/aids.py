@@ -39,7 +39,7 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
         longest = max(together, key=lambda aid: aid.longest_without)
         labels = ", ".join(_named(aid) for aid in together)
         changed = any(axis.change for aid in together for axis in aid.axes.values())
-        cause = CHANGE if changed else _sensor(switch, source)
+        cause = _sensor(switch, source) or (CHANGE if changed else "")
         yield warning(
             "aid_starved",
             f"EKF2 had {longest.longest_without:.0f} s without {labels} that it meant to fuse",

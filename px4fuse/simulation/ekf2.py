@@ -22,7 +22,6 @@ from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.ekf2.inputs import NO_LIMIT, Inputs, Received, Rules
 from px4fuse.ekf2.intervals import (
     ACCELEROMETER_BIAS,
-    FIELD_STATES,
     GRAVITY_M_S2,
     GYRO_BIAS,
     POSITION,
@@ -33,9 +32,9 @@ from px4fuse.ekf2.intervals import (
 from px4fuse.ekf2.model import delayed_states, run_variants
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.recursion import EAST, HEADING, LEVEL, NORTH, Run, Variant
-from px4fuse.ekf2.stretches import Field, Stretch, down_sampled, step_ends
-from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, settings_in_force
-from px4fuse.filter.model import move, noise, spread, update
+from px4fuse.ekf2.stretches import Stretch, down_sampled, step_ends, with_field
+from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid, settings_in_force
+from px4fuse.filter.model import predict, update
 from px4fuse.simulation import sensors
 from px4fuse.simulation.ekf2_topics import Height, TopicTrack, ekf2_topics
 from px4fuse.simulation.mistakes import Mistakes
@@ -81,18 +80,26 @@ class Others:
     barometer: Topic
 
 
+def _fused(scenario: Scenario) -> tuple[Aid, ...]:
+    """What of EKF2's aids has parameters in the model."""
+    return (scenario.aid, MAG) if scenario.aid == GNSS_POS else (scenario.aid,)
+
+
 def parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]:
     """EKF2's parameters as flown: all that its model has, by PX4 name."""
     aid = scenario.aid
     gnss = aid == GNSS_POS
-    known = settings_in_force({}, aid, *([MAG] if gnss else []))
+    known = settings_in_force({}, *_fused(scenario))
     delay_ms = known[aid.delay] if mistakes.ekf2_delay_s is None else 1e3 * mistakes.ekf2_delay_s
     of_aid: dict[str, float] = {aid.noise_mode: 1}
     if gnss:
         # of the magnetic heading alone (1), or of all its axes where it should be right (0)
         only_heading = int(bool(mistakes.heading_deg))
         of_aid = {GNSS_VEL.noise: scenario.sigma_gnss_m_s, MAG.switch: only_heading}
-        of_aid |= {BAROMETER.noise: sensors.SIGMA_BAROMETER_M, BAROMETER.gate: 5.0}
+        of_aid |= {
+            BAROMETER.noise: sensors.SIGMA_BAROMETER_M,
+            BAROMETER.gate: BAROMETER.default_gate,
+        }
     return (
         known
         | of_aid
@@ -131,7 +138,7 @@ def fly(
     aid_source_hz : float
         To what estimator_aid_src_ev_pos is thinned; 0 leaves it.
     """
-    aid = scenario.aid
+    aid, aids = scenario.aid, _fused(scenario)
     stretch, time_us, nominal = _stretch(scenario, mistakes, motion, imu, at_rest)
     known = {name: float(np.float32(v)) for name, v in flown.items()}
     height = None
@@ -140,7 +147,7 @@ def fly(
         stretch = replace(stretch, down_m=height.down_m, down_variance_m2=height.variance_m2)
         if not known[MAG.switch]:
             stretch = _with_field(stretch, others.magnetometer)
-    settings = settings_in_force(known, aid, MAG)
+    settings = settings_in_force(known, *aids)
     rules = GNSS_RULES if aid == GNSS_POS else RULES
     step_s = float(np.median(stretch.step_s))
     length = int(np.ceil(settings["EKF2_DELAY_MAX"] * 1e3 / PREDICT_US))
@@ -215,19 +222,10 @@ def _stretch(
 
 def _with_field(stretch: Stretch, magnetometer: Topic) -> Stretch:
     """The same stretch with the magnetic fields among its states, aligned on the ground."""
-    stamp_s = sensors.time_s(magnetometer)
-    step = np.searchsorted(stretch.time_s, stamp_s - 0.5 * float(np.median(stretch.step_s)))
-    inside = (step > 0) & (step < len(stretch.time_s))
+    taken_s = sensors.time_s(magnetometer) - 0.5 * float(np.median(stretch.step_s))
     gauss = magnetometer.fields["magnetometer_ga"].astype(np.float64)
-    correlation = np.eye(FIELD_STATES)
-    correlation[:STATES, :STATES] = stretch.correlation
-    return replace(
-        stretch,
-        state=np.concatenate([stretch.state, sensors.EARTH_FIELD_GAUSS, np.zeros(3)]),
-        variance=np.concatenate([stretch.variance, np.full(6, FIELD_SD_GAUSS**2)]),
-        correlation=correlation,
-        field=Field(step[inside], gauss[inside], 1.0),
-    )
+    fields = np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)])
+    return with_field(stretch, taken_s, gauss, 1.0, fields, np.full(6, FIELD_SD_GAUSS**2))
 
 
 def _height(
@@ -248,10 +246,7 @@ def _height(
     found, rows = [(p, r)], []
     steps, gained = stretch.step_s.tolist(), (force[:, 2] + GRAVITY_M_S2[2]).tolist()
     for at, (dt, a) in enumerate(zip(steps, gained, strict=True), start=1):
-        p, v = move(p, v, a, dt)
-        more = (q * dt * each for each in noise(dt))
-        p00, p01, p11 = (old + new for old, new in zip(spread(covariance, dt), more, strict=True))
-        covariance = p00, p01, p11
+        p, v, covariance = predict(p, v, covariance, a, q * dt, dt)
         if at in samples:
             told, (p, v, covariance) = update(p, v, covariance, samples[at], r)
             rows.append((at, samples[at], *told[:2]))
