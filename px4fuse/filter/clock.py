@@ -338,9 +338,11 @@ def _parts(
     moved: PreparedMotion, offset: float, noises: Noises, factor: float
 ) -> tuple[tuple[PartOffset, ...], float | None]:
     """Offset of each stretch by itself, and the p-value of no change, by the likelihood ratio."""
-    grid = offset + np.linspace(-SEARCH_S, SEARCH_S, 2 * COARSE_POINTS - 1)
-    grid = grid[np.abs(grid) <= SEARCH_S]  # at equal steps, as the parabolas need them
-    profiles = fitted(moved.blocks(grid), noises, moved.weight).by_stretch()[0]
+    coarse = offset + np.linspace(-SEARCH_S, SEARCH_S, COARSE_POINTS)
+    coarse = coarse[np.abs(coarse) <= SEARCH_S]
+    tried = fitted(moved.blocks(coarse), noises, moved.weight).by_stretch()[0]
+    grid = np.linspace(coarse[0], coarse[-1], CURVE_POINTS)
+    profiles = CubicSpline(coarse, tried, axis=1)(grid)
     found, used = [], []
     for begin, end, profile in zip(moved.edges, moved.edges[1:], profiles, strict=False):
         middle, sigma = _vertex(grid, profile)

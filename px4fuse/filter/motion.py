@@ -122,7 +122,7 @@ class PreparedMotion:
 
     def thinned(self, count: int) -> PreparedMotion:
         """About so many of the measurements, in the stretches that keep a few; all without one."""
-        kept = np.arange(len(self.time_s)) % max(1, len(self.time_s) // count) == 0
+        kept = np.arange(len(self.time_s)) % max(1, round(len(self.time_s) / count)) == 0
         counts = np.add.reduceat(kept.astype(int), self.edges[:-1])
         enough = counts >= FEW_MEASUREMENTS
         if not enough.any():
