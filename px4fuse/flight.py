@@ -410,7 +410,8 @@ class Flight(Shown):
     ----------
     log : LogInfo
     imu : DataFrame or Unavailable
-        Specific force (m/s², body FRD, not bias corrected) and angular rate (rad/s, body FRD).
+        Specific force (m/s², body FRD, not bias corrected) and angular rate (rad/s, body FRD), and
+        ``clipped``, above 0 where an accelerometer was at the end of its range, where logged.
     attitude : DataFrame or Unavailable
         Quaternion w, x, y, z that turns body FRD into NED.
     positions : tuple of PositionTrack
@@ -432,6 +433,8 @@ class Flight(Shown):
         Files read beside the log.
     modes : tuple of FlightMode, or Unavailable
         In order of time, without overlap.
+    tumbled : tuple of (float, float)
+        Stretches (s) in which PX4's failure detector found roll or pitch beyond their limits.
     barometer : DataFrame or None
         ``down_m`` by the pressure, from a height that is not known.
     """
@@ -449,6 +452,7 @@ class Flight(Shown):
     unused: tuple[Unused, ...] = ()
     inputs: tuple[InputFile, ...] = ()
     modes: tuple[FlightMode, ...] | Unavailable = MODES_NOT_LOGGED
+    tumbled: tuple[tuple[float, float], ...] = ()
     barometer: pd.DataFrame | None = None
 
 

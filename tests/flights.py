@@ -57,6 +57,7 @@ class Imu:
     rate_hz: float = 100.0
     sigma_a_m_s2: float = 0.5
     gap_s: Span | None = None
+    clipped_s: Span | None = None
 
 
 @dataclass(frozen=True)
@@ -116,6 +117,7 @@ def aisle_flight(
     dropouts: tuple[Dropout, ...] = (),
     notes: tuple[str, ...] = (),
     damage: tuple[str, ...] = (),
+    tumbled: tuple[Span, ...] = (),
 ) -> Flight:
     """Fly along the aisle; None leaves a part out of the log."""
     rng = np.random.default_rng(seed)
@@ -124,6 +126,7 @@ def aisle_flight(
         return motion(time_s, heading_deg, length_m)
 
     sensor = imu or CLEAN_IMU
+    clipped_s = sensor.clipped_s or (np.inf, np.inf)
     time = times(duration_s, sensor.rate_hz, sensor.gap_s)
     force = (path(time)[2] - [0.0, 0.0, GRAVITY_M_S2]) @ BODY_TO_NED.as_matrix()
     # white noise: averaged over DT it must be sigma_a
@@ -150,7 +153,7 @@ def aisle_flight(
         if imu is None
         else table(
             time, np.hstack([force, 0.0 * force]), SPECIFIC_FORCE_COLUMNS + ANGULAR_RATE_COLUMNS
-        ),
+        ).assign(clipped=(time >= clipped_s[0]) & (time <= clipped_s[1])),
         attitude=unavailable("attitude")
         if attitude_hz is None
         else table(
@@ -175,6 +178,7 @@ def aisle_flight(
         if truth
         else unavailable("ground truth"),
         airborne=((0.0, duration_s),),
+        tumbled=tumbled,
     )
 
 

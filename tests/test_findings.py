@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ from px4fuse.flight import (
     Unavailable,
 )
 from px4fuse.origin import ALIGNED, KEPT
+from px4fuse.readers import read_log
 from px4fuse.recording import ClockMap, Dropout
 
 ALIGNED_TOPIC = "estimator_visual_odometry_aligned"
@@ -209,6 +211,9 @@ FAULTS = [
     Fault("no_motion", "warning", {"range_m": about(0.33, 0.15)}, {"length_m": 0.0}),
     # the log
     Fault("imu_gap", "warning", {"total_s": about(2.0, 1e-6)}, {"imu": Imu(gap_s=(40.0, 42.0))}),
+    Fault("vehicle_tumbled", "error", {"total_s": 4.0}, {"tumbled": ((100.0, 104.0),)}),
+    Fault("accelerometer_clipped", "warning", {"count": 30, "total_s": about(0.3, 0.01)},
+          {"imu": Imu(clipped_s=(50.0, 50.295))}),
     Fault("logger_dropouts", "warning", {"count": 2, "total_s": about(0.5, 1e-9)},
           {"dropouts": (Dropout(20.0, 0.3), Dropout(50.0, 0.2), Dropout(500.0, 9.0))}),
     Fault("logging_rate_low", "warning", {"rate_hz": about(20.0), "topic": "sensor_combined"},
@@ -291,6 +296,18 @@ def ids(findings: tuple[Finding, ...]) -> set[str]:
 @pytest.mark.parametrize("seed", range(2, 8))
 def test_a_clean_flight_has_no_findings(seed: int) -> None:
     assert found(compare(aisle_flight(seed=seed))) == ()
+
+
+@pytest.mark.reallogs
+def test_a_crash_is_told_first(shared_logs: Path) -> None:
+    """Flight Review's "ekf_failure": vibration to the end of the range, then a tumble at 68 s."""
+    flight = read_log(shared_logs / "real" / "PX4_flight-review-rs_ekf_failure.ulg")
+    first, second = found(compare(flight))[:2]
+    assert (first.id, second.id) == ("vehicle_tumbled", "accelerometer_clipped")
+    assert first.spans_s == (pytest.approx((68.04, 68.67), abs=0.01),)
+    assert "--end 67.0" in first.remedy
+    assert second.evidence["count"] == 202
+    assert second.spans_s[0][0] == pytest.approx(24.9, abs=0.1)
 
 
 def test_the_faults_cover_every_finding() -> None:

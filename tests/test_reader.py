@@ -233,6 +233,23 @@ def test_accelerometer_times_follow_their_offset(read):
     np.testing.assert_allclose(times(imu), expected, atol=1e-9)
 
 
+def test_clipping_and_a_tumbling_vehicle_are_read_where_they_are_logged(read):
+    log = make_log("v1.16")
+    assert (plain := read(log)).tumbled == ()
+    assert "clipped" not in plain.imu
+    bits = np.zeros(len(log["sensor_combined"]["timestamp"]), np.uint8)
+    bits[300:304] = 4  # of the third axis
+    log["sensor_combined"]["accelerometer_clipping"] = bits
+    at = stamps(10.0, 2.0)
+    seconds = seconds_of(at)
+    sides = {"fd_roll": (2.9, 4.1), "fd_pitch": (3.9, 5.1), "fd_motor": (7.9, 8.1)}
+    failing = {name: (seconds > low) & (seconds < high) for name, (low, high) in sides.items()}
+    log.add(topic("failure_detector_status", at, failing))
+    flight = read(log)
+    np.testing.assert_array_equal(np.flatnonzero(flight.imu["clipped"]), range(300, 304))
+    assert flight.tumbled == ((pytest.approx(3.0), pytest.approx(5.5)),)
+
+
 @pytest.mark.parametrize(
     ("name", "at", "jump_us"),
     [

@@ -1,4 +1,4 @@
-"""What is wrong with the IMU: a bias of the accelerometer, gaps, too low a rate."""
+"""What is wrong with the IMU, bias, clipping, gaps, too low a rate; and a vehicle that tumbled."""
 
 from __future__ import annotations
 
@@ -18,12 +18,16 @@ TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))
 IMU_GAP_TOTAL_S = 0.2  # two prediction steps
 MIN_IMU_RATE_HZ = 50.0  # 5 IMU samples per DT of 0.1 s, and 10 with margin for aliasing
 MIN_ATTITUDE_RATE_HZ = 10.0  # PX4's default is 20 Hz; slerp bridges 0.1 s of a tilt
+MAX_CLIPPED_S = 0.1  # a prediction step; a touch-down clips a sample or two
+CLIPPED_APART_S = 2.0  # clipped samples further apart are told as two times
 RATE_MARGIN = 0.98  # a stream set to a rate runs a little below it
 
 
 def detect(analysis: Analysis) -> Found:
     """All of them."""
+    yield from tumbling(analysis)
     yield from bias(analysis)
+    yield from clipping(analysis)
     yield from gaps(analysis)
     yield from rates(analysis.flight)
 
@@ -77,6 +81,51 @@ def _ekf2_bias(analysis: Analysis) -> list[float] | None:
         return None
     inside = within(ekf2.accelerometer_bias, analysis.segment)[SPECIFIC_FORCE_COLUMNS]
     return None if inside.empty else [float(median) for median in inside.median()]
+
+
+def tumbling(analysis: Analysis) -> Found:
+    """PX4's failure detector found the attitude beyond its limits."""
+    segment = analysis.segment
+    spans = tuple(
+        (max(start, segment.start_s), min(end, segment.end_s))
+        for start, end in analysis.flight.tumbled
+        if start < segment.end_s and end > segment.start_s
+    )
+    if spans:
+        yield finding(
+            "error",
+            "vehicle_tumbled",
+            "The vehicle tumbled: PX4's failure detector found roll or pitch beyond its limit",
+            " (FD_FAIL_R, FD_FAIL_P). What both filters do from then on says nothing of the "
+            "flight before.",
+            f"Judge the flight up to then: --end {max(spans[0][0] - 1.0, 0.0):.1f}; what the "
+            "other findings say of the time before may be why.",
+            {"total_s": sum(end - start for start, end in spans)},
+            spans,
+        )
+
+
+def clipping(analysis: Analysis) -> Found:
+    """The accelerometer was at the end of its range."""
+    imu = analysis.flight.imu
+    if not isinstance(imu, pd.DataFrame) or "clipped" not in imu:
+        return
+    inside = within(imu, analysis.segment)
+    time_s = inside.index[inside["clipped"] > 0.0].to_numpy()
+    total_s = len(time_s) / sample_rate(imu)
+    if total_s > MAX_CLIPPED_S:
+        bursts = np.split(time_s, np.flatnonzero(np.diff(time_s) > CLIPPED_APART_S) + 1)
+        yield warning(
+            "accelerometer_clipped",
+            f"The accelerometer reached the end of its range in {len(time_s)} samples, "
+            f"{total_s:.2f} s in all",
+            ": what is beyond is lost, and both filters integrate what is left of it. Height and "
+            "vertical velocity suffer first, and what looks like a bias may come from it.",
+            "Look for what shakes or strikes it (propellers, motors, mounting, a hard landing), "
+            "and choose a segment without it (--start, --end).",
+            {"count": len(time_s), "total_s": total_s},
+            tuple((float(each[0]), float(each[-1])) for each in bursts),
+        )
 
 
 def gaps(analysis: Analysis) -> Found:

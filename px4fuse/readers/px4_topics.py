@@ -39,7 +39,10 @@ IMU = (
         "sensor_combined",
         elements(SPECIFIC_FORCE_COLUMNS, "accelerometer_m_s2")
         | elements(ANGULAR_RATE_COLUMNS, "gyro_rad"),
-        {"accelerometer_offset_us": "accelerometer_timestamp_relative"},
+        {
+            "accelerometer_offset_us": "accelerometer_timestamp_relative",
+            "clipped": "accelerometer_clipping",  # v1.10
+        },
     ),
 )
 
@@ -85,6 +88,7 @@ SELECTOR = (Layout("estimator_selector_status", {"instance": "primary_instance"}
 LAND_DETECTED = (Layout("vehicle_land_detected", {"landed": "landed"}),)
 
 FLIGHT_MODE = (Layout("vehicle_status", {"nav_state": "nav_state"}),)
+FAILURE = (Layout("failure_detector_status", {"roll": "fd_roll", "pitch": "fd_pitch"}),)  # v1.13
 # vehicle_status.nav_state as QGroundControl names it, msg/VehicleStatus.msg; the numbers that are
 # missing here were never flown in v1.12 to v1.16
 NAV_STATES: Mapping[int, str] = {
@@ -359,8 +363,8 @@ UNUSED: Mapping[str, str] = {
 def topics() -> list[str]:
     """Every topic named in this table, sorted: all that a reader needs to decode."""
     groups = (
-        IMU, ATTITUDE, LOCAL_POSITION, SENSOR_BIAS, SELECTOR, LAND_DETECTED, FLIGHT_MODE, BAROMETER,
-        TRUTH_LOCAL, TRUTH_GLOBAL, TRUTH_ATTITUDE, AID_OBSERVATION_HORIZONTAL,
+        IMU, ATTITUDE, LOCAL_POSITION, SENSOR_BIAS, SELECTOR, LAND_DETECTED, FLIGHT_MODE, FAILURE,
+        BAROMETER, TRUTH_LOCAL, TRUTH_GLOBAL, TRUTH_ATTITUDE, AID_OBSERVATION_HORIZONTAL,
         AID_OBSERVATION_VERTICAL, *(track.layouts for track in _TRACKS),
     )  # fmt: skip
     named = {layout.topic for group in groups for layout in group}

@@ -83,6 +83,7 @@ def to_flight(topics: Topics) -> Flight:
         truth=truth,
         airborne=airborne,
         modes=_read_modes(topics),
+        tumbled=_read_tumbled(topics),
         barometer=None
         if air is None
         else barometer(air["altitude_m"], topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3),
@@ -149,7 +150,7 @@ def _read_imu(topics: Topics) -> pd.DataFrame | None:
         keep = increasing(time_us.astype(np.int64) + topics.zero_us)
         imu = imu.iloc[keep].set_axis(pd.Index(time_us[keep] * 1e-6, name="time_s"))
     columns = SPECIFIC_FORCE_COLUMNS + ANGULAR_RATE_COLUMNS
-    return parts.finite_rows(imu[columns], columns, parts.BEYOND_IMU)
+    return parts.finite_rows(imu, columns, parts.BEYOND_IMU)
 
 
 def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavailable:
@@ -163,6 +164,15 @@ def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavaila
         )
     topics.came_from("airborne", px4.LAND_DETECTED[0].topic)
     return parts.stretches_of_flight(detected["landed"], topics.log.duration_s)
+
+
+def _read_tumbled(topics: Topics) -> tuple[tuple[float, float], ...]:
+    """Stretches in which PX4's failure detector finds roll or pitch beyond their limits."""
+    status = topics.read(px4.FAILURE, step=True)
+    if status is None:
+        return ()
+    upright = status[["roll", "pitch"]].max(axis=1) == 0.0
+    return parts.stretches_of_flight(upright, topics.log.duration_s)
 
 
 def _read_modes(topics: Topics) -> tuple[FlightMode, ...] | Unavailable:
