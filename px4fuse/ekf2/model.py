@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array
 from px4fuse.display import brief
+from px4fuse.ekf2.heights import SENSORS
 from px4fuse.ekf2.inputs import WHAT, Inputs, prepare, same_sample
 from px4fuse.ekf2.intervals import (
     ACCELEROMETER_BIAS,
@@ -43,6 +44,8 @@ from px4fuse.ekf2.replay import (
     with_obedient,
 )
 from px4fuse.ekf2_parameters import (
+    AIDS,
+    BAROMETER,
     FIELD_NOISES,
     GNSS_POS,
     GNSS_VEL,
@@ -93,7 +96,22 @@ def open_model(flight: Flight) -> Model | Unavailable:
     ----------
     flight : Flight
     """
-    inputs = prepare(flight)
+    model = _open(flight)
+    if isinstance(model, Unavailable) or not (doubtful := model.agreement.doubtful):
+        return model
+    why = "; ".join(f"{AIDS[name].label}: {reason}" for name, reason in doubtful.items())
+    if isinstance(again := _open(flight, why), Unavailable):
+        return again
+    told = {name: getattr(model.agreement, name) for name in ("gnss_hgt", "baro_hgt")}
+    agreement = structs.replace(again.agreement, doubtful=doubtful, **told)
+    return replace(
+        again, flown=structs.replace(again.flown, agreement=agreement), agreement=agreement
+    )
+
+
+def _open(flight: Flight, imposed: str = "") -> Model | Unavailable:
+    """The model; ``imposed`` says why the height is to be EKF2's own."""
+    inputs = prepare(flight, imposed)
     if isinstance(inputs, Unavailable):
         return structs.replace(inputs, what=WHAT)
     if inputs.aid == GNSS_POS and isinstance(flight.ekf2, Ekf2):
@@ -150,6 +168,7 @@ def replay_settings(
     if inputs.aid == GNSS_POS:
         no_field = "the log does not hold what EKF2 fused of a magnetometer"
         idle |= dict.fromkeys(of_others & {*MAG.own, *FIELD_NOISES}, no_field)
+        idle |= dict.fromkeys(of_others & BAROMETER.own, _no_height(inputs))
     if inputs.rules.horizon_by_delay:
         firmware = model.flight.log.firmware
         idle["EKF2_DELAY_MAX"] = f"in {firmware} the longest delay makes the horizon"
@@ -158,8 +177,11 @@ def replay_settings(
     for name in [name for change in changes for name in change if name in idle]:
         raise SettingsError(f"{name} changes nothing here: {idle[name]}.")
     without = without or {}
-    for name in without.keys() - (known := aids_of(inputs)):
-        raise SettingsError(f"{name}: of this log the model fuses {', '.join(known)}.")
+    for name in without:
+        if name not in (known := aids_of(inputs)):
+            height = inputs.aid == GNSS_POS and name in (aid.name for aid in SENSORS)
+            why = f"; {_no_height(inputs)}" if height else ""
+            raise SettingsError(f"{name}: of this log the model fuses {', '.join(known)}{why}.")
     if not changes:
         return ()
     obeys = left_out_s is not None
@@ -184,7 +206,15 @@ def replay_settings(
 def aids_of(inputs: Inputs) -> list[str]:
     """PX4's names of the aids that the model fuses."""
     velocity = [GNSS_VEL.name] if inputs.received.velocity_m_s is not None else []
-    return [inputs.aid.name, *velocity, *([MAG.name] if MAG.noise in inputs.settings else [])]
+    magnetic = [MAG.name] if MAG.noise in inputs.settings else []
+    heights = inputs.stretches[0].heights
+    return [inputs.aid.name, *velocity, *magnetic, *(heights.fused if heights else ())]
+
+
+def _no_height(inputs: Inputs) -> str:
+    if not inputs.imposed:
+        return "EKF2 did not fuse this sensor of height"
+    return f"the height is EKF2's own as flown ({inputs.imposed})"
 
 
 def _without(inputs: Inputs, replay: Ekf2Replay, left_out_s: Array) -> Ekf2Replay:
@@ -290,11 +320,23 @@ def _assemble(
         updates=pd.concat([_updates(part, at) for part in runs]),
         delayed=pd.concat([delayed for delayed, _ in tracks]),
         published=pd.concat([published for _, published in tracks]),
+        heights=_heights(runs, at),
         stretches_s=tuple(tuple(part.stretch.time_s[[0, -1]].tolist()) for part in runs),
         source=inputs.received.source,
         late=sum(int(part.events[at].late.sum()) for part in runs),
         lost=sum(int(part.events[at].lost.sum()) for part in runs),
     )
+
+
+def _heights(runs: Sequence[Run], at: int) -> dict[str, pd.DataFrame]:
+    """What was done with each sample of the heights that were fused, by PX4's name."""
+    found: dict[str, list[pd.DataFrame]] = {}
+    for part in runs:
+        for number, aid in enumerate(SENSORS):
+            if part.heights and aid.name in part.heights.fused:
+                end_s = part.stretch.time_s[part.events[at].end]
+                found.setdefault(aid.name, []).append(part.heights.updates(number, at, end_s))
+    return {name: pd.concat(frames) for name, frames in found.items()}
 
 
 def _updates(part: Run, at: int) -> pd.DataFrame:

@@ -23,25 +23,8 @@ from px4fuse.simulation.ulog_writer import Topic
 # full rate, a vehicle only at this one
 VEHICLE_AID_SOURCE_HZ = 2.0
 STATES_HZ, LOCAL_POSITION_HZ, FLAGS_HZ = 2.0, 10.0, 1.0
-MAGNETOMETER_HZ, BAROMETER_HZ, OTHER_AIDS_HZ = 2.0, 5.0, 2.0
+MAGNETOMETER_HZ, OTHER_AIDS_HZ = 2.0, 2.0
 PUBLISHED_LATER_US = 100
-
-
-@dataclass(frozen=True)
-class Height:
-    """Height by the barometer, down (m), at the end of each prediction step, shape (n + 1,).
-
-    Attributes
-    ----------
-    down_m, variance_m2 : ndarray
-    samples : ndarray, shape (m, 4)
-        Of each sample of the barometer the step that fused it, what it measured, its innovation
-        and the variance of that.
-    """
-
-    down_m: Array
-    variance_m2: Array
-    samples: Array
 
 
 @dataclass(frozen=True)
@@ -80,7 +63,6 @@ def ekf2_topics(
     inputs: Inputs,
     done: Run,
     track: TopicTrack,
-    height: Height | None,
     attitude_hz: float,
     aid_source_hz: float,
 ) -> tuple[Topic, ...]:
@@ -90,8 +72,6 @@ def ekf2_topics(
     ----------
     done : Run
         The model's run, of one variant in one stretch.
-    height : Height or None
-        Where a barometer was fused.
     attitude_hz : float
         Of vehicle_attitude, which is EKF2's where it fuses a magnetometer.
     aid_source_hz : float
@@ -101,7 +81,7 @@ def ekf2_topics(
         _local_position(track, gnss=inputs.aid == GNSS_POS),
         _states(done, track, gnss=inputs.aid == GNSS_POS),
         *_aid_sources(inputs, done, track, aid_source_hz),
-        *([] if height is None else [_barometer(track, height)]),
+        *_barometer(inputs, done, track),
         *([] if done.stretch.field is None else _of_field(inputs, done, track, attitude_hz)),
         _flags(inputs, done, track),
     )
@@ -204,20 +184,31 @@ def _aid_sources(inputs: Inputs, done: Run, track: TopicTrack, rate_hz: float) -
     )
 
 
-def _barometer(track: TopicTrack, height: Height) -> Topic:
-    step = height.samples[:, 0].astype(np.intp)
-    seen = step < len(track.time_us) - track.lag
-    seen &= sensors.thinned(sensors.seconds(track.time_us[step]), OTHER_AIDS_HZ)
-    rows, (measured, innovation, variance) = step[seen], height.samples[seen, 1:].T
-    outside = innovation**2 > BAROMETER.default_gate**2 * variance
-    return _aid_source(
+def _barometer(inputs: Inputs, done: Run, track: TopicTrack) -> list[Topic]:
+    """What a barometer has EKF2 say: its innovations."""
+    if done.heights is None or done.stretch.heights is None:
+        return []
+    end, heights = done.events[0].end, done.stretch.heights
+    told = done.heights.updates(0, 0, end.astype(float)).iloc[1:]
+    told = told[told["fused_at_s"] < len(track.time_us) - track.lag]
+    told = told[sensors.thinned(told.index.to_numpy(), OTHER_AIDS_HZ)]
+    rows, taken_s = told["fused_at_s"].to_numpy().astype(np.intp), told.index.to_numpy()
+    taken_us = np.rint(taken_s * 1e6).astype(np.int64)
+    later_us = track.time_us[rows] + _horizon_us(track, rows) - taken_us
+    measured = heights.down_m[np.searchsorted(heights.taken_s, taken_s)]
+    topic = _aid_source(
         BAROMETER,
-        {BAROMETER.gate: BAROMETER.default_gate},
-        sensors.stamps(track.time_us[rows], _horizon_us(track, rows)),
+        inputs.settings,
+        sensors.stamps(taken_us, later_us),
         (measured - sensors.HOME[2]).astype(np.float32),
-        (innovation, variance, variance - height.variance_m2[rows]),
-        (outside, ~outside),
+        (
+            told["innovation_down_m"].to_numpy(),
+            told["innovation_variance_down_m2"].to_numpy(),
+            np.full(len(rows), inputs.settings[BAROMETER.noise] ** 2),
+        ),
+        (told["rejected"].to_numpy() > 0.0, told["fused"].to_numpy() > 0.0),
     )
+    return [topic]
 
 
 def _of_field(inputs: Inputs, done: Run, track: TopicTrack, attitude_hz: float) -> list[Topic]:
