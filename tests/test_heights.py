@@ -63,7 +63,7 @@ def told(heights: HeightFilter, end: np.ndarray, x: np.ndarray, P: np.ndarray) -
     """What the barometer told a state that nobody moves."""
     for e in range(len(end)):
         heights.fuse(e, x, P, np.zeros(1), np.ones(1))
-    return heights.updates(0, 0, end * STEP_S)
+    return heights.updates("baro_hgt", 0, end * STEP_S)
 
 
 def test_the_bias_is_the_scalar_kalman_filters_with_its_steady_variance() -> None:
@@ -122,7 +122,7 @@ def test_a_sample_is_judged_by_where_the_vehicle_was_then() -> None:
         x = np.zeros((1, 9))
         x[0, 5], x[0, 8] = -2.0 - 3.0 * time[at], down[at]
         heights.fuse(e, x, np.zeros((1, 9, 9)), np.zeros(1), np.ones(1))
-    found = heights.updates(0, 0, end * STEP_S)
+    found = heights.updates("baro_hgt", 0, end * STEP_S)
     np.testing.assert_allclose(found["innovation_down_m"], -0.1, atol=1e-9)
     np.testing.assert_allclose(found.index, time[steps])
     np.testing.assert_allclose(found["fused_at_s"], [0.2, 0.2, 0.3, 0.5])

@@ -181,13 +181,13 @@ class HeightFilter:
         step_s = float(np.median(stretch.step_s))
         self.share = step_s / (FILTER_S + step_s)
 
-    def updates(self, at: int, variant: int, end_s: Array) -> pd.DataFrame:
+    def updates(self, sensor: str, variant: int, end_s: Array) -> pd.DataFrame:
         """What one variant did with each sample of a sensor; ``end_s`` is the time of each event.
 
         By the time of measurement as EKF2 takes it.
         """
-        rows = []
-        for place in [[*range(len(self.down_m))], [len(self.down_m)]][at]:
+        rows, slots = [], len(self.down_m)
+        for place in [slots] if sensor == GNSS_HGT.name else range(slots):
             times, seen = self.time_s[place], self.seen[place][:, variant]
             taken_s = times[seen, min(variant, times.shape[1] - 1)]
             rows.append(np.vstack([taken_s, self.told[seen, place, :, variant].T, end_s[seen]]))

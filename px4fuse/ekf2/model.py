@@ -330,13 +330,13 @@ def _assemble(
 
 def _heights(runs: Sequence[Run], at: int) -> dict[str, pd.DataFrame]:
     """What was done with each sample of the heights that were fused, by PX4's name."""
-    found: dict[str, list[pd.DataFrame]] = {}
-    for part in runs:
-        for number, aid in enumerate(SENSORS):
-            if part.heights and aid.name in part.heights.fused:
-                end_s = part.stretch.time_s[part.events[at].end]
-                found.setdefault(aid.name, []).append(part.heights.updates(number, at, end_s))
-    return {name: pd.concat(frames) for name, frames in found.items()}
+    filters = [
+        (part.heights, part.stretch.time_s[part.events[at].end]) for part in runs if part.heights
+    ]
+    return {
+        name: pd.concat([of.updates(name, at, end_s) for of, end_s in filters])
+        for name in (filters[0][0].fused if filters else ())
+    }
 
 
 def _updates(part: Run, at: int) -> pd.DataFrame:

@@ -186,29 +186,24 @@ def _aid_sources(inputs: Inputs, done: Run, track: TopicTrack, rate_hz: float) -
 
 def _barometer(inputs: Inputs, done: Run, track: TopicTrack) -> list[Topic]:
     """What a barometer has EKF2 say: its innovations."""
-    if done.heights is None or done.stretch.heights is None:
+    heights, end = done.stretch.heights, done.events[0].end
+    if heights is None or done.heights is None:
         return []
-    end, heights = done.events[0].end, done.stretch.heights
-    told = done.heights.updates(0, 0, end.astype(float)).iloc[1:]
-    told = told[told["fused_at_s"] < len(track.time_us) - track.lag]
+    told = done.heights.updates(BAROMETER.name, 0, end.astype(float))
+    told = told[told["fused_at_s"] < len(track.time_us) - track.lag].iloc[1:]
     told = told[sensors.thinned(told.index.to_numpy(), OTHER_AIDS_HZ)]
-    rows, taken_s = told["fused_at_s"].to_numpy().astype(np.intp), told.index.to_numpy()
+    innovation, variance, rejected, fused, rows = told.to_numpy().T
+    taken_s, step = told.index.to_numpy(), rows.astype(np.intp)
     taken_us = np.rint(taken_s * 1e6).astype(np.int64)
-    later_us = track.time_us[rows] + _horizon_us(track, rows) - taken_us
-    measured = heights.down_m[np.searchsorted(heights.taken_s, taken_s)]
-    topic = _aid_source(
-        BAROMETER,
-        inputs.settings,
-        sensors.stamps(taken_us, later_us),
-        (measured - sensors.HOME[2]).astype(np.float32),
-        (
-            told["innovation_down_m"].to_numpy(),
-            told["innovation_variance_down_m2"].to_numpy(),
-            np.full(len(rows), inputs.settings[BAROMETER.noise] ** 2),
-        ),
-        (told["rejected"].to_numpy() > 0.0, told["fused"].to_numpy() > 0.0),
-    )
-    return [topic]
+    later_us = track.time_us[step] + _horizon_us(track, step) - taken_us
+    measured = heights.down_m[np.searchsorted(heights.taken_s, taken_s)] - sensors.HOME[2]
+    noise = np.full(len(step), inputs.settings[BAROMETER.noise] ** 2)
+    return [
+        _aid_source(
+            BAROMETER, inputs.settings, sensors.stamps(taken_us, later_us),
+            measured.astype(np.float32), (innovation, variance, noise), (rejected > 0, fused > 0),
+        )
+    ]  # fmt: skip
 
 
 def _of_field(inputs: Inputs, done: Run, track: TopicTrack, attitude_hz: float) -> list[Topic]:
