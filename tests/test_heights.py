@@ -101,6 +101,16 @@ def test_without_its_reference_the_bias_of_the_other_stays() -> None:
     assert 0.0 < -after.iloc[0] < 0.5 < -found["innovation_down_m"].iloc[0]
 
 
+@pytest.mark.parametrize(("down_m", "learned"), [(-2.0, True), (-2.3, False)])
+def test_beyond_three_standard_deviations_nothing_is_learned_of_a_bias(
+    down_m: float, learned: bool
+) -> None:
+    """Of √(0.25 + 0.25) m here."""
+    heights = fusing(climbing(sampled([10], [down_m])), np.array([10]))
+    told(heights, np.array([10]), np.zeros((1, 9)), np.zeros((1, 9, 9)))
+    assert (heights.bias_m[0] > 0.0) == learned
+
+
 @pytest.mark.parametrize("reference", BOTH)
 def test_the_reference_has_no_bias(reference: str) -> None:
     steps = list(range(10, 400, 10))
@@ -353,6 +363,9 @@ def test_what_other_settings_of_heights_would_have_done(models: dict[str, Model]
     # R is 49 times as large, and the bias takes up what is slow
     ratio = loose.heights["baro_hgt"].nis_mean / flown.heights["baro_hgt"].nis_mean
     assert 1.0 / 49.0 < ratio < 1.0 / 25.0
+    # R of 1.5 times EKF2_GPS_P_NOISE, in place of the 0.6 m that the receiver states
+    wide = heights(EKF2_GPS_P_NOISE=2.0)[0].heights["gnss_hgt"]
+    assert 9.0 < wide.innovation_std_m**2 / wide.nis_mean < 9.6
     narrow, _ = heights(EKF2_BARO_GATE=1.0)
     # of a normal distribution with the variance that its NIS tells, beyond 1 √S
     assert narrow.heights["baro_hgt"].rejected_share == pytest.approx(0.17, abs=0.03)
