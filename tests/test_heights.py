@@ -365,7 +365,7 @@ def test_what_other_settings_of_heights_would_have_done(models: dict[str, Model]
     assert 1.0 / 49.0 < ratio < 1.0 / 25.0
     # R of 1.5 times EKF2_GPS_P_NOISE, in place of the 0.6 m that the receiver states
     wide = heights(EKF2_GPS_P_NOISE=2.0)[0].heights["gnss_hgt"]
-    assert 9.0 < wide.innovation_std_m**2 / wide.nis_mean < 9.6
+    assert 8.0 < wide.innovation_std_m**2 / wide.nis_mean < 9.6  # and a mean besides
     narrow, _ = heights(EKF2_BARO_GATE=1.0)
     # of a normal distribution with the variance that its NIS tells, beyond 1 √S
     assert narrow.heights["baro_hgt"].rejected_share == pytest.approx(0.17, abs=0.03)
