@@ -604,7 +604,8 @@ def test_fixes_that_the_logger_left_out_are_filled_in(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.velocity.loc[found.samples.index[50], "east_m_s"], 2.0)
     assert "3 of their heights are interpolated" in " ".join(found.notes)
     # EKF2 has their heights too, beside its bias of them where they are not its reference
-    for bias_m, interpolated in ((0.0, 0), (0.3, 3)):
+    for reference, bias_m, interpolated in ((1.0, 0.0, 0), (0.0, 0.3, 3)):
+        log.parameters["EKF2_HGT_REF"] = reference
         log.drop(*({"estimator_aid_src_gnss_hgt"} & log.names()))
         log.add(topic("estimator_aid_src_gnss_hgt", rows.fields["timestamp_sample"], {
             "observation": bias_m - heights_m, "innovation": np.zeros(len(heights_m)),

@@ -43,21 +43,13 @@ def with_heights(
     flight: Flight, ekf2: Ekf2, record: FusionRecord, stretches: Sequence[Stretch]
 ) -> tuple[tuple[Stretch, ...], str]:
     """Stretches that hold what EKF2's height rests on; or as they are, and why they do not."""
-    found = _heights(flight, ekf2, record, stretches)
-    if isinstance(found, str):
-        return tuple(stretches), found
-    made, delayed = [], record.delayed["down_m"]
-    for stretch, heights in zip(stretches, found, strict=True):
-        state = stretch.state.copy()
-        state[DOWN] = np.interp(stretch.time_s[0], delayed.index, delayed)
-        made.append(replace(stretch, state=state, heights=heights))
-    return tuple(made), ""
+    made = _with_heights(flight, ekf2, record, stretches)
+    return (tuple(stretches), made) if isinstance(made, str) else (tuple(made), "")
 
 
-def _heights(
+def _with_heights(
     flight: Flight, ekf2: Ekf2, record: FusionRecord, stretches: Sequence[Stretch]
-) -> list[Heights] | str:
-    """Of each stretch; or why the log does not hold them."""
+) -> list[Stretch] | str:
     parameters, times = record.parameters, np.concatenate([one.time_s for one in stretches])
     if fuses_by_mask(parameters):
         return "before PX4 v1.14 EKF2 keeps to one sensor of height"
@@ -70,7 +62,7 @@ def _heights(
     if len(fused) == 1:  # the one that there is takes its place
         (reference,) = fused
     if reference not in fused:
-        return "its reference is neither GNSS nor the barometer"
+        return "its reference is neither GNSS nor the barometer, as far as the log tells"
     taken_s, down_m = np.zeros((2, 0))
     if BAROMETER.name in fused and flight.barometer is not None:
         taken_s = flight.barometer.index.to_numpy() - 0.5 * ekf2.step_s
@@ -78,7 +70,7 @@ def _heights(
     zone_m = parameters.get("EKF2_GND_EFF_DZ", DEAD_ZONE_M)
     dead_m = np.where(record.was(GROUND_EFFECT, taken_s), zone_m, 0.0)
     had_hz = OLD_BAROMETER_HZ if record.per_step_biases else BAROMETER_HZ
-    made = []
+    made, delayed = [], record.delayed["down_m"]
     for stretch in stretches:
         start_s, bias = float(stretch.time_s[0]), (0.0, 0.0)
         for other in {*fused} - {reference}:
@@ -92,7 +84,10 @@ def _heights(
         if BAROMETER.name in fused and rate_hz < LEAST_HZ:
             return f"the log holds {rate_hz:.1f} samples of the barometer a second"
         weight = max(had_hz / rate_hz, 1.0) if rate_hz else 1.0
-        made.append(Heights(tuple(fused), reference, bias, *samples, weight))
+        state = stretch.state.copy()
+        state[DOWN] = np.interp(start_s, delayed.index, delayed)
+        heights = Heights(tuple(fused), reference, bias, *samples, weight)
+        made.append(replace(stretch, state=state, heights=heights))
     return made
 
 

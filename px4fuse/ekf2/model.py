@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array
 from px4fuse.display import brief
-from px4fuse.ekf2.heights import SENSORS
 from px4fuse.ekf2.inputs import WHAT, Inputs, prepare, same_sample
 from px4fuse.ekf2.intervals import (
     ACCELEROMETER_BIAS,
@@ -165,10 +164,13 @@ def replay_settings(
     changes, inputs = [check(change) for change in settings], model.inputs
     of_others = PARAMETERS.keys() - inputs.settings.keys()
     idle = dict.fromkeys(of_others, f"EKF2 fused {inputs.aid.label} in this log")
+    height = f"the height is EKF2's own as flown ({inputs.imposed})"
     if inputs.aid == GNSS_POS:
         no_field = "the log does not hold what EKF2 fused of a magnetometer"
         idle |= dict.fromkeys(of_others & {*MAG.own, *FIELD_NOISES}, no_field)
-        idle |= dict.fromkeys(of_others & BAROMETER.own, _no_height(inputs))
+        idle |= dict.fromkeys(
+            of_others & BAROMETER.own, height if inputs.imposed else "EKF2 fused no barometer"
+        )
     if inputs.rules.horizon_by_delay:
         firmware = model.flight.log.firmware
         idle["EKF2_DELAY_MAX"] = f"in {firmware} the longest delay makes the horizon"
@@ -179,8 +181,7 @@ def replay_settings(
     without = without or {}
     for name in without:
         if name not in (known := aids_of(inputs)):
-            height = inputs.aid == GNSS_POS and name in (aid.name for aid in SENSORS)
-            why = f"; {_no_height(inputs)}" if height else ""
+            why = f"; {height}" if inputs.imposed else ""
             raise SettingsError(f"{name}: of this log the model fuses {', '.join(known)}{why}.")
     if not changes:
         return ()
@@ -209,12 +210,6 @@ def aids_of(inputs: Inputs) -> list[str]:
     magnetic = [MAG.name] if MAG.noise in inputs.settings else []
     heights = inputs.stretches[0].heights
     return [inputs.aid.name, *velocity, *magnetic, *(heights.fused if heights else ())]
-
-
-def _no_height(inputs: Inputs) -> str:
-    if not inputs.imposed:
-        return "EKF2 did not fuse this sensor of height"
-    return f"the height is EKF2's own as flown ({inputs.imposed})"
 
 
 def _without(inputs: Inputs, replay: Ekf2Replay, left_out_s: Array) -> Ekf2Replay:

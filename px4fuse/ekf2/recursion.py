@@ -14,12 +14,7 @@ from typing import Any
 import numpy as np
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.ekf2.heights import (
-    MIN_GATE,
-    SENSORS,
-    HeightFilter,
-    barometer_samples,
-)
+from px4fuse.ekf2.heights import MIN_GATE, SENSORS, HeightFilter, barometer_samples
 from px4fuse.ekf2.inputs import Inputs, Rules
 from px4fuse.ekf2.intervals import (
     ACCELEROMETER_BIAS,
@@ -217,10 +212,8 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     x, P = _start(stretch, biases, attitude)
     logged = inputs.received.rejected[sample], inputs.received.reset[sample]
     used = on[inputs.aid.name]
-    usable = np.where(used, action, IDLE), event["startable"] & used
-    fusion = _Fusion(
-        inputs.rules, stretch.time_s[0], *usable, now_s, gated, as_logged, *logged
-    )  # fmt: skip
+    usable = np.where(used, action, IDLE), event["startable"] & used, now_s, gated, as_logged
+    fusion = _Fusion(inputs.rules, stretch.time_s[0], *usable, *logged)
     innovations, variances = np.full((2, events, size, 6), np.nan)
     of_field = np.full((events, 3, size, 3), np.nan)
     rejected, fused, reset = np.zeros((3, events, size), bool)

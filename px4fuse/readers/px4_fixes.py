@@ -37,17 +37,14 @@ def left_out_fixes(topics: Topics, gps: pd.DataFrame, ekf2: Ekf2 | Unavailable) 
     position, velocity = (topics.of_primary(layout) for layout in px4.FUSED_FIXES)
     # rows are of half a prediction step before (estimator_interface.cpp)
     fixes = position.join(velocity, how="inner").dropna()
-    if topics.find((px4.FUSED_HEIGHT,)) is not None:
+    # of the reference; else it has EKF2's bias in it
+    if topics.find((px4.FUSED_HEIGHT,)) and topics.ekf2_parameters.get("EKF2_HGT_REF", 1.0) == 1.0:
         fixes = fixes.join(topics.of_primary(px4.FUSED_HEIGHT))
     fixes = fixes.set_axis(fixes.index + 0.5 * ekf2.step_s)
     at = np.clip(np.searchsorted(gps.index, fixes.index), 1, len(gps) - 1)
     apart = np.minimum(*(np.abs(gps.index.to_numpy()[at - k] - fixes.index) for k in (0, 1)))
     inside = (fixes.index > gps.index[0]) & (fixes.index < gps.index[-1])
     known, lacking = fixes[apart <= SAME_FIX_S], fixes[(apart > SAME_FIX_S) & inside]
-    if "altitude_m" in fixes:  # of the reference, or else with EKF2's bias in it
-        off_m = known["altitude_m"] - np.interp(known.index, gps.index, gps["altitude_m"])
-        if not abs(off_m.median()) < EXACT_M:
-            lacking = lacking.drop(columns="altitude_m")
     # before v1.16 their position is local, in m
     degrees = known["latitude_deg"].sub(gps["latitude_deg"].median()).abs().median() < NEAR_DEG
     return lacking if degrees else pd.DataFrame()
