@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import numpy as np
 import pandas as pd
 import pytest
 from exchange import replace
 from findings_tools import made
 
+from px4fuse.analysis import run_what_if
 from px4fuse.ekf2.heights import HeightFilter, barometer_samples, with_heights
 from px4fuse.ekf2.model import Model, open_model, run_variants
 from px4fuse.ekf2.recursion import Variant
@@ -20,6 +23,11 @@ from px4fuse.ekf2.whatif import HEIGHT_FOLLOWS, HEIGHT_STAYS, WhatIf, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.flight import AidLog, Flight, Unavailable
 from px4fuse.readers import read_log
+from px4fuse.report.whatif import rows
+from px4fuse.report.why import agreement_words
+from px4fuse.request import WhatIfRequest
+from px4fuse.results.build import whatif_results
+from px4fuse.results.contract import schema, to_json
 from px4fuse.simulation import ekf2 as simulated
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
@@ -256,6 +264,7 @@ def test_a_height_that_does_not_agree_is_named_and_the_rest_stands() -> None:
     assert set(agreement.doubtful) == {"baro_hgt"}
     assert "correlate by" in agreement.doubtful["baro_hgt"]
     assert agreement.baro_hgt["down"].innovation_correlation < 0.95
+    assert ". Not so the barometer, of which nothing is concluded: " in agreement_words(agreement)
     assert model.flown.heights == {}
     own = np.interp(model.flown.delayed.index, flight.ekf2.state.index, flight.ekf2.state["down_m"])
     assert np.abs(model.flown.delayed["down_m"] - own).max() < 0.5
@@ -388,3 +397,19 @@ def test_a_flight_whose_height_was_also_of_a_range_finder_says_so(shared_logs: P
     assert model.agreement.good
     with pytest.raises(SettingsError, match="EKF2 fused range to the ground in a part"):
         what_if(model, [{"EKF2_BARO_NOISE": 1.0}])
+
+
+@pytest.mark.reallogs
+def test_table_and_results_have_each_sensor_of_height(shared_logs: Path) -> None:
+    log = str(shared_logs / "gps" / "v1.16.1_gps_nominal.ulg")
+    request = WhatIfRequest(log=log, changes={"EKF2_BARO_GATE": 1.5}, without={"gnss_hgt": 100.0})
+    found = run_what_if(request)
+    said = json.loads(to_json(whatif_results(request, found)))
+    jsonschema.validate(said, schema())
+    assert said["whatif"]["heights"].keys() == {"baro_hgt"}
+    assert said["replayed"]["heights"].keys() == {"baro_hgt", "gnss_hgt"}
+    shown = {row[0]: row[1:] for row in rows(found)}
+    assert shown["GNSS height: mean NIS"][-1] == "n/a"
+    assert shown["height: RMSE to truth (m)"] == [
+        f"{said[which]['height_rmse_to_truth_m']:.3f}" for which in ("logged", "replayed", "whatif")
+    ]

@@ -14,7 +14,7 @@ from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
 from px4fuse.ekf2.inputs import aid_source, replayed_aid, same_sample
 from px4fuse.ekf2.stretches import SETTLING_S
-from px4fuse.ekf2_parameters import AIDS, GNSS_POS, MAG
+from px4fuse.ekf2_parameters import AIDS, GNSS_POS, MAG, Aid
 from px4fuse.filter import signals
 from px4fuse.filter.heading import heading_rad
 from px4fuse.flight import (
@@ -28,6 +28,7 @@ from px4fuse.flight import (
     Truth,
     Unavailable,
 )
+from px4fuse.readers.px4_innovations import along as innovations_along
 from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
 
 Spans = tuple[Span, ...]
@@ -301,10 +302,9 @@ def _heights(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, 
     found: dict[str, dict[str, AxisAgreement]] = {}
     doubtful = {}
     for name, updates in replay.heights.items():
-        aid = ekf2.aids[name]
-        logged, model = _matched(
-            replay, updates, logged_height(aid), own=aid_source(AIDS[name]) in aid.topics
-        )
+        aid, log = AIDS[name], ekf2.aids[name]
+        own = aid_source(aid) in log.topics
+        logged, model = _matched(replay, updates, logged_height(aid, log), own=own)
         if len(logged) < MIN_SAMPLES:
             doubtful[name] = f"{len(logged)} logged innovations are too few to compare with"
             continue
@@ -316,13 +316,11 @@ def _heights(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, 
     return found, doubtful
 
 
-def logged_height(log: AidLog) -> pd.DataFrame:
+def logged_height(aid: Aid, log: AidLog) -> pd.DataFrame:
     """Innovations, variances and rejections of a height, one row per logged sample."""
-    names = {"innovation_down": "innovation_down_m", "variance_down": "innovation_variance_down_m2"}
-    frame = log.samples.rename(columns=names)
-    if "rejected" in frame:
-        return frame[(frame["fused"] > 0.0) | (frame["rejected"] > 0.0)]
-    return frame.assign(rejected=0.0)
+    frame = innovations_along(log, "down", log.parameters.get(aid.gate, aid.default_gate))
+    names = {"innovation_m": "innovation_down_m"}
+    return frame.rename(columns=names | {"innovation_variance_m2": "innovation_variance_down_m2"})
 
 
 def _matched(

@@ -28,7 +28,7 @@ from px4fuse.ekf2.replay import (
     rms_to_truth,
     settled,
 )
-from px4fuse.ekf2_parameters import GNSS_POS, MAG, check
+from px4fuse.ekf2_parameters import AIDS, GNSS_POS, MAG, check
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.heading import heading_rad
@@ -377,7 +377,7 @@ def _of_log(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
         longest = _longest(np.concatenate([fused, resets]), judged)
     assert isinstance(flight.attitude, pd.DataFrame)  # it was replayed
     heading = pd.Series(heading_rad(flight.attitude), flight.attitude.index)
-    heights = {name: logged_height(ekf2.aids[name]) for name in replay.heights}
+    heights = {name: logged_height(AIDS[name], ekf2.aids[name]) for name in replay.heights}
     return _summary(
         flight, judged, used, ekf2.state, None, heights,
         changed={}, longest_without_fusion_s=longest, resets=len(resets),
@@ -439,7 +439,7 @@ def _summary(
 def _of_height(used: pd.DataFrame, judged: Spans) -> HeightSummary:
     nu, rejected = (used[name].to_numpy() for name in ("innovation_down_m", "rejected"))
     fused_s = used.index.to_numpy()[rejected == 0.0]
-    parts = [(fused_s[(fused_s > a) & (fused_s < b)], ((a, b),)) for a, b in judged]
+    parts = ((fused_s[(fused_s > a) & (fused_s < b)], ((a, b),)) for a, b in judged)
     return HeightSummary(
         nis_mean=float(np.mean(nu**2 / used["innovation_variance_down_m2"])),
         nis_band=nis_band(len(nu)),
