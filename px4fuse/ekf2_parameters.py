@@ -96,6 +96,7 @@ BAROMETER = Aid(
     label="barometer", reported="EKF2_BARO_NOISE and the variance of its bias",
 )  # fmt: skip
 BAROMETER_NOISE_M = 3.5  # PX4's default of EKF2_BARO_NOISE
+GNSS_HGT = _gnss("gnss_hgt", "GNSS height", GNSS_POS.noise, GNSS_POS.gate, "m")
 GNSS_VEL = _gnss("gnss_vel", "GNSS velocity", "EKF2_GPS_V_NOISE", "EKF2_GPS_V_GATE", "m/s")
 MAG = Aid("mag", "EKF2_MAG_TYPE", "EKF2_MAG_NOISE", "EKF2_MAG_GATE", "EKF2_MAG_DELAY",
           label="magnetometer", unit="gauss", default_gate=3.0)  # fmt: skip
@@ -106,7 +107,7 @@ AIDS: Mapping[str, Aid] = {
     for aid in (
         GNSS_POS,
         GNSS_VEL,
-        _gnss("gnss_hgt", "GNSS height", GNSS_POS.noise, GNSS_POS.gate, "m"),
+        GNSS_HGT,
         _gnss("gnss_yaw", "GNSS yaw", "", "EKF2_HDG_GATE", "rad"),
         EV_POS,
         _vision("ev_vel", "velocity", "EKF2_EVV_NOISE", "EKF2_EVV_GATE", "m/s"),
@@ -174,6 +175,8 @@ PARAMETERS: Mapping[str, Parameter] = {
     MAG.noise: Parameter("gauss", 0.05, 0.001, 1.0),
     MAG.gate: Parameter("SD", 3.0, 1.0, 1e3),
     **FIELD_NOISES,
+    BAROMETER.noise: Parameter("m", BAROMETER_NOISE_M, 0.01, 15.0),
+    BAROMETER.gate: Parameter("SD", BAROMETER.default_gate, 1.0, 1e3),
     "EKF2_DELAY_MAX": Parameter("ms", 200.0, 0.0, 1e3),
     **dict.fromkeys((*EV_POS.place, *GNSS_POS.place), Parameter("m", 0.0, -math.inf, math.inf)),
     "EKF2_ACC_NOISE": Parameter("m/s^2", 0.35, 0.01, 1.0),
@@ -210,7 +213,7 @@ def settings_in_force(
     used = {one.switch for one in (aid, *others)}
     of_others = {
         name
-        for other in (EV_POS, GNSS_POS, GNSS_VEL, MAG)
+        for other in (EV_POS, GNSS_POS, GNSS_VEL, MAG, BAROMETER)
         if other.switch not in used
         for name in (*other.own, *other.place, *(FIELD_NOISES if other == MAG else ()))
     }

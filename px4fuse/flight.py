@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from px4fuse.arrays import Array
+from px4fuse.arrays import Array, BoolArray
 from px4fuse.display import Shown, brief
 from px4fuse.ekf2_parameters import BAROMETER, Aid
 from px4fuse.origin import Origin
@@ -243,6 +243,9 @@ RECORD_NOT_LOGGED = Unavailable(
 )
 
 
+GROUND_EFFECT, BAD_ACCELERATION = "gnd_effect", "bad_acc_vertical"
+
+
 @dataclass(frozen=True)
 class FusionRecord:
     """What the log tells of the inside of EKF2's filter: where a replay of it starts from.
@@ -267,6 +270,13 @@ class FusionRecord:
     field_gauss : DataFrame, shape (m, 4)
         Magnetic field that was measured, body FRD, by time of measurement, and ``fused_3d``: 1
         where EKF2 fused all of it, 0 where only its heading; empty where not logged.
+    altitude_m : float
+        Of the origin, where EKF2 keeps its height as altitude above the sea (from v1.16); else 0.
+    height_bias : mapping from PX4's name of an aid to DataFrame, shape (k, 2)
+        By how much its height is above the reference's: ``bias_m`` and its variance ``bias_m2``.
+    states : mapping from :data:`GROUND_EFFECT` and :data:`BAD_ACCELERATION` to Series
+        1 while EKF2 takes the rotors' wash to disturb the barometer, and the vertical acceleration
+        to be wrong; 0 while not, step functions. Without those that the log does not tell.
     """
 
     parameters: Mapping[str, float]
@@ -275,8 +285,16 @@ class FusionRecord:
     other_aiding: tuple[str, ...]
     vision_age_s: pd.Series
     field_gauss: pd.DataFrame = field(default_factory=pd.DataFrame)
+    altitude_m: float = 0.0
+    height_bias: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    states: Mapping[str, pd.Series[float]] = field(default_factory=dict)
 
     __repr__ = brief
+
+    def was(self, state: str, times_s: Array) -> BoolArray:
+        """Whether EKF2 was in one of :attr:`states` then; not where the log does not tell."""
+        known = self.states.get(state)
+        return np.zeros(len(times_s), bool) if known is None else at_times(known, times_s) > 0.0
 
 
 @dataclass(frozen=True)
@@ -313,7 +331,7 @@ class AidLog:
     __repr__ = brief
 
 
-def at_times(steps: pd.Series[float], times: pd.Index[float]) -> Array:
+def at_times(steps: pd.Series[float], times: pd.Index[float] | Array) -> Array:
     """Values of a step function at some times; before its first step that of the first."""
     at = np.clip(np.searchsorted(steps.index, times, side="right") - 1, 0, None)
     return np.asarray(steps, dtype=np.float64)[at]

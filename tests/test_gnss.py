@@ -588,6 +588,10 @@ def test_fixes_that_the_logger_left_out_are_filled_in(tmp_path: Path) -> None:
     }, sampled=True)  # fmt: skip
     log.drop("estimator_aid_src_gnss_pos")
     log.add(rows, speed)
+    # heights that no neighbour tells
+    zigzag_m = 0.02 * (-1.0) ** np.arange(len(every["timestamp"]))
+    every["altitude_msl_m"] = every["altitude_msl_m"] + zigzag_m
+    heights_m = every["altitude_msl_m"].copy()
     whole = track_of(flight_of(log, tmp_path)).samples
     left = np.ones(len(every["timestamp"]), bool)
     left[[20, 50, 51]] = False
@@ -598,6 +602,18 @@ def test_fixes_that_the_logger_left_out_are_filled_in(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.samples.index, whole.index, atol=1e-6)
     np.testing.assert_allclose(found.samples[POSITION_COLUMNS], whole[POSITION_COLUMNS], atol=0.05)
     np.testing.assert_allclose(found.velocity.loc[found.samples.index[50], "east_m_s"], 2.0)
+    assert "3 of their heights are interpolated" in " ".join(found.notes)
+    # EKF2 has their heights too, beside its bias of them where they are not its reference
+    for reference, bias_m, interpolated in ((1.0, 0.0, 0), (0.0, 0.3, 3)):
+        log.parameters["EKF2_HGT_REF"] = reference
+        log.drop(*({"estimator_aid_src_gnss_hgt"} & log.names()))
+        log.add(topic("estimator_aid_src_gnss_hgt", rows.fields["timestamp_sample"], {
+            "observation": bias_m - heights_m, "innovation": np.zeros(len(heights_m)),
+        }, sampled=True))  # fmt: skip
+        found = track_of(flight_of(log, tmp_path))
+        assert f"{interpolated} of their heights are interpolated" in " ".join(found.notes)
+        off_m = np.abs(found.samples["down_m"].to_numpy() - whole["down_m"].to_numpy())
+        assert (off_m[[20, 50, 51]] > 1e-3).sum() == interpolated
 
 
 def with_velocity(log: Log) -> Log:

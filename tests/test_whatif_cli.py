@@ -133,7 +133,7 @@ def test_the_request_is_written_as_it_was_typed() -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--set", "EKF2_BARO_NOISE=1"], ", ".join(PARAMETERS)),
+        (["--set", "EKF2_BARO_DELAY=1"], ", ".join(PARAMETERS)),
         (["--set", "EKF2_EVP_NOISE"], "give NAME=VALUE"),
         (["--set", "EKF2_EVP_NOISE=much"], "'much' is not a number"),
         (["--set", "EKF2_EVP_NOISE=nan"], "outside PX4's range"),

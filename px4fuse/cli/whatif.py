@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 @inputs.option("--sweep NAME=LOW:HIGH[:COUNT]", "Parameter to change over several values.")
 @inputs.option(
     "--without AID",
-    "Aid that is no longer fused, as gnss_pos, gnss_vel, mag or ev_pos; may be repeated.",
+    "Aid that is no longer fused, as gnss_pos, gnss_vel, baro_hgt, mag or ev_pos; may be repeated.",
 )
 @click.option(
     "--from",

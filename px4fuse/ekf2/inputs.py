@@ -13,9 +13,11 @@ import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
+from px4fuse.ekf2.heights import with_heights
 from px4fuse.ekf2.stretches import IMU_GAP_S, MIN_STRETCH_S, Stretch, find_stretches, predict_s
 from px4fuse.ekf2_parameters import (
     AID_MASK,
+    BAROMETER,
     EV_POS,
     GNSS_MODE,
     GNSS_POS,
@@ -160,6 +162,8 @@ class Inputs:
         EKF2_IMU_POS, body FRD.
     max_interval_s : float
         Height and heading are measured at least this often where vision is silent.
+    imposed : str
+        On GNSS, why the height is EKF2's own as flown; empty where it is fused.
     """
 
     settings: dict[str, float]
@@ -173,16 +177,19 @@ class Inputs:
     imu_offset_m: Array
     aid: Aid = EV_POS
     max_interval_s: float = MAX_INTERVAL_S
+    imposed: str = ""
 
     __repr__ = brief
 
 
-def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason each)
+def prepare(flight: Flight, imposed: str = "") -> Inputs | Unavailable:  # noqa: PLR0911, PLR0912
     """What the model runs on, or why the log cannot carry it.
 
     Parameters
     ----------
     flight : Flight
+    imposed : str
+        Why the height is to be EKF2's own as flown.
     """
     imu, attitude, ekf2 = flight.imu, flight.attitude, flight.ekf2
     if isinstance(imu, Unavailable):
@@ -200,11 +207,11 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
         return record
     if isinstance(innovations := ekf2.innovations["north"], Unavailable):
         return innovations
-    if others := [one for one in record.other_aiding if not (gnss and one in OF_GNSS)]:
+    if more := [one for one in record.other_aiding if not (gnss and one in OF_GNSS)]:
         fused = "GNSS" if gnss else "vision position"
-        said = f"EKF2 fused more than {fused} horizontally ({', '.join(others)})"
-        more = "" if gnss else f", {GNSS_POS.switch} 0 and without bit 2 of {EV_POS.switch}"
-        return Unavailable(WHAT, said, f"Fly with EKF2_OF_CTRL 0{more}.")
+        said = f"EKF2 fused more than {fused} horizontally ({', '.join(more)})"
+        remedy = "" if gnss else f", {GNSS_POS.switch} 0 and without bit 2 of {EV_POS.switch}"
+        return Unavailable(WHAT, said, f"Fly with EKF2_OF_CTRL 0{remedy}.")
     if lacking := _imu_lacks(imu.index.to_numpy()):
         return lacking
     read = read_gnss(flight, ekf2, record) if gnss else read_vision(flight, ekf2, record, attitude)
@@ -226,9 +233,13 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
             "Record without dropouts (a faster SD card, fewer topics), with steady positions.",
         )
     fusing = ekf2.fusing
-    magnetic = [MAG] if any(stretch.field for stretch in stretches) else []
+    if gnss and not imposed:
+        stretches, imposed = with_heights(flight, ekf2, record, stretches)
+    others = [MAG] if any(stretch.field for stretch in stretches) else []
+    heights = stretches[0].heights
+    others += [BAROMETER] if heights and BAROMETER.name in heights.fused else []
     return Inputs(
-        settings=settings_in_force(record.parameters, aid, *magnetic) | place,
+        settings=settings_in_force(record.parameters, aid, *others) | place,
         stretches=stretches,
         received=read,
         rules=_rules(record, ekf2.step_s, gnss=gnss),
@@ -240,6 +251,7 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
         and bool(fusing["vertical"].mean() > 0.5),
         imu_offset_m=np.array([record.parameters.get(f"EKF2_IMU_POS_{x}", 0.0) for x in "XYZ"]),
         aid=aid,
+        imposed=imposed,
     )
 
 

@@ -43,6 +43,8 @@ from px4fuse.ekf2.replay import (
     with_obedient,
 )
 from px4fuse.ekf2_parameters import (
+    AIDS,
+    BAROMETER,
     FIELD_NOISES,
     GNSS_POS,
     GNSS_VEL,
@@ -93,7 +95,22 @@ def open_model(flight: Flight) -> Model | Unavailable:
     ----------
     flight : Flight
     """
-    inputs = prepare(flight)
+    model = _open(flight)
+    if isinstance(model, Unavailable) or not (doubtful := model.agreement.doubtful):
+        return model
+    why = "; ".join(f"{AIDS[name].label}: {reason}" for name, reason in doubtful.items())
+    if isinstance(again := _open(flight, why), Unavailable):
+        return again
+    told = {name: getattr(model.agreement, name) for name in ("gnss_hgt", "baro_hgt")}
+    agreement = structs.replace(again.agreement, doubtful=doubtful, **told)
+    return replace(
+        again, flown=structs.replace(again.flown, agreement=agreement), agreement=agreement
+    )
+
+
+def _open(flight: Flight, imposed: str = "") -> Model | Unavailable:
+    """The model; ``imposed`` says why the height is to be EKF2's own."""
+    inputs = prepare(flight, imposed)
     if isinstance(inputs, Unavailable):
         return structs.replace(inputs, what=WHAT)
     if inputs.aid == GNSS_POS and isinstance(flight.ekf2, Ekf2):
@@ -147,9 +164,13 @@ def replay_settings(
     changes, inputs = [check(change) for change in settings], model.inputs
     of_others = PARAMETERS.keys() - inputs.settings.keys()
     idle = dict.fromkeys(of_others, f"EKF2 fused {inputs.aid.label} in this log")
+    height = f"the height is EKF2's own as flown ({inputs.imposed})"
     if inputs.aid == GNSS_POS:
         no_field = "the log does not hold what EKF2 fused of a magnetometer"
         idle |= dict.fromkeys(of_others & {*MAG.own, *FIELD_NOISES}, no_field)
+        idle |= dict.fromkeys(
+            of_others & BAROMETER.own, height if inputs.imposed else "EKF2 fused no barometer"
+        )
     if inputs.rules.horizon_by_delay:
         firmware = model.flight.log.firmware
         idle["EKF2_DELAY_MAX"] = f"in {firmware} the longest delay makes the horizon"
@@ -158,8 +179,10 @@ def replay_settings(
     for name in [name for change in changes for name in change if name in idle]:
         raise SettingsError(f"{name} changes nothing here: {idle[name]}.")
     without = without or {}
-    for name in without.keys() - (known := aids_of(inputs)):
-        raise SettingsError(f"{name}: of this log the model fuses {', '.join(known)}.")
+    for name in without:
+        if name not in (known := aids_of(inputs)):
+            why = f"; {height}" if inputs.imposed else ""
+            raise SettingsError(f"{name}: of this log the model fuses {', '.join(known)}{why}.")
     if not changes:
         return ()
     obeys = left_out_s is not None
@@ -184,7 +207,9 @@ def replay_settings(
 def aids_of(inputs: Inputs) -> list[str]:
     """PX4's names of the aids that the model fuses."""
     velocity = [GNSS_VEL.name] if inputs.received.velocity_m_s is not None else []
-    return [inputs.aid.name, *velocity, *([MAG.name] if MAG.noise in inputs.settings else [])]
+    magnetic = [MAG.name] if MAG.noise in inputs.settings else []
+    heights = inputs.stretches[0].heights
+    return [inputs.aid.name, *velocity, *magnetic, *(heights.fused if heights else ())]
 
 
 def _without(inputs: Inputs, replay: Ekf2Replay, left_out_s: Array) -> Ekf2Replay:
@@ -290,11 +315,23 @@ def _assemble(
         updates=pd.concat([_updates(part, at) for part in runs]),
         delayed=pd.concat([delayed for delayed, _ in tracks]),
         published=pd.concat([published for _, published in tracks]),
+        heights=_heights(runs, at),
         stretches_s=tuple(tuple(part.stretch.time_s[[0, -1]].tolist()) for part in runs),
         source=inputs.received.source,
         late=sum(int(part.events[at].late.sum()) for part in runs),
         lost=sum(int(part.events[at].lost.sum()) for part in runs),
     )
+
+
+def _heights(runs: Sequence[Run], at: int) -> dict[str, pd.DataFrame]:
+    """What was done with each sample of the heights that were fused, by PX4's name."""
+    filters = [
+        (part.heights, part.stretch.time_s[part.events[at].end]) for part in runs if part.heights
+    ]
+    return {
+        name: pd.concat([of.updates(name, at, end_s) for of, end_s in filters])
+        for name in (filters[0][0].fused if filters else ())
+    }
 
 
 def _updates(part: Run, at: int) -> pd.DataFrame:

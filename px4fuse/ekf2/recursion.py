@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.ekf2.heights import MIN_GATE, SENSORS, HeightFilter, barometer_samples
 from px4fuse.ekf2.inputs import Inputs, Rules
 from px4fuse.ekf2.intervals import (
     ACCELEROMETER_BIAS,
@@ -43,9 +44,11 @@ TOGETHER = 64
 NOT_TAKEN = 1e9
 # Of a position (m) and a velocity (m/s), ev_pos_control.cpp
 MIN_SD = 0.01
+# Of the acceleration (m/s²) while EKF2 takes it to be wrong (BADACC_BIAS_PNOISE, common.h)
+BAD_NOISE = 4.9
 # EKF2 takes the vertical velocity of GNSS for half as exact again (gps_control.cpp)
 VERTICAL_SCALE = np.array([1.0, 1.0, 2.25])
-MIN_GATE = 1.0
+HEIGHT_SCALE = 1.5  # of EKF2_GPS_P_NOISE (gnss_height_control.cpp)
 # covariance.cpp: at most 0.1 g of bias, at most a ratio of 100 between the axes
 MAX_BIAS_SD = 0.1 * 9.80665
 BIAS_RATIO = 0.01
@@ -137,6 +140,8 @@ class Run:
     field : ndarray, shape (E, 3, S, 3)
         Of the magnetometer (body FRD): innovation (gauss), its variance for one sample, and whether
         it was fused; NaN where there was none.
+    heights : HeightFilter or None
+        Where heights are fused, and are not EKF2's own.
     """
 
     stretch: Stretch
@@ -152,6 +157,7 @@ class Run:
     variance: Array
     covariance: Array
     field: Array
+    heights: HeightFilter | None = None
 
 
 def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
@@ -175,10 +181,9 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     action = np.where(gated, event["action"], np.where(event["usable"], FUSE, IDLE))
     end, active = event["end"], action > IDLE
     now_s, sampled = stretch.time_s[end], np.any(active, axis=1)
-    off_s = {aid.name: np.array([v.without.get(aid.name, np.inf) for v in variants])
-             for aid in (inputs.aid, GNSS_VEL, MAG)}  # fmt: skip
-    on = now_s < off_s[inputs.aid.name]
-    with_velocity = (action == FUSE) & (now_s < off_s[GNSS_VEL.name]) & fuses_velocity
+    on = {aid.name: now_s < np.array([v.without.get(aid.name, np.inf) for v in variants])
+          for aid in (inputs.aid, GNSS_VEL, MAG, *SENSORS)}  # fmt: skip
+    with_velocity = (action == FUSE) & on[GNSS_VEL.name] & fuses_velocity
     sample = np.maximum(intervals[0].events.sample, 0)
     measured, noise = _measurements(inputs, stretch, sample, end, knob, reported)
     in_turn, has_speed = inputs.aid == GNSS_POS, inputs.received.velocity_m_s is not None
@@ -188,20 +193,27 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     own = np.stack([stretch.attitude_error_rad[end, HEADING], stretch.down_m[end]], axis=-1)
     own_attitude = stretch.attitude_variance_rad2[end]
     own_variance = np.stack([own_attitude[:, :, HEADING], stretch.down_variance_m2[end]], axis=-1)
-    seen = None
-    if stretch.field is not None:
-        each = [gather(stretch.field, stretch.rotation, one.events.end) for one in distinct]
+    seen = heights = None
+    if (field := stretch.field) is not None:
+        each = [gather(field, stretch.rotation, one.events.end) for one in distinct]
         seen = FieldSamples(*(np.stack(part, axis=1)[:, pick] for part in zip(*each, strict=True)))
-        seen = seen._replace(number=np.where(now_s < off_s[MAG.name], seen.number, 0.0))
+        seen = seen._replace(number=np.where(on[MAG.name], seen.number, 0.0))
+    if stretch.heights is not None:
+        samples = barometer_samples(stretch, [one.events.end for one in distinct])
+        told = np.stack(samples, axis=-1)[..., pick]
+        heights = HeightFilter(stretch, told, event["time_s"], active, on, knob, gated)
     gyro2 = np.where(attitude, knob["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
-    force2 = (knob["EKF2_ACC_NOISE"] ** 2)[:, None, None]
+    shaken = False if stretch.shaken is None else stretch.shaken[end]
+    force2 = np.where(shaken, BAD_NOISE, knob["EKF2_ACC_NOISE"]) ** 2
+    force2 = np.broadcast_to(force2, active.shape)[:, :, None, None]
     drift, drift_limit = _drift(inputs, stretch, knob, biases, attitude)
     steps = np.diff(end, axis=0, prepend=0)[:, :, None]
     floor = inputs.rules.bias_floor
     x, P = _start(stretch, biases, attitude)
     logged = inputs.received.rejected[sample], inputs.received.reset[sample]
-    usable = np.where(on, action, IDLE), event["startable"] & on, now_s, gated, as_logged, *logged
-    fusion = _Fusion(inputs.rules, stretch.time_s[0], *usable)
+    used = on[inputs.aid.name]
+    usable = np.where(used, action, IDLE), event["startable"] & used, now_s, gated, as_logged
+    fusion = _Fusion(inputs.rules, stretch.time_s[0], *usable, *logged)
     innovations, variances = np.full((2, events, size, 6), np.nan)
     of_field = np.full((events, 3, size, 3), np.nan)
     rejected, fused, reset = np.zeros((3, events, size), bool)
@@ -215,7 +227,7 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
             transition = stacked("transition", some)
             pushed = stacked("drive", some) + attitude[:, None] * stacked("turn", some)
             added = gyro2 * stacked("gyro_noise", some)
-            added = added + force2 * stacked("accelerometer_noise", some)
+            added = added + force2[some] * stacked("accelerometer_noise", some)
             drifted = drift * steps[some]
         phi = transition[within]
         # x = Φx + u, P = ΦPΦ' + Q
@@ -230,8 +242,8 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
             _limit_bias(P, floor, biases)
         innovation[:, 2:], R[:, 2:] = 0.0, NOT_TAKEN
         if seen is not None and seen.number[e].any():
-            told = FieldSamples(*(part[e] for part in seen))
-            x, P, of_field[e] = fuse_field(x, P, told, knob[MAG.noise], knob[MAG.gate])
+            field_now = FieldSamples(*(part[e] for part in seen))
+            x, P, of_field[e] = fuse_field(x, P, field_now, knob[MAG.noise], knob[MAG.gate])
             spread = _diagonal(P)
         if sampled[e]:
             nu = measured[e] - x[:, TOLD]
@@ -252,28 +264,24 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
             else:
                 innovation[:, 2:] = nu[:, LEVEL]
                 R[fused[e], 2:] = noise[e, fused[e], LEVEL]
-        if seen is not None:  # only the height is EKF2's own, and held
+        if heights is not None:
+            x, P = heights.fuse(e, x, P, measured[e, :, 5], noise[e, :, 5])
+            spread = _diagonal(P)
+        elif seen is not None:  # only the height is EKF2's own, and held
             K, P = _surer(P, DOWN, own_variance[e, :, 1])
             x = x + K * (own[e, :, 1] - x[:, DOWN])[:, None]
             x[:, DOWN] = own[e, :, 1]
-        else:
+        if seen is None:
             np.subtract(own[e], x[:, OWN], out=innovation[:, :2])
             R[:, :2] = _down_to(spread[:, OWN], own_variance[e])
             heading = np.where(attitude, x[:, HEADING] + innovation[:, 0], 0.0)
-            if inputs.vision_height:
+            if inputs.vision_height or heights is not None:
                 R[:, 1] = NOT_TAKEN
-                if sampled[e]:
+                if sampled[e] and heights is None:
                     innovation[:, 1] = nu[:, 5]
                     R[:, 1] = np.where(active[e], noise[e, :, 5], NOT_TAKEN)
-            # K = PH'(HPH' + R)⁻¹, x = x + Kν, P = P - KHP
-            HP = np.take(P, MEASURED, axis=1)
-            HPH = np.take(HP, MEASURED, axis=2)
-            HPH.reshape(size, -1)[:, :: len(MEASURED) + 1] += R
-            K = np.swapaxes(HP, 1, 2) @ np.linalg.inv(HPH)
-            x = x + (K @ innovation[:, :, None])[:, :, 0]
+            x, P = _together(x, P, innovation, R)
             x[:, HEADING] = heading
-            P = P - K @ HP
-            P = 0.5 * (P + np.swapaxes(P, 1, 2))
         if reset[e].any():
             after = inputs.rules.reset_scale * noise[e, :, LEVEL]
             _set(x, P, reset[e], HORIZONTAL, measured[e, :, LEVEL], after)
@@ -282,8 +290,19 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
         states[e + 1], spreads[e + 1] = x, _diagonal(P)
     return Run(
         stretch, tuple(variants), tuple(each.events for each in intervals), innovations, variances,
-        noise, rejected, fused, reset, states, spreads, P, of_field,
+        noise, rejected, fused, reset, states, spreads, P, of_field, heights,
     )  # fmt: skip
+
+
+def _together(x: Array, P: Array, innovation: Array, R: Array) -> tuple[Array, Array]:
+    """Fuse what is measured all at once: K = PH'(HPH' + R)⁻¹, x = x + Kν, P = P - KHP."""
+    HP = np.take(P, MEASURED, axis=1)
+    HPH = np.take(HP, MEASURED, axis=2)
+    HPH.reshape(len(x), -1)[:, :: len(MEASURED) + 1] += R
+    K = np.swapaxes(HP, 1, 2) @ np.linalg.inv(HPH)
+    x = x + (K @ innovation[:, :, None])[:, :, 0]
+    P = P - K @ HP
+    return x, 0.5 * (P + np.swapaxes(P, 1, 2))
 
 
 def _set(x: Array, P: Array, which: BoolArray, rows: slice, value: Array, variance: Array) -> None:
@@ -485,4 +504,6 @@ def _measurements(
         stated = received.velocity_variance_m2_s2[sample][:, None]
         least = np.maximum(knob[GNSS_VEL.noise], MIN_SD)[:, None] ** 2
         noise[..., :3] = np.maximum(stated, least) * VERTICAL_SCALE
+    if aid == GNSS_POS:
+        noise[..., 5] = np.maximum(noise[..., 5], (HEIGHT_SCALE * knob[aid.noise]) ** 2)
     return measured, noise

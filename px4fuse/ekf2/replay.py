@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,18 +14,21 @@ from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
 from px4fuse.ekf2.inputs import aid_source, replayed_aid, same_sample
 from px4fuse.ekf2.stretches import SETTLING_S
-from px4fuse.ekf2_parameters import GNSS_POS, MAG
+from px4fuse.ekf2_parameters import AIDS, GNSS_POS, MAG, Aid
 from px4fuse.filter import signals
 from px4fuse.filter.heading import heading_rad
 from px4fuse.flight import (
+    AXIS_NAMES,
     POSITION_COLUMNS,
     VELOCITY_COLUMNS,
+    AidLog,
     AxisName,
     Ekf2,
     Flight,
     Truth,
     Unavailable,
 )
+from px4fuse.readers.px4_innovations import along as innovations_along
 from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
 
 Spans = tuple[Span, ...]
@@ -95,6 +99,8 @@ class Agreement(Record, frozen=True, kw_only=True):
         The same by the name of the aid; empty where it is the other one.
     gnss_vel : mapping from "north" and "east" to AxisAgreement
         Of the velocity that is fused with it.
+    gnss_hgt, baro_hgt : mapping from "down" to AxisAgreement
+        Of the heights, where the log holds what EKF2 fused of them.
     samples : int
         Logged innovations compared, all but those of each stretch's first seconds
         (:data:`~px4fuse.ekf2.stretches.SETTLING_S`).
@@ -106,6 +112,8 @@ class Agreement(Record, frozen=True, kw_only=True):
         Of the horizontal position that is published, replay minus log.
     heading_rms_difference_deg : float or None
         Of the filter's heading; None where the replay takes it from the log.
+    doubtful : mapping from PX4's name of an aid to str
+        Heights of which nothing may be concluded, and why: the replay has EKF2's own as flown.
     good : bool
         Whether anything may be concluded from a replay of this log.
     reason : str
@@ -117,6 +125,8 @@ class Agreement(Record, frozen=True, kw_only=True):
     ev_pos: Mapping[str, AxisAgreement] = {}
     gnss_pos: Mapping[str, AxisAgreement] = {}
     gnss_vel: Mapping[str, AxisAgreement] = {}
+    gnss_hgt: Mapping[str, AxisAgreement] = {}
+    baro_hgt: Mapping[str, AxisAgreement] = {}
     samples: Count
     rejected_share_logged: Share
     rejected_share_replayed: Share
@@ -125,6 +135,7 @@ class Agreement(Record, frozen=True, kw_only=True):
     good: bool
     reason: str
     heading_rms_difference_deg: NotNegative | None = None
+    doubtful: Mapping[str, str] = {}
 
     @property
     def axes(self) -> Mapping[str, AxisAgreement]:
@@ -179,6 +190,10 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
         whether it was rejected by the gate, fused, or the position reset to it; variances of
         position and velocity after it, R, and the end of the step in which that happened; then
         the same innovations of velocity.
+    heights : mapping from PX4's name to DataFrame, shape (k, 5)
+        Per sample of GNSS height and barometer, where they are fused: innovation and S
+        (``innovation_down_m``, ``innovation_variance_down_m2``), ``rejected``, ``fused`` and
+        ``fused_at_s``.
     delayed : DataFrame, shape (n, 7)
         Position and velocity at the fusion horizon at the end of each step (m, m/s, NED), and
         ``heading_rad``.
@@ -191,6 +206,7 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
     updates: pd.DataFrame
     delayed: pd.DataFrame
     published: pd.DataFrame
+    heights: Mapping[str, pd.DataFrame] = {}
 
     __repr__ = brief
 
@@ -211,7 +227,8 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     """
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    log, model = _matched(replay, ekf2, logged_innovations(ekf2))
+    own = aid_source(replayed_aid(ekf2)) in ekf2.innovation_topics
+    log, model = _matched(replay, replay.updates, logged_innovations(ekf2), own=own)
     if len(log) < MIN_SAMPLES:
         return Unavailable(
             "EKF2 replay",
@@ -232,13 +249,16 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     shares = float(by_log.mean()), float(by_model.mean())
     good, reason = _verdict(axes, *shares)
     on_gnss = replayed_aid(ekf2) == GNSS_POS
+    heights, doubtful = _heights(ekf2, replay)
     apart_m = np.hypot(north.position_rms_difference_m, east.position_rms_difference_m)
     return Agreement(
         north=north,
         east=east,
         ev_pos={} if on_gnss else axes,
         gnss_pos=axes if on_gnss else {},
-        gnss_vel=_velocity(ekf2, replay),
+        gnss_vel=_velocity(ekf2, replay, own=own),
+        **heights,
+        doubtful=doubtful,
         samples=len(log),
         rejected_share_logged=shares[0],
         rejected_share_replayed=shares[1],
@@ -261,12 +281,12 @@ def _heading_off_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     return float(np.degrees(rms(np.angle(np.exp(1j * off)))))
 
 
-def _velocity(ekf2: Ekf2, replay: Ekf2Replay) -> dict[str, AxisAgreement]:
+def _velocity(ekf2: Ekf2, replay: Ekf2Replay, *, own: bool) -> dict[str, AxisAgreement]:
     """Agreement of the velocity of GNSS; empty where it is not fused or not logged."""
     log = ekf2.aids.get("gnss_vel")
     if log is None or VELOCITY_UPDATE_COLUMNS[0] not in replay.updates:
         return {}
-    logged, model = _matched(replay, ekf2, log.samples)
+    logged, model = _matched(replay, replay.updates, log.samples, own=own)
     if len(logged) < MIN_SAMPLES:
         return {}
     # under the names of a position's
@@ -277,13 +297,39 @@ def _velocity(ekf2: Ekf2, replay: Ekf2Replay) -> dict[str, AxisAgreement]:
     return {axis: _axis(axis, logged, model, ekf2, replay) for axis in HORIZONTAL}
 
 
+def _heights(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, str]]:
+    """Agreement of the heights that were fused, and which of them do not agree, and why."""
+    found: dict[str, dict[str, AxisAgreement]] = {}
+    doubtful = {}
+    for name, updates in replay.heights.items():
+        aid, log = AIDS[name], ekf2.aids[name]
+        own = aid_source(aid) in log.topics
+        logged, model = _matched(replay, updates, logged_height(aid, log), own=own)
+        if len(logged) < MIN_SAMPLES:
+            doubtful[name] = f"{len(logged)} logged innovations are too few to compare with"
+            continue
+        found[name] = {"down": _axis("down", logged, model, ekf2, replay)}
+        shares = (float(np.mean(frame["rejected"] > 0.0)) for frame in (logged, model))
+        good, reason = _verdict(found[name], *shares)
+        if not good:
+            doubtful[name] = reason
+    return found, doubtful
+
+
+def logged_height(aid: Aid, log: AidLog) -> pd.DataFrame:
+    """Innovations, variances and rejections of a height, one row per logged sample."""
+    frame = innovations_along(log, "down", log.parameters.get(aid.gate, aid.default_gate))
+    names = {"innovation_m": "innovation_down_m"}
+    return frame.rename(columns=names | {"innovation_variance_m2": "innovation_variance_down_m2"})
+
+
 def _matched(
-    replay: Ekf2Replay, ekf2: Ekf2, logged: pd.DataFrame
+    replay: Ekf2Replay, updates: pd.DataFrame, logged: pd.DataFrame, *, own: bool
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """The logged innovations that are judged, and the replay's updates of the same samples."""
-    matched = match(replay, ekf2, logged.index.to_numpy())
+    """The logged innovations that are judged, and the updates of the same samples."""
+    matched = match(updates, logged.index.to_numpy(), own=own)
     use = (matched >= 0) & settled(logged.index, replay.judged_s)
-    return logged[use], replay.updates.iloc[matched[use]]
+    return logged[use], updates.iloc[matched[use]]
 
 
 def logged_innovations(ekf2: Ekf2) -> pd.DataFrame:
@@ -305,24 +351,27 @@ def settled(times_s: ArrayLike, judged: Spans) -> BoolArray:
     return np.asarray(np.any([(times > a) & (times < b) for a, b in judged], axis=0))
 
 
-def match(replay: Ekf2Replay, ekf2: Ekf2, times: Array) -> IntArray:
-    """Row of the replay's updates of each logged innovation; -1 where there is none."""
-    if aid_source(replayed_aid(ekf2)) in ekf2.innovation_topics:
-        return same_sample(replay.updates.index.to_numpy(), times)
-    fused_at = replay.updates["fused_at_s"].to_numpy()
+def match(updates: pd.DataFrame, times: Array, *, own: bool) -> IntArray:
+    """Row of the updates of each logged innovation; -1 where there is none.
+
+    ``own``: of the aid's own topic, which has the times of measurement.
+    """
+    if own:
+        return same_sample(updates.index.to_numpy(), times)
+    fused_at = updates["fused_at_s"].to_numpy()
     at = np.searchsorted(fused_at, times + 1e-4, side="right") - 1
     age = times - fused_at[np.maximum(at, 0)]
     return np.where((at >= 0) & (age <= MAX_REPEAT_S), at, -1)
 
 
 def _axis(
-    axis: str, log: pd.DataFrame, model: pd.DataFrame, ekf2: Ekf2, replay: Ekf2Replay
+    axis: AxisName, log: pd.DataFrame, model: pd.DataFrame, ekf2: Ekf2, replay: Ekf2Replay
 ) -> AxisAgreement:
     nu, nu_log = (f[f"innovation_{axis}_m"].to_numpy() for f in (model, log))
     s, s_log = (f[f"innovation_variance_{axis}_m2"].to_numpy() for f in (model, log))
     low, middle, high = np.percentile(s / s_log, [5, 50, 95])
     times = ekf2.state.index[settled(ekf2.state.index, replay.judged_s)].to_numpy()
-    direction = np.eye(3)[HORIZONTAL.index(axis)]
+    direction = np.eye(3)[AXIS_NAMES.index(axis)]
     position, velocity = (
         along(replay.published, columns, direction, times)
         - along(ekf2.state, columns, direction, times)
@@ -342,16 +391,19 @@ def _axis(
 
 
 def along(frame: pd.DataFrame, columns: list[str], direction: Array, times: Array) -> Array:
-    """North and east columns of a time-indexed frame, interpolated, along a direction."""
-    summed = signals.along(frame, columns[:2], direction[:2])
+    """Columns of a time-indexed frame, interpolated, along a direction."""
+    summed = signals.along(frame, columns, direction[: len(columns)])
     return np.asarray(np.interp(times, frame.index, summed))
 
 
 def rms_to_truth(flight: Flight, position: Array, direction: Array, times: Array) -> float | None:
-    """Error of a horizontal position (m, RMS) in the truth's span; None where there is no truth."""
+    """Error of a position (m, RMS) along a direction in the truth's span; None without truth."""
     if not isinstance(flight.truth, Truth):
         return None
-    truth = flight.truth.samples.dropna(subset=POSITION_COLUMNS[:2])
+    needed = POSITION_COLUMNS[2:] if direction[2] else POSITION_COLUMNS[:2]
+    truth = flight.truth.samples.dropna(subset=needed)
+    if truth.empty:
+        return None
     inside = (times >= truth.index[0]) & (times <= truth.index[-1])
     error = (position - along(truth, POSITION_COLUMNS, direction, times))[inside]
     return rms(error) if len(error) else None

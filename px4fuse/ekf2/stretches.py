@@ -12,11 +12,12 @@ import numpy as np
 import pandas as pd
 from scipy.linalg import block_diag
 
-from px4fuse.arrays import Array, IntArray
+from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
 from px4fuse.flight import (
     ACCELEROMETER_BIAS_COLUMNS,
     ANGULAR_RATE_COLUMNS,
+    BAD_ACCELERATION,
     BODY_FIELD_COLUMNS,
     DELAYED_VARIANCE_COLUMNS,
     EARTH_FIELD_COLUMNS,
@@ -82,6 +83,40 @@ class Field:
 
 
 @dataclass(frozen=True)
+class Heights:
+    """What EKF2's height rests on in one stretch.
+
+    Attributes
+    ----------
+    fused : tuple of str
+        PX4's names of its sensors: of the barometer, of GNSS, or of both.
+    reference : str
+        The one that has no bias.
+    bias : (float, float)
+        By how much the other one is too high at the start (m), and its variance (m²).
+    step : ndarray of int, shape (m,)
+        At the end of which prediction step EKF2 takes each sample of the barometer.
+    taken_s, down_m : ndarray, shape (m,)
+        When it takes it to have been measured, and what it is.
+    dead_m : ndarray, shape (m,)
+        By how much it may be below the state unheeded: in ground effect.
+    weight : float
+        Samples that EKF2 had for each one in the log.
+    """
+
+    fused: tuple[str, ...]
+    reference: str
+    bias: tuple[float, float]
+    step: IntArray
+    taken_s: Array
+    down_m: Array
+    dead_m: Array
+    weight: float
+
+    __repr__ = brief
+
+
+@dataclass(frozen=True)
 class Stretch:
     """A part of the flight that the model replays in one go: n prediction steps.
 
@@ -119,6 +154,10 @@ class Stretch:
     field : Field or None
         What the magnetometer measured: then the magnetic fields are states too, and there are 21;
         None: the heading is EKF2's own as flown, whatever is changed.
+    heights : Heights or None
+        None: the height is EKF2's own as flown, or vision's.
+    shaken : ndarray of bool, shape (n + 1,), or None
+        Where EKF2 took the vertical acceleration to be wrong, and relied on it less; None: nowhere.
     """
 
     time_s: Array
@@ -136,6 +175,8 @@ class Stretch:
     correlation: Array
     fusing: bool = True
     field: Field | None = None
+    heights: Heights | None = None
+    shaken: BoolArray | None = None
 
     __repr__ = brief
 
@@ -191,6 +232,8 @@ def find_stretches(
         covered = (time[1:] > states[at]) & (time[:-1] < high)
         if np.all(np.diff(time)[covered] <= IMU_GAP_S):
             made = _stretch(imu, attitude, ekf2, record, at, high)
+            if magnetic:
+                made = replace(made, shaken=record.was(BAD_ACCELERATION, made.time_s))
             within = of_field and of_field[0] <= states[at] and high <= of_field[1]
             found.append(_with_field(made, record, at, ekf2.step_s) if within else made)
     return tuple(found)

@@ -23,11 +23,12 @@ from px4fuse.ekf2.replay import (
     Ekf2Replay,
     Spans,
     along,
+    logged_height,
     logged_innovations,
     rms_to_truth,
     settled,
 )
-from px4fuse.ekf2_parameters import GNSS_POS, MAG, check
+from px4fuse.ekf2_parameters import AIDS, GNSS_POS, MAG, check
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.heading import heading_rad
@@ -45,15 +46,17 @@ NO_TRUTH = Unavailable(
 # Of a flight on GNSS
 HEADING_FOLLOWS = (
     "The heading follows, with the magnetometer as EKF2 fused it (as flown it is {:.1f}° off the "
-    "log, RMS); the height is EKF2's own as flown"
+    "log, RMS)"
 )
 HEADING_STAYS = (
-    "Heading and height are EKF2's own as flown, whatever is changed: the log does not hold what "
-    "EKF2 fused of a magnetometer, all axes throughout"
+    "The heading is EKF2's own as flown, whatever is changed: the log does not hold what EKF2 "
+    "fused of a magnetometer, all axes throughout"
 )
+HEIGHT_FOLLOWS, HEIGHT_STAYS = "The height follows too", "The height is EKF2's own as flown"
 OWN_HEADING = Unavailable(
     "heading error", "on external vision the heading is EKF2's own as flown", "Read it in the log."
 )
+OWN_HEIGHT = Unavailable("height error", "the height is EKF2's own as flown", "Read it in the log.")
 # What must be left to judge once an aid is taken away
 JUDGED_S = 5.0
 SWEEP_VALUES = 9
@@ -62,6 +65,8 @@ MAX_SWEEP_VALUES = 200
 # leave it where it was, and never where most samples are rejected
 DISTURBED_M, DISTURBED_RUNS = 0.002, 4
 FEW_REJECTED, MOST_REJECTED = 0.02, 0.35
+# After so long without a height EKF2 resets it (hgt_fusion_timeout_max, common.h)
+HEIGHT_TIMEOUT_S = 5.0
 STEADY_NIS, STEADY_REJECTED, STEADY_RMSE = 1.10, 0.03, 1.15
 
 
@@ -88,6 +93,31 @@ class AxisSummary(Record, frozen=True):
     position_rmse_to_truth_m: NotNegative | Unavailable
 
 
+class HeightSummary(Record, frozen=True):
+    """One sensor of height of one EKF2: of all samples that it tried to fuse.
+
+    Attributes
+    ----------
+    nis_mean : float
+    nis_band : (float, float)
+    innovation_std_m : float
+    rejected_share : float
+    longest_without_fusion_s : float
+    """
+
+    nis_mean: NotNegative
+    nis_band: tuple[NotNegative, NotNegative]
+    innovation_std_m: NotNegative
+    rejected_share: Share
+    longest_without_fusion_s: NotNegative
+
+    @property
+    def steady(self) -> bool:
+        """Whether it goes on without the resets of EKF2's height, which the model does not have."""
+        kept = self.longest_without_fusion_s <= HEIGHT_TIMEOUT_S
+        return kept and self.rejected_share <= MOST_REJECTED
+
+
 class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     """One EKF2: as logged, as replayed, or with other parameters.
 
@@ -105,6 +135,9 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
         Of horizontal position.
     heading_error_mean_deg : float or Unavailable
         Heading minus the truth's, clockwise seen from above.
+    heights : mapping from PX4's name of an aid to HeightSummary
+        Of the sensors of height that the replay fuses; empty where the height is EKF2's own.
+    height_rmse_to_truth_m : float or Unavailable
     late, lost : int
         Samples that arrived after the fusion horizon had passed them: fused late, and never.
     steady : bool
@@ -119,6 +152,8 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     longest_without_fusion_s: NotNegative | Unavailable
     resets: Count
     heading_error_mean_deg: float | Unavailable = OWN_HEADING
+    heights: Mapping[str, HeightSummary] = {}
+    height_rmse_to_truth_m: NotNegative | Unavailable = OWN_HEIGHT
     late: Count = 0
     lost: Count = 0
     steady: bool = True
@@ -225,16 +260,17 @@ def what_if(
         ),
         judged=judged,
         notes=(
-            *((_of_heading(model.agreement),) if replays and gnss else ()),
+            *(_of_heading_and_height(model) if replays and gnss else ()),
             *(note for replay in replays for note in _notes(model, replay)),
             *(_carried(model, replay, without, judged) for replay in replays if without),
         ),
     )
 
 
-def _of_heading(agreement: Agreement) -> str:
-    off_deg = agreement.heading_rms_difference_deg
-    return HEADING_STAYS if off_deg is None else HEADING_FOLLOWS.format(off_deg)
+def _of_heading_and_height(model: Model) -> tuple[str, str]:
+    off_deg = model.agreement.heading_rms_difference_deg
+    heading = HEADING_STAYS if off_deg is None else HEADING_FOLLOWS.format(off_deg)
+    return heading, HEIGHT_FOLLOWS if model.flown.heights else HEIGHT_STAYS
 
 
 def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) -> list[float]:
@@ -282,7 +318,9 @@ def _steadied(
             same.append(_of_replay(model.flight, replay, judged))
     return tuple(
         replace(
-            one, steady=not one.changed or (one.rejected_share <= MOST_REJECTED and _alike(same))
+            one,
+            steady=all(height.steady for height in one.heights.values())
+            and (not one.changed or (one.rejected_share <= MOST_REJECTED and _alike(same))),
         )
         for one, same in zip(found, runs, strict=True)
     )
@@ -311,7 +349,7 @@ def _of_replay(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
         variance[f"{axis}_m2"] = np.column_stack([s - r, after]).ravel()
     fused = used["fused_at_s"][(used["fused"] > 0) | (used["reset"] > 0)]
     return _summary(
-        flight, judged, used, replay.published, variance,
+        flight, judged, used, replay.published, variance, replay.heights,
         changed=replay.changed, longest_without_fusion_s=_longest(fused.to_numpy(), judged),
         resets=int(used["reset"].sum()), late=replay.late, lost=replay.lost,
         heading_error_mean_deg=_heading_error(
@@ -339,8 +377,9 @@ def _of_log(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
         longest = _longest(np.concatenate([fused, resets]), judged)
     assert isinstance(flight.attitude, pd.DataFrame)  # it was replayed
     heading = pd.Series(heading_rad(flight.attitude), flight.attitude.index)
+    heights = {name: logged_height(AIDS[name], ekf2.aids[name]) for name in replay.heights}
     return _summary(
-        flight, judged, used, ekf2.state, None,
+        flight, judged, used, ekf2.state, None, heights,
         changed={}, longest_without_fusion_s=longest, resets=len(resets),
         heading_error_mean_deg=_heading_error(flight, replay, heading, judged),
     )  # fmt: skip
@@ -352,6 +391,7 @@ def _summary(
     used: pd.DataFrame,
     published: pd.DataFrame,
     variance: pd.DataFrame | None,
+    heights: Mapping[str, pd.DataFrame],
     **more: Any,
 ) -> Summary:
     """What innovations, the published position and its stated variance show, and ``more``.
@@ -384,7 +424,29 @@ def _summary(
         )
     north, east = (axes[axis] for axis in HORIZONTAL)
     share = float(used["rejected"].mean())
+    if heights:
+        down = np.eye(3)[2]
+        error = rms_to_truth(flight, along(published, POSITION_COLUMNS, down, times), down, times)
+        more["height_rmse_to_truth_m"] = NO_TRUTH if error is None else error
+        more["heights"] = {
+            name: _of_height(kept, judged)
+            for name, each in heights.items()
+            if len(kept := each[settled(each.index, judged)])
+        }
     return Summary(north=north, east=east, samples=len(used), rejected_share=share, **more)
+
+
+def _of_height(used: pd.DataFrame, judged: Spans) -> HeightSummary:
+    nu, rejected = (used[name].to_numpy() for name in ("innovation_down_m", "rejected"))
+    fused_s = used.index.to_numpy()[rejected == 0.0]
+    parts = ((fused_s[(fused_s > a) & (fused_s < b)], ((a, b),)) for a, b in judged)
+    return HeightSummary(
+        nis_mean=float(np.mean(nu**2 / used["innovation_variance_down_m2"])),
+        nis_band=nis_band(len(nu)),
+        innovation_std_m=float(np.std(nu)),
+        rejected_share=float(rejected.mean()),
+        longest_without_fusion_s=max(_longest(*part) for part in parts),
+    )
 
 
 def _heading_error(
@@ -411,19 +473,22 @@ def _longest(fused_s: Array, judged: Spans) -> float:
 def _carried(model: Model, replay: Ekf2Replay, without: Mapping[str, float], judged: Spans) -> str:
     """How far from the replay as flown EKF2 comes without some aids."""
     flown, found = (
-        one.published.loc[settled(one.published.index, judged), POSITION_COLUMNS[:2]]
+        one.published.loc[settled(one.published.index, judged), POSITION_COLUMNS]
         for one in (model.flown, replay)
     )
-    apart = np.hypot(*(found - flown).to_numpy().T)
+    *level, down = np.abs((found - flown).to_numpy()).T
+    apart = np.hypot(*level)
     lost = ", ".join(f"{name} from {since:g} s on" for name, since in without.items())
-    position = {*aids_of(model.inputs)} - {MAG.name}
+    heights = {*model.flown.heights}
+    position = {*aids_of(model.inputs)} - {MAG.name} - heights
+    height = f"; its height is {down.max():.3g} m from it at most" if heights & {*without} else ""
     given_up = (
         "; with no horizontal aid EKF2 itself gives its position up after EKF2_NOAID_TOUT (5 s), "
         "while the model dead-reckons on"
     )
     return (
         f"Without {lost}, what is published is {apart.max():.3g} m from the replay as flown at "
-        f"most (at {found.index[apart.argmax()]:.1f} s), {apart[-1]:.3g} m at the end"
+        f"most (at {found.index[apart.argmax()]:.1f} s), {apart[-1]:.3g} m at the end{height}"
         + (given_up if position <= without.keys() else "")
     )
 

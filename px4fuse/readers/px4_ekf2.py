@@ -17,10 +17,12 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.ekf2_parameters import AIDS, EV_POS, settings_in_force
 from px4fuse.flight import (
     ACCELEROMETER_BIAS_COLUMNS,
+    BAD_ACCELERATION,
     BIAS_NOT_LOGGED,
     DELAYED_STATE_COLUMNS,
     DELAYED_VARIANCE_COLUMNS,
     EKF2_STEP_S,
+    GROUND_EFFECT,
     HORIZON_NOT_LOGGED,
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
@@ -307,12 +309,13 @@ def _read_record(
     inside = delayed[np.abs(norm - 1.0) < 0.01].copy()
     if inside.empty:
         return RECORD_NOT_LOGGED
-    horizontal = POSITION_COLUMNS[:2]
+    horizontal, altitude_m = POSITION_COLUMNS[:2], 0.0
     if not inside[horizontal].to_numpy().any():  # from v1.16 kept as latitude and longitude
         inside[horizontal] = np.nan
         # and its height, where there is an origin, as altitude above the sea (ekf_helper.cpp)
         origin_m = local["ref_alt"].dropna() if "ref_alt" in local else pd.Series(dtype=float)
-        inside["down_m"] += float(origin_m.iloc[-1]) if len(origin_m) else 0.0
+        altitude_m = float(origin_m.iloc[-1]) if len(origin_m) else 0.0
+        inside["down_m"] += altitude_m
     age = _age_s(topics, VISION).sort_index()
     return FusionRecord(
         parameters=topics.ekf2_parameters,
@@ -325,6 +328,13 @@ def _read_record(
         ),
         vision_age_s=age[~age.index.duplicated()],
         field_gauss=_read_field(topics, step_s),
+        altitude_m=altitude_m,
+        states={one: meant[one] for one in (GROUND_EFFECT, BAD_ACCELERATION) if one in meant},
+        height_bias={
+            name: topics.of_primary(layout).dropna()
+            for name, layout in px4.HEIGHT_BIAS.items()
+            if topics.find((layout,)) is not None
+        },
     )
 
 

@@ -37,6 +37,9 @@ def left_out_fixes(topics: Topics, gps: pd.DataFrame, ekf2: Ekf2 | Unavailable) 
     position, velocity = (topics.of_primary(layout) for layout in px4.FUSED_FIXES)
     # rows are of half a prediction step before (estimator_interface.cpp)
     fixes = position.join(velocity, how="inner").dropna()
+    # of the reference; else it has EKF2's bias in it
+    if topics.find((px4.FUSED_HEIGHT,)) and topics.ekf2_parameters.get("EKF2_HGT_REF", 1.0) == 1.0:
+        fixes = fixes.join(topics.of_primary(px4.FUSED_HEIGHT))
     fixes = fixes.set_axis(fixes.index + 0.5 * ekf2.step_s)
     at = np.clip(np.searchsorted(gps.index, fixes.index), 1, len(gps) - 1)
     apart = np.minimum(*(np.abs(gps.index.to_numpy()[at - k] - fixes.index) for k in (0, 1)))

@@ -102,7 +102,7 @@ def innovations_of(
         group = "vertical" if axis == "down" else "horizontal"
         sensor = (axis == "down" and source.height) or source.name
         log = aids.get(source.vertical if axis == "down" else source.horizontal)
-        frame = None if log is None else _along(log, axis, gate)
+        frame = None if log is None else along(log, axis, gate)
         if isinstance(fusing, pd.DataFrame) and not fusing[group].any():
             quantity = "height" if axis == "down" else "horizontal position"
             found[axis] = Unavailable(
@@ -124,7 +124,7 @@ def innovations_of(
     return found, tuple(used)
 
 
-def _along(log: AidLog, axis: AxisName, gate: float) -> pd.DataFrame:
+def along(log: AidLog, axis: AxisName, gate: float) -> pd.DataFrame:
     """One axis of what was fused or rejected; a rejection is of all axes of the aid."""
     samples = log.samples
     nis = {

@@ -316,6 +316,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     left_out = left_out_fixes(topics, gps, ekf2)
     if len(left_out):
         gps = pd.concat([gps, left_out]).sort_index()
+        interpolated = int(gps["altitude_m"].isna().sum())
         # what their rows do not have is as in the fix before
         gps = gps.assign(altitude_m=gps["altitude_m"].interpolate("index")).ffill()
     samples = projected(gps, _local_origin(topics))
@@ -339,7 +340,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     if len(left_out):
         notes += (
             f"{len(left_out)} positions of GNSS that the logger left out are from "
-            "estimator_aid_src_gnss_pos, their heights are interpolated",
+            f"estimator_aid_src_gnss_pos, {interpolated} of their heights are interpolated",
         )
     more: dict[str, Any] = {}
     if set(px4.ANTENNA_COLUMNS) <= set(gps.columns):  # since v1.17 of each receiver

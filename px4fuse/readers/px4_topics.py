@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from px4fuse.ekf2_parameters import AID_MASK, EV_POS
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
+    BAD_ACCELERATION,
+    GROUND_EFFECT,
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
     QUATERNION_COLUMNS,
@@ -110,6 +112,11 @@ TRUTH_GLOBAL = (
 TRUTH_ATTITUDE = (Layout("vehicle_attitude_groundtruth", elements(QUATERNION_COLUMNS, "q")),)
 
 BAROMETER = (Layout("vehicle_air_data", {"altitude_m": "baro_alt_meter"}),)
+_BIAS = {"bias_m": "bias", "bias_m2": "bias_var"}
+HEIGHT_BIAS = {
+    "baro_hgt": Layout("estimator_baro_bias", _BIAS),
+    "gnss_hgt": Layout("estimator_gnss_hgt_bias", _BIAS),
+}
 
 _GPS_OPTIONAL = {
     "eph_m": "eph", "epv_m": "epv", "fix_type": "fix_type", "utc_us": "time_utc_usec",
@@ -147,6 +154,9 @@ FUSED_FIXES = (
         {"latitude_deg": "observation[0]", "longitude_deg": "observation[1]"},  # v1.16
     ),
     Layout("estimator_aid_src_gnss_vel", elements(VELOCITY_COLUMNS, "observation")),
+)
+FUSED_HEIGHT = Layout(
+    "estimator_aid_src_gnss_hgt", {"altitude_m": "observation"}, scale={"altitude_m": -1.0}
 )
 
 
@@ -341,6 +351,9 @@ SOURCES: Mapping[str, AidSource] = {
     "fake_pos": AidSource(
         _HORIZONTAL, (), (), (("cs_fake_pos", "cs_valid_fake_pos"), ("cs_fake_pos",))
     ),
+    # no aids, but what bears on them
+    GROUND_EFFECT: AidSource((), flags=(("cs_gnd_effect",),), bit=20),
+    BAD_ACCELERATION: AidSource((), flags=(("fs_bad_acc_vertical",),)),
 }  # fmt: skip
 # Releases whose rows say "fused" whether it was or not (v1.15, v1.16): the control bit tells
 FLAG_ALWAYS_SET = ("gravity", "drag")
@@ -365,7 +378,7 @@ def topics() -> list[str]:
     groups = (
         IMU, ATTITUDE, LOCAL_POSITION, SENSOR_BIAS, SELECTOR, LAND_DETECTED, FLIGHT_MODE, FAILURE,
         BAROMETER, TRUTH_LOCAL, TRUTH_GLOBAL, TRUTH_ATTITUDE, AID_OBSERVATION_HORIZONTAL,
-        AID_OBSERVATION_VERTICAL, *(track.layouts for track in _TRACKS),
+        AID_OBSERVATION_VERTICAL, HEIGHT_BIAS.values(), *(track.layouts for track in _TRACKS),
     )  # fmt: skip
     named = {layout.topic for group in groups for layout in group}
     named |= {f"estimator_aid_src_{name}" for name in SOURCES}

@@ -7,8 +7,14 @@ from collections.abc import Callable, Iterator
 
 from px4fuse.analysis import Counterfactual
 from px4fuse.ekf2.replay import HORIZONTAL
-from px4fuse.ekf2.whatif import DISTURBED_M, MOST_REJECTED, Summary
-from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.ekf2.whatif import (
+    DISTURBED_M,
+    HEIGHT_TIMEOUT_S,
+    MOST_REJECTED,
+    HeightSummary,
+    Summary,
+)
+from px4fuse.ekf2_parameters import AIDS, PARAMETERS
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
 from px4fuse.plain import number_words
@@ -35,6 +41,14 @@ ROWS: tuple[tuple[str, Callable[[Summary], str]], ...] = (
 )
 # and where EKF2's heading follows what is changed
 HEADING_ROW = ("heading - truth (°)", lambda s: _number(s.heading_error_mean_deg, 1))
+# and its height: of each sensor, and over all
+HEIGHT_ROWS: tuple[tuple[str, Callable[[HeightSummary], str]], ...] = (
+    ("{}: mean NIS", lambda s: number_words(s.nis_mean)),
+    ("    consistent is", lambda s: "{:.2f} to {:.2f}".format(*s.nis_band)),
+    ("    std ν (m)", lambda s: _number(s.innovation_std_m)),
+    ("    rejected", lambda s: f"{s.rejected_share:.1%}"),
+)
+HEIGHT_ROW = ("height: RMSE to truth (m)", lambda s: _number(s.height_rmse_to_truth_m))
 
 
 def _named(name: str) -> str:
@@ -65,10 +79,19 @@ def rows(made_of: Counterfactual) -> list[list[str]]:
         for label, cell in AXIS_ROWS
     ]
     follows = isinstance(found.replayed.heading_error_mean_deg, float)
-    return made + [
+    heights = found.replayed.heights
+    more = [*([HEADING_ROW] if follows else []), *([HEIGHT_ROW] if heights else [])]
+    made += [
         [label, *(cell(s) if s.steady else CHAOTIC for s in every)]
-        for label, cell in (*ROWS, *([HEADING_ROW] if follows else []))
+        for label, cell in (*ROWS, *more)
     ]
+    return made + [
+        [label.format(AIDS[name].label),
+         *(CHAOTIC if not s.steady else cell(s.heights[name]) if name in s.heights else "n/a"
+           for s in every)]
+        for name in heights
+        for label, cell in HEIGHT_ROWS
+    ]  # fmt: skip
 
 
 def sweep_heads(made_of: Counterfactual) -> list[str]:
@@ -135,8 +158,9 @@ def reading(made_of: Counterfactual) -> list[str]:
     if not all(one.steady for one in made_of.whatif.whatif):
         lines.append(
             f"Chaotic: more than {MOST_REJECTED:.0%} would be rejected, or "
-            f"{1e3 * DISTURBED_M:.0f} mm of noise on the positions changes the answer. Each "
-            "rejection decides the next there, and nothing can be predicted."
+            f"{1e3 * DISTURBED_M:.0f} mm of noise on the positions changes the answer, or heights "
+            f"would be rejected for {HEIGHT_TIMEOUT_S:g} s on end. Each rejection decides the next "
+            "there, and nothing can be predicted."
         )
     return [*lines, *(f"{note}." for note in made_of.whatif.notes)]
 

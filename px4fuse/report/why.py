@@ -11,6 +11,7 @@ import pandas as pd
 from px4fuse.arrays import Array
 from px4fuse.ekf2.replay import Agreement, Ekf2Replay
 from px4fuse.ekf2.walk import Why
+from px4fuse.ekf2_parameters import AIDS
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital
@@ -94,6 +95,10 @@ def agreement_words(agreement: Agreement) -> str:
         f"{agreement.rejected_share_logged:.1%}. "
         + ("It agrees: " if agreement.good else "It does not agree: ")
         + agreement.reason
+        + "".join(
+            f". Not so the {AIDS[name].label}, of which nothing is concluded: {reason}"
+            for name, reason in agreement.doubtful.items()
+        )
     )
 
 

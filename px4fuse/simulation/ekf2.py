@@ -5,10 +5,10 @@ initial variances, levelled at rest, then IMU and positions as simulated. The mo
 an attitude, here the true one: what the gyro measures beyond it enters as a turn, so that nothing
 of the truth reaches the estimate.
 
-Outdoors EKF2 fuses the magnetometer, and vehicle_attitude is its own. Its height is of the
-barometer and the IMU, by a filter of two states. Indoors a slow error about the truth stands in
-for both sensors, and vehicle_attitude is not made by the model, so that what a student's filter is
-fed with does not depend on EKF2's parameters; the model's own attitude is in estimator_states.
+Outdoors EKF2 fuses magnetometer and barometer, and vehicle_attitude is its own. Indoors a slow
+error about the truth stands in for both sensors, and vehicle_attitude is not made by the model, so
+that what a student's filter is fed with does not depend on EKF2's parameters; the model's own
+attitude is in estimator_states.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.ekf2.heights import inside
 from px4fuse.ekf2.inputs import NO_LIMIT, Inputs, Received, Rules
 from px4fuse.ekf2.intervals import (
     ACCELEROMETER_BIAS,
@@ -32,11 +33,10 @@ from px4fuse.ekf2.intervals import (
 from px4fuse.ekf2.model import delayed_states, run_variants
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.recursion import EAST, HEADING, LEVEL, NORTH, Run, Variant
-from px4fuse.ekf2.stretches import Stretch, down_sampled, step_ends, with_field
+from px4fuse.ekf2.stretches import Heights, Stretch, down_sampled, step_ends, with_field
 from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid, settings_in_force
-from px4fuse.filter.model import predict, update
 from px4fuse.simulation import sensors
-from px4fuse.simulation.ekf2_topics import Height, TopicTrack, ekf2_topics
+from px4fuse.simulation.ekf2_topics import TopicTrack, ekf2_topics
 from px4fuse.simulation.mistakes import Mistakes
 from px4fuse.simulation.motion import Motion, attitude
 from px4fuse.simulation.scenario import Scenario
@@ -51,7 +51,6 @@ from px4fuse.trajectory.rotation import (
 )
 
 PREDICT_US = 10_000  # EKF2_PREDICT_US
-STANDING_SD_M_S = 0.01
 # Of each axis of both fields, when the magnetometer has been aligned on the ground
 FIELD_SD_GAUSS = 0.03
 # v1.14 to main: EV_MAX_INTERVAL (ev_control.cpp), reset_timeout_max (common.h)
@@ -82,7 +81,7 @@ class Others:
 
 def _fused(scenario: Scenario) -> tuple[Aid, ...]:
     """What of EKF2's aids has parameters in the model."""
-    return (scenario.aid, MAG) if scenario.aid == GNSS_POS else (scenario.aid,)
+    return (scenario.aid, MAG, BAROMETER) if scenario.aid == GNSS_POS else (scenario.aid,)
 
 
 def parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]:
@@ -96,10 +95,7 @@ def parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]
         # of the magnetic heading alone (1), or of all its axes where it should be right (0)
         only_heading = int(bool(mistakes.heading_deg))
         of_aid = {GNSS_VEL.noise: scenario.sigma_gnss_m_s, MAG.switch: only_heading}
-        of_aid |= {
-            BAROMETER.noise: sensors.SIGMA_BAROMETER_M,
-            BAROMETER.gate: BAROMETER.default_gate,
-        }
+        of_aid |= {BAROMETER.noise: sensors.SIGMA_BAROMETER_M}
     return (
         known
         | of_aid
@@ -141,10 +137,8 @@ def fly(
     aid, aids = scenario.aid, _fused(scenario)
     stretch, time_us, nominal = _stretch(scenario, mistakes, motion, imu, at_rest)
     known = {name: float(np.float32(v)) for name, v in flown.items()}
-    height = None
     if others is not None:
-        height = _height(scenario, mistakes, stretch, others.barometer, known)
-        stretch = replace(stretch, down_m=height.down_m, down_variance_m2=height.variance_m2)
+        stretch = replace(stretch, heights=_heights(stretch, others.barometer))
         if not known[MAG.switch]:
             stretch = _with_field(stretch, others.magnetometer)
     settings = settings_in_force(known, *aids)
@@ -167,7 +161,7 @@ def fly(
     )
     done = run_variants(inputs, [Variant(settings)], {})[0]
     track = _track(inputs, done, time_us, nominal)
-    return ekf2_topics(inputs, done, track, height, scenario.attitude_rate_hz, aid_source_hz)
+    return ekf2_topics(inputs, done, track, scenario.attitude_rate_hz, aid_source_hz)
 
 
 def _stretch(
@@ -228,31 +222,12 @@ def _with_field(stretch: Stretch, magnetometer: Topic) -> Stretch:
     return with_field(stretch, taken_s, gauss, 1.0, fields, np.full(6, FIELD_SD_GAUSS**2))
 
 
-def _height(
-    scenario: Scenario,
-    mistakes: Mistakes,
-    stretch: Stretch,
-    barometer: Topic,
-    flown: Mapping[str, float],
-) -> Height:
-    """Height by the barometer, EKF2's only one here, and the IMU with its bias known."""
-    bias, _ = sensors.biases(scenario, mistakes)
-    force = np.einsum("nij,nj->ni", stretch.rotation[1:], stretch.force_m_s2 - bias)
+def _heights(stretch: Stretch, barometer: Topic) -> Heights:
+    """The barometer, EKF2's only sensor of height here."""
+    taken_s = sensors.time_s(barometer) - 0.5 * float(np.median(stretch.step_s))
     down_m = sensors.HOME[2] - barometer.fields["baro_alt_meter"].astype(np.float64)
-    due = np.searchsorted(stretch.time_s, sensors.time_s(barometer)).tolist()
-    samples = dict(zip(due, down_m.tolist(), strict=True))
-    r, q = flown[BAROMETER.noise] ** 2, flown["EKF2_ACC_NOISE"] ** 2
-    p, v, covariance = down_m[0], 0.0, (r, 0.0, STANDING_SD_M_S**2)
-    found, rows = [(p, r)], []
-    steps, gained = stretch.step_s.tolist(), (force[:, 2] + GRAVITY_M_S2[2]).tolist()
-    for at, (dt, a) in enumerate(zip(steps, gained, strict=True), start=1):
-        p, v, covariance = predict(p, v, covariance, a, q * dt, dt)
-        if at in samples:
-            told, (p, v, covariance) = update(p, v, covariance, samples[at], r)
-            rows.append((at, samples[at], *told[:2]))
-        found.append((p, covariance[0]))
-    down, variance = np.array(found).T
-    return Height(down, variance, np.array(rows))
+    samples = inside(stretch, taken_s, down_m, np.zeros(len(down_m)))
+    return Heights((BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *samples, 1.0)
 
 
 def _standing(

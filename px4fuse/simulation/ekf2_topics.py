@@ -23,25 +23,8 @@ from px4fuse.simulation.ulog_writer import Topic
 # full rate, a vehicle only at this one
 VEHICLE_AID_SOURCE_HZ = 2.0
 STATES_HZ, LOCAL_POSITION_HZ, FLAGS_HZ = 2.0, 10.0, 1.0
-MAGNETOMETER_HZ, BAROMETER_HZ, OTHER_AIDS_HZ = 2.0, 5.0, 2.0
+MAGNETOMETER_HZ, OTHER_AIDS_HZ = 2.0, 2.0
 PUBLISHED_LATER_US = 100
-
-
-@dataclass(frozen=True)
-class Height:
-    """Height by the barometer, down (m), at the end of each prediction step, shape (n + 1,).
-
-    Attributes
-    ----------
-    down_m, variance_m2 : ndarray
-    samples : ndarray, shape (m, 4)
-        Of each sample of the barometer the step that fused it, what it measured, its innovation
-        and the variance of that.
-    """
-
-    down_m: Array
-    variance_m2: Array
-    samples: Array
 
 
 @dataclass(frozen=True)
@@ -80,7 +63,6 @@ def ekf2_topics(
     inputs: Inputs,
     done: Run,
     track: TopicTrack,
-    height: Height | None,
     attitude_hz: float,
     aid_source_hz: float,
 ) -> tuple[Topic, ...]:
@@ -90,8 +72,6 @@ def ekf2_topics(
     ----------
     done : Run
         The model's run, of one variant in one stretch.
-    height : Height or None
-        Where a barometer was fused.
     attitude_hz : float
         Of vehicle_attitude, which is EKF2's where it fuses a magnetometer.
     aid_source_hz : float
@@ -101,7 +81,7 @@ def ekf2_topics(
         _local_position(track, gnss=inputs.aid == GNSS_POS),
         _states(done, track, gnss=inputs.aid == GNSS_POS),
         *_aid_sources(inputs, done, track, aid_source_hz),
-        *([] if height is None else [_barometer(track, height)]),
+        *_barometer(inputs, done, track),
         *([] if done.stretch.field is None else _of_field(inputs, done, track, attitude_hz)),
         _flags(inputs, done, track),
     )
@@ -204,20 +184,26 @@ def _aid_sources(inputs: Inputs, done: Run, track: TopicTrack, rate_hz: float) -
     )
 
 
-def _barometer(track: TopicTrack, height: Height) -> Topic:
-    step = height.samples[:, 0].astype(np.intp)
-    seen = step < len(track.time_us) - track.lag
-    seen &= sensors.thinned(sensors.seconds(track.time_us[step]), OTHER_AIDS_HZ)
-    rows, (measured, innovation, variance) = step[seen], height.samples[seen, 1:].T
-    outside = innovation**2 > BAROMETER.default_gate**2 * variance
-    return _aid_source(
-        BAROMETER,
-        {BAROMETER.gate: BAROMETER.default_gate},
-        sensors.stamps(track.time_us[rows], _horizon_us(track, rows)),
-        (measured - sensors.HOME[2]).astype(np.float32),
-        (innovation, variance, variance - height.variance_m2[rows]),
-        (outside, ~outside),
-    )
+def _barometer(inputs: Inputs, done: Run, track: TopicTrack) -> list[Topic]:
+    """What a barometer has EKF2 say: its innovations."""
+    heights, end = done.stretch.heights, done.events[0].end
+    if heights is None or done.heights is None:
+        return []
+    told = done.heights.updates(BAROMETER.name, 0, end.astype(float))
+    told = told[told["fused_at_s"] < len(track.time_us) - track.lag].iloc[1:]
+    told = told[sensors.thinned(told.index.to_numpy(), OTHER_AIDS_HZ)]
+    innovation, variance, rejected, fused, rows = told.to_numpy().T
+    taken_s, step = told.index.to_numpy(), rows.astype(np.intp)
+    taken_us = np.rint(taken_s * 1e6).astype(np.int64)
+    later_us = track.time_us[step] + _horizon_us(track, step) - taken_us
+    measured = heights.down_m[np.searchsorted(heights.taken_s, taken_s)] - sensors.HOME[2]
+    noise = np.full(len(step), inputs.settings[BAROMETER.noise] ** 2)
+    return [
+        _aid_source(
+            BAROMETER, inputs.settings, sensors.stamps(taken_us, later_us),
+            measured.astype(np.float32), (innovation, variance, noise), (rejected > 0, fused > 0),
+        )
+    ]  # fmt: skip
 
 
 def _of_field(inputs: Inputs, done: Run, track: TopicTrack, attitude_hz: float) -> list[Topic]:

@@ -19,7 +19,7 @@ from px4fuse.readers.px4_topics import IMU
 from px4fuse.readers.ulog_topics import NOTE_KEY, Topics
 from px4fuse.recording import LogInfo
 from px4fuse.simulation import ekf2, sensors
-from px4fuse.simulation.ekf2_topics import BAROMETER_HZ, MAGNETOMETER_HZ, VEHICLE_AID_SOURCE_HZ
+from px4fuse.simulation.ekf2_topics import MAGNETOMETER_HZ, VEHICLE_AID_SOURCE_HZ
 from px4fuse.simulation.mistakes import MISTAKES, Mistakes, as_typed, made
 from px4fuse.simulation.motion import Motion, plan
 from px4fuse.simulation.scenario import Scenario
@@ -96,7 +96,7 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
             sensors.magnetometer(scenario, mistakes, motion), sensors.barometer(scenario, motion)
         )
         topics.append(sensors.at_rate(others.magnetometer, MAGNETOMETER_HZ))
-        topics.append(sensors.at_rate(others.barometer, BAROMETER_HZ))
+        topics.append(others.barometer)
     if scenario.truth:
         topics.append(sensors.ground_truth(scenario, motion))
     for topic in topics:

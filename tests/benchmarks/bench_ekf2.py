@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from px4fuse.ekf2.model import Model, open_model, replay_settings
+from px4fuse.ekf2.replay import Agreement
 from px4fuse.ekf2.walk import SPEED, STEPS, walk
 from px4fuse.ekf2.whatif import Summary, WhatIf, what_if
 from px4fuse.flight import Flight, Unavailable
@@ -54,6 +55,13 @@ def judge_agreement(name: str, model: Model) -> None:
     agreement = model.agreement
     assert agreement.good, (name, agreement.reason)
     gnss = bool(agreement.gnss_pos)
+    assert not agreement.doubtful, (name, agreement.doubtful)
+    for aid, least in (("gnss_hgt", 0.998), ("baro_hgt", 0.96)):
+        for axis in getattr(agreement, aid).values():
+            assert axis.innovation_correlation >= least, (name, aid)
+            assert 0.99 < axis.s_ratio_p5 < axis.s_ratio_p95 < 1.01, (name, aid)
+            assert axis.position_rms_difference_m < 0.05, (name, aid)
+            assert axis.velocity_rms_difference_m_s < 0.02, (name, aid)
     for axis in agreement.axes.values():
         if OVERCONFIDENT in name:
             off = agreement.rejected_share_replayed - agreement.rejected_share_logged
@@ -111,8 +119,8 @@ def agreement_page(models: dict[str, Model], left: dict[str, float]) -> str:
     """Agreement on every flight as the documentation has it."""
     lines = [
         "| flight | innovations | correlation n/e | S replayed / logged, 5 to 95 % | rejected | "
-        "published, m rms n/e | left |",
-        "|---|---|---|---|---|---|---|",
+        "published, m rms n/e | left | height: correlation GNSS / barometer, published, m rms |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for name, model in models.items():
         a, (north, east) = model.agreement, model.agreement.axes.values()
@@ -121,9 +129,18 @@ def agreement_page(models: dict[str, Model], left: dict[str, float]) -> str:
             f"{east.innovation_correlation:.4f} | {min(north.s_ratio_p5, east.s_ratio_p5):.3f} to "
             f"{max(north.s_ratio_p95, east.s_ratio_p95):.3f} | {a.rejected_share_replayed:.1%} / "
             f"{a.rejected_share_logged:.1%} | {north.position_rms_difference_m:.3f} / "
-            f"{east.position_rms_difference_m:.3f} | {left[name]:.1%} |"
+            f"{east.position_rms_difference_m:.3f} | {left[name]:.1%} | {height_cell(a)} |"
         )
     return "\n".join(lines)
+
+
+def height_cell(agreement: Agreement) -> str:
+    """Of a flight whose heights are replayed."""
+    heights = [*agreement.gnss_hgt.values(), *agreement.baro_hgt.values()]
+    if not heights or agreement.doubtful:
+        return "EKF2's own"
+    both = " / ".join(f"{axis.innovation_correlation:.4f}" for axis in heights)
+    return f"{both}, {heights[0].position_rms_difference_m:.3f}"
 
 
 def in_page() -> str:

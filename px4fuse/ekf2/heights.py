@@ -1,0 +1,243 @@
+"""Height as EKF2 fuses it: by GNSS and the barometer, with a bias of the one that is no reference.
+
+Samples of the barometer between two events are fused at the later one, as measurements of height
+and vertical velocity then: where the vehicle was before is known from both and the IMU.
+
+Sources: PX4-Autopilot ``EKF/bias_estimator`` (``bias_estimator.cpp``), ``EKF/aid_sources``
+(``barometer/baro_height_control.cpp``, ``gnss/gnss_height_control.cpp``), before v1.16
+``EKF/baro_height_control.cpp`` and ``EKF/gnss_height_control.cpp``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.ekf2.stretches import Heights, Stretch
+from px4fuse.ekf2_parameters import AIDS, BAROMETER, GNSS_HGT, fuses_by_mask
+from px4fuse.flight import GROUND_EFFECT, Ekf2, Flight, FusionRecord, at_times
+
+GRAVITY_M_S2 = 9.80665  # CONSTANTS_ONE_G
+SPEED_DOWN, DOWN = 5, 8
+SENSORS = (BAROMETER, GNSS_HGT)
+HEIGHTS = (*SENSORS, AIDS["rng_hgt"], AIDS["ev_hgt"])
+DEAD_ZONE_M = 4.0  # EKF2_GND_EFF_DZ
+REFERENCES = {0: BAROMETER.name, 1: GNSS_HGT.name}  # EKF2_HGT_REF
+# Biases are logged twice a second
+BIAS_LATE_S = 1.0
+# EKF2 has so many samples of the barometer a second, since v1.15 and before; one of fewer that are
+# in the log stands for several, down to the last rate
+BAROMETER_HZ, OLD_BAROMETER_HZ, LEAST_HZ = 10.0, 15.0, 4.0
+MIN_GATE, MIN_SD_M = 1.0, 0.01
+# Of the bias: noise density (m/s/√Hz; bias_nsd, common.h), least variance, least one of a
+# measurement, gate; where innovations keep to one side its noise is raised (isOffsetDetected)
+BIAS_DENSITY, LEAST_M2, LEAST_NOISE_M2, BIAS_GATE = 0.13, 1e-8, 1e-4, 3.0
+ONE_SIDED, RAISED, FILTER_S = 0.2, 1e3, 10.0
+
+
+def with_heights(
+    flight: Flight, ekf2: Ekf2, record: FusionRecord, stretches: Sequence[Stretch]
+) -> tuple[tuple[Stretch, ...], str]:
+    """Stretches that hold what EKF2's height rests on; or as they are, and why they do not."""
+    made = _with_heights(flight, ekf2, record, stretches)
+    return (tuple(stretches), made) if isinstance(made, str) else (tuple(made), "")
+
+
+def _with_heights(
+    flight: Flight, ekf2: Ekf2, record: FusionRecord, stretches: Sequence[Stretch]
+) -> list[Stretch] | str:
+    parameters, times = record.parameters, np.concatenate([one.time_s for one in stretches])
+    if fuses_by_mask(parameters):
+        return "before PX4 v1.14 EKF2 keeps to one sensor of height"
+    meant = {name: log.meant for name, log in ekf2.aids.items() if log.meant is not None}
+    shares = {name: float(np.mean(at_times(on, times) > 0.0)) for name, on in meant.items()}
+    fused = [aid.name for aid in SENSORS if shares.get(aid.name) == 1.0]
+    if more := [aid for aid in HEIGHTS if shares.get(aid.name) and aid.name not in fused]:
+        return f"EKF2 fused {more[0].label} in a part of the flight"
+    reference = REFERENCES.get(int(parameters.get("EKF2_HGT_REF", 1.0)))
+    if len(fused) == 1:  # the one that there is takes its place
+        (reference,) = fused
+    if reference not in fused:
+        return "its reference is neither GNSS nor the barometer, as far as the log tells"
+    taken_s, down_m = np.zeros((2, 0))
+    if BAROMETER.name in fused and flight.barometer is not None:
+        taken_s = flight.barometer.index.to_numpy() - 0.5 * ekf2.step_s
+        down_m = flight.barometer["down_m"].to_numpy() + record.altitude_m
+    zone_m = parameters.get("EKF2_GND_EFF_DZ", DEAD_ZONE_M)
+    dead_m = np.where(record.was(GROUND_EFFECT, taken_s), zone_m, 0.0)
+    had_hz = OLD_BAROMETER_HZ if record.per_step_biases else BAROMETER_HZ
+    made, delayed = [], record.delayed["down_m"]
+    for stretch in stretches:
+        start_s, bias = float(stretch.time_s[0]), (0.0, 0.0)
+        for other in {*fused} - {reference}:
+            known = record.height_bias.get(other)
+            if known is None or not known.index[0] - BIAS_LATE_S < start_s < known.index[-1]:
+                return f"the log does not hold EKF2's bias of the {AIDS[other].label}"
+            value, variance = (np.interp(start_s, known.index, known[name]) for name in known)
+            bias = float(value), float(variance)
+        samples = inside(stretch, taken_s, down_m, dead_m)
+        rate_hz = len(samples[0]) / float(stretch.time_s[-1] - start_s)
+        if BAROMETER.name in fused and rate_hz < LEAST_HZ:
+            return f"the log holds {rate_hz:.1f} samples of the barometer a second"
+        weight = max(had_hz / rate_hz, 1.0) if rate_hz else 1.0
+        state = stretch.state.copy()
+        state[DOWN] = np.interp(start_s, delayed.index, delayed)
+        heights = Heights(tuple(fused), reference, bias, *samples, weight)
+        made.append(replace(stretch, state=state, heights=heights))
+    return made
+
+
+def inside(
+    stretch: Stretch, taken_s: Array, down_m: Array, dead_m: Array
+) -> tuple[IntArray, Array, Array, Array]:
+    """Samples of the barometer in a stretch, behind the step at the end of which each is taken."""
+    step = np.searchsorted(stretch.time_s, taken_s - 1e-9)
+    kept = (step > 0) & (step < len(stretch.time_s))
+    return step[kept], taken_s[kept], down_m[kept], dead_m[kept]
+
+
+def barometer_samples(stretch: Stretch, ends: Sequence[IntArray]) -> list[Array]:
+    """Samples by the event at which they are fused, for several sets of events by their steps.
+
+    Each of shape (5, k, E), for the k that come in one interval at most: height at the event, as if
+    the vehicle had stood still since, age then, time, dead zone, and 1; all 0 where there is none.
+    """
+    heights, time_s = stretch.heights, stretch.time_s
+    assert heights is not None
+    force = np.einsum("nj,nj->n", stretch.rotation[1:, 2], stretch.force_m_s2) + GRAVITY_M_S2
+    # by the IMU alone, from a standstill
+    speed = np.concatenate([[0.0], np.cumsum(force * stretch.step_s)])
+    path = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * stretch.step_s)])
+    found = []
+    for end in ends:
+        event = np.searchsorted(end, heights.step)
+        event = event[event < len(end)]
+        step, at = heights.step[: len(event)], end[event]
+        age_s = time_s[at] - time_s[step]
+        down_m, taken_s, dead_m = (
+            each[: len(event)] for each in (heights.down_m, heights.taken_s, heights.dead_m)
+        )
+        down_m = down_m + path[at] - path[step] - speed[at] * age_s
+        place = np.arange(len(event)) - np.searchsorted(event, event)
+        samples = np.zeros((5, place.max(initial=-1) + 1, len(end)))
+        samples[:, place, event] = down_m, age_s, taken_s, dead_m, np.ones(len(event))
+        found.append(samples)
+    most = max(samples.shape[1] for samples in found)
+    return [np.pad(each, ((0, 0), (0, most - each.shape[1]), (0, 0))) for each in found]
+
+
+class HeightFilter:
+    """The heights of S variants through one stretch, event by event.
+
+    Parameters
+    ----------
+    stretch : Stretch
+    barometer : ndarray, shape (5, k, E, S) or (5, k, E, 1)
+        As :func:`barometer_samples` has them.
+    fix_s, fixed : ndarray, shape (E, S) or (E, 1)
+        When the fix of each event was measured, and whether there is one.
+    on : mapping from PX4's name of an aid to ndarray of bool, shape (E, S)
+        Whether it is still there.
+    knob : mapping from PX4's name to ndarray, shape (S,)
+    gated : ndarray of bool, shape (S,)
+
+    Attributes
+    ----------
+    told : ndarray, shape (E, k + 1, 3, S)
+        Of the barometer's samples and of GNSS at each event: innovation (m, measurement minus
+        state), its variance, and whether it was fused.
+    """
+
+    def __init__(
+        self, stretch: Stretch, barometer: Array, fix_s: Array, fixed: BoolArray,
+        on: Mapping[str, BoolArray], knob: Mapping[str, Array], gated: BoolArray,
+    ) -> None:  # fmt: skip
+        heights, size = stretch.heights, len(gated)
+        assert heights is not None
+        self.fused = heights.fused
+        self.down_m, self.age_s, taken_s, self.dead_m, there = barometer
+        self.time_s = [*taken_s, fix_s]
+        self.told = np.full((len(fix_s), len(self.time_s), 3, size), np.nan)
+        fixed = fixed & on[GNSS_HGT.name] & (GNSS_HGT.name in heights.fused)
+        self.seen = [*((there > 0.0) & on[BAROMETER.name]), fixed]
+        self.any = [np.any(each, axis=1).tolist() for each in self.seen]
+        self.near = self.dead_m.any(axis=2)
+        gates = [np.maximum(knob.get(aid.gate, MIN_GATE), MIN_GATE) for aid in SENSORS]
+        self.gate2 = [np.where(gated, gate**2, np.inf) for gate in gates]
+        self.noise_m2 = np.maximum(knob.get(BAROMETER.noise, MIN_SD_M), MIN_SD_M) ** 2
+        self.biased = [aid.name != heights.reference for aid in SENSORS]
+        self.weight, self.learning = (heights.weight, 1.0), on[heights.reference]
+        self.bias_m, self.bias_m2 = (np.full(size, value) for value in heights.bias)
+        self.one_sided, self.last_s = np.zeros(size), np.full(size, stretch.time_s[0])
+        step_s = float(np.median(stretch.step_s))
+        self.share = step_s / (FILTER_S + step_s)
+
+    def updates(self, sensor: str, variant: int, end_s: Array) -> pd.DataFrame:
+        """What one variant did with each sample of a sensor; ``end_s`` is the time of each event.
+
+        By the time of measurement as EKF2 takes it.
+        """
+        rows, slots = [], len(self.down_m)
+        for place in [slots] if sensor == GNSS_HGT.name else range(slots):
+            times, seen = self.time_s[place], self.seen[place][:, variant]
+            taken_s = times[seen, min(variant, times.shape[1] - 1)]
+            rows.append(np.vstack([taken_s, self.told[seen, place, :, variant].T, end_s[seen]]))
+        taken_s, nu, S, fused, end_s = np.hstack(rows)
+        columns = {"innovation_down_m": nu, "innovation_variance_down_m2": S}
+        columns |= {"rejected": 1.0 - fused, "fused": fused, "fused_at_s": end_s}
+        return pd.DataFrame(columns, pd.Index(taken_s, name="time_s")).sort_index()
+
+    def fuse(
+        self, e: int, x: Array, P: Array, gnss_m: Array, gnss_m2: Array
+    ) -> tuple[Array, Array]:
+        """State and covariance after both at one event; height of GNSS and its R are given."""
+        for place in range(len(self.down_m)):
+            if self.any[place][e]:
+                age_s = self.age_s[place, e]
+                column = P[:, :, DOWN] - age_s[:, None] * P[:, :, SPEED_DOWN]
+                spread = column[:, DOWN] - age_s * column[:, SPEED_DOWN]
+                nu = self.down_m[place, e] - x[:, DOWN] + age_s * x[:, SPEED_DOWN]
+                x, P = self._take(e, place, 0, x, P, column, spread, nu, self.noise_m2)
+        if self.any[-1][e]:
+            column, nu = P[:, :, DOWN], gnss_m - x[:, DOWN]
+            x, P = self._take(e, -1, 1, x, P, column, column[:, DOWN], nu, gnss_m2)
+        return x, P
+
+    def _take(
+        self, e: int, place: int, at: int, x: Array, P: Array, column: Array, spread: Array,
+        nu: Array, R: Array,
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """Fuse an innovation; ``column`` is PH', ``spread`` HPH'."""
+        if self.biased[at]:
+            nu, R = self._corrected(e, place, nu, spread, R, self.weight[at])
+        if at == 0 and self.near[place, e]:
+            nu = np.where(nu > 0.0, np.maximum(nu - self.dead_m[place, e], 0.0), nu)
+        S = spread + R
+        taken = self.seen[place][e] & (nu * nu <= self.gate2[at] * S)
+        self.told[e, place] = nu, S, taken
+        K = column * (taken / (spread + R / self.weight[at]))[:, None]
+        return x + K * nu[:, None], P - K[:, :, None] * column[:, None]
+
+    def _corrected(
+        self, e: int, place: int, nu: Array, spread: Array, noise_m2: Array, weight: float
+    ) -> tuple[Array, Array]:
+        """Innovation and R with the bias as it was, which learns of them before they are fused."""
+        seen, time_s = self.seen[place][e], self.time_s[place][e]
+        learns, most = seen & self.learning[e], np.maximum(noise_m2, LEAST_NOISE_M2)
+        raised = np.where(np.abs(self.one_sided) > ONE_SIDED, RAISED, 1.0)
+        gained = BIAS_DENSITY**2 * (time_s - self.last_s) * raised * learns
+        variance = np.minimum(self.bias_m2 + gained, most)
+        nu, R = nu + self.bias_m, noise_m2 + variance
+        S = variance + np.maximum((noise_m2 + spread) / weight, LEAST_NOISE_M2)
+        ratio = nu * nu / (BIAS_GATE**2 * S)
+        K = variance / S * (learns & (ratio < 1.0))
+        self.bias_m = self.bias_m - K * nu
+        self.bias_m2 = np.maximum(variance * (1.0 - K), LEAST_M2)
+        signed = np.minimum(ratio, 1.0) * np.sign(-nu)
+        self.one_sided = self.one_sided + self.share * weight * learns * (signed - self.one_sided)
+        self.last_s = np.where(seen, time_s, self.last_s)
+        return nu, R

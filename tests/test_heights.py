@@ -1,0 +1,415 @@
+"""Height in the model of EKF2 on GNSS: closed forms, simulated pairs, and flights of PX4's EKF2."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pandas as pd
+import pytest
+from exchange import replace
+from findings_tools import made
+
+from px4fuse.analysis import run_what_if
+from px4fuse.ekf2.heights import HeightFilter, barometer_samples, with_heights
+from px4fuse.ekf2.model import Model, open_model, run_variants
+from px4fuse.ekf2.recursion import Variant
+from px4fuse.ekf2.stretches import Heights, Stretch
+from px4fuse.ekf2.whatif import HEIGHT_FOLLOWS, HEIGHT_STAYS, WhatIf, what_if
+from px4fuse.errors import SettingsError
+from px4fuse.flight import AidLog, Flight, Unavailable
+from px4fuse.readers import read_log
+from px4fuse.report.whatif import rows
+from px4fuse.report.why import agreement_words
+from px4fuse.request import WhatIfRequest
+from px4fuse.results.build import whatif_results
+from px4fuse.results.contract import schema, to_json
+from px4fuse.simulation import ekf2 as simulated
+from px4fuse.simulation.flights import simulate_flight
+from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.scenario import scenario_of
+
+BOTH = ("baro_hgt", "gnss_hgt")
+STEP_S, PERIOD_S = 0.01, 0.1
+
+
+def climbing(heights: Heights, count: int = 400, up_m_s2: float = 0.0) -> Stretch:
+    force = np.tile([0.0, 0.0, -9.80665 - up_m_s2], (count, 1))
+    return made(
+        Stretch, time_s=STEP_S * np.arange(count + 1), step_s=np.full(count, STEP_S),
+        rotation=np.tile(np.eye(3), (count + 1, 1, 1)), force_m_s2=force, heights=heights,
+    )  # fmt: skip
+
+
+def sampled(
+    steps: list[int], down_m: list[float], *, fused: tuple[str, ...] = BOTH,
+    reference: str = "gnss_hgt", dead_m: float = 0.0, weight: float = 1.0,
+) -> Heights:  # fmt: skip
+    step = np.array(steps)
+    return Heights(
+        fused, reference, (0.0, 1.0), step, STEP_S * step, np.array(down_m),
+        np.full(len(step), dead_m), weight,
+    )  # fmt: skip
+
+
+def fusing(
+    stretch: Stretch, end: np.ndarray, *, reference_until: float = np.inf, fixed: bool = False,
+    gated: bool = True, noise_m: float = 0.5, gate: float = 5.0,
+) -> HeightFilter:  # fmt: skip
+    (samples,) = barometer_samples(stretch, [end])
+    there, time_s = np.full((len(end), 1), fixed), stretch.time_s[end][:, None]
+    on = {"baro_hgt": np.ones_like(there), "gnss_hgt": time_s < reference_until}
+    knob = {"EKF2_BARO_NOISE": np.array([noise_m]), "EKF2_BARO_GATE": np.array([gate])}
+    return HeightFilter(stretch, samples[..., None], time_s, there, on, knob, np.array([gated]))
+
+
+def told(heights: HeightFilter, end: np.ndarray, x: np.ndarray, P: np.ndarray) -> pd.DataFrame:
+    """What the barometer told a state that nobody moves."""
+    for e in range(len(end)):
+        heights.fuse(e, x, P, np.zeros(1), np.ones(1))
+    return heights.updates("baro_hgt", 0, end * STEP_S)
+
+
+def test_the_bias_is_the_scalar_kalman_filters_with_its_steady_variance() -> None:
+    """Of a barometer 1.7 m too high (down 1.7 less) over a height that is known exactly.
+
+    Steady: p = (q + √(q² + 4 q R)) / 2 before a sample, with q = 0.13² T (bias_estimator.cpp).
+    """
+    steps = list(range(10, 4000, 10))
+    stretch = climbing(sampled(steps, [-1.7] * len(steps)), 4000)
+    heights = fusing(stretch, np.array(steps))
+    found = told(heights, np.array(steps), np.zeros((1, 9)), np.zeros((1, 9, 9)))
+    q, R = 0.13**2 * PERIOD_S, 0.25
+    p = (q + np.sqrt(q * q + 4.0 * q * R)) / 2.0
+    assert heights.bias_m2[0] == pytest.approx(p * R / (p + R), rel=1e-6)
+    assert found["innovation_variance_down_m2"].iloc[-1] == pytest.approx(p + R, rel=1e-6)
+    assert heights.bias_m[0] == pytest.approx(1.7, abs=1e-6)
+    # and on the way there as its recursion has it
+    bias, variance, innovations = 0.0, 1.0, []
+    for _ in steps:
+        variance = min(variance + q, R)
+        innovations.append(-1.7 + bias)
+        K = variance / (variance + R)
+        if innovations[-1] ** 2 < 9.0 * (variance + R):
+            bias, variance = bias + K * (1.7 - bias), variance * (1.0 - K)
+    np.testing.assert_allclose(found["innovation_down_m"], innovations, atol=1e-9)
+
+
+def test_without_its_reference_the_bias_of_the_other_stays() -> None:
+    steps = list(range(10, 400, 10))
+    stretch = climbing(sampled(steps, [-1.0] * len(steps)))
+    heights = fusing(stretch, np.array(steps), reference_until=1.005)
+    found = told(heights, np.array(steps), np.zeros((1, 9)), np.zeros((1, 9, 9)))
+    after = found["innovation_down_m"].loc[1.15:]
+    assert np.ptp(after) == 0.0
+    assert 0.0 < -after.iloc[0] < 0.5 < -found["innovation_down_m"].iloc[0]
+
+
+@pytest.mark.parametrize(("down_m", "learned"), [(-2.0, True), (-2.3, False)])
+def test_beyond_three_standard_deviations_nothing_is_learned_of_a_bias(
+    down_m: float, learned: bool
+) -> None:
+    """Of √(0.25 + 0.25) m here."""
+    heights = fusing(climbing(sampled([10], [down_m])), np.array([10]))
+    told(heights, np.array([10]), np.zeros((1, 9)), np.zeros((1, 9, 9)))
+    assert (heights.bias_m[0] > 0.0) == learned
+
+
+@pytest.mark.parametrize("reference", BOTH)
+def test_the_reference_has_no_bias(reference: str) -> None:
+    steps = list(range(10, 400, 10))
+    stretch = climbing(sampled(steps, [-1.0] * len(steps), reference=reference))
+    heights = fusing(stretch, np.array(steps))
+    told(heights, np.array(steps), np.zeros((1, 9)), np.zeros((1, 9, 9)))
+    assert (heights.bias_m[0] == 0.0) == (reference == "baro_hgt")
+
+
+def test_a_sample_is_judged_by_where_the_vehicle_was_then() -> None:
+    """Climbing at 2 m/s and 3 m/s², two samples before each event, and one at it."""
+    time = STEP_S * np.arange(401)
+    down = -2.0 * time - 1.5 * time**2
+    steps = [13, 17, 30, 45]
+    of = sampled(steps, [down[at] - 0.1 for at in steps], fused=("baro_hgt",), reference="baro_hgt")
+    end = np.array([10, 20, 30, 40, 50])
+    heights = fusing(climbing(of, up_m_s2=3.0), end)
+    for e, at in enumerate(end):
+        x = np.zeros((1, 9))
+        x[0, 5], x[0, 8] = -2.0 - 3.0 * time[at], down[at]
+        heights.fuse(e, x, np.zeros((1, 9, 9)), np.zeros(1), np.ones(1))
+    found = heights.updates("baro_hgt", 0, end * STEP_S)
+    np.testing.assert_allclose(found["innovation_down_m"], -0.1, atol=1e-9)
+    np.testing.assert_allclose(found.index, time[steps])
+    np.testing.assert_allclose(found["fused_at_s"], [0.2, 0.2, 0.3, 0.5])
+
+
+def test_one_sample_in_the_log_weighs_as_those_that_ekf2_had() -> None:
+    """Of R = 0.25 m² with weight 2 as two of them; S is of one."""
+    P = np.zeros((1, 9, 9))
+    P[0, 8, 8] = 0.5
+    variances = []
+    for steps, weight in (([10], 2.0), ([10, 10], 1.0)):
+        of = sampled(
+            steps, [0.3] * len(steps), fused=("baro_hgt",), reference="baro_hgt", weight=weight
+        )
+        heights = fusing(climbing(of), np.array([10]))
+        x, after = heights.fuse(0, np.zeros((1, 9)), P, np.zeros(1), np.ones(1))
+        variances.append((after[0, 8, 8], x[0, 8]))
+        assert heights.told[0, 0, 1, 0] == pytest.approx(0.75)
+    assert variances[0] == pytest.approx(variances[1])
+
+
+@pytest.mark.parametrize(
+    ("innovation", "expected"), [(-0.5, -0.5), (0.5, 0.0), (3.9, 0.0), (4.5, 0.5)]
+)
+def test_in_ground_effect_too_low_a_barometer_is_unheeded(
+    innovation: float, expected: float
+) -> None:
+    """baro_height_control.cpp: a dead zone of EKF2_GND_EFF_DZ."""
+    of = sampled([10], [innovation], fused=("baro_hgt",), reference="baro_hgt", dead_m=4.0)
+    heights = fusing(climbing(of), np.array([10]))
+    found = told(heights, np.array([10]), np.zeros((1, 9)), np.zeros((1, 9, 9)))
+    assert found["innovation_down_m"].item() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("gated", "fused"), [(True, 0.0), (False, 1.0)])
+def test_beyond_its_gate_a_height_is_rejected(gated: bool, fused: float) -> None:
+    of = sampled([10], [2.6], fused=("baro_hgt",), reference="baro_hgt")
+    heights = fusing(climbing(of), np.array([10]), gated=gated)
+    found = told(heights, np.array([10]), np.zeros((1, 9)), np.zeros((1, 9, 9)))
+    assert (found["fused"].item(), found["rejected"].item()) == (fused, 1.0 - fused)
+
+
+# ---------------------------------------------------------------- simulated flights
+
+
+@cache
+def outdoors(baro_noise_m: float = 0.4) -> Flight:
+    """A flight whose EKF2 takes its barometer to be so exact."""
+    usual = simulated.parameters
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            simulated, "parameters", lambda *of: usual(*of) | {"EKF2_BARO_NOISE": baro_noise_m}
+        )
+        return simulate_flight(scenario_of("outdoor", seed=3, passes=3), parse(()))
+
+
+def opened(flight: Flight) -> Model:
+    model = open_model(flight)
+    assert isinstance(model, Model)
+    return model
+
+
+def test_what_if_predicts_the_height_of_the_flight_with_the_other_noise() -> None:
+    model = opened(outdoors())
+    assert model.agreement.baro_hgt["down"].innovation_correlation > 0.999
+    assert model.agreement.baro_hgt["down"].position_rms_difference_m < 0.02
+    other = opened(outdoors(2.0))
+    for one, value, then in ((model, 2.0, other), (other, 0.4, model)):
+        found, true = what_if(one, [{"EKF2_BARO_NOISE": value}]), what_if(then, [])
+        assert isinstance(found, WhatIf)
+        assert isinstance(true, WhatIf)
+        (predicted,), logged = found.whatif, true.logged
+        for name in ("nis_mean", "innovation_std_m"):
+            expected = getattr(true.replayed.heights["baro_hgt"], name)
+            assert getattr(predicted.heights["baro_hgt"], name) == pytest.approx(expected, rel=0.02)
+        assert predicted.height_rmse_to_truth_m == pytest.approx(
+            logged.height_rmse_to_truth_m, rel=0.1
+        )
+        assert HEIGHT_FOLLOWS in found.notes
+    # with 25 times the variance, the barometer holds the height more loosely
+    assert (
+        found.whatif[0].heights["baro_hgt"].nis_mean
+        > 5.0 * found.logged.heights["baro_hgt"].nis_mean
+    )
+
+
+def test_without_its_only_sensor_the_height_drifts_and_that_is_told() -> None:
+    found = what_if(opened(outdoors()), [{}], {"baro_hgt": 40.0})
+    assert isinstance(found, WhatIf)
+    (lost,) = found.whatif
+    assert lost.heights == {}
+    assert not isinstance(lost.height_rmse_to_truth_m, Unavailable)
+    assert lost.height_rmse_to_truth_m > 2.0 * found.replayed.height_rmse_to_truth_m
+    assert "; its height is " in found.notes[-1]
+
+
+def test_a_height_that_would_be_rejected_for_long_is_not_predicted() -> None:
+    """EKF2 resets it after five seconds, which the model does not."""
+    flight = outdoors()
+    jump = flight.barometer.copy()
+    jump.loc[40.0:50.0, "down_m"] += 3.0
+    model = opened(flight)
+    other = replace(flight, barometer=jump)
+    stretches, why = with_heights(
+        other, model.flight.ekf2, model.flight.ekf2.record, model.inputs.stretches
+    )
+    assert not why
+    jumping = replace(model, inputs=replace(model.inputs, stretches=stretches))
+    found = what_if(jumping, [{"EKF2_BARO_GATE": gate} for gate in (3.0, 50.0)])
+    assert isinstance(found, WhatIf)
+    assert [one.steady for one in found.whatif] == [False, True]
+    assert found.whatif[0].heights["baro_hgt"].longest_without_fusion_s > 5.0
+
+
+def test_a_height_that_does_not_agree_is_named_and_the_rest_stands() -> None:
+    flight = outdoors()
+    noise = np.random.default_rng(1).normal(0.0, 1.0, (len(flight.barometer), 1))
+    model = opened(replace(flight, barometer=flight.barometer + noise))
+    agreement = model.agreement
+    assert agreement.good
+    assert set(agreement.doubtful) == {"baro_hgt"}
+    assert "correlate by" in agreement.doubtful["baro_hgt"]
+    assert agreement.baro_hgt["down"].innovation_correlation < 0.95
+    assert ". Not so the barometer, of which nothing is concluded: " in agreement_words(agreement)
+    assert model.flown.heights == {}
+    own = np.interp(model.flown.delayed.index, flight.ekf2.state.index, flight.ekf2.state["down_m"])
+    assert np.abs(model.flown.delayed["down_m"] - own).max() < 0.5
+    found = what_if(model, [{"EKF2_GPS_DELAY": 0.0}])
+    assert isinstance(found, WhatIf)
+    assert HEIGHT_STAYS in found.notes
+    with pytest.raises(SettingsError, match=r"EKF2_BARO_NOISE changes nothing here: .*barometer: "):
+        what_if(model, [{"EKF2_BARO_NOISE": 1.0}])
+    with pytest.raises(SettingsError, match=r"baro_hgt: of this log .*barometer: "):
+        what_if(model, [{}], {"baro_hgt": 40.0})
+
+
+def test_what_the_log_lacks_of_the_heights_is_said() -> None:
+    flight = outdoors()
+    model = opened(flight)
+    ekf2, stretches = model.flight.ekf2, model.inputs.stretches
+    record = ekf2.record
+
+    def why(meant: dict[str, float], rows: int = 1, **parameters: float) -> str:
+        """With aids meant to be fused for so much of the flight; 0 is GNSS from 60 s on."""
+        found = {
+            name: made(AidLog, meant=pd.Series([share, 1.0], index=[0.0, 60.0]))
+            for name, share in meant.items()
+        }
+        log = replace(record, parameters=record.parameters | parameters)
+        other = replace(flight, barometer=flight.barometer.iloc[::rows])
+        kept, said = with_heights(other, replace(ekf2, aids=found), log, stretches)
+        assert bool(said) == (kept[0] is stretches[0])
+        return said
+
+    assert why({"baro_hgt": 1.0}) == ""
+    assert "range to the ground in a part" in why({"baro_hgt": 1.0, "rng_hgt": 0.0})
+    assert "GNSS height in a part" in why({"baro_hgt": 1.0, "gnss_hgt": 0.0})
+    assert "bias of the barometer" in why(dict.fromkeys(BOTH, 1.0), EKF2_HGT_REF=1.0)
+    assert "bias of the GNSS height" in why(dict.fromkeys(BOTH, 1.0), EKF2_HGT_REF=0.0)
+    assert "reference is neither" in why(dict.fromkeys(BOTH, 1.0), EKF2_HGT_REF=2.0)
+    assert "reference is neither" in why({})
+    assert "3.3 samples of the barometer" in why({"baro_hgt": 1.0}, rows=3)
+    old = {"EKF2_AID_MASK": 1.0}
+    log = replace(record, parameters=old)
+    assert "before PX4 v1.14" in with_heights(flight, ekf2, log, stretches)[1]
+
+
+def test_an_acceleration_that_ekf2_took_to_be_wrong_is_noise_of_4_9() -> None:
+    """covariance.cpp, BADACC_BIAS_PNOISE."""
+    inputs = opened(outdoors()).inputs
+    (stretch,) = inputs.stretches
+    spoilt = replace(stretch, shaken=np.ones(len(stretch.time_s), bool))
+    runs = [
+        run_variants(replace(inputs, stretches=(one,)), [Variant(settings)], {})[0]
+        for one, settings in (
+            (spoilt, inputs.settings),
+            (stretch, inputs.settings | {"EKF2_ACC_NOISE": 4.9}),
+        )
+    ]
+    np.testing.assert_array_equal(runs[0].state, runs[1].state)
+
+
+# ---------------------------------------------------------------- flights of PX4's EKF2
+
+FLOWN = {
+    "delay0": (0.998, 0.96, 0.05), "fullrate": (0.998, 0.96, 0.05), "nominal": (0.998, 0.96, 0.05),
+    "overconfident": (0.999, 0.999, 0.02),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def models(shared_logs: Path) -> dict[str, Model]:
+    return {
+        name: opened(read_log(shared_logs / "gps" / f"v1.16.1_gps_{name}.ulg")) for name in FLOWN
+    }
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize("name", FLOWN)
+def test_heights_are_replayed(models: dict[str, Model], name: str) -> None:
+    """Half of the barometer's samples are not in the log, but for the last flight."""
+    gnss, barometer, published_m = FLOWN[name]
+    agreement = models[name].agreement
+    assert agreement.doubtful == {}
+    for aid, least in (("gnss_hgt", gnss), ("baro_hgt", barometer)):
+        axis = getattr(agreement, aid)["down"]
+        assert axis.innovation_correlation > least
+        assert 0.99 < axis.s_ratio_p5 <= axis.s_ratio_p95 < 1.01
+        assert axis.nis_mean_replayed == pytest.approx(axis.nis_mean_logged, rel=0.15)
+        assert axis.position_rms_difference_m < published_m
+        assert axis.velocity_rms_difference_m_s < 0.02
+    for summary in (found := what_if(models[name], [])).logged, found.replayed:  # type: ignore[union-attr]
+        assert {one.rejected_share for one in summary.heights.values()} == {0.0}
+    assert found.replayed.height_rmse_to_truth_m == pytest.approx(
+        found.logged.height_rmse_to_truth_m, abs=0.02
+    )
+
+
+@pytest.mark.reallogs
+def test_what_other_settings_of_heights_would_have_done(models: dict[str, Model]) -> None:
+    """The barometer's noise of 0.5 m makes its NIS; the gate rejects what lies beyond."""
+
+    def heights(without: dict[str, float] | None = None, **settings: float) -> Any:
+        found = what_if(models["nominal"], [settings], without)
+        assert isinstance(found, WhatIf)
+        return found.whatif[0], found.replayed
+
+    loose, flown = heights(EKF2_BARO_NOISE=3.5)
+    # R is 49 times as large, and the bias takes up what is slow
+    ratio = loose.heights["baro_hgt"].nis_mean / flown.heights["baro_hgt"].nis_mean
+    assert 1.0 / 49.0 < ratio < 1.0 / 25.0
+    # R of 1.5 times EKF2_GPS_P_NOISE, in place of the 0.6 m that the receiver states
+    wide = heights(EKF2_GPS_P_NOISE=2.0)[0].heights["gnss_hgt"]
+    assert 8.0 < wide.innovation_std_m**2 / wide.nis_mean < 9.6  # and a mean besides
+    narrow, _ = heights(EKF2_BARO_GATE=1.0)
+    # of a normal distribution with the variance that its NIS tells, beyond 1 √S
+    assert narrow.heights["baro_hgt"].rejected_share == pytest.approx(0.17, abs=0.03)
+    assert narrow.heights["gnss_hgt"].rejected_share == 0.0
+    # GNSS alone has the height: 0.6 m of noise ten times a second, held by its own velocity
+    alone, flown = heights({"baro_hgt": 60.0})
+    assert alone.heights.keys() == {"gnss_hgt"}
+    assert alone.height_rmse_to_truth_m == pytest.approx(flown.height_rmse_to_truth_m, abs=0.05)
+    # and what the barometer's bias was is then wrong for good
+    drifting, flown = heights({"gnss_hgt": 60.0})
+    assert drifting.height_rmse_to_truth_m > 1.5 * flown.height_rmse_to_truth_m
+    assert drifting.north.position_rmse_to_truth_m == pytest.approx(
+        flown.north.position_rmse_to_truth_m, abs=0.01
+    )
+
+
+@pytest.mark.reallogs
+def test_a_flight_whose_height_was_also_of_a_range_finder_says_so(shared_logs: Path) -> None:
+    model = opened(read_log(shared_logs / "simulated" / "v1.16.1_no_uwb.ulg"))
+    assert model.agreement.good
+    with pytest.raises(SettingsError, match="EKF2 fused range to the ground in a part"):
+        what_if(model, [{"EKF2_BARO_NOISE": 1.0}])
+
+
+@pytest.mark.reallogs
+def test_table_and_results_have_each_sensor_of_height(shared_logs: Path) -> None:
+    log = str(shared_logs / "gps" / "v1.16.1_gps_nominal.ulg")
+    request = WhatIfRequest(log=log, changes={"EKF2_BARO_GATE": 1.5}, without={"gnss_hgt": 100.0})
+    found = run_what_if(request)
+    said = json.loads(to_json(whatif_results(request, found)))
+    jsonschema.validate(said, schema())
+    assert said["whatif"]["heights"].keys() == {"baro_hgt"}
+    assert said["replayed"]["heights"].keys() == {"baro_hgt", "gnss_hgt"}
+    shown = {row[0]: row[1:] for row in rows(found)}
+    assert shown["GNSS height: mean NIS"][-1] == "n/a"
+    assert shown["height: RMSE to truth (m)"] == [
+        f"{said[which]['height_rmse_to_truth_m']:.3f}" for which in ("logged", "replayed", "whatif")
+    ]
