@@ -14,7 +14,7 @@ from forgery import forged, with_results
 from pypdf import PdfReader, PdfWriter
 
 from px4fuse.grading import grade as grading
-from px4fuse.grading import outputs, records
+from px4fuse.grading import records
 from px4fuse.grading.model import Entry, Graded, Item
 from px4fuse.verification import workers
 from px4fuse.verification.model import Verdict
@@ -74,7 +74,7 @@ def in_this_process(monkeypatch) -> None:
     What goes to them and what comes back is pickled all the same.
     """
 
-    for module in (grading, outputs, workers):
+    for module in (grading, workers):
         monkeypatch.setattr(module, "run_bounded", in_turn)
 
 

@@ -17,7 +17,6 @@ from pypdf.generic import DecodedStreamObject, DictionaryObject, NameObject, Num
 
 from px4fuse.errors import ResultsError
 from px4fuse.reading import files_by_sha256
-from px4fuse.report.seal import seal_of, sealed
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json
 from px4fuse.results.reading import read_results
 from px4fuse.verification import rerun
@@ -28,13 +27,12 @@ from px4fuse.verification.verification import verify
 Forge = Callable[[PdfWriter], Any]
 Edit = Callable[[bytes], bytes]
 Change = Callable[[dict[str, Any]], Any]
-SEAL = re.compile(rb"%px4fuse-sha256 [0-9a-f]{64}\n\Z")
 ESCAPED = {0x08: b"\\b", 0x09: b"\\t", 0x0A: b"\\n", 0x0C: b"\\f", 0x0D: b"\\r", 0x28: b"\\(",
            0x29: b"\\)", 0x5C: b"\\\\"}  # fmt: skip
 
 
 def forged(pdf: bytes, *changes: Forge) -> bytes:
-    """The file with something changed in it, without a seal."""
+    """The file with something changed in it."""
     writer = PdfWriter(clone_from=io.BytesIO(pdf))
     for change in changes:
         change(writer)
@@ -46,12 +44,6 @@ def saved(writer: PdfWriter) -> bytes:
     out = io.BytesIO()
     writer.write(out)
     return out.getvalue()
-
-
-def seal(pdf: bytes) -> bytes:
-    found = SEAL.search(pdf)
-    assert found is not None
-    return found[0]
 
 
 def edited(stream: Any, change: Edit) -> DecodedStreamObject:
@@ -150,7 +142,7 @@ def report_of(pdf: bytes) -> Report:
     """A report, read without care: tests of reading are elsewhere."""
     results = read_results(PdfReader(io.BytesIO(pdf)).attachments["results.json"][0])
     assert isinstance(results, ComparisonResults | LoopResults)
-    return Report(hashlib.sha256(pdf).hexdigest(), seal_of(pdf), results, pdf)
+    return Report(hashlib.sha256(pdf).hexdigest(), results, pdf)
 
 
 def plain(report: Report) -> dict[str, Any]:
@@ -194,8 +186,8 @@ class Base:
         return verify(report, self.files, recompute=self.recompute)
 
     def with_results(self, results: dict[str, Any]) -> bytes:
-        """The report with other results attached, and a seal that fits."""
-        return sealed(forged(self.pdf, with_results(to_json(results))))
+        """The report with other results attached."""
+        return forged(self.pdf, with_results(to_json(results)))
 
 
 def base(pdf: bytes, log: Path) -> Base:

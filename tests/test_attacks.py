@@ -27,7 +27,6 @@ from px4fuse.grading.model import Graded
 from px4fuse.grading.rubric import Rubric, read_rubric
 from px4fuse.grading.scoring import assess, refused
 from px4fuse.report import pdf as pdf_module
-from px4fuse.report.seal import sealed
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
@@ -243,7 +242,7 @@ def test_files(
 def test_pages_that_were_painted_over(flight: Flight, honest: Graded, rubric: Rubric) -> None:
     """The numbers are verified, the page is not, and what is scored is the redrawn report."""
     painted = on_page(1, lambda stream: stream + b"\n0 0 0 rg 100 300 200 200 re f\n")
-    pdf = sealed(forged(flight.honest.pdf, painted))
+    pdf = forged(flight.honest.pdf, painted)
     verdict = flight.honest.verified(pdf)
     graded = flight.graded(report_of(pdf), verdict, rubric)
     assert graded.status == "page differs"

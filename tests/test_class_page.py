@@ -86,9 +86,9 @@ CLASS = (
     row("Émile", 9.0, id="1010", numbers={"mean NIS": 0.5}),
     row("Bo", 20.0, id="99", numbers={"mean NIS": -3.0}),
     row("", None, file="broken.pdf", status="cannot verify", reasons=("Not a PDF.",)),
-    row(MARKUP, 5.0, id=FORMULA, file=BREAKOUT, flags=(MARKUP, MARKUP), handed_in=b"<svg onload=x>",
-        notes=BREAKOUT, reasons=(BREAKOUT,), numbers={MARKUP: 1.0}, pending=MARKUP,
-        form=FORM, mistakes={MARKUP: False},
+    row(MARKUP, 5.0, id=FORMULA, file=BREAKOUT, flags=(MARKUP, MARKUP), notes=BREAKOUT,
+        reasons=(BREAKOUT,), numbers={MARKUP: 1.0}, pending=MARKUP,
+        form=FORM, mistakes={MARKUP: False}, handed_in="//example.org/in.png",
         sheets=("//example.org/x.png",), redrawn_name="javascript:alert(1)", comment=BREAKOUT,
         items=(Item(BREAKOUT, 5.0, 20.0, MARKUP, by_hand=True, waits=True),), handed_in_at=MARKUP,
         overrides={BREAKOUT: Override(None, MARKUP)}),
@@ -200,8 +200,8 @@ def anonymous_class() -> list[Entry]:
             mistakes={"positions that jump": False}, comment=said,
             overrides={f"For {name}": Override(10.0, said)},
             others=(graded(name, 3.0, file=f"old/{file}"),),
-            sheets=("pages/0123-001-of-001.png",), redrawn_name=f"reports/{student_id}.pdf",
-            handed_in=png(), sha256="ab" * 32,
+            sheets=("records/0123.page-001.png",), redrawn_name=f"reports/{student_id}.pdf",
+            handed_in="records/0123.handed-in.png", sha256="ab" * 32,
             pseudonym=f"Student {(7 * number) % 4 + 1:03}",
         )  # fmt: skip
         entries.append(entry if file else Entry(name, student_id, None, pseudonym=entry.pseudonym))
@@ -225,10 +225,10 @@ def test_an_anonymous_class_names_nobody() -> None:
         if part[1] == "Points (proposed)"
     ]
     assert {(row[1], row[2]) for rows in points for row in rows} == {("9", "20")}
-    # no link to a PDF, which names its student, and no picture of what was handed in
+    # no link to a PDF, which names its student, and no picture of a page
     assert ".pdf" not in written
+    assert ".png" not in written
     assert "data:image/png" not in written
-    assert "pages/0123-001-of-001.png" in written
     # in the order of the pseudonyms, which says nothing of the names
     names = [row[0][0][0] for row in content(text)["rows"]]
     assert names == sorted(names)
@@ -337,13 +337,13 @@ def test_keys_step_through_the_reports(page: Browser) -> None:
 
 
 def test_a_page_that_differs_stands_beside_the_redrawn_one() -> None:
-    one = row("Zoë", 18.5, sheets=("pages/1.png", "pages/2.png"), handed_in=png(4), page=2,
+    one = row("Zoë", 18.5, sheets=("pages/1.png", "pages/2.png"), handed_in="pages/in.png", page=2,
               redrawn_name="reports/1.pdf")  # fmt: skip
-    made = content(html_text([one, row("Bo", 1.0, handed_in=png())], "Class", "px4fuse 1"))
+    made = content(html_text([one, row("Bo", 1.0, handed_in="pages/bo.png")], "Class", "px4fuse 1"))
     both, every = (part for part in made["rows"][0][3] if part[0] == "pictures")
     assert [said for said, *_ in both[2]] == ["Page 2 of 2", "Page 2, as handed in: not verified"]
     assert both[2][0][2] == "pages/2.png"
-    assert base64.b64decode(both[2][1][2].split(",")[1]) == png(4)
+    assert both[2][1][2] == "pages/in.png"
     assert [source for *_, source in every[2]] == ["pages/1.png", "pages/2.png"]
     (leads,) = (part for part in made["rows"][0][3] if part[0] == "links")
     assert [to for _, to in leads[2]] == ["reports/1.pdf"]

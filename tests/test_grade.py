@@ -125,6 +125,10 @@ def test_a_report_with_its_log_is_verified_and_a_changed_one_is_not(tmp_path) ->
     assert len(redrawn) == 3
     assert len(set(redrawn)) == 1
     assert len(PdfReader(io.BytesIO(redrawn[0])).pages) == 8
+    drawn = [one.name for one in (output / "records").glob("*.png")]
+    assert len(drawn) == 3 * 8
+    page = (output / "class.html").read_text(encoding="utf-8")
+    assert all(f"records/{name}" in page for name in drawn)
     # a page away is a flag, and costs nothing
     assert (third.verdict.status, third.verdict.outcome) == ("verified", "page differs")
     assert third.status == "page differs"
@@ -168,6 +172,11 @@ def test_another_log_at_hand_verifies_again(tmp_path) -> None:
     for logs in ([], [LOG], [LOG], []):
         outcome = grade([tmp_path / "in"], logs, read_rubric(None), tmp_path / "out", processes=1)
         said.append((outcome.graded[0].verdict.status, outcome.reused))
+        # the redrawn pages, or the cover as it was handed in, and nothing of the run before
+        drawn = [one.name for one in (tmp_path / "out" / "records").glob("*.p*")]
+        assert len(drawn) == (9 if logs else 1)
+        page = (tmp_path / "out" / "class.html").read_text(encoding="utf-8")
+        assert all(f"records/{name}" in page for name in drawn if name.endswith(".png"))
     assert said == [
         ("cannot verify", 0), ("verified", 0), ("verified", 1), ("cannot verify", 0)
     ]  # fmt: skip

@@ -94,7 +94,6 @@ def dictionary(**entries: object) -> DictionaryObject:
 
 def test_the_real_report():
     report = read_report(REAL, "aisle_uwb.pdf")
-    assert report.seal == "intact"
     assert to_json(report.results).encode() == JSON
     assert report.pdf is REAL
 
@@ -110,16 +109,14 @@ def test_the_real_report():
 def test_other_reports(pdf, results):
     report = read_report(pdf(), "a\nb\u202e\x1b" * 10_000)
     assert report.results == decoded(results)
-    assert report.seal == "missing"
 
 
 def test_a_report_that_was_saved_again():
     writer = PdfWriter(clone_from=io.BytesIO(REAL))
     again = read_report(saved(writer), "r.pdf")
-    assert again.seal == "missing"
     assert to_json(again.results).encode() == JSON
     changed = read_report(REAL.replace(b"/Title", b"/Titlf"), "r.pdf")
-    assert changed.seal == "broken"
+    assert to_json(changed.results).encode() == JSON
 
 
 # ------------------------------------------------------------------ no report

@@ -116,19 +116,16 @@ def free_report(stem: str, settings: str, mine: Results) -> Path:
 
 def _is_ours(file: Path, mine: Results) -> bool:
     """Whether a report or its results are of the same, or not there yet."""
-    from pypdf import PdfReader
-    from pypdf.errors import PyPdfError
-
-    from px4fuse.report.pdf import RESULTS_NAME
     from px4fuse.results.reading import read_results
+    from px4fuse.verification.intake import attached_results
 
     if not file.exists():
         return True
+    read = read_results if file.suffix == ".json" else attached_results
     try:
-        results = file.suffix == ".json"
-        text = file.read_bytes() if results else PdfReader(file).attachments[RESULTS_NAME][0]
-        (asked, names), (ours, our_names) = map(_of_what, (read_results(text), mine))
-    except (OSError, PyPdfError, KeyError, ValueError, ResultsError):
+        found = read(file.read_bytes(), file.name)
+        (asked, names), (ours, our_names) = map(_of_what, (found, mine))
+    except (OSError, ResultsError):
         return False  # not a report, or not one that this version reads
     return asked == ours and names in ((), our_names)  # a name is added to what had none
 

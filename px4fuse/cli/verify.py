@@ -81,7 +81,6 @@ def _plain(report: Report, verdict: Verdict) -> dict[str, object]:
     return {
         "schema": SCHEMA,
         "report_sha256": report.sha256,
-        "seal": report.seal,
         "outcome": verdict.outcome,
         **values,
         "limit": LIMIT,

@@ -7,7 +7,7 @@ import unicodedata
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from px4fuse.grading.model import INSTRUCTOR, Entry, Graded
+from px4fuse.grading.model import INSTRUCTOR, Entry
 from px4fuse.webpage.frame import Part
 
 # Shorter words are in every text
@@ -62,12 +62,6 @@ class Veil:
             rules = rules if POINTS.fullmatch(rules) else self.hide(rules)
             return f"{rules}{mark}{self.hide(said, own_words=True)}"
         return [*map(self._hidden, value)] if isinstance(value, list | tuple) else value
-
-
-def hidden_words(entry: Entry, one: Graded) -> tuple[str, ...]:
-    """What pictures of a report must not show: names, ids, and of names also each word."""
-    texts = {*_identities(entry), *_words(entry), one.student, one.student_id}
-    return tuple(sorted(text for text in texts if len(text.strip()) > 1))
 
 
 def _identities(entry: Entry) -> Iterator[str]:

@@ -1,12 +1,12 @@
 """A class as one web page: a student per row, and on top what an instructor asks.
 
-Nothing that a student wrote can act: see :mod:`px4fuse.webpage`. Pictures of redrawn pages
-and PDFs stand in folders beside the page and are loaded as they are unfolded.
+Nothing that a student wrote can act: see :mod:`px4fuse.webpage`. Pictures of pages
+and PDFs stand in folders beside the page and are loaded as they are unfolded; where names are
+hidden there are none.
 """
 
 from __future__ import annotations
 
-import base64
 import math
 import statistics
 from collections import Counter, defaultdict
@@ -22,7 +22,7 @@ from px4fuse.plain import number_words
 from px4fuse.webpage import frame
 from px4fuse.webpage.charts import tenths
 from px4fuse.webpage.frame import Cell, Column, Part, Row
-from px4fuse.webpage.safe import PICTURE, local_link, template
+from px4fuse.webpage.safe import local_link, template
 
 MISSING = "nothing handed in"
 # How each status looks, and its sign, from the best to what says nothing
@@ -37,7 +37,6 @@ LOOKS: dict[str, tuple[str, str]] = {
 STATUSES = tuple(LOOKS)
 # Of one submission, on the page; all of it stands in the report
 MAX_DIFFERENCES = 50
-PNG = b"\x89PNG\r\n\x1a\n"
 SHOWN = (*STATUSES, "pending", "to read", "flagged", "late", "said by you")
 
 
@@ -161,7 +160,7 @@ def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str], veil: Veil)
     nothing = (frame.listed("Missing", ["Nothing was handed in."]), _comment(entry))
     details = map(veil.of_part, _details(entry, one) if one else nothing)
     boxes = () if entry.pseudonym else (_boxes(entry),)
-    beside = _beside(entry, one) if one else ()
+    beside = _beside(entry, one) if one and not entry.pseudonym else ()
     return Row(cells, tuple(_tags(entry)), (*details, *boxes), beside)
 
 
@@ -233,7 +232,7 @@ def _boxes(entry: Entry) -> Part:
 
 
 def _beside(entry: Entry, one: Graded) -> tuple[Part, ...]:
-    """The report's pages, and links to it, but for those that would name its student."""
+    """The report's pages and links to it, which may name its student."""
     whose = f"of the report of {entry.called}"
     drawn = [
         (f"Page {at} of {len(one.sheets)}", f"Page {at} {whose}, drawn again from the log", link)
@@ -241,12 +240,9 @@ def _beside(entry: Entry, one: Graded) -> tuple[Part, ...]:
         if (link := local_link(name))
     ]
     every = frame.pictures("Every page, drawn again from the log", drawn)
-    if entry.pseudonym:
-        return (every,)
     handed_in = []
-    if one.handed_in.startswith(PNG):
+    if source := local_link(one.handed_in):
         said = f"Page {one.page}, as handed in: not verified"
-        source = f"{PICTURE}{base64.b64encode(one.handed_in).decode()}"
         # the redrawn one stands beside it
         handed_in = drawn[one.page - 1 : one.page]
         handed_in += [(said, f"Page {one.page} {whose}, as handed in", source)]

@@ -111,7 +111,7 @@ def grade(
     graded, reused = grade_all(found, logs, rubric, records, key, register, processes, progress)
     entries, unknown = class_entries(graded, found, register, course, overrides)
     name = title or rubric.title or "Class"
-    written, more = write_class(entries, register, course, name, output, processes)
+    written, more = write_class(entries, register, course, name, output)
     return GradeOutcome(entries, (*notes, *renamed, *unknown, *more), reused, written)
 
 

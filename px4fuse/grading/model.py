@@ -85,13 +85,12 @@ class Graded:
         The student's own words.
     mistakes : mapping
         What the answer key says is wrong in the student's flight, and whether the form names it.
-    handed_in : bytes
-        PNG of a page as it was handed in: the cover where nothing could be redrawn, else the one
-        that differs most.
+    handed_in, sheets, redrawn_name : str, tuple of str, str
+        Where the picture of a page as it was handed in (the cover where nothing could be redrawn,
+        else the one that differs most), pictures of the redrawn pages, and the redrawn PDF stand,
+        relative to the class page.
     page : int
-        Which page that is, counted from 1.
-    sheets, redrawn_name : tuple of str, str
-        Where pictures of the redrawn pages, and the redrawn PDF, stand, relative to the class page.
+        Which page was pictured as it was handed in, counted from 1.
     """
 
     submission: str
@@ -108,7 +107,7 @@ class Graded:
     version: str = ""
     notes: str = field(default="", repr=False)
     mistakes: Mapping[str, bool] = field(default_factory=dict)
-    handed_in: bytes = field(default=b"", repr=False)
+    handed_in: str = ""
     page: int = 1
     redrawn_name: str = ""
     sheets: tuple[str, ...] = ()

@@ -22,7 +22,7 @@ from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, f
 from px4fuse.results.reading import read_results
 from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import Refused, Verdict
-from px4fuse.verification.pages import MEMORY_BYTES, TIMEOUT_S, picture
+from px4fuse.verification.pages import MEMORY_BYTES, TIMEOUT_S, pictures
 from px4fuse.verification.rerun import log_sha256
 from px4fuse.verification.verification import verify
 from px4fuse.verification.workers import bounded
@@ -30,7 +30,9 @@ from px4fuse.writing import write_all
 
 # In the folder of a class
 RECORDS = "records"
-HANDED_IN, REDRAWN = ".handed-in.png", ".pdf"
+# Pictures stand in files that the class page loads when a row is unfolded: three hundred reports
+# have a hundred megabytes of them
+HANDED_IN, REDRAWN, PAGE = ".handed-in.png", ".pdf", ".page-{:03}.png"
 MADE_WITH = ("px4fuse", "numpy", "scipy", "matplotlib", "pypdfium2", "pillow")
 
 
@@ -97,13 +99,19 @@ def verified(
     gap = rests_on.get(log_sha256(report.results)) == "handed out"
     verdict = verify(report, {} if gap else logs)
     page = max(verdict.pages, key=lambda one: (one.picture, one.words)).page if verdict.pages else 1
-    handed_in: object = b""
+    parts: dict[str, bytes] = {}
     if verdict.pages or not verdict.redrawn:
-        handed_in = bounded(partial(picture, page=page - 1), pdf, TIMEOUT_S, MEMORY_BYTES)
+        handed_in = bounded(partial(pictures, page=page - 1), pdf, TIMEOUT_S, MEMORY_BYTES)
+        if isinstance(handed_in, tuple):
+            parts[HANDED_IN] = handed_in[0]
+    if verdict.redrawn:
+        drawn = pictures(verdict.redrawn)
+        shown = drawn if isinstance(drawn, tuple) else ()
+        parts |= {PAGE.format(at): made for at, made in enumerate(shown, start=1)}
+        parts[REDRAWN] = verdict.redrawn
     unread = replace(verdict, redrawn=b"")
     kept = VerificationRecord(_versions(), None, results, rests_on, unread, page)
-    shown = handed_in if isinstance(handed_in, bytes) else b""
-    _keep(records, sha256, kept, {HANDED_IN: shown, REDRAWN: verdict.redrawn})
+    _keep(records, sha256, kept, parts)
     return (report.results, unread, page), False
 
 
@@ -125,6 +133,10 @@ def _versions() -> dict[str, str]:
 
 
 def _keep(records: Path, sha256: str, kept: VerificationRecord, parts: Mapping[str, bytes]) -> None:
+    for earlier in records.glob(f"{sha256}.*"):
+        # another process may be reading what an identical file left
+        if earlier.suffix != ".json":
+            earlier.unlink(missing_ok=True)
     files = {file_of(records, sha256, end): content for end, content in parts.items()}
     write_all({**files, file_of(records, sha256): msgspec.json.encode(kept)})
 

@@ -11,7 +11,6 @@ Sources: MAVLink developer guide, "Packet Serialization"; pymavlink's generated 
 from __future__ import annotations
 
 import hashlib
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -72,7 +71,7 @@ class Frames:
     payload_length : ndarray of uint8, shape (n,)
     received_us : ndarray of int64, shape (n,), or None
         Time of receipt, µs UNIX, of a recording with stamps (damaged ones interpolated).
-    passed_over : mapping from message id to count
+    passed_over : int
         Whole frames of messages that the dialect does not know.
     bad_bytes : int
         Bytes that belong to no frame.
@@ -92,7 +91,7 @@ class Frames:
     payload_start: Integers
     payload_length: NDArray[np.uint8]
     received_us: Integers | None
-    passed_over: Mapping[int, int]
+    passed_over: int
     bad_bytes: int
     in_frame: bool
     bad_stamps: int
@@ -294,27 +293,24 @@ def _is_stamped(start: Integers, end: Integers) -> bool:
     return bool(stamped > bare) if stamped + bare else bool(start[0] == STAMP)
 
 
-def _between(
-    content: bytes, start: Integers, end: Integers, stamp: int
-) -> tuple[Counter[int], int, bool]:
+def _between(content: bytes, start: Integers, end: Integers, stamp: int) -> tuple[int, int, bool]:
     """What lies between the good frames, of which ``start`` is with the stamp.
 
     Returns
     -------
-    Counter
-        Whole frames of messages that the dialect does not know, by message id.
+    int
+        Whole frames of messages that the dialect does not know.
     int
         Bytes that belong to no frame.
     bool
         Whether the last of them begin one.
     """
-    passed_over: Counter[int] = Counter()
-    bad, rest = 0, b""
+    passed_over, bad, rest = 0, 0, b""
     lows, highs = np.append(0, end), np.append(start, len(content))
     for low, high in np.column_stack([lows, highs])[lows < highs].tolist():
         at = low
-        for number, size in _unknown_frames(content, low, high, stamp):
-            passed_over[number] += 1
+        for size in _unknown_frames(content, low, high, stamp):
+            passed_over += 1
             at += size
         bad += high - at
         rest = content[at:high] if high == len(content) else b""
@@ -322,8 +318,8 @@ def _between(
     return passed_over, bad, 0 < len(rest) < stamp + LONGEST_FRAME and begun
 
 
-def _unknown_frames(content: bytes, at: int, high: int, stamp: int) -> Iterator[tuple[int, int]]:
-    """Message id and size of unknown frames that follow one another, by their headers alone."""
+def _unknown_frames(content: bytes, at: int, high: int, stamp: int) -> Iterator[int]:
+    """Sizes of unknown frames that follow one another, by their headers alone."""
     while at + stamp + HEADER_1 + CHECKSUM <= high:
         head = content[at + stamp : at + stamp + HEADER_2]
         number, size = head[5], stamp + head[1] + HEADER_1 + CHECKSUM
@@ -333,7 +329,7 @@ def _unknown_frames(content: bytes, at: int, high: int, stamp: int) -> Iterator[
         at += size
         if head[0] not in (MAGIC_1, MAGIC_2) or number in dialect.mavlink_map or at > high:
             return
-        yield number, size
+        yield size
 
 
 def _stamps(source: NDArray[np.uint8], start: Integers, end: Integers) -> tuple[Integers, int]:

@@ -324,12 +324,9 @@ def _without_strays(stamps: Array, rows: IntArray) -> IntArray:
 def _frame_notes(frames: Frames, back: int) -> list[str]:
     notes = []
     if frames.passed_over:
-        listed = ", ".join(
-            f"{count} of {message_name(number)}"
-            for number, count in sorted(frames.passed_over.items())
-        )
         notes.append(
-            f"whole frames of messages that px4fuse does not know were passed over: {listed}"
+            "whole frames of messages that px4fuse does not know were passed over: "
+            f"{frames.passed_over}"
         )
     if frames.bad_stamps:
         notes.append(f"{frames.bad_stamps} times of receipt are damaged and were interpolated")

@@ -25,7 +25,6 @@ from pypdf.generic import ArrayObject, DictionaryObject, IndirectObject, StreamO
 
 from px4fuse.errors import ResultsError
 from px4fuse.report.pdf import RESULTS_NAME
-from px4fuse.report.seal import seal_of
 from px4fuse.results.contract import AidsResults, ComparisonResults, LoopResults, Results
 from px4fuse.results.reading import MAX_BYTES as MAX_ATTACHMENT_BYTES
 from px4fuse.results.reading import one_line, read_results
@@ -124,7 +123,7 @@ def read_report(pdf: bytes, name: str) -> Report | Refused:
             "the aids of EKF2 alone, nothing of our filter" if alone else "no results of a report"
         )
         return Refused(f"{one_line(name, 200)}: {RESULTS_NAME} in it holds {held}.")
-    return Report(hashlib.sha256(pdf).hexdigest(), seal_of(pdf), results, pdf)
+    return Report(hashlib.sha256(pdf).hexdigest(), results, pdf)
 
 
 def attached_results(pdf: bytes, name: str) -> Results:

@@ -39,7 +39,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image, ImageDraw
+from PIL import Image
 from scipy.ndimage import uniform_filter
 
 from px4fuse.flight import Unavailable
@@ -68,9 +68,6 @@ MAX_DRAWN_COLOURS = 20_000
 # PDF's own limit is 14,400 points, or 200 inches
 MAX_POINTS = 14_400.0
 WHAT = "picture of the page"
-# Where a report's pages name log and student, and what names are covered with
-HEAD = 0.045
-COVER = (190, 190, 190)
 # PDFium's own errors are RuntimeErrors; the others come from ctypes and Pillow
 FAILURES = (
     RuntimeError, ValueError, TypeError, ArithmeticError, LookupError, AssertionError, OSError,
@@ -194,79 +191,33 @@ def _distance(one: npt.NDArray[np.float32], other: npt.NDArray[np.float32]) -> f
 # ------------------------------------------------------------------ pictures
 
 
-def picture(pdf: bytes, page: int) -> bytes | Unavailable:
-    """Draw one page of a PDF.
+def pictures(pdf: bytes, page: int | None = None) -> tuple[bytes, ...] | Unavailable:
+    """Draw the pages of a PDF, or one of them.
 
-    Needs pypdfium2. Nothing in the PDF is executed, and the picture's size is bounded whatever the
-    page's is; time and memory are not, so call it in a process that has limits.
+    Needs pypdfium2. Nothing in the PDF is executed, and a picture's size is bounded whatever the
+    page's is; time and memory are not: what was handed in is for a process that has limits.
 
     Parameters
     ----------
     pdf : bytes
         May be anything.
-    page : int
-        Counted from 0.
-
-    Returns
-    -------
-    bytes or Unavailable
-        A PNG of at most :data:`MAX_PICTURE_BYTES`.
-    """
-    try:
-        with opened(pdf) as document:
-            if not 0 <= page < len(document):
-                raise ValueError(f"there is no page {page + 1}")
-            return _small_png(rendered(document[page], WIDTH_PX))
-    except FAILURES as error:
-        return undrawn(error)
-
-
-def page_pictures(pdf: bytes, hide: Sequence[str] = ()) -> tuple[bytes, ...] | Unavailable:
-    """Draw every page of a report that px4fuse drew.
-
-    Parameters
-    ----------
-    hide : sequence of str
-        Words that must not be read in the pictures: they are covered, and so is the head of each
-        page. Where none of them is found on the first page, nothing is drawn: the words are there
-        in letters that cannot be searched.
+    page : int, optional
+        Counted from 0; by default all.
 
     Returns
     -------
     tuple of bytes or Unavailable
-        A PNG per page.
+        PNGs of at most :data:`MAX_PICTURE_BYTES`.
     """
-    made = []
     try:
         with opened(pdf) as document:
-            for number in range(len(document)):
-                sheet = document[number]
-                image = rendered(sheet, WIDTH_PX)
-                if hide and not _cover(image, sheet, hide) and not number:
-                    raise ValueError("a name on its first page cannot be found to cover it")
-                made.append(_small_png(image))
+            every = range(len(document))
+            if page is not None and page not in every:
+                raise ValueError(f"there is no page {page + 1}")
+            shown = every if page is None else [page]
+            return tuple(_small_png(rendered(document[at], WIDTH_PX)) for at in shown)
     except FAILURES as error:
         return undrawn(error)
-    return tuple(made)
-
-
-def _cover(image: Image.Image, sheet: Any, hide: Sequence[str]) -> int:
-    """Cover words and the head of a page; how many places below the head there were."""
-    scale = image.width / sheet.get_width()
-    pen = ImageDraw.Draw(image)
-    pen.rectangle((0.0, 0.0, image.width, HEAD * image.height), COVER)
-    text = sheet.get_textpage()
-    found = 0
-    for word in hide:
-        search = text.search(word, match_case=False, match_whole_word=False)
-        while (place := search.get_next()) is not None:
-            for each in range(text.count_rects(*place)):
-                left, bottom, right, top = text.get_rect(each)
-                box = (left, sheet.get_height() - top, right, sheet.get_height() - bottom)
-                x0, y0, x1, y1 = (scale * edge for edge in box)
-                pen.rectangle((x0 - 2.0, y0 - 2.0, x1 + 2.0, y1 + 2.0), COVER)
-                found += y1 > HEAD * image.height
-    return found
 
 
 @contextmanager

@@ -50,7 +50,6 @@ from px4fuse.errors import Px4FuseError  # noqa: E402
 from px4fuse.fleet.regressions import read_baseline  # noqa: E402
 from px4fuse.fleet.rows import table_of  # noqa: E402
 from px4fuse.grading import grade as grading  # noqa: E402
-from px4fuse.grading import outputs  # noqa: E402
 from px4fuse.grading.overrides import read_overrides  # noqa: E402
 from px4fuse.grading.rubric import read_rubric, rubric_text  # noqa: E402
 from px4fuse.readers import read_log  # noqa: E402
@@ -251,7 +250,7 @@ def _command(*words: str) -> Callable[[Path], object]:
         shutil.rmtree(out, ignore_errors=True)
         given = [word.format(path=path, out=out) for word in words]
         with contextlib.ExitStack() as stack:
-            for module in (grading, outputs, workers):
+            for module in (grading, workers):
                 stack.enter_context(mock.patch.object(module, "run_bounded", in_turn))
             done = CliRunner().invoke(cli, given)
         if done.exception is not None and not isinstance(done.exception, SystemExit):

@@ -59,7 +59,7 @@ def _chordal(graph: PoseGraph) -> PoseGraph:
     spin = np.trace(graph.information[:, d:, d:], axis1=1, axis2=2)
     model.require_connected(graph, spin > 0.0, "edges that tell a rotation")
     held = graph.first == 0, graph.second == 0
-    system = BlockSystem(graph.first, graph.second, len(graph), d)
+    system = BlockSystem(graph.first, graph.second, len(graph))
     measured = lie.rotation_matrix(graph.measurements)
     transposed = measured.transpose(0, 2, 1)
     first = lie.rotation_matrix(graph.poses[:1])[0]

@@ -169,27 +169,24 @@ def right_jacobian_inverse(tangent: Array) -> Array:
     -------
     ndarray, shape (..., 3, 3) or (..., 6, 6)
     """
+    once = _commutator(tangent)
+    twice = once @ once
+    turn = tangent[..., 2 if tangent.shape[-1] == 3 else 3 :]
+    theta = np.linalg.norm(turn, axis=-1)[..., None, None]
+    c, slope = _c(theta), 0.5 * _c_slope(theta)
+    # x / (1 - exp(-x)) of it, as ad^5 = -2 theta^2 ad^3 - theta^4 ad
+    made: Array = np.eye(once.shape[-1]) + 0.5 * once + (c - theta * theta * slope) * twice
+    return made - slope * (twice @ twice)
+
+
+def _commutator(tangent: Array) -> Array:
+    """``ad``: how :func:`adjoint` of ``exp(t tangent)`` grows with t (Barfoot 2017, 7.33)."""
     if tangent.shape[-1] == 3:
-        theta = tangent[..., 2]
-        half, a = 0.5 * theta, 1.0 - theta * theta * _c(np.abs(theta))
-        # how the position that exp(xi) reaches, in its own axes, moves with the rotation
-        even, odd = theta * _b(np.abs(theta)), _a(np.abs(theta))
-        x = even * tangent[..., 0] - odd * tangent[..., 1]
-        y = odd * tangent[..., 0] + even * tangent[..., 1]
-        return from_elements(
-            (a, -half, half * y - a * x), (half, a, -half * x - a * y), (0.0, 0.0, 1.0)
-        )
-    rho, phi = tangent[..., :3], tangent[..., 3:]
-    theta = np.linalg.norm(phi, axis=-1)[..., None, None]
-    dot = np.sum(rho * phi, axis=-1)[..., None, None]
-    hat = skew(phi)
-    square = _outer(phi, phi) - theta * theta * np.eye(3)
-    c = _c(theta)
-    product = _outer(rho, phi)
-    both = product + np.swapaxes(product, -1, -2) - 2.0 * dot * np.eye(3)  # phi^ rho^ + rho^ phi^
+        x, y, theta = np.moveaxis(tangent, -1, 0)
+        return from_elements((0.0, -theta, y), (theta, 0.0, -x), (0.0, 0.0, 0.0))
     made = np.zeros((*tangent.shape, 6))
-    made[..., :3, :3] = made[..., 3:, 3:] = np.eye(3) + 0.5 * hat + c * square
-    made[..., :3, 3:] = 0.5 * skew(rho) + c * both + (dot * _c_slope(theta)) * square
+    made[..., :3, :3] = made[..., 3:, 3:] = skew(tangent[..., 3:])
+    made[..., :3, 3:] = skew(tangent[..., :3])
     return made
 
 
@@ -217,10 +214,6 @@ def chain(steps: Array) -> Array:
 def _turn(pose: Array) -> Rotation:
     """Rotation of poses in space."""
     return Rotation.from_quat(pose[..., 3:])
-
-
-def _outer(a: Array, b: Array) -> Array:
-    return a[..., :, None] * b[..., None, :]
 
 
 def _a(theta: Array) -> Array:

@@ -170,7 +170,7 @@ class _GraphProblem:
 
     def __init__(self, graph: PoseGraph) -> None:
         self.graph = graph
-        self._system = BlockSystem(graph.first, graph.second, len(graph), graph.freedom)
+        self._system = BlockSystem(graph.first, graph.second, len(graph))
 
     def minimise(
         self,

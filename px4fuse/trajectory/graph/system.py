@@ -1,12 +1,10 @@
-"""The sparse normal equations of a pose graph: pattern and order once, numbers many times."""
+"""The sparse normal equations of a pose graph: pattern once, numbers many times."""
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse.linalg import splu
 
 from px4fuse.arrays import Array, IntArray
 
@@ -14,15 +12,9 @@ from px4fuse.arrays import Array, IntArray
 # with valgrind on scipy 1.17); single columns as relaxed supernodes also fill in least
 _RELAX, _PANEL = 1, 4
 
-Order = Literal["NATURAL", "MMD_AT_PLUS_A"]
-
 
 class BlockSystem:
     """Normal equations with a block of d × d for each pose but the first, which is held.
-
-    The fill-reducing order is found on the small matrix with one number per block, by SuperLU's
-    minimum degree on A' + A: on the graphs of the benchmark it fills in 1.1 to 1.9 times less than
-    its column order (COLAMD) and 2 to 6 times less than reverse Cuthill-McKee.
 
     Parameters
     ----------
@@ -30,26 +22,17 @@ class BlockSystem:
         Poses that each edge joins.
     poses : int
         How many there are.
-    size : int
-        d.
     """
 
-    def __init__(self, first: IntArray, second: IntArray, poses: int, size: int) -> None:
-        self._first, self._second, self._size = first, second, size
-        slot = np.full(poses, -1, dtype=np.intp)
-        slot[1:] = self._slot = _order(first, second, poses)
-        a, b = slot[first], slot[second]
-        # blocks H_ii, H_jj, H_ij, H_ji of all edges, then empty ones on the diagonal
-        row, column = np.concatenate([a, b, a, b]), np.concatenate([a, b, b, a])
-        source = np.flatnonzero((row >= 0) & (column >= 0))  # the pose that is held has none
-        every = np.arange(poses - 1)
-        place = np.append(column[source], every) * (poses - 1) + np.append(row[source], every)
-        key, block = np.unique(place, return_inverse=True)
-        self._gather = sparse.csr_array(
-            (np.ones(len(source)), (block[: len(source)], source)), shape=(len(key), len(row))
-        )
-        columns, self._rows = np.divmod(key, poses - 1)
-        self._starts = np.searchsorted(columns, np.arange(poses))
+    def __init__(self, first: IntArray, second: IntArray, poses: int) -> None:
+        self._first, self._second, self._poses = first, second, poses
+        # blocks H_ii, H_jj, H_ij, H_ji of all edges; the pose that is held has none
+        ends = np.concatenate([first, second]), np.concatenate([second, first])
+        row, column = np.append([first, second], ends[0]), np.append([first, second], ends[1])
+        inside = np.flatnonzero((row > 0) & (column > 0))
+        self._source = inside[np.argsort(row[inside], kind="stable")]
+        self._columns = column[self._source] - 1
+        self._starts = np.searchsorted(row[self._source], np.arange(1, poses + 1))
 
     def matrix(self, ii: Array, jj: Array, ij: Array) -> sparse.csc_array[np.float64]:
         """Sum the blocks of all edges.
@@ -59,11 +42,10 @@ class BlockSystem:
         ii, jj, ij : ndarray, shape (m, d, d)
             Second derivatives by first and first pose, second and second, first and second.
         """
-        d = self._size
-        blocks = np.concatenate([ii, jj, ij, ij.transpose(0, 2, 1)]).reshape(-1, d * d)
-        summed = (self._gather @ blocks).reshape(-1, d, d).transpose(0, 2, 1)
-        # by columns, which are the rows of the transposed matrix
-        return sparse.bsr_array((summed, self._rows, self._starts)).tocsr().T
+        blocks = np.concatenate([ii, jj, ij, ij.transpose(0, 2, 1)])[self._source]
+        made = sparse.bsr_array((blocks, self._columns, self._starts)).tocsr()
+        made.sum_duplicates()
+        return made.T
 
     def vector(self, i: Array, j: Array) -> Array:
         """Sum the gradients of all edges.
@@ -78,7 +60,7 @@ class BlockSystem:
         ndarray, shape (n, d, ...)
             Zero for the pose that is held.
         """
-        made = np.zeros((len(self._slot) + 1, *i.shape[1:]))
+        made = np.zeros((self._poses, *i.shape[1:]))
         np.add.at(made, self._first, i)
         np.add.at(made, self._second, j)
         made[0] = 0.0
@@ -105,48 +87,18 @@ class BlockSystem:
         """
         damped = matrix.copy()
         damped.setdiag(matrix.diagonal() + damping)
-        ordered = np.empty(right[1:].shape)
-        ordered[self._slot] = right[1:]
         try:
-            solved = factorise(damped, "NATURAL").solve(ordered.reshape(-1, *right.shape[2:]))
-        except RuntimeError:
+            factors = splu(
+                damped,
+                # on the graphs of the benchmark it fills in 1.1 to 1.9 times less than COLAMD
+                permc_spec="MMD_AT_PLUS_A",
+                diag_pivot_thresh=0.0,
+                relax=_RELAX,
+                panel_size=_PANEL,
+                options={"SymmetricMode": True},
+            )
+        except RuntimeError:  # exactly singular
             return None
         made = np.zeros(right.shape)
-        made[1:] = solved.reshape(ordered.shape)[self._slot]
+        made[1:] = factors.solve(right[1:].reshape(-1, *right.shape[2:])).reshape(right[1:].shape)
         return made if np.all(np.isfinite(made)) else None
-
-
-def factorise(matrix: sparse.csc_array[np.float64], order: Order) -> SuperLU:
-    """Factors of a symmetric positive definite matrix.
-
-    Parameters
-    ----------
-    matrix : csc_array
-    order : {"NATURAL", "MMD_AT_PLUS_A"}
-
-    Raises
-    ------
-    RuntimeError
-        From SuperLU, if the matrix is exactly singular.
-    """
-    return splu(
-        matrix,
-        permc_spec=order,
-        diag_pivot_thresh=0.0,
-        relax=_RELAX,
-        panel_size=_PANEL,
-        options={"SymmetricMode": True},
-    )
-
-
-def _order(first: IntArray, second: IntArray, poses: int) -> IntArray:
-    """Place of each pose but the first in a fill-reducing order, shape (n - 1,)."""
-    count = poses - 1
-    inside = (first > 0) & (second > 0)
-    i, j = first[inside] - 1, second[inside] - 1
-    links = sparse.coo_array((np.ones(len(i)), (i, j)), shape=(count, count)).tocsr()
-    links = links + links.T
-    # Diagonally dominant, so that elimination is along the diagonal in any order
-    degree: Array = np.asarray(links.sum(axis=1)).ravel()
-    dominant = sparse.csc_array(sparse.diags_array(degree + 1.0) - links)
-    return factorise(dominant, "MMD_AT_PLUS_A").perm_c.astype(np.intp)
