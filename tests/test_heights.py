@@ -321,6 +321,30 @@ def test_an_acceleration_that_ekf2_took_to_be_wrong_is_noise_of_4_9() -> None:
         )
     ]
     np.testing.assert_array_equal(runs[0].state, runs[1].state)
+    # one axis of three throughout is as a third of the steps
+    usual = inputs.settings["EKF2_ACC_NOISE"] ** 2
+    third = inputs.settings | {"EKF2_ACC_NOISE": float(np.sqrt((2.0 * usual + 4.9**2) / 3.0))}
+    clipped = replace(stretch, shaken=np.full(len(stretch.time_s), 1.0 / 3.0))
+    runs = [
+        run_variants(replace(inputs, stretches=(one,)), [Variant(settings)], {})[0]
+        for one, settings in ((clipped, inputs.settings), (stretch, third))
+    ]
+    np.testing.assert_allclose(runs[0].variance, runs[1].variance, rtol=1e-9)
+
+
+def test_axes_at_the_end_of_their_range_are_relied_on_less_in_their_step() -> None:
+    flight = outdoors()
+    assert isinstance(flight.imu, pd.DataFrame)
+    (plain,) = opened(flight).inputs.stretches
+    clipped = pd.Series(0, flight.imu.index)
+    at = plain.time_s[[100, 200]] - 1e-4
+    clipped.iloc[np.searchsorted(flight.imu.index, at)] = [0b101, 0b111]
+    (told,) = opened(replace(flight, imu=flight.imu.assign(clipped=clipped))).inputs.stretches
+    assert told.shaken is not None
+    assert plain.shaken is not None
+    assert not plain.shaken.any()
+    assert told.shaken[[100, 200]].tolist() == [pytest.approx(2.0 / 3.0), 1.0]
+    assert np.flatnonzero(told.shaken).tolist() == [100, 200]
 
 
 # ---------------------------------------------------------------- flights of PX4's EKF2

@@ -44,7 +44,8 @@ TOGETHER = 64
 NOT_TAKEN = 1e9
 # Of a position (m) and a velocity (m/s), ev_pos_control.cpp
 MIN_SD = 0.01
-# Of the acceleration (m/s²) while EKF2 takes it to be wrong (BADACC_BIAS_PNOISE, common.h)
+# Of an acceleration (m/s²) that EKF2 takes to be wrong, or that was clipped (BADACC_BIAS_PNOISE,
+# common.h; covariance.cpp)
 BAD_NOISE = 4.9
 # EKF2 takes the vertical velocity of GNSS for half as exact again (gps_control.cpp)
 VERTICAL_SCALE = np.array([1.0, 1.0, 2.25])
@@ -203,11 +204,13 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
         told = np.stack(samples, axis=-1)[..., pick]
         heights = HeightFilter(stretch, told, event["time_s"], active, on, knob, gated)
     gyro2 = np.where(attitude, knob["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
-    shaken = False if stretch.shaken is None else stretch.shaken[end]
-    force2 = np.where(shaken, BAD_NOISE, knob["EKF2_ACC_NOISE"]) ** 2
-    force2 = np.broadcast_to(force2, active.shape)[:, :, None, None]
     drift, drift_limit = _drift(inputs, stretch, knob, biases, attitude)
     steps = np.diff(end, axis=0, prepend=0)[:, :, None]
+    force2 = np.broadcast_to(knob["EKF2_ACC_NOISE"] ** 2, active.shape)[:, :, None, None]
+    if stretch.shaken is not None:  # in how much of each interval
+        sums = np.diff(np.cumsum(stretch.shaken)[end], axis=0, prepend=stretch.shaken[0])
+        share = (sums[:, :, None] / np.maximum(steps, 1))[..., None]
+        force2 = (1.0 - share) * force2 + share * BAD_NOISE**2
     floor = inputs.rules.bias_floor
     x, P = _start(stretch, biases, attitude)
     logged = inputs.received.rejected[sample], inputs.received.reset[sample]

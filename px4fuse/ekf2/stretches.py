@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from scipy.linalg import block_diag
 
-from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.arrays import Array, IntArray
 from px4fuse.display import brief
 from px4fuse.flight import (
     ACCELEROMETER_BIAS_COLUMNS,
@@ -156,8 +156,10 @@ class Stretch:
         None: the heading is EKF2's own as flown, whatever is changed.
     heights : Heights or None
         None: the height is EKF2's own as flown, or vision's.
-    shaken : ndarray of bool, shape (n + 1,), or None
-        Where EKF2 took the vertical acceleration to be wrong, and relied on it less; None: nowhere.
+    shaken : ndarray, shape (n + 1,), or None
+        Share of the accelerometer's axes that EKF2 relied on less in the step before: all while it
+        took the vertical acceleration to be wrong, else those at the end of their range (of the
+        axes together, as R turns them); None: never any.
     """
 
     time_s: Array
@@ -176,7 +178,7 @@ class Stretch:
     fusing: bool = True
     field: Field | None = None
     heights: Heights | None = None
-    shaken: BoolArray | None = None
+    shaken: Array | None = None
 
     __repr__ = brief
 
@@ -233,10 +235,20 @@ def find_stretches(
         if np.all(np.diff(time)[covered] <= IMU_GAP_S):
             made = _stretch(imu, attitude, ekf2, record, at, high)
             if magnetic:
-                made = replace(made, shaken=record.was(BAD_ACCELERATION, made.time_s))
+                made = replace(made, shaken=_shaken(imu, record, made.time_s))
             within = of_field and of_field[0] <= states[at] and high <= of_field[1]
             found.append(_with_field(made, record, at, ekf2.step_s) if within else made)
     return tuple(found)
+
+
+def _shaken(imu: pd.DataFrame, record: FusionRecord, time_s: Array) -> Array:
+    """Share of the accelerometer's axes that are relied on less, at the end of each step."""
+    shaken = record.was(BAD_ACCELERATION, time_s).astype(float)
+    if "clipped" in imu:  # a bit for each axis
+        clipped = imu.loc[(imu["clipped"] > 0.0) & (imu.index <= time_s[-1]), "clipped"]
+        share = np.unpackbits(clipped.to_numpy(np.uint8)[:, None], axis=1).sum(axis=1) / 3.0
+        np.maximum.at(shaken, np.searchsorted(time_s, clipped.index), share)
+    return shaken
 
 
 def _stretch(
