@@ -150,7 +150,39 @@ def test_what_no_innovation_shows_asks_for_no_smaller_noise(
     assert all(each.change["sigma_z_m"] == pytest.approx(0.7 * sigma_z_m, rel=0.05)
                for each in tried)  # fmt: skip
     if denied:
-        assert told(analysis).keys() <= {"errors_larger_than_claimed"}
+        assert set(told(analysis)) == {"source_coloured"}
+
+
+@pytest.mark.parametrize("tau_s", [5.0, 20.0])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_truth_shows_slow_errors_that_pass_for_those_of_the_imu(tau_s: float, seed: int) -> None:
+    """As long as errors of the IMU are, so that no innovation shows them."""
+    analysis = judged(partial(errors.coloured, tau_s=tau_s), 5.0, seed, truth_for=0.10)
+    found = told(analysis)
+    assert set(found) == {"source_coloured"}
+    finding = found["source_coloured"]
+    evidence = finding.evidence
+    assert evidence["low_s"] < tau_s < evidence.get("high_s", np.inf)
+    assert evidence["white_m"] == pytest.approx(0.07, abs=0.015)
+    assert 0.03 < evidence["slow_m"] < 0.15
+    assert ("at least" in finding.headline) == ("high_s" not in evidence)
+    blind = told(judged(partial(errors.coloured, tau_s=tau_s), 5.0, seed))
+    assert "source_coloured" not in blind or "at least" in blind["source_coloured"].headline
+
+
+@pytest.mark.parametrize(
+    ("model", "name"),
+    [
+        (partial(errors.scaled, scale=0.2), "source_scale_wrong"),
+        (partial(errors.jumped, size=1.0), "source_jumps"),
+        (partial(errors.clock, late=0.3), "source_clock_offset"),
+        (LOUD, "source_noise_changes"),
+        (UNEQUAL, "source_axes_unequal"),
+        (partial(errors.low_pass, tau_s=0.3), "source_smoothed"),
+    ],
+)
+def test_what_a_truth_shows_of_other_errors_is_no_slow_one(model: errors.Model, name: str) -> None:
+    assert set(told(judged(model, truth_for=0.10))) == {name}
 
 
 def test_a_low_pass_lags_by_less_than_its_time_constant() -> None:
