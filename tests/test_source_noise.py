@@ -202,6 +202,16 @@ def test_a_low_pass_is_no_slow_error_of_late_stamps(shared_logs: Path) -> None:
     assert set(found) == {"source_smoothed"}
 
 
+@pytest.mark.reallogs
+def test_the_noise_of_one_axis_is_no_jump_along_it(shared_logs: Path) -> None:
+    """Judged by one noise for both axes, the larger one passed for a jump of 0.5 m."""
+    log = shared_logs / "simulated" / "v1.16.1_aisle_10hz.ulg"
+    flight = read_log(log)
+    flight = errors.laid_over(flight, errors.truth_of(log, flight), UNEQUAL, 5.0, 1107)
+    found = told(explain(compare(flight, RIGHT, axes=("north", "east"))))
+    assert set(found) == {"source_axes_unequal"}
+
+
 def test_a_filter_that_outliers_pull_is_no_noisy_part() -> None:
     """At 2 Hz most innovations of 13 s are large, since outliers lead the filter away."""
     analysis = judged(partial(errors.with_outliers, share=0.05), 2.0, seed=13)

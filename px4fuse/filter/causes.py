@@ -277,8 +277,8 @@ def _step_squares(model: Hypotheses, sigma_a: float, skip: BoolArray, times: Arr
             response = model.whitened(alone, sigma_a, skip)[0][~skip]
             mixed = columns.T @ response
             size = np.sum(response**2, axis=0) - np.sum(mixed * (base.covariance @ mixed), axis=0)
-            chi_square[few] += (rest @ response) ** 2 / np.maximum(size, 1e-9)
-    return np.asarray(chi_square / max(base.spread, 1.0) ** 2)
+            chi_square[few] += (rest @ response / base.spreads[axis]) ** 2 / np.maximum(size, 1e-9)
+    return chi_square
 
 
 def _placed(
@@ -315,7 +315,8 @@ def _judge(
         return None
     found = model.fit(sigma_a, later)
     size, covariance = found.coefficients[columns], found.covariance[np.ix_(columns, columns)]
-    chi_square = float(size @ np.linalg.solve(covariance, size)) / max(found.spread, 1.0) ** 2
+    size = size / found.spreads
+    chi_square = float(size @ np.linalg.solve(covariance, size))
     if chi_square < chdtri(len(columns), chance):
         return None
     return Jump(time_s, tuple(found.estimate(int(at)) for at in columns), chi_square)
@@ -350,6 +351,12 @@ class HypothesisFit:
     square: float
     score: float
     spread: float
+
+    @property
+    def spreads(self) -> Array:
+        """Root mean square that remains along each axis, at least 1: one may be the noisier."""
+        square = np.bincount(self.axis, self.rest**2) / np.bincount(self.axis)
+        return np.sqrt(np.maximum(square, 1.0))
 
     def estimate(self, column: int) -> Estimate:
         """One coefficient, its σ widened where more remains than the noises say."""
