@@ -137,8 +137,8 @@ class Analysis(Comparison):
         known = [truth for truth in truths if not isinstance(truth, Unavailable)]
         if isinstance(together, Unavailable) or len(known) < len(axes):
             return together
-        slow = against_truth(axes, known, left_out, offset_s, jumps, together[1])
-        return together[0], slow
+        smooth, slow = together
+        return smooth, against_truth(axes, known, left_out, offset_s, jumps, slow)
 
     @property
     def smoothing(self) -> Smoothing | Unavailable:

@@ -137,15 +137,9 @@ class Explained:
 
 
 def explained(
-    flight: Flight,
-    axes: tuple[Axis, ...],
-    settings: Settings,
-    *,
-    sigma_a_m_s2: float,
-    sigma_z_m: float,
-    outlier_time_s: Array,
-    clock_offset_s: float,
-) -> Explained | Unavailable:
+    flight: Flight, axes: tuple[Axis, ...], settings: Settings, *, sigma_a_m_s2: float,
+    sigma_z_m: float, outlier_time_s: Array, clock_offset_s: float,
+) -> Explained | Unavailable:  # fmt: skip
     """Estimate biases and scale, and look for jumps of the source.
 
     Parameters
@@ -178,14 +172,8 @@ def explained(
     if jumps:
         model = replace(model, steps=steps(model.time_s, [jump.time_s for jump in jumps]))
         sigma_a, found = _fit_noise(model, levels, skip)
-    return Explained(
-        found.estimate(FORWARD),
-        found.estimate(RIGHT),
-        found.estimate(TURN),
-        _scale(model, sigma_a, skip),
-        jumps,
-        sigma_a,
-    )
+    forward, right, turn = map(found.estimate, (FORWARD, RIGHT, TURN))
+    return Explained(forward, right, turn, _scale(model, sigma_a, skip), jumps, sigma_a)
 
 
 def _fit_noise(model: Hypotheses, levels: Array, skip: BoolArray) -> tuple[float, HypothesisFit]:
@@ -492,12 +480,9 @@ def _with_signals(legs: Preintegrated, dp: Array, dv: Array, measured_m: Array) 
 
 
 def hypotheses_of(
-    flight: Flight,
-    axes: tuple[Axis, ...],
-    settings: Settings,
-    sigma_z: float,
+    flight: Flight, axes: tuple[Axis, ...], settings: Settings, sigma_z: float,
     clock_offset_s: float,
-) -> Hypotheses | Unavailable:
+) -> Hypotheses | Unavailable:  # fmt: skip
     """Lay out the axes with the columns that every hypothesis is fitted beside.
 
     Parameters

@@ -62,6 +62,8 @@ LOW_PASS_S, LOG_TAU_STEP = (0.02, 3.0), 0.05
 # two more numbers), how near a sample of it must be (s: between them, at 2 m/s², it is known to
 # 1 cm), time constants and shares
 TRUTH_MEASUREMENTS, TRUTH_NATS, TRUTH_AWAY_S = 300, 5.0, 0.1
+# Parts of the flight with a clock offset each, which may change
+CLOCK_PARTS = 12
 TRUTH_TAUS_S, TRUTH_SHARES = np.geomspace(0.3, 80.0, 17), np.linspace(0.05, 0.999, 20)
 
 
@@ -122,15 +124,9 @@ class Coloured:
 
 
 def hanging_together(
-    flight: Flight,
-    axes: tuple[Axis, ...],
-    settings: Settings,
-    noises: Noises,
-    *,
-    outlier_time_s: Array,
-    clock_offset_s: float,
-    jumps: Sequence[Jump] = (),
-) -> tuple[Smoothing, Coloured | Unavailable] | Unavailable:
+    flight: Flight, axes: tuple[Axis, ...], settings: Settings, noises: Noises, *,
+    outlier_time_s: Array, clock_offset_s: float, jumps: Sequence[Jump] = (),
+) -> tuple[Smoothing, Coloured | Unavailable] | Unavailable:  # fmt: skip
     """Look for a low pass and for a slow error of the source.
 
     Parameters
@@ -196,15 +192,9 @@ def hanging_together(
         correlation = float(np.exp(-np.median(np.diff(time)) / tau_s))
         lag_s = float(np.median(np.diff(time))) * correlation / (1.0 - correlation)
         smooth = Smoothing(correlation, lag_s, plain - score, before.sigma_z_m)
-    return smooth, Coloured(
-        tau_s=slow.noises.tau_s,
-        low_s=slow.noises.tau_s,
-        high_s=np.inf,
-        slow_m=slow.noises.slow_m,
-        white_m=slow.noises.sigma_z_m,
-        gain_nats=plain - found,
-        lag_nats=found - score + (OFFSET_NATS if late_s else 0.0),
-    )
+    likely, lag_nats = slow.noises, found - score + (OFFSET_NATS if late_s else 0.0)
+    sizes = likely.slow_m, likely.sigma_z_m, plain - found, lag_nats
+    return smooth, Coloured(likely.tau_s, likely.tau_s, np.inf, *sizes)
 
 
 def against_truth(
@@ -234,8 +224,10 @@ def against_truth(
     sent = np.transpose([a.measurement_m[np.isin(a.measurement_time_s, time)] for a in axes])
     track = CubicSpline(place.index, place)
     true, speed = (track(time + clock_offset_s, order) for order in (0, 1))
+    part = np.eye(CLOCK_PARTS)[CLOCK_PARTS * np.arange(len(time)) // len(time)]
+    late = np.einsum("tp,ta->tpa", part, speed).reshape(len(time), -1)
     jumped = steps(time, [jump.time_s for jump in jumps])
-    taken = np.column_stack([np.ones_like(time), true, speed, jumped])
+    taken = np.column_stack([np.ones_like(time), true, late, jumped])
     rest = np.linalg.qr(taken, mode="complete")[0][:, taken.shape[1] :]
     error, share, fits = rest.T @ (sent - true), TRUTH_SHARES, []
     half = 0.5 * np.array([len(axes), len(error)])
@@ -245,19 +237,17 @@ def against_truth(
         variance = 1.0 - share + share * spread[:, None]
         square = ((turn.T @ error) ** 2).T @ (1.0 / variance) / len(error)
         score = half @ [np.log(variance).sum(axis=0), np.log(square).sum(axis=0)]
-        at = np.argmin(score)
-        fits.append((score[at], square[:, at].mean(), share[at]))
-    score, square, share = np.transpose(fits)
-    gain = half[1] * np.log(np.mean(error**2, axis=0)).sum() - score
-    at = np.argmax(gain)
-    if gain[at] < least:
+        fits.append((score, square.mean(axis=0)))
+    score, square = np.transpose(fits, (1, 0, 2))  # by time constant and share
+    at, of = divmod(int(np.argmin(score)), len(share))
+    gain = half[1] * np.log(np.mean(error**2, axis=0)).sum() - score.min(axis=1)
+    if gain.max() < least:
         return by_imu
-    first, last = np.flatnonzero(gain > gain[at] - PROFILE_DROP)[[0, -1]]
+    first, last = np.flatnonzero(gain > gain.max() - PROFILE_DROP)[[0, -1]]
     # the ends lie between time constants that were tried
-    taus = np.append(TRUTH_TAUS_S, np.inf)
-    tau_s, low_s, high_s = taus[[at, max(first - 1, 0), last + 1]].tolist()
-    slow_m, white_m = np.sqrt(square[at] * np.array([share[at], 1.0 - share[at]])).tolist()
-    return Coloured(tau_s, low_s, high_s, slow_m, white_m, float(gain[at]), lag_nats)
+    tau_s = np.append(TRUTH_TAUS_S, np.inf)[[at, max(first - 1, 0), last + 1]]
+    sizes_m = np.sqrt(square[at, of] * np.array([share[of], 1.0 - share[of]]))
+    return Coloured(*np.concatenate([tau_s, sizes_m, [gain.max(), lag_nats]]).tolist())
 
 
 def _most_likely(moved: PreparedMotion, offset_s: float, start: Noises) -> NoiseFit:
@@ -306,13 +296,9 @@ class _Source:
         # what was undone with an outlier is one too: left out of all models, which are compared
         kept = ~(bad | (known & np.concatenate([[False], bad[:-1]])))
         moved = motion(
-            self.flight,
-            time[kept],
-            undone[kept],
+            self.flight, time[kept], undone[kept], dt_s=self.settings.dt_s, signals=self.signals,
             directions=np.array([axis.direction for axis in self.axes]),
-            dt_s=self.settings.dt_s,
-            signals=self.signals,
-        )
+        )  # fmt: skip
         if isinstance(moved, Unavailable):
             return moved
         # nothing is known of where a stretch begins: the first one says nothing
