@@ -38,7 +38,7 @@ from px4fuse.ekf2_parameters import check
 from px4fuse.errors import LogError, MissingDataError, SettingsError
 from px4fuse.filter.causes import AFTER_STEP_S, Explained, explained
 from px4fuse.filter.clock import ClockOffset
-from px4fuse.filter.coloured import Coloured, Smoothing, hanging_together
+from px4fuse.filter.coloured import Coloured, Smoothing, against_truth, hanging_together
 from px4fuse.filter.heading import HeadingError
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Axis
@@ -129,10 +129,16 @@ class Analysis(Comparison):
         for jump in jumps:
             near = (time_s >= jump.time_s) & (time_s < jump.time_s + AFTER_STEP_S)
             left_out = np.union1d(left_out, time_s[near])
-        return hanging_together(
+        together = hanging_together(
             self.flight, axes, self.settings, tuned.noises, outlier_time_s=left_out,
             clock_offset_s=offset_s, jumps=jumps,
         )  # fmt: skip
+        truths = [self.axes[axis.name].truth for axis in axes]
+        known = [truth for truth in truths if not isinstance(truth, Unavailable)]
+        if isinstance(together, Unavailable) or len(known) < len(axes):
+            return together
+        smooth, slow = together
+        return smooth, against_truth(axes, known, left_out, offset_s, jumps, slow)
 
     @property
     def smoothing(self) -> Smoothing | Unavailable:

@@ -480,7 +480,7 @@ def low_pass(gain: float, lag_s: float, **parts: Any) -> Any:
 
 
 def slow(gain: float, lag: float, slow_m: float = 0.1) -> Coloured:
-    return Coloured(tau_s=1.0, slow_m=slow_m, white_m=0.1, gain_nats=gain, lag_nats=lag)
+    return Coloured(1.0, 1.0, np.inf, slow_m=slow_m, white_m=0.1, gain_nats=gain, lag_nats=lag)
 
 
 def repeating(again: int, count: int, moved_m: float = 5.0) -> Any:

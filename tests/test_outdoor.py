@@ -150,7 +150,7 @@ def test_a_clean_flight_is_consistent_replayed_and_has_nothing_to_put_right(seed
         ("r-scale=0.1", "ekf2_variance_understated"),
         ("ekf2-gate=1", "ekf2_gate_small"),
         ("mag=0.2", "aid_changed"),
-        ("slow-error=0.5,30", "errors_larger_than_claimed"),
+        ("slow-error=0.5,30", "source_coloured"),
         ("slow-error=0.8,10", "source_coloured"),
     ],
 )

@@ -150,7 +150,45 @@ def test_what_no_innovation_shows_asks_for_no_smaller_noise(
     assert all(each.change["sigma_z_m"] == pytest.approx(0.7 * sigma_z_m, rel=0.05)
                for each in tried)  # fmt: skip
     if denied:
-        assert told(analysis).keys() <= {"errors_larger_than_claimed"}
+        assert set(told(analysis)) == {"source_coloured"}
+
+
+@pytest.mark.parametrize("tau_s", [5.0, 20.0])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_truth_shows_slow_errors_that_pass_for_those_of_the_imu(tau_s: float, seed: int) -> None:
+    """As long as errors of the IMU are, so that no innovation shows them."""
+    analysis = judged(partial(errors.coloured, tau_s=tau_s), 5.0, seed, truth_for=0.10)
+    found = told(analysis)
+    assert set(found) == {"source_coloured"}
+    finding = found["source_coloured"]
+    evidence = finding.evidence
+    assert evidence["low_s"] < tau_s < 1.1 * evidence.get("high_s", np.inf)
+    assert evidence["white_m"] == pytest.approx(0.07, abs=0.015)
+    assert 0.03 < evidence["slow_m"] < 0.15
+    assert ("at least" in finding.headline) == ("high_s" not in evidence)
+    blind = told(judged(partial(errors.coloured, tau_s=tau_s), 5.0, seed))
+    assert "source_coloured" not in blind or "at least" in blind["source_coloured"].headline
+
+
+@pytest.mark.parametrize(
+    ("model", "name"),
+    [
+        (partial(errors.scaled, scale=0.2), "source_scale_wrong"),
+        (partial(errors.jumped, size=1.0), "source_jumps"),
+        (partial(errors.clock, late=0.3), "source_clock_offset"),
+        (LOUD, "source_noise_changes"),
+        (UNEQUAL, "source_axes_unequal"),
+        (partial(errors.low_pass, tau_s=0.3), "source_smoothed"),
+    ],
+)
+def test_what_a_truth_shows_of_other_errors_is_no_slow_one(model: errors.Model, name: str) -> None:
+    assert set(told(judged(model, truth_for=0.10))) == {name}
+
+
+def test_a_clock_that_changes_too_little_to_be_told_is_no_slow_error() -> None:
+    """Errors along the motion, from one time on: against the truth they hang together."""
+    changes = partial(errors.clock_jump, late=0.15)
+    assert "source_coloured" not in told(judged(changes, 20.0, truth_for=0.10))
 
 
 def test_a_low_pass_lags_by_less_than_its_time_constant() -> None:
@@ -168,6 +206,16 @@ def test_a_low_pass_is_no_slow_error_of_late_stamps(shared_logs: Path) -> None:
     flight = errors.laid_over(flight, errors.truth_of(log, flight), smooth, 5.0, 8)
     found = told(explain(compare(flight, RIGHT, axes=("north", "east"))))
     assert set(found) == {"source_smoothed"}
+
+
+@pytest.mark.reallogs
+def test_the_noise_of_one_axis_is_no_jump_along_it(shared_logs: Path) -> None:
+    """Judged by one noise for both axes, the larger one passed for a jump of 0.5 m."""
+    log = shared_logs / "simulated" / "v1.16.1_aisle_10hz.ulg"
+    flight = read_log(log)
+    flight = errors.laid_over(flight, errors.truth_of(log, flight), UNEQUAL, 5.0, 1107)
+    found = told(explain(compare(flight, RIGHT, axes=("north", "east"))))
+    assert set(found) == {"source_axes_unequal"}
 
 
 def test_a_filter_that_outliers_pull_is_no_noisy_part() -> None:

@@ -137,15 +137,9 @@ class Explained:
 
 
 def explained(
-    flight: Flight,
-    axes: tuple[Axis, ...],
-    settings: Settings,
-    *,
-    sigma_a_m_s2: float,
-    sigma_z_m: float,
-    outlier_time_s: Array,
-    clock_offset_s: float,
-) -> Explained | Unavailable:
+    flight: Flight, axes: tuple[Axis, ...], settings: Settings, *, sigma_a_m_s2: float,
+    sigma_z_m: float, outlier_time_s: Array, clock_offset_s: float,
+) -> Explained | Unavailable:  # fmt: skip
     """Estimate biases and scale, and look for jumps of the source.
 
     Parameters
@@ -178,14 +172,8 @@ def explained(
     if jumps:
         model = replace(model, steps=steps(model.time_s, [jump.time_s for jump in jumps]))
         sigma_a, found = _fit_noise(model, levels, skip)
-    return Explained(
-        found.estimate(FORWARD),
-        found.estimate(RIGHT),
-        found.estimate(TURN),
-        _scale(model, sigma_a, skip),
-        jumps,
-        sigma_a,
-    )
+    forward, right, turn = map(found.estimate, (FORWARD, RIGHT, TURN))
+    return Explained(forward, right, turn, _scale(model, sigma_a, skip), jumps, sigma_a)
 
 
 def _fit_noise(model: Hypotheses, levels: Array, skip: BoolArray) -> tuple[float, HypothesisFit]:
@@ -277,8 +265,8 @@ def _step_squares(model: Hypotheses, sigma_a: float, skip: BoolArray, times: Arr
             response = model.whitened(alone, sigma_a, skip)[0][~skip]
             mixed = columns.T @ response
             size = np.sum(response**2, axis=0) - np.sum(mixed * (base.covariance @ mixed), axis=0)
-            chi_square[few] += (rest @ response) ** 2 / np.maximum(size, 1e-9)
-    return np.asarray(chi_square / max(base.spread, 1.0) ** 2)
+            chi_square[few] += (rest @ response / base.spreads[axis]) ** 2 / np.maximum(size, 1e-9)
+    return chi_square
 
 
 def _placed(
@@ -315,7 +303,8 @@ def _judge(
         return None
     found = model.fit(sigma_a, later)
     size, covariance = found.coefficients[columns], found.covariance[np.ix_(columns, columns)]
-    chi_square = float(size @ np.linalg.solve(covariance, size)) / max(found.spread, 1.0) ** 2
+    size = size / found.spreads
+    chi_square = float(size @ np.linalg.solve(covariance, size))
     if chi_square < chdtri(len(columns), chance):
         return None
     return Jump(time_s, tuple(found.estimate(int(at)) for at in columns), chi_square)
@@ -350,6 +339,12 @@ class HypothesisFit:
     square: float
     score: float
     spread: float
+
+    @property
+    def spreads(self) -> Array:
+        """Root mean square that remains along each axis, at least 1: one may be the noisier."""
+        square = np.bincount(self.axis, self.rest**2) / np.bincount(self.axis)
+        return np.sqrt(np.maximum(square, 1.0))
 
     def estimate(self, column: int) -> Estimate:
         """One coefficient, its σ widened where more remains than the noises say."""
@@ -485,12 +480,9 @@ def _with_signals(legs: Preintegrated, dp: Array, dv: Array, measured_m: Array) 
 
 
 def hypotheses_of(
-    flight: Flight,
-    axes: tuple[Axis, ...],
-    settings: Settings,
-    sigma_z: float,
+    flight: Flight, axes: tuple[Axis, ...], settings: Settings, sigma_z: float,
     clock_offset_s: float,
-) -> Hypotheses | Unavailable:
+) -> Hypotheses | Unavailable:  # fmt: skip
     """Lay out the axes with the columns that every hypothesis is fitted beside.
 
     Parameters

@@ -14,6 +14,11 @@ A slow error of first order, c_k = ρ c_(k-1) + √(1 - ρ²) σ_c w, is a third
 measurement sees: z = p + c + v. It hangs together too, but lags behind nothing. Both are tried with
 the stamps as they are, and a slow error also with the clock offset that was found, the other
 reading of a lag.
+
+What is much slower than a second passes for an error of the IMU, so that such a time constant is a
+lower bound. A truth shows the errors themselves, and judges them where there is one: by their own
+likelihood, what a turned, moved or scaled frame and late stamps would add to them taken out
+(restricted likelihood, Patterson and Thompson 1971).
 """
 
 from __future__ import annotations
@@ -23,11 +28,14 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
+import pandas as pd
+from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
 from px4fuse.arrays import Array, BoolArray
-from px4fuse.filter.causes import Jump
+from px4fuse.filter.causes import Jump, steps
 from px4fuse.filter.fitting import NoiseFit, Noises, fitted, most_likely
+from px4fuse.filter.likelihood import PROFILE_DROP
 from px4fuse.filter.motion import PreparedMotion, SignalCache, motion
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, too_few
@@ -50,6 +58,13 @@ LOOK_NATS, LEAST_NATS = 0.5, 2.0
 OFFSET_NATS = 2.0
 # Time constants of a low pass, and how near in ln τ is near enough
 LOW_PASS_S, LOG_TAU_STEP = (0.02, 3.0), 0.05
+# Against a truth: at most so many measurements, what must be gained (a likelihood ratio of 150 for
+# two more numbers), how near a sample of it must be (s: between them, at 2 m/s², it is known to
+# 1 cm), time constants and shares
+TRUTH_MEASUREMENTS, TRUTH_NATS, TRUTH_AWAY_S = 300, 5.0, 0.1
+# Parts of the flight with a clock offset each, which may change
+CLOCK_PARTS = 12
+TRUTH_TAUS_S, TRUTH_SHARES = np.geomspace(0.3, 80.0, 17), np.linspace(0.05, 0.999, 20)
 
 
 @dataclass(frozen=True)
@@ -83,6 +98,8 @@ class Coloured:
     ----------
     tau_s : float
         Time in which it forgets itself.
+    low_s, high_s : float
+        Where that lies: 95 % by a truth; over the IMU it may be any longer (infinity).
     slow_m, white_m : float
         Standard deviations of both parts, per axis.
     gain_nats : float
@@ -93,6 +110,8 @@ class Coloured:
     """
 
     tau_s: float
+    low_s: float
+    high_s: float
     slow_m: float
     white_m: float
     gain_nats: float
@@ -105,15 +124,9 @@ class Coloured:
 
 
 def hanging_together(
-    flight: Flight,
-    axes: tuple[Axis, ...],
-    settings: Settings,
-    noises: Noises,
-    *,
-    outlier_time_s: Array,
-    clock_offset_s: float,
-    jumps: Sequence[Jump] = (),
-) -> tuple[Smoothing, Coloured | Unavailable] | Unavailable:
+    flight: Flight, axes: tuple[Axis, ...], settings: Settings, noises: Noises, *,
+    outlier_time_s: Array, clock_offset_s: float, jumps: Sequence[Jump] = (),
+) -> tuple[Smoothing, Coloured | Unavailable] | Unavailable:  # fmt: skip
     """Look for a low pass and for a slow error of the source.
 
     Parameters
@@ -179,13 +192,62 @@ def hanging_together(
         correlation = float(np.exp(-np.median(np.diff(time)) / tau_s))
         lag_s = float(np.median(np.diff(time))) * correlation / (1.0 - correlation)
         smooth = Smoothing(correlation, lag_s, plain - score, before.sigma_z_m)
-    return smooth, Coloured(
-        tau_s=slow.noises.tau_s,
-        slow_m=slow.noises.slow_m,
-        white_m=slow.noises.sigma_z_m,
-        gain_nats=plain - found,
-        lag_nats=found - score + (OFFSET_NATS if late_s else 0.0),
-    )
+    likely, lag_nats = slow.noises, found - score + (OFFSET_NATS if late_s else 0.0)
+    sizes = likely.slow_m, likely.sigma_z_m, plain - found, lag_nats
+    return smooth, Coloured(likely.tau_s, likely.tau_s, np.inf, *sizes)
+
+
+def against_truth(
+    axes: Sequence[Axis], truths: Sequence[pd.DataFrame], outlier_time_s: Array,
+    clock_offset_s: float, jumps: Sequence[Jump], by_imu: Coloured | Unavailable,
+) -> Coloured | Unavailable:  # fmt: skip
+    """A slow error in the positions' errors against a truth, where that says more than the IMU.
+
+    Parameters
+    ----------
+    axes, outlier_time_s, clock_offset_s, jumps
+        As :func:`hanging_together` has them.
+    truths : sequence of DataFrame
+        True ``position_m`` along each axis.
+    by_imu : Coloured or Unavailable
+        What :func:`hanging_together` found, with the lag that only it can tell.
+    """
+    least, lag_nats = TRUTH_NATS, 0.0
+    if isinstance(by_imu, Coloured):
+        least, lag_nats = max(TRUTH_NATS, by_imu.gain_nats), by_imu.lag_nats
+    place = pd.concat([truth["position_m"] for truth in truths], axis=1).dropna()
+    time = np.setdiff1d(axes[0].measurement_time_s, outlier_time_s)
+    time = time[place.index.get_indexer(pd.Index(time), "nearest", tolerance=TRUTH_AWAY_S) >= 0]
+    time = time[:: max(1, -(-len(time) // TRUTH_MEASUREMENTS))]
+    if len(time) < MIN_MEASUREMENTS:
+        return by_imu
+    sent = np.transpose([a.measurement_m[np.isin(a.measurement_time_s, time)] for a in axes])
+    track = CubicSpline(place.index, place)
+    true, speed = (track(time + clock_offset_s, order) for order in (0, 1))
+    part = np.eye(CLOCK_PARTS)[CLOCK_PARTS * np.arange(len(time)) // len(time)]
+    late = np.einsum("tp,ta->tpa", part, speed).reshape(len(time), -1)
+    jumped = steps(time, [jump.time_s for jump in jumps])
+    taken = np.column_stack([np.ones_like(time), true, late, jumped])
+    rest = np.linalg.qr(taken, mode="complete")[0][:, taken.shape[1] :]
+    error, share, fits = rest.T @ (sent - true), TRUTH_SHARES, []
+    half = 0.5 * np.array([len(axes), len(error)])
+    for tau in TRUTH_TAUS_S:
+        slow = rest.T @ np.exp(-np.abs(time[:, None] - time) / tau) @ rest
+        spread, turn = np.linalg.eigh(slow)
+        variance = 1.0 - share + share * spread[:, None]
+        square = ((turn.T @ error) ** 2).T @ (1.0 / variance) / len(error)
+        score = half @ [np.log(variance).sum(axis=0), np.log(square).sum(axis=0)]
+        fits.append((score, square.mean(axis=0)))
+    score, square = np.transpose(fits, (1, 0, 2))  # by time constant and share
+    at, of = divmod(int(np.argmin(score)), len(share))
+    gain = half[1] * np.log(np.mean(error**2, axis=0)).sum() - score.min(axis=1)
+    if gain.max() < least:
+        return by_imu
+    first, last = np.flatnonzero(gain > gain.max() - PROFILE_DROP)[[0, -1]]
+    # the ends lie between time constants that were tried
+    tau_s = np.append(TRUTH_TAUS_S, np.inf)[[at, max(first - 1, 0), last + 1]]
+    sizes_m = np.sqrt(square[at, of] * np.array([share[of], 1.0 - share[of]]))
+    return Coloured(*np.concatenate([tau_s, sizes_m, [gain.max(), lag_nats]]).tolist())
 
 
 def _most_likely(moved: PreparedMotion, offset_s: float, start: Noises) -> NoiseFit:
@@ -234,13 +296,9 @@ class _Source:
         # what was undone with an outlier is one too: left out of all models, which are compared
         kept = ~(bad | (known & np.concatenate([[False], bad[:-1]])))
         moved = motion(
-            self.flight,
-            time[kept],
-            undone[kept],
+            self.flight, time[kept], undone[kept], dt_s=self.settings.dt_s, signals=self.signals,
             directions=np.array([axis.direction for axis in self.axes]),
-            dt_s=self.settings.dt_s,
-            signals=self.signals,
-        )
+        )  # fmt: skip
         if isinstance(moved, Unavailable):
             return moved
         # nothing is known of where a stretch begins: the first one says nothing

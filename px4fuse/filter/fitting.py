@@ -36,6 +36,8 @@ FIRST_SHARE, FIRST_WIDTH, MAX_SHARE = 0.005, 10.0, 0.4
 # SIGMA_Z is at most this many times what the median of the squares says
 BULK = 1.2
 SETTLED = 0.01
+# -ln p of each measurement where it cannot be computed; any that can be is far below
+FAR = 1e6
 # Step of ln σ for slopes
 SLOPE_STEP = 1e-4
 # Nodes about each place, and their distance in ln σ; while the outliers still change, few
@@ -340,7 +342,10 @@ def _maximise(likelihood: Likelihood, start: Noises, steps: int = MAX_STEPS) -> 
 
     def score(logs: Array) -> float:
         # of each measurement: the first step is as long as the slope, at most 1
-        return likelihood(made(logs)) / count
+        try:
+            return likelihood(made(logs)) / count
+        except np.linalg.LinAlgError:  # so far from the data that rounding is all: the step is cut
+            return FAR
 
     def made(logs: Array) -> Noises:
         return Noises(**dict(zip(values, np.exp(logs).tolist(), strict=True)))

@@ -19,6 +19,7 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, tune
 from px4fuse.findings.model import Found, error, info, warning
 from px4fuse.findings.source_positions import LAG_NATS, hardly_moved
 from px4fuse.flight import POSITION_COLUMNS, Unavailable
+from px4fuse.plain import number_words
 
 COLOURED_NATS = 5.0  # a likelihood ratio of 150 for two more numbers; 1 of 400 clean flights
 REPEATS = 0.05  # of the positions
@@ -49,10 +50,12 @@ def slow(analysis: Analysis) -> Found:
         return
     if found.lag_nats >= LAG_NATS:
         return  # smoothed
+    low, high = (number_words(end, 1) for end in (found.low_s, found.high_s))
+    over = f"{low} to {high} s" if np.isfinite(found.high_s) else f"at least {low} s"
     gnss = analysis.source.origin.is_gnss
     yield (info if gnss else warning)(
         "source_coloured",
-        f"The errors of {analysis.source.name} hang together over about {found.tau_s:.1g} s",
+        f"The errors of {analysis.source.name} hang together over {over}",
         f": a slow part of about {found.slow_m:.2g} m beside white noise of {found.white_m:.2g} m. "
         "Both filters take each error for new: they follow the slow part, which shows in no "
         "innovation, and claim to be better than they are.",
@@ -63,7 +66,7 @@ def slow(analysis: Analysis) -> Found:
             else "Look for what is slow (reflections, geometry of the anchors, a filter in the "
             "sender), or feed the filters fewer positions, further apart than that time."
         ),
-        asdict(found),
+        {name: value for name, value in asdict(found).items() if np.isfinite(value)},
     )
 
 

@@ -5,7 +5,17 @@ the real EKF2) and the truth of the JSON file beside each, lays simulated errors
 system over the truth, at several rates, and prints for each model of errors how often each finding
 was told, and each "since" of the story. ``--pairs`` lays two models over the truth at once. It is
 independent of ``px4fuse.simulation``: it shares no line with it. EKF2's own record is left out,
-since it fused other positions.
+since it fused other positions. Logs without the positions as they arrived (no
+``vehicle_visual_odometry``) are no use: theirs were made of EKF2's output, of which less is said.
+
+The truth stays in the flight, as it is in the log; ``--no-truth`` takes it out, as on a flight
+outdoors. Right is a flight whose first finding, EKF2's absence left out, is the model's own, and
+for white noise none; no other statement counts. The stamps are right: the truth of the JSON files
+agrees with the logs' own ground truth at 0.000 s. The clock offset that is found, 10 to 20 ms late
+on average at 0.1 m, is the estimate's: half its σ, as late with an IMU made of the truth and fresh
+noise, and within 5 ms of zero with one without noise. Several logs of PX4's simulation share one
+sequence of IMU noise (it is seeded), so that what the IMU adds is no fresh chance in each. At 2 Hz
+errors of 0.2 s are white to all purposes: 92 % of them is forgotten from one position to the next.
 
 ``--possible`` prints for slow errors how often they can be told at all: by the likelihood ratio of
 the very process that made them, its numbers known, against white noise. No test with as few false
@@ -214,13 +224,15 @@ def laid_over(
     )
 
 
-def told(job: tuple[str, str, float, int]) -> tuple[str, tuple[str, ...]]:
-    """Findings of one flight that are no information, causes only."""
+def told(job: tuple[str, str, float, int], *, truth: bool = True) -> tuple[str, tuple[str, ...]]:
+    """Findings of one flight that are no information, causes only, most severe first."""
     log, name, rate_hz, seed = job
     flight = read_log(Path(log))
     sigma_z_m = float(SIGMA_M * np.sqrt(len(name.split(BOTH))))
     known = truth_of(Path(log), flight)
     flight = laid_over(flight, known, model_of(name), rate_hz, seed, sigma_z_m)
+    if not truth:
+        flight = replace(flight, truth=Unavailable("truth", "left out", "Not in this study."))
     analysis = explain(compare(flight, Settings(0.27, sigma_z_m), axes=("north", "east")))
     told = story(analysis, find(analysis))[0].partition(", since ")[2]
     since = (f"since: {re.sub(r'[-+0-9.]+', '#', told.partition(' (')[0])}",) if told else ()
@@ -255,13 +267,20 @@ def possible(job: tuple[str, str, float, int]) -> tuple[str, float, float]:
     return name, rate_hz, white.score(white.noises) - float(min(totals))
 
 
+def right(name: str, ids: tuple[str, ...]) -> bool:
+    """Whether the first finding is the model's own; of a pair, whether both are told."""
+    wanted = {MODELS[each][1] for each in name.split(BOTH)} - {""}
+    causes = [one.strip("!") for one in ids if not one.startswith(("since", "ekf2_unavailable"))]
+    return wanted <= set(causes if len(wanted) > 1 else causes[:1]) and bool(wanted) >= bool(causes)
+
+
 def jobs(
-    logs: list[str], flights: int, only: str, *, pairs: bool
+    logs: list[str], flights: int, only: str, *, pairs: bool, first: int = 0
 ) -> Iterator[tuple[str, str, float, int]]:
     rates = (5.0, 10.0, 20.0, 2.0)
     for name in map(BOTH.join, PAIRS) if pairs else MODELS:
         if only in name:
-            for seed in range(flights):
+            for seed in range(first, first + flights):
                 yield logs[seed % len(logs)], name, rates[seed // len(logs) % len(rates)], seed
 
 
@@ -269,7 +288,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("logs", nargs="+")
     parser.add_argument("--flights", type=int, default=8)
+    parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--only", default="")
+    parser.add_argument("--no-truth", action="store_true", help="as on a flight without one")
+    parser.add_argument("--processes", type=int)
     parser.add_argument("--pairs", action="store_true", help="two models at once")
     parser.add_argument("--possible", action="store_true", help="what can be told of slow errors")
     given = parser.parse_args()
@@ -283,17 +305,19 @@ def main() -> None:
         return
     found: dict[str, Counter[str]] = {}
     counts: Counter[str] = Counter()
-    with ProcessPoolExecutor() as pool:
-        for name, ids in pool.map(
-            told, jobs(given.logs, given.flights, given.only, pairs=given.pairs)
-        ):
+    good: Counter[str] = Counter()
+    with ProcessPoolExecutor(given.processes) as pool:
+        flown = jobs(given.logs, given.flights, given.only, pairs=given.pairs, first=given.first)
+        for name, ids in pool.map(partial(told, truth=not given.no_truth), flown):
             counts[name] += 1
+            good[name] += right(name, ids)
             found.setdefault(name, Counter()).update(ids or ["nothing"])
     for name, ids in found.items():
         wanted = " and ".join(MODELS[each][1] or "nothing" for each in name.split(BOTH))
-        print(f"{name} ({counts[name]} flights; {wanted} expected)")
+        print(f"{name} ({good[name]} of {counts[name]} flights right; {wanted} expected)")
         for finding, count in ids.most_common():
             print(f"    {count:3d}  {finding}")
+    print(f"{sum(good.values())} of {sum(counts.values())} right")
 
 
 if __name__ == "__main__":
