@@ -49,6 +49,12 @@ def test_what_a_log_cannot_show_is_not_found_by_chance() -> None:
         assert row.rate <= 0.1
 
 
+def test_noises_whose_likelihood_is_lost_in_rounding_are_passed_over() -> None:
+    """A slow error of 10 m over a SIGMA_Z of 1 mm, two positions 0.5 ms apart."""
+    jump = Condition("source_clock_changes", "--mistake clock-jump=400ms")
+    assert found(FAULTY_SEED + 2, jump)[0] == "source_clock_changes"
+
+
 def test_the_code_still_does_what_the_table_says() -> None:
     certain = {(row.finding, row.condition) for row in TABLE.itertuples() if row.rate == 1.0}
     assert found(5) == ()
