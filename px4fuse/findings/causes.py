@@ -91,6 +91,9 @@ NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
     "measurement noise", "process noise", "outliers", "clock", "frame", "gate", "accelerometer",
     "elsewhere",
 )  # fmt: skip
+# In the evidence of a slow error: how many times what a filter assumes of the noise its white part
+# is; where it is beyond that, the noise is wrong by itself
+WHITE_BEYOND = "white_over_assumed"
 # Likewise of an aid: it is of the sensor that the positions are of, or changed in flight
 SENSOR, CHANGE = "the source's sensor", "change"
 
@@ -199,7 +202,7 @@ def by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     groups = sorted(by_root(findings), key=lambda group: places[group[0].id])
     for cause, listed in CONSEQUENCES.items():
         into = next((group for group in groups if group[0].id == cause), None)
-        if into is None:
+        if into is None or WHITE_BEYOND in into[0].evidence:
             continue
         taken = [group for group in groups if group is not into and _follows(group[0], listed)]
         groups = [group for group in groups if group not in taken]

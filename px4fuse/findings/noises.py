@@ -330,7 +330,7 @@ def _is_default(analysis: Analysis, owner: FilterName, result: AxisComparison) -
         default = PARAMETERS[name].default
     untouched = analysis.flight.log.parameters.get(name, default) == default
     # a sender that reports a larger variance has chosen it
-    return untouched and not abs(np.log(_ekf2_noise_m(result) / default)) > np.log(NOISE_FITS)
+    return untouched and not abs(np.log(ekf2_noise_m(result) / default)) > np.log(NOISE_FITS)
 
 
 def _asked(noise: Noise) -> float | None:
@@ -384,7 +384,7 @@ def _not_replayed(analysis: Analysis, result: AxisComparison, tuned: AxisTuning 
     asked_m = None if tuned is None else _asked(tuned.sigma_z)
     if asked_m is None or why is None:
         return UNKNOWN_NOISE if tuned is None else NOT_EXPLAINED
-    noise_m, used_m = max(asked_m, EKF2_NOISE_FLOOR_M), _ekf2_noise_m(result)
+    noise_m, used_m = max(asked_m, EKF2_NOISE_FLOOR_M), ekf2_noise_m(result)
     said = f"The source's noise is {noise_m:.2g} m, EKF2 takes it to be {used_m:.2g} m"
     statement = result.filters["ekf2"]
     assert not isinstance(statement, Unavailable)
@@ -401,7 +401,7 @@ def _not_replayed(analysis: Analysis, result: AxisComparison, tuned: AxisTuning 
     return f"{said}: set {settings_words(changes)}. {not_replayed(why)}"
 
 
-def _ekf2_noise_m(result: AxisComparison) -> float:
+def ekf2_noise_m(result: AxisComparison) -> float:
     """Median √R that EKF2 used; NaN where unknown."""
     frame = result.ekf2_innovations
     if isinstance(frame, Unavailable):

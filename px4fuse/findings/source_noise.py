@@ -16,7 +16,9 @@ from px4fuse.filter.coloured import Coloured
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.signals import within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, tune
+from px4fuse.findings.causes import WHITE_BEYOND
 from px4fuse.findings.model import Found, error, info, warning
+from px4fuse.findings.noises import NOISE_FITS, ekf2_noise_m
 from px4fuse.findings.source_positions import LAG_NATS, hardly_moved
 from px4fuse.flight import POSITION_COLUMNS, Unavailable
 from px4fuse.plain import number_words
@@ -53,6 +55,10 @@ def slow(analysis: Analysis) -> Found:
     low, high = (number_words(end, 1) for end in (found.low_s, found.high_s))
     over = f"{low} to {high} s" if np.isfinite(found.high_s) else f"at least {low} s"
     gnss = analysis.source.origin.is_gnss
+    evidence = {name: value for name, value in asdict(found).items() if np.isfinite(value)}
+    assumed_m = [analysis.settings.sigma_z_m, *map(ekf2_noise_m, analysis.axes.values())]
+    if (beyond := found.white_m / float(np.nanmin(assumed_m))) > NOISE_FITS:
+        evidence[WHITE_BEYOND] = beyond
     yield (info if gnss else warning)(
         "source_coloured",
         f"The errors of {analysis.source.name} hang together over {over}",
@@ -66,7 +72,7 @@ def slow(analysis: Analysis) -> Found:
             else "Look for what is slow (reflections, geometry of the anchors, a filter in the "
             "sender), or feed the filters fewer positions, further apart than that time."
         ),
-        {name: value for name, value in asdict(found).items() if np.isfinite(value)},
+        evidence,
     )
 
 
