@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from px4fuse.ekf2.inputs import Inputs, Rules
-from px4fuse.ekf2.intervals import GRAVITY_M_S2, Events
-from px4fuse.ekf2.stretches import Stretch
+from px4fuse.ekf2.intervals import Events
+from px4fuse.ekf2.stretches import GRAVITY_M_S2, Stretch
 from px4fuse.trajectory.rotation import skew
 
 EYE = np.eye(15)

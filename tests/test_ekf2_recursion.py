@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation
 from px4fuse.ekf2.inputs import Inputs, Received, Rules
 from px4fuse.ekf2.intervals import (
     FUSE,
-    GRAVITY_M_S2,
     IDLE,
     START,
     Timing,
@@ -38,7 +37,7 @@ from px4fuse.ekf2.recursion import (
     run,
 )
 from px4fuse.ekf2.recursion import _measurements as measurements
-from px4fuse.ekf2.stretches import Field, Stretch
+from px4fuse.ekf2.stretches import GRAVITY_M_S2, Field, Stretch
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, MAG, Aid, settings_in_force
 from px4fuse.errors import SettingsError
 from px4fuse.trajectory.rotation import skew

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,10 +70,6 @@ def happened(comparison: Comparison) -> Events:
     flight, segment = comparison.flight, comparison.segment
     low, high = segment.start_s, segment.end_s
 
-    def inside(spans: Iterator[Span] | tuple[Span, ...]) -> tuple[Span, ...]:
-        cut = ((max(start, low), min(end, high)) for start, end in spans)
-        return tuple((start, end) for start, end in cut if end > start)
-
     airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
     edges = [low, *(time for span in airborne for time in span), high]
     known = not isinstance(flight.airborne, Unavailable)
@@ -81,10 +77,10 @@ def happened(comparison: Comparison) -> Events:
     resets = flight.ekf2.resets if isinstance(flight.ekf2, Ekf2) else ()
     return Events(
         gaps=source_gaps(comparison.lines[0].measurement_time_s, comparison.source.rate_hz),
-        dropouts=inside(
+        dropouts=segment.cut(
             (lost.start_s, lost.start_s + lost.duration_s) for lost in flight.log.dropouts
         ),
-        ground=inside(zip(edges[::2], edges[1::2], strict=True)) if known else (),
+        ground=segment.cut(zip(edges[::2], edges[1::2], strict=True)) if known else (),
         take_off_s=tuple(start for start, _ in airborne if low <= start <= high),
         landing_s=tuple(end for _, end in airborne if low <= end <= high),
         modes=tuple(

@@ -17,11 +17,10 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.ekf2.stretches import Heights, Stretch
+from px4fuse.ekf2.stretches import GRAVITY_M_S2, Heights, Stretch, steps_of
 from px4fuse.ekf2_parameters import AIDS, BAROMETER, GNSS_HGT, fuses_by_mask
 from px4fuse.flight import GROUND_EFFECT, Ekf2, Flight, FusionRecord, at_times
 
-GRAVITY_M_S2 = 9.80665  # CONSTANTS_ONE_G
 SPEED_DOWN, DOWN = 5, 8
 SENSORS = (BAROMETER, GNSS_HGT)
 HEIGHTS = (*SENSORS, AIDS["rng_hgt"], AIDS["ev_hgt"])
@@ -32,7 +31,7 @@ BIAS_LATE_S = 1.0
 # EKF2 has so many samples of the barometer a second, since v1.15 and before; one of fewer that are
 # in the log stands for several, down to the last rate
 BAROMETER_HZ, OLD_BAROMETER_HZ, LEAST_HZ = 10.0, 15.0, 4.0
-MIN_GATE, MIN_SD_M = 1.0, 0.01
+MIN_GATE, MIN_SD = 1.0, 0.01  # the latter of position and height (m), and of a velocity (m/s)
 # Of the bias: noise density (m/s/√Hz; bias_nsd, common.h), least variance, least one of a
 # measurement, gate; where innovations keep to one side its noise is raised (isOffsetDetected)
 BIAS_DENSITY, LEAST_M2, LEAST_NOISE_M2, BIAS_GATE = 0.13, 1e-8, 1e-4, 3.0
@@ -95,9 +94,8 @@ def inside(
     stretch: Stretch, taken_s: Array, down_m: Array, dead_m: Array
 ) -> tuple[IntArray, Array, Array, Array]:
     """Samples of the barometer in a stretch, behind the step at the end of which each is taken."""
-    step = np.searchsorted(stretch.time_s, taken_s - 1e-9)
-    kept = (step > 0) & (step < len(stretch.time_s))
-    return step[kept], taken_s[kept], down_m[kept], dead_m[kept]
+    step, kept = steps_of(stretch, taken_s)
+    return step, taken_s[kept], down_m[kept], dead_m[kept]
 
 
 def barometer_samples(stretch: Stretch, ends: Sequence[IntArray]) -> list[Array]:
@@ -108,7 +106,7 @@ def barometer_samples(stretch: Stretch, ends: Sequence[IntArray]) -> list[Array]
     """
     heights, time_s = stretch.heights, stretch.time_s
     assert heights is not None
-    force = np.einsum("nj,nj->n", stretch.rotation[1:, 2], stretch.force_m_s2) + GRAVITY_M_S2
+    force = np.einsum("nj,nj->n", stretch.rotation[1:, 2], stretch.force_m_s2) + GRAVITY_M_S2[2]
     # by the IMU alone, from a standstill
     speed = np.concatenate([[0.0], np.cumsum(force * stretch.step_s)])
     path = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * stretch.step_s)])
@@ -168,7 +166,7 @@ class HeightFilter:
         self.near = self.dead_m.any(axis=2)
         gates = [np.maximum(knob.get(aid.gate, MIN_GATE), MIN_GATE) for aid in SENSORS]
         self.gate2 = [np.where(gated, gate**2, np.inf) for gate in gates]
-        self.noise_m2 = np.maximum(knob.get(BAROMETER.noise, MIN_SD_M), MIN_SD_M) ** 2
+        self.noise_m2 = np.maximum(knob.get(BAROMETER.noise, MIN_SD), MIN_SD) ** 2
         self.biased = [aid.name != heights.reference for aid in SENSORS]
         self.weight, self.learning = (heights.weight, 1.0), on[heights.reference]
         self.bias_m, self.bias_m2 = (np.full(size, value) for value in heights.bias)

@@ -182,7 +182,9 @@ class Inputs:
     __repr__ = brief
 
 
-def prepare(flight: Flight, imposed: str = "") -> Inputs | Unavailable:  # noqa: PLR0911, PLR0912
+def prepare(  # noqa: PLR0911, PLR0912 (a reason each)
+    flight: Flight, imposed: str = ""
+) -> Inputs | Unavailable:
     """What the model runs on, or why the log cannot carry it.
 
     Parameters
@@ -224,7 +226,7 @@ def prepare(flight: Flight, imposed: str = "") -> Inputs | Unavailable:  # noqa:
         if not flight.log.firmware.startswith(STAMPED_AT_HORIZON):
             return Unavailable(WHAT, horizon_s.reason, horizon_s.remedy)
         horizon_s = 0.0  # a buffer of one step: EKF2_EV_DELAY is at most EKF2_PREDICT_US
-    stretches = find_stretches(flight, imu, attitude, ekf2, record, read.stamp_s, magnetic=gnss)
+    stretches = find_stretches(flight, imu, attitude, ekf2, record, read.stamp_s, gnss=gnss)
     if not stretches:
         return Unavailable(
             WHAT,

@@ -23,10 +23,9 @@ import numpy as np
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
 from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.stretches import Stretch
+from px4fuse.ekf2.stretches import GRAVITY_M_S2, Stretch
 from px4fuse.trajectory.rotation import skew
 
-GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])  # CONSTANTS_ONE_G
 STATES = 15
 MOVED = 9  # of them, those that the IMU moves: all but the biases
 FIELD_STATES = 21  # with the magnetic fields of earth (NED) and body (FRD), where they are fused

@@ -22,7 +22,6 @@ from px4fuse.display import brief
 from px4fuse.ekf2.inputs import WHAT, Inputs, prepare, same_sample
 from px4fuse.ekf2.intervals import (
     ACCELEROMETER_BIAS,
-    GRAVITY_M_S2,
     GYRO_BIAS,
     POSITION,
     THETA,
@@ -42,6 +41,7 @@ from px4fuse.ekf2.replay import (
     agreement_with_log,
     with_obedient,
 )
+from px4fuse.ekf2.stretches import GRAVITY_M_S2
 from px4fuse.ekf2_parameters import (
     AIDS,
     BAROMETER,

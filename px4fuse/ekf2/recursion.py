@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.ekf2.heights import MIN_GATE, SENSORS, HeightFilter, barometer_samples
+from px4fuse.ekf2.heights import MIN_GATE, MIN_SD, SENSORS, HeightFilter, barometer_samples
 from px4fuse.ekf2.inputs import Inputs, Rules
 from px4fuse.ekf2.intervals import (
     ACCELEROMETER_BIAS,
@@ -42,8 +42,6 @@ LEAST_VARIANCE = 1e-30
 TOGETHER = 64
 # Variance by which a sample is not taken at all
 NOT_TAKEN = 1e9
-# Of a position (m) and a velocity (m/s), ev_pos_control.cpp
-MIN_SD = 0.01
 # Of an acceleration (m/s²) that EKF2 takes to be wrong, or that was clipped (BADACC_BIAS_PNOISE,
 # common.h; covariance.cpp)
 BAD_NOISE = 4.9

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from scipy.linalg import block_diag
 
-from px4fuse.arrays import Array, IntArray
+from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
 from px4fuse.flight import (
     ACCELEROMETER_BIAS_COLUMNS,
@@ -59,6 +59,9 @@ FIELD_AFTER_S = 1.0
 # log stands for several, down to this rate
 FIELD_HZ, LEAST_FIELD_HZ = 14.0, 1.5
 MIN_STRETCH_S = 10.0
+
+
+GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])  # CONSTANTS_ONE_G
 
 
 @dataclass(frozen=True)
@@ -191,7 +194,7 @@ def find_stretches(
     record: FusionRecord,
     source_s: Array,
     *,
-    magnetic: bool = False,
+    gnss: bool = False,
 ) -> tuple[Stretch, ...]:
     """Parts of a flight without gaps in IMU and positions, from when EKF2 has fused for a while.
 
@@ -204,8 +207,9 @@ def find_stretches(
     record : FusionRecord
     source_s : ndarray
         Stamps of the positions that EKF2 fused.
-    magnetic : bool
-        Whether the magnetic fields are to be states, where the log allows it.
+    gnss : bool
+        Whether EKF2 fuses GNSS: then the magnetic fields are states, where the log allows it, and
+        an acceleration that is wrong or clipped is relied on less.
     """
     innovations = ekf2.innovations["north"]
     assert isinstance(innovations, pd.DataFrame)
@@ -218,7 +222,7 @@ def find_stretches(
     first = max(attitude.index[0], source_s[0])
     last = min(attitude.index[-1], source_s[-1] + 1.0)
     airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
-    of_field = _field_s(record) if magnetic else None
+    of_field = _field_s(record) if gnss else None
     cuts += of_field[1:] if of_field else ()
     found = []
     for low, high in pairwise(np.unique(np.clip(cuts, first, last))):
@@ -234,7 +238,7 @@ def find_stretches(
         covered = (time[1:] > states[at]) & (time[:-1] < high)
         if np.all(np.diff(time)[covered] <= IMU_GAP_S):
             made = _stretch(imu, attitude, ekf2, record, at, high)
-            if magnetic:
+            if gnss:
                 made = replace(made, shaken=_shaken(imu, record, made.time_s))
             within = of_field and of_field[0] <= states[at] and high <= of_field[1]
             found.append(_with_field(made, record, at, ekf2.step_s) if within else made)
@@ -347,15 +351,21 @@ def with_field(
     fields, variance : ndarray, shape (6,)
         At the start, of earth (NED) and body.
     """
-    step = np.searchsorted(stretch.time_s, taken_s - 1e-9)
-    inside = (step > 0) & (step < len(stretch.time_s))
+    step, inside = steps_of(stretch, taken_s)
     return replace(
         stretch,
         state=np.concatenate([stretch.state, fields]),
         variance=np.concatenate([stretch.variance, variance]),
         correlation=block_diag(stretch.correlation, np.eye(len(fields))),
-        field=Field(step[inside], gauss[inside], weight),
+        field=Field(step, gauss[inside], weight),
     )
+
+
+def steps_of(stretch: Stretch, taken_s: Array) -> tuple[IntArray, BoolArray]:
+    """Step at the end of which each sample in a stretch is taken, and which samples those are."""
+    step = np.searchsorted(stretch.time_s, taken_s - 1e-9)
+    inside = (step > 0) & (step < len(stretch.time_s))
+    return step[inside], inside
 
 
 def predict_s(record: FusionRecord) -> float:

@@ -5,6 +5,7 @@ NED acceleration = R(q) · specific force + [0, 0, g] (Groves 2013, eq. 5.52 wit
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
@@ -43,6 +44,11 @@ class Segment:
     start_s: float
     end_s: float
     reason: str
+
+    def cut(self, spans: Iterable[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
+        """What lies inside of some spans (s)."""
+        parts = ((max(start, self.start_s), min(end, self.end_s)) for start, end in spans)
+        return tuple((start, end) for start, end in parts if end > start)
 
 
 @dataclass(frozen=True)

@@ -85,13 +85,7 @@ def _ekf2_bias(analysis: Analysis) -> list[float] | None:
 
 def tumbling(analysis: Analysis) -> Found:
     """PX4's failure detector found the attitude beyond its limits."""
-    segment = analysis.segment
-    spans = tuple(
-        (max(start, segment.start_s), min(end, segment.end_s))
-        for start, end in analysis.flight.tumbled
-        if start < segment.end_s and end > segment.start_s
-    )
-    if spans:
+    if spans := analysis.segment.cut(analysis.flight.tumbled):
         yield finding(
             "error",
             "vehicle_tumbled",

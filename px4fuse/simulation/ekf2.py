@@ -23,7 +23,6 @@ from px4fuse.ekf2.heights import inside
 from px4fuse.ekf2.inputs import NO_LIMIT, Inputs, Received, Rules
 from px4fuse.ekf2.intervals import (
     ACCELEROMETER_BIAS,
-    GRAVITY_M_S2,
     GYRO_BIAS,
     POSITION,
     STATES,
@@ -33,7 +32,14 @@ from px4fuse.ekf2.intervals import (
 from px4fuse.ekf2.model import delayed_states, run_variants
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.recursion import EAST, HEADING, LEVEL, NORTH, Run, Variant
-from px4fuse.ekf2.stretches import Heights, Stretch, down_sampled, step_ends, with_field
+from px4fuse.ekf2.stretches import (
+    GRAVITY_M_S2,
+    Heights,
+    Stretch,
+    down_sampled,
+    step_ends,
+    with_field,
+)
 from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid, settings_in_force
 from px4fuse.simulation import sensors
 from px4fuse.simulation.ekf2_topics import TopicTrack, ekf2_topics

@@ -7,7 +7,6 @@ from typing import Literal
 
 from px4fuse.results.contract import Reported
 
-# Whether the file is, to the byte, as px4fuse wrote it
 # Of the numbers; how the pages look is a result of its own
 Status = Literal["verified", "numbers differ", "other log", "cannot verify"]
 PageStatus = Literal["same", "differ", "not compared"]
