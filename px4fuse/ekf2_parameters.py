@@ -98,6 +98,11 @@ BAROMETER = Aid(
 BAROMETER_NOISE_M = 3.5  # PX4's default of EKF2_BARO_NOISE
 GNSS_HGT = _gnss("gnss_hgt", "GNSS height", GNSS_POS.noise, GNSS_POS.gate, "m")
 GNSS_VEL = _gnss("gnss_vel", "GNSS velocity", "EKF2_GPS_V_NOISE", "EKF2_GPS_V_GATE", "m/s")
+FLOW = Aid(
+    "optical_flow", "EKF2_OF_CTRL", "EKF2_OF_N_MIN", "EKF2_OF_GATE", "EKF2_OF_DELAY",
+    label="optical flow", unit="rad/s", default_gate=3.0,
+    reported="EKF2_OF_N_MIN to EKF2_OF_N_MAX, by quality",
+)  # fmt: skip
 MAG = Aid("mag", "EKF2_MAG_TYPE", "EKF2_MAG_NOISE", "EKF2_MAG_GATE", "EKF2_MAG_DELAY",
           label="magnetometer", unit="gauss", default_gate=3.0)  # fmt: skip
 # What EKF2 can fuse, in the order in which it is told. gate, noise and what else forms R: PX4's
@@ -117,9 +122,7 @@ AIDS: Mapping[str, Aid] = {
         Aid("rng_hgt", "EKF2_RNG_CTRL", "EKF2_RNG_NOISE", "EKF2_RNG_GATE", "EKF2_RNG_DELAY",
             label="range to the ground",
             reported="EKF2_RNG_NOISE, EKF2_RNG_SFE and the height's own variance"),
-        Aid("optical_flow", "EKF2_OF_CTRL", "EKF2_OF_N_MIN", "EKF2_OF_GATE", "EKF2_OF_DELAY",
-            label="optical flow", unit="rad/s", default_gate=3.0,
-            reported="EKF2_OF_N_MIN to EKF2_OF_N_MAX, by quality"),
+        FLOW,
         MAG,
         Aid("mag_heading", "EKF2_MAG_TYPE", "EKF2_HEAD_NOISE", "EKF2_HDG_GATE", "EKF2_MAG_DELAY",
             label="magnetic heading", unit="rad", default_gate=2.6),

@@ -244,6 +244,8 @@ RECORD_NOT_LOGGED = Unavailable(
 
 
 GROUND_EFFECT, BAD_ACCELERATION = "gnd_effect", "bad_acc_vertical"
+# Of a sample of optical flow in EKF2's low pass of them (_flow_vel_body_lpf, ekf.h)
+FLOW_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -270,6 +272,11 @@ class FusionRecord:
     field_gauss : DataFrame, shape (m, 4)
         Magnetic field that was measured, body FRD, by time of measurement, and ``fused_3d``: 1
         where EKF2 fused all of it, 0 where only its heading; empty where not logged.
+    flow : DataFrame, shape (l, 5)
+        Velocity of the body by optical flow, ``forward_m_s`` and ``right_m_s`` (FRD), by the time
+        that EKF2 takes the last of ``samples`` to be of, which are ``interval_s`` apart and count
+        for less the older they are (:data:`FLOW_SHARE`); ``noise_m2_s2`` is R of each. Empty where
+        the log does not hold it.
     altitude_m : float
         Of the origin, where EKF2 keeps its height as altitude above the sea (from v1.16); else 0.
     height_bias : mapping from PX4's name of an aid to DataFrame, shape (k, 2)
@@ -285,6 +292,7 @@ class FusionRecord:
     other_aiding: tuple[str, ...]
     vision_age_s: pd.Series
     field_gauss: pd.DataFrame = field(default_factory=pd.DataFrame)
+    flow: pd.DataFrame = field(default_factory=pd.DataFrame)
     altitude_m: float = 0.0
     height_bias: Mapping[str, pd.DataFrame] = field(default_factory=dict)
     states: Mapping[str, pd.Series[float]] = field(default_factory=dict)

@@ -47,8 +47,13 @@ def test_a_logged_innovation_belongs_to_the_sample_of_its_time() -> None:
 
 
 def test_the_first_five_seconds_of_each_stretch_are_not_judged() -> None:
-    judged = made(Ekf2Replay, stretches_s=((10.0, 30.0), (40.0, 60.0))).judged_s
+    replay = made(Ekf2Replay, stretches_s=((10.0, 30.0), (40.0, 60.0)), carried_s=())
+    judged = replay.judged_s
     assert judged == ((15.0, 30.0), (45.0, 60.0))
+    # nor is what flow alone carried, and what follows it
+    carried = made(Ekf2Replay, stretches_s=replay.stretches_s,
+                   carried_s=((20.0, 23.0), (52.0, 58.0)))  # fmt: skip
+    assert carried.judged_s == ((15.0, 20.0), (28.0, 30.0), (45.0, 52.0))
     times = np.array([15.0, 15.1, 29.9, 30.0, 45.0, 50.0, 60.0])
     assert settled(times, judged).tolist() == [False, True, True, False, False, True, False]
 
@@ -151,8 +156,9 @@ def compared(count: int, *, varying: bool = True) -> Agreement | Unavailable:
         updates[f"innovation_variance_{axis}_m2"] = 0.01
     updates.loc[updates.index[-1], "rejected"] = 1.0
     replay = SimpleNamespace(
-        updates=updates, published=state, judged_s=((14.5, 999.0),), settings={}, heights={}
-    )
+        updates=updates, published=state, judged_s=((14.5, 999.0),), settings={}, heights={},
+        carried_s=(),
+    )  # fmt: skip
     return agreement_with_log(SimpleNamespace(ekf2=ekf2), replay)  # type: ignore[arg-type]
 
 

@@ -114,8 +114,9 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
         fusing: Any = NONE, per_step_biases: bool = False, without: Any = (), **parameters: float,
     ) -> Any:  # fmt: skip
         record = made(
-            FusionRecord, parameters=parameters, other_aiding=(), per_step_biases=per_step_biases
-        )
+            FusionRecord, parameters=parameters, other_aiding=(), per_step_biases=per_step_biases,
+            flow=pd.DataFrame(),
+        )  # fmt: skip
         ekf2 = made(
             Ekf2, record=record, innovations={"north": pd.DataFrame()}, horizon_s=horizon_s,
             step_s=0.01, fusing=fusing, aids={},

@@ -22,10 +22,7 @@ NOT_CARRIED = {
     "v1.16.1_aisle_hwlog": "estimator_aid_src_ev_pos holds one sample in",
 }
 # Why is in test_gnss.py
-GNSS_NOT_CARRIED = (
-    "main202603_gps_outage_flow", "v1.13.3_gps_profile1", "v1.14.4_gps_magdist",
-    "v1.16.1_gps_stock_flow",
-)  # fmt: skip
+GNSS_NOT_CARRIED = ("v1.13.3_gps_profile1", "v1.14.4_gps_magdist")
 
 
 def test_the_figures_of_the_benchmark_hold_on_every_simulated_flight(shared_logs: Path) -> None:

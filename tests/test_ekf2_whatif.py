@@ -19,7 +19,8 @@ from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.inputs import Inputs, Received
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.replay import Ekf2Replay, along, rms_to_truth
-from px4fuse.ekf2.walk import OUTPUT, STEPS, Why, _coast, _variants, walk
+from px4fuse.ekf2.stretches import Flow, Stretch
+from px4fuse.ekf2.walk import FLOWING, GATE, OUTPUT, SPEED, STEPS, Why, _coast, _variants, walk
 from px4fuse.ekf2.whatif import (
     AxisSummary,
     Summary,
@@ -120,7 +121,10 @@ def test_a_run_of_another_time_is_not_walked_from(model: Model) -> None:
 def test_the_walk_changes_one_thing_after_the_other() -> None:
     flown = {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_NOISE_MD": 0.0, "EKF2_ACC_NOISE": 0.35}
     received = made(Received)
-    model = made(Model, inputs=made(Inputs, settings=flown, step_s=0.01, received=received))
+    plain = (made(Stretch, flow=None, heights=None),)
+    model = made(Model, inputs=made(
+        Inputs, settings=flown, step_s=0.01, received=received, stretches=plain,
+    ))  # fmt: skip
     ours = Settings(0.5, 0.2, 0.16, clock_offset_s=-0.05)
     found = list(_variants(model, ours).values())
     settings = [one.settings for one in found]
@@ -136,6 +140,7 @@ def test_the_walk_changes_one_thing_after_the_other() -> None:
     gnss = made(
         Inputs, aid=GNSS_POS, step_s=0.01, received=made(Received, velocity_m_s=np.zeros((1, 3))),
         settings={"EKF2_ACC_NOISE": 0.35, "EKF2_GPS_P_NOISE": 0.5, "EKF2_GPS_DELAY": 110.0},
+        stretches=plain,
     )  # fmt: skip
     found = list(_variants(made(Model, inputs=gnss), ours).values())
     assert [one.velocity for one in found] == [False] * 6 + [True] * 2
@@ -143,6 +148,11 @@ def test_the_walk_changes_one_thing_after_the_other() -> None:
     # the delay was taken from the positions of GNSS that ours is given
     assert found[0].stamp_offset_s == pytest.approx(-0.16)
     assert [one.settings["EKF2_GPS_P_NOISE"] for one in found] == [0.2] * 2 + [0.5] * 6
+    flow = (made(Stretch, flow=made(Flow), heights=None),)
+    flowing = made(Inputs, **{**vars(gnss), "stretches": flow})
+    variants = _variants(made(Model, inputs=flowing), ours)
+    assert list(variants)[-3:] == [SPEED, FLOWING, GATE]
+    assert ["optical_flow" in one.without for one in variants.values()] == [True] * 7 + [False] * 2
 
 
 def test_the_longest_run_of_rejections_is_said_with_how_far_it_led() -> None:

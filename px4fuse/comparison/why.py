@@ -179,6 +179,7 @@ def _reasons(
         ),
         ways.ATTITUDE: "EKF2 lets the positions correct its attitude, ours takes it as it is",
         ways.SPEED: "EKF2 fuses the velocity of GNSS too, ours its position alone",
+        ways.FLOWING: "EKF2 fuses optical flow too, ours positions alone",
         ways.GATE: f"EKF2's gate rejects {rejected:.1%} of the samples, ours takes all",
         ways.OUTPUT: (
             f"EKF2 filters {inputs.horizon_s * 1e3:.0f} ms behind the present, carries that to now "

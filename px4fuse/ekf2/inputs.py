@@ -6,19 +6,24 @@ Sources: PX4-Autopilot ``EKF/aid_sources/external_vision/ev_pos_control.cpp`` an
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
+from px4fuse.ekf2.flow import with_flow
 from px4fuse.ekf2.heights import with_heights
 from px4fuse.ekf2.stretches import IMU_GAP_S, MIN_STRETCH_S, Stretch, find_stretches, predict_s
 from px4fuse.ekf2_parameters import (
     AID_MASK,
+    AIDS,
     BAROMETER,
     EV_POS,
+    FLOW,
     GNSS_MODE,
     GNSS_POS,
     GNSS_VEL,
@@ -38,6 +43,7 @@ from px4fuse.flight import (
     FusionRecord,
     PositionTrack,
     Unavailable,
+    at_times,
 )
 from px4fuse.origin import GIVEN_FILE
 from px4fuse.readers.px4_innovations import fuses, with_gnss
@@ -183,15 +189,15 @@ class Inputs:
 
 
 def prepare(  # noqa: PLR0911, PLR0912 (a reason each)
-    flight: Flight, imposed: str = ""
+    flight: Flight, doubtful: Mapping[str, str] = MappingProxyType({})
 ) -> Inputs | Unavailable:
     """What the model runs on, or why the log cannot carry it.
 
     Parameters
     ----------
     flight : Flight
-    imposed : str
-        Why the height is to be EKF2's own as flown.
+    doubtful : mapping from PX4's name of an aid to str
+        Why the height is to be EKF2's own as flown, and why optical flow alone carries nothing.
     """
     imu, attitude, ekf2 = flight.imu, flight.attitude, flight.ekf2
     if isinstance(imu, Unavailable):
@@ -209,7 +215,8 @@ def prepare(  # noqa: PLR0911, PLR0912 (a reason each)
         return record
     if isinstance(innovations := ekf2.innovations["north"], Unavailable):
         return innovations
-    if more := [one for one in record.other_aiding if not (gnss and one in OF_GNSS)]:
+    modelled = (*OF_GNSS, *([FLOW.label] if len(record.flow) else [])) if gnss else ()
+    if more := [one for one in record.other_aiding if one not in modelled]:
         fused = "GNSS" if gnss else "vision position"
         said = f"EKF2 fused more than {fused} horizontally ({', '.join(more)})"
         remedy = "" if gnss else f", {GNSS_POS.switch} 0 and without bit 2 of {EV_POS.switch}"
@@ -226,7 +233,10 @@ def prepare(  # noqa: PLR0911, PLR0912 (a reason each)
         if not flight.log.firmware.startswith(STAMPED_AT_HORIZON):
             return Unavailable(WHAT, horizon_s.reason, horizon_s.remedy)
         horizon_s = 0.0  # a buffer of one step: EKF2_EV_DELAY is at most EKF2_PREDICT_US
-    stretches = find_stretches(flight, imu, attitude, ekf2, record, read.stamp_s, gnss=gnss)
+    carrying_s, flow = read.stamp_s, record.flow if gnss else record.flow.iloc[:0]
+    if len(flow) and FLOW.name not in doubtful:
+        carrying_s = np.union1d(carrying_s, flow.index)
+    stretches = find_stretches(flight, imu, attitude, ekf2, record, carrying_s, gnss=gnss)
     if not stretches:
         return Unavailable(
             WHAT,
@@ -235,6 +245,12 @@ def prepare(  # noqa: PLR0911, PLR0912 (a reason each)
             "Record without dropouts (a faster SD card, fewer topics), with steady positions.",
         )
     fusing = ekf2.fusing
+    if len(flow):
+        gate = record.parameters.get(FLOW.gate, FLOW.default_gate)
+        stretches = tuple(with_flow(stretch, flow, gate) for stretch in stretches)
+    imposed = "; ".join(
+        f"{AIDS[name].label}: {why}" for name, why in doubtful.items() if name != FLOW.name
+    )
     if gnss and not imposed:
         stretches, imposed = with_heights(flight, ekf2, record, stretches)
     others = [MAG] if any(stretch.field for stretch in stretches) else []
@@ -319,20 +335,24 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> Received | Un
         )
     parameters = record.parameters
     switch = int(parameters.get(GNSS_POS.switch, 7.0))
+    samples, velocities = track.samples, track.velocity
+    if (meant := ekf2.aids[GNSS_POS.name].meant) is not None:  # others came while EKF2 did without
+        kept = at_times(meant, samples.index) > 0.0
+        samples, velocities = samples[kept], velocities[kept]
     # the stamp of a fix that has a time of its own is made up, so that its age is the delay
     flown_s = settings_in_force(parameters, GNSS_POS)[GNSS_POS.delay] * 1e-3
-    stamp = track.samples.index.to_numpy() + flown_s
+    stamp = samples.index.to_numpy() + flown_s
     # EKF2 believes no fix to be worse than without aiding (gps_control.cpp)
     worst_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
-    stated = track.samples[POSITION_VARIANCE_COLUMNS].fillna(0.0).clip(upper=worst_m**2)
-    velocity = track.velocity[VELOCITY_COLUMNS].to_numpy()
+    stated = samples[POSITION_VARIANCE_COLUMNS].fillna(0.0).clip(upper=worst_m**2)
+    velocity = velocities[VELOCITY_COLUMNS].to_numpy()
     fused = fuses_by_mask(parameters) or switch & GNSS_VELOCITY_BIT
-    spread = track.velocity[VELOCITY_VARIANCE_COLUMNS].fillna(0.0).to_numpy()
+    spread = velocities[VELOCITY_VARIANCE_COLUMNS].fillna(0.0).to_numpy()
     known = bool(fused and np.isfinite(velocity).all())
     return Received(
         stamp,
         stamp,
-        track.samples[POSITION_COLUMNS].to_numpy(),
+        samples[POSITION_COLUMNS].to_numpy(),
         stated.to_numpy(),
         *_decisions(ekf2, record, stamp, GNSS_POS),
         track.name,

@@ -23,15 +23,18 @@ import numpy as np
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
 from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.stretches import GRAVITY_M_S2, Stretch
+from px4fuse.ekf2.stretches import (
+    BIASES,
+    GRAVITY_M_S2,
+    MOVED,
+    POSITION,
+    STATES,
+    THETA,
+    VELOCITY,
+    Stretch,
+)
 from px4fuse.trajectory.rotation import skew
 
-STATES = 15
-MOVED = 9  # of them, those that the IMU moves: all but the biases
-FIELD_STATES = 21  # with the magnetic fields of earth (NED) and body (FRD), where they are fused
-THETA, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
-GYRO_BIAS, ACCELEROMETER_BIAS, BIASES = slice(9, 12), slice(12, 15), slice(9, 15)
-EARTH_FIELD, BODY_FIELD = slice(15, 18), slice(18, 21)
 # A sample that is this much older than the horizon when it arrives is never fused
 # (RingBuffer.h, pop_first_older_than)
 MAX_LATE_S = 0.1

@@ -14,8 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from px4fuse.arrays import Array, IntArray
-from px4fuse.ekf2.intervals import BODY_FIELD, EARTH_FIELD, FIELD_STATES, THETA
-from px4fuse.ekf2.stretches import Field
+from px4fuse.ekf2.stretches import BODY_FIELD, EARTH_FIELD, FIELD_STATES, THETA, Field
 from px4fuse.trajectory.rotation import skew
 
 MIN_SD_GAUSS = 0.01
@@ -63,15 +62,33 @@ def fuse_field(
     H[:, :, EARTH_FIELD] = told.turn @ (EYE - of_turn)
     H[:, :, BODY_FIELD] = EYE
     seen = (H[:, :, EARTH_FIELD] @ earth[:, :, None])[:, :, 0] + x[:, BODY_FIELD]
-    nu = told.gauss - seen
     R = np.maximum(noise_gauss, MIN_SD_GAUSS) ** 2
+    return fuse_mean(x, P, H, told.gauss - seen, R, told.number, gate)
+
+
+def fuse_mean(
+    x: Array, P: Array, H: Array, nu: Array, R: Array, number: Array, gate: Array
+) -> tuple[Array, Array, Array]:
+    """State and covariance of S variants after the mean of some samples, as :func:`fuse_field`.
+
+    Parameters
+    ----------
+    H : ndarray, shape (S, k, n)
+    nu : ndarray, shape (S, k)
+        Mean minus what is expected of it.
+    R, number : ndarray, shape (S,)
+        Variance of one sample, and how many there were.
+    gate : ndarray, shape (S,)
+        Of one sample, in standard deviations.
+    """
     HP = H @ P
     S = HP @ H.transpose(0, 2, 1)
     single = np.einsum("nii->ni", S) + R[:, None]
-    seen_at_all = told.number > 0.0
+    seen_at_all = number > 0.0
     taken = seen_at_all & (nu * nu <= gate[:, None] ** 2 * single).all(axis=1)
     fused = np.broadcast_to(taken[:, None], nu.shape)
-    S += (R / np.maximum(told.number, 1.0))[:, None, None] * EYE
+    left = np.where(seen_at_all, R / np.maximum(number, 1.0), 1.0)
+    S += left[:, None, None] * np.eye(nu.shape[1])
     K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * taken[:, None, None]
     x = x + (K @ nu[:, :, None])[:, :, 0]
     P = P - K @ HP

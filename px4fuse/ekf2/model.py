@@ -11,6 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,16 +22,7 @@ from scipy.spatial.transform import Rotation
 from px4fuse.arrays import Array
 from px4fuse.display import brief
 from px4fuse.ekf2.inputs import WHAT, Inputs, prepare, same_sample
-from px4fuse.ekf2.intervals import (
-    ACCELEROMETER_BIAS,
-    GYRO_BIAS,
-    POSITION,
-    THETA,
-    VELOCITY,
-    Intervals,
-    Timing,
-    make_intervals,
-)
+from px4fuse.ekf2.intervals import Intervals, Timing, make_intervals
 from px4fuse.ekf2.output_predictor import follow_attitude, later, publish
 from px4fuse.ekf2.recursion import HEADING, LEVEL, Run, Variant, run, with_correlation
 from px4fuse.ekf2.replay import (
@@ -41,11 +34,20 @@ from px4fuse.ekf2.replay import (
     agreement_with_log,
     with_obedient,
 )
-from px4fuse.ekf2.stretches import GRAVITY_M_S2
+from px4fuse.ekf2.stretches import (
+    ACCELEROMETER_BIAS,
+    GRAVITY_M_S2,
+    GYRO_BIAS,
+    POSITION,
+    RESTART_GAP_S,
+    THETA,
+    VELOCITY,
+    Stretch,
+)
 from px4fuse.ekf2_parameters import (
-    AIDS,
     BAROMETER,
     FIELD_NOISES,
+    FLOW,
     GNSS_POS,
     GNSS_VEL,
     MAG,
@@ -95,22 +97,24 @@ def open_model(flight: Flight) -> Model | Unavailable:
     ----------
     flight : Flight
     """
-    model = _open(flight)
-    if isinstance(model, Unavailable) or not (doubtful := model.agreement.doubtful):
-        return model
-    why = "; ".join(f"{AIDS[name].label}: {reason}" for name, reason in doubtful.items())
-    if isinstance(again := _open(flight, why), Unavailable):
-        return again
-    told = {name: getattr(model.agreement, name) for name in ("gnss_hgt", "baro_hgt")}
-    agreement = structs.replace(again.agreement, doubtful=doubtful, **told)
-    return replace(
-        again, flown=structs.replace(again.flown, agreement=agreement), agreement=agreement
-    )
+    doubtful: dict[str, str] = {}
+    told: dict[str, Any] = {}
+    while not isinstance(model := _open(flight, doubtful), Unavailable):
+        agreement = model.agreement
+        if not agreement.doubtful:
+            agreement = structs.replace(agreement, doubtful=doubtful, **told)
+            flown = structs.replace(model.flown, agreement=agreement)
+            return replace(model, flown=flown, agreement=agreement)
+        doubtful |= agreement.doubtful
+        fields = {FLOW.name: "carried_difference_m"}
+        for name in agreement.doubtful:
+            told[fields.get(name, name)] = getattr(agreement, fields.get(name, name))
+    return model
 
 
-def _open(flight: Flight, imposed: str = "") -> Model | Unavailable:
-    """The model; ``imposed`` says why the height is to be EKF2's own."""
-    inputs = prepare(flight, imposed)
+def _open(flight: Flight, doubtful: Mapping[str, str]) -> Model | Unavailable:
+    """The model without what is doubtful."""
+    inputs = prepare(flight, doubtful)
     if isinstance(inputs, Unavailable):
         return structs.replace(inputs, what=WHAT)
     if inputs.aid == GNSS_POS and isinstance(flight.ekf2, Ekf2):
@@ -208,8 +212,9 @@ def aids_of(inputs: Inputs) -> list[str]:
     """PX4's names of the aids that the model fuses."""
     velocity = [GNSS_VEL.name] if inputs.received.velocity_m_s is not None else []
     magnetic = [MAG.name] if MAG.noise in inputs.settings else []
+    flow = [FLOW.name] if inputs.stretches[0].flow is not None else []
     heights = inputs.stretches[0].heights
-    return [inputs.aid.name, *velocity, *magnetic, *(heights.fused if heights else ())]
+    return [inputs.aid.name, *velocity, *magnetic, *flow, *(heights.fused if heights else ())]
 
 
 def _without(inputs: Inputs, replay: Ekf2Replay, left_out_s: Array) -> Ekf2Replay:
@@ -309,10 +314,17 @@ def _assemble(
     inputs: Inputs, runs: Sequence[Run], at: int, changed: Mapping[str, float]
 ) -> Ekf2Replay:
     tracks = [_tracks(inputs, part, at) for part in runs]
+    updates = [_updates(part, at) for part in runs]
     return Ekf2Replay(
         settings=runs[0].variants[at].settings,
         changed=dict(changed),
-        updates=pd.concat([_updates(part, at) for part in runs]),
+        updates=pd.concat(updates),
+        carried_s=tuple(
+            span
+            for part, own in zip(runs, updates, strict=True)
+            if part.stretch.flow is not None
+            for span in _carried_s(own, part.stretch)
+        ),
         delayed=pd.concat([delayed for delayed, _ in tracks]),
         published=pd.concat([published for _, published in tracks]),
         heights=_heights(runs, at),
@@ -321,6 +333,13 @@ def _assemble(
         late=sum(int(part.events[at].late.sum()) for part in runs),
         lost=sum(int(part.events[at].lost.sum()) for part in runs),
     )
+
+
+def _carried_s(updates: pd.DataFrame, stretch: Stretch) -> list[tuple[float, float]]:
+    """Times between positions that are fused, where they are longer than the model goes without."""
+    taken = (updates["fused"] > 0.0) | (updates["reset"] > 0.0)
+    ends = [*updates.loc[taken, "fused_at_s"], float(stretch.time_s[-1])]
+    return [(a, b) for a, b in pairwise(ends) if b - a > RESTART_GAP_S]
 
 
 def _heights(runs: Sequence[Run], at: int) -> dict[str, pd.DataFrame]:

@@ -14,26 +14,22 @@ from typing import Any
 import numpy as np
 
 from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.ekf2.flow import FlowSamples, fuse_flow, gather_flow
 from px4fuse.ekf2.heights import MIN_GATE, MIN_SD, SENSORS, HeightFilter, barometer_samples
 from px4fuse.ekf2.inputs import Inputs, Rules
-from px4fuse.ekf2.intervals import (
+from px4fuse.ekf2.intervals import FUSE, IDLE, START, Events, Intervals, Timing
+from px4fuse.ekf2.magnetometer import FieldSamples, fuse_field, gather
+from px4fuse.ekf2.stretches import (
     ACCELEROMETER_BIAS,
     BIASES,
-    FUSE,
     GYRO_BIAS,
-    IDLE,
     MOVED,
-    START,
     STATES,
     THETA,
     VELOCITY,
-    Events,
-    Intervals,
-    Timing,
+    Stretch,
 )
-from px4fuse.ekf2.magnetometer import FieldSamples, fuse_field, gather
-from px4fuse.ekf2.stretches import Stretch
-from px4fuse.ekf2_parameters import GNSS_POS, GNSS_VEL, MAG
+from px4fuse.ekf2_parameters import FLOW, GNSS_POS, GNSS_VEL, MAG
 
 # How long the first pass runs that gives the correlations at the start
 CORRELATING_S = 8.0
@@ -181,7 +177,7 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     end, active = event["end"], action > IDLE
     now_s, sampled = stretch.time_s[end], np.any(active, axis=1)
     on = {aid.name: now_s < np.array([v.without.get(aid.name, np.inf) for v in variants])
-          for aid in (inputs.aid, GNSS_VEL, MAG, *SENSORS)}  # fmt: skip
+          for aid in (inputs.aid, GNSS_VEL, MAG, FLOW, *SENSORS)}  # fmt: skip
     with_velocity = (action == FUSE) & on[GNSS_VEL.name] & fuses_velocity
     sample = np.maximum(intervals[0].events.sample, 0)
     measured, noise = _measurements(inputs, stretch, sample, end, knob, reported)
@@ -192,11 +188,15 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     own = np.stack([stretch.attitude_error_rad[end, HEADING], stretch.down_m[end]], axis=-1)
     own_attitude = stretch.attitude_variance_rad2[end]
     own_variance = np.stack([own_attitude[:, :, HEADING], stretch.down_variance_m2[end]], axis=-1)
-    seen = heights = None
+    seen = heights = speeds = None
     if (field := stretch.field) is not None:
         each = [gather(field, stretch.rotation, one.events.end) for one in distinct]
         seen = FieldSamples(*(np.stack(part, axis=1)[:, pick] for part in zip(*each, strict=True)))
         seen = seen._replace(number=np.where(on[MAG.name], seen.number, 0.0))
+    if (flow := stretch.flow) is not None:
+        rows = [gather_flow(stretch, flow, one.events.end) for one in distinct]
+        speeds = FlowSamples(*(np.stack(part, axis=1)[:, pick] for part in zip(*rows, strict=True)))
+        speeds = speeds._replace(number=np.where(on[FLOW.name], speeds.number, 0.0))
     if stretch.heights is not None:
         samples = barometer_samples(stretch, [one.events.end for one in distinct])
         told = np.stack(samples, axis=-1)[..., pick]
@@ -245,6 +245,9 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
         if seen is not None and seen.number[e].any():
             field_now = FieldSamples(*(part[e] for part in seen))
             x, P, of_field[e] = fuse_field(x, P, field_now, knob[MAG.noise], knob[MAG.gate])
+            spread = _diagonal(P)
+        if speeds is not None and flow is not None and speeds.number[e].any():
+            x, P = fuse_flow(x, P, FlowSamples(*(part[e] for part in speeds)), flow.gate)
             spread = _diagonal(P)
         if sampled[e]:
             nu = measured[e] - x[:, TOLD]

@@ -14,7 +14,7 @@ from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
 from px4fuse.ekf2.inputs import aid_source, replayed_aid, same_sample
 from px4fuse.ekf2.stretches import SETTLING_S
-from px4fuse.ekf2_parameters import AIDS, GNSS_POS, MAG, Aid
+from px4fuse.ekf2_parameters import AIDS, FLOW, GNSS_POS, MAG, Aid
 from px4fuse.filter import signals
 from px4fuse.filter.heading import heading_rad
 from px4fuse.flight import (
@@ -53,6 +53,8 @@ MIN_CORRELATION = 0.95
 MAX_S_OFF = 0.05
 # Of the position that EKF2 publishes; there it is within 0.013 m
 MAX_PUBLISHED_OFF_M = 0.10
+# and where flow alone carries it, of which the log has a part
+MAX_CARRIED_OFF_M = 0.5
 # Where EKF2 rejects much, one sample on the edge of the gate decides the next ones: then shares
 # and mean NIS must agree, and single samples when the model rejects what EKF2 rejected
 REJECTING_SHARE = 0.1
@@ -112,8 +114,12 @@ class Agreement(Record, frozen=True, kw_only=True):
         Of the horizontal position that is published, replay minus log.
     heading_rms_difference_deg : float or None
         Of the filter's heading; None where the replay takes it from the log.
+    carried_difference_m : float or None
+        Of the same, the largest while optical flow alone carried the position, which is not in what
+        is said of it otherwise; None where positions never failed for long.
     doubtful : mapping from PX4's name of an aid to str
-        Heights of which nothing may be concluded, and why: the replay has EKF2's own as flown.
+        Of which nothing may be concluded, and why: heights, instead of which the replay has EKF2's
+        own as flown, and optical flow, without which it begins again where positions do.
     good : bool
         Whether anything may be concluded from a replay of this log.
     reason : str
@@ -135,6 +141,7 @@ class Agreement(Record, frozen=True, kw_only=True):
     good: bool
     reason: str
     heading_rms_difference_deg: NotNegative | None = None
+    carried_difference_m: NotNegative | None = None
     doubtful: Mapping[str, str] = {}
 
     @property
@@ -194,6 +201,8 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
         Per sample of GNSS height and barometer, where they are fused: innovation and S
         (``innovation_down_m``, ``innovation_variance_down_m2``), ``rejected``, ``fused`` and
         ``fused_at_s``.
+    carried_s : tuple of (float, float)
+        From the last position to the next ones, where optical flow alone carried the filter.
     delayed : DataFrame, shape (n, 7)
         Position and velocity at the fusion horizon at the end of each step (m, m/s, NED), and
         ``heading_rad``.
@@ -207,13 +216,23 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
     delayed: pd.DataFrame
     published: pd.DataFrame
     heights: Mapping[str, pd.DataFrame] = {}
+    carried_s: Spans = ()
 
     __repr__ = brief
 
     @property
     def judged_s(self) -> Spans:
-        """Parts that are judged: each stretch without its beginning."""
-        return tuple((start + SETTLING_S, end) for start, end in self.stretches_s)
+        """Parts that are judged: each stretch without its beginning and what flow carried."""
+        parts = []
+        for start, end in self.stretches_s:
+            begin = start + SETTLING_S
+            for last, again in self.carried_s:
+                if begin < last < end:
+                    parts.append((begin, last))
+                    begin = again + SETTLING_S
+            if begin < end:
+                parts.append((begin, end))
+        return tuple(parts)
 
 
 def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavailable:
@@ -251,6 +270,12 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     on_gnss = replayed_aid(ekf2) == GNSS_POS
     heights, doubtful = _heights(ekf2, replay)
     apart_m = np.hypot(north.position_rms_difference_m, east.position_rms_difference_m)
+    carried_m = _carried_off_m(ekf2, replay)
+    if carried_m is not None and carried_m > MAX_CARRIED_OFF_M:
+        doubtful[FLOW.name] = (
+            f"while it alone carried the position, what is published comes {carried_m:.2f} m off "
+            f"the log (at most {MAX_CARRIED_OFF_M:g} m)"
+        )
     return Agreement(
         north=north,
         east=east,
@@ -267,7 +292,22 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
         good=good,
         reason=reason,
         heading_rms_difference_deg=_heading_off_deg(ekf2, replay),
+        carried_difference_m=carried_m,
     )
+
+
+def _carried_off_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
+    """How far what is published comes off the log horizontally while flow alone carried it."""
+    times = ekf2.state.index
+    within = settled(times, replay.carried_s)
+    if not within.any():
+        return None
+    north, east = (
+        along(replay.published, POSITION_COLUMNS, one, times[within].to_numpy())
+        - along(ekf2.state, POSITION_COLUMNS, one, times[within].to_numpy())
+        for one in np.eye(3)[:2]
+    )
+    return float(np.hypot(north, east).max())
 
 
 def _heading_off_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
@@ -348,7 +388,10 @@ def logged_innovations(ekf2: Ekf2) -> pd.DataFrame:
 def settled(times_s: ArrayLike, judged: Spans) -> BoolArray:
     """Which times lie in one of some spans."""
     times = np.asarray(times_s)
-    return np.asarray(np.any([(times > a) & (times < b) for a, b in judged], axis=0))
+    inside = np.zeros(times.shape, bool)
+    for start, end in judged:
+        inside |= (times > start) & (times < end)
+    return inside
 
 
 def match(updates: pd.DataFrame, times: Array, *, own: bool) -> IntArray:

@@ -59,9 +59,21 @@ FIELD_AFTER_S = 1.0
 # log stands for several, down to this rate
 FIELD_HZ, LEAST_FIELD_HZ = 14.0, 1.5
 MIN_STRETCH_S = 10.0
-
+# Resets are published up to the longest delay and a row of the log later
+RESET_LATE_S = 0.5
+# Of the samples in a second: more clipped ones are lost motion
+CLIPPED_SHARE = 0.05
 
 GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])  # CONSTANTS_ONE_G
+
+
+# States, of Stretch.state
+STATES = 15
+MOVED = 9  # of them, those that the IMU moves: all but the biases
+FIELD_STATES = 21  # with the magnetic fields of earth (NED) and body (FRD), where they are fused
+THETA, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
+GYRO_BIAS, ACCELEROMETER_BIAS, BIASES = slice(9, 12), slice(12, 15), slice(9, 15)
+EARTH_FIELD, BODY_FIELD = slice(15, 18), slice(18, 21)
 
 
 @dataclass(frozen=True)
@@ -81,6 +93,34 @@ class Field:
     step: IntArray
     gauss: Array
     weight: float
+
+    __repr__ = brief
+
+
+@dataclass(frozen=True)
+class Flow:
+    """What optical flow measured in one stretch, in m means of several samples.
+
+    Attributes
+    ----------
+    step : ndarray of int, shape (m,)
+        At the end of which prediction step EKF2 takes the last sample of each.
+    speed_m_s : ndarray, shape (m, 2)
+        Forward and to the right, less what the IMU gained of it since the stretch began.
+    turn : ndarray, shape (m, 2, 3)
+        Mean rotation from NED to these.
+    noise_m2_s2, samples : ndarray, shape (m,)
+        R of one sample, and how many there were.
+    gate : float
+        In standard deviations.
+    """
+
+    step: IntArray
+    speed_m_s: Array
+    turn: Array
+    noise_m2_s2: Array
+    samples: Array
+    gate: float
 
     __repr__ = brief
 
@@ -163,6 +203,8 @@ class Stretch:
         Share of the accelerometer's axes that EKF2 relied on less in the step before: all while it
         took the vertical acceleration to be wrong, else those at the end of their range (of the
         axes together, as R turns them); None: never any.
+    flow : Flow or None
+        What optical flow measured, where EKF2 fused it.
     """
 
     time_s: Array
@@ -182,6 +224,7 @@ class Stretch:
     field: Field | None = None
     heights: Heights | None = None
     shaken: Array | None = None
+    flow: Flow | None = None
 
     __repr__ = brief
 
@@ -206,7 +249,7 @@ def find_stretches(
     ekf2 : Ekf2
     record : FusionRecord
     source_s : ndarray
-        Stamps of the positions that EKF2 fused.
+        Stamps of what EKF2's position rests on.
     gnss : bool
         Whether EKF2 fuses GNSS: then the magnetic fields are states, where the log allows it, and
         an acceleration that is wrong or clipped is relied on less.
@@ -219,11 +262,15 @@ def find_stretches(
     for stamps, limit in ((time, IMU_GAP_S), (source_s, RESTART_GAP_S)):
         gap = np.flatnonzero(np.diff(stamps) > limit)
         cuts += [*stamps[gap], *stamps[gap + 1]]
+    cuts += _breaks_s(imu, ekf2) if gnss else ()
     first = max(attitude.index[0], source_s[0])
     last = min(attitude.index[-1], source_s[-1] + 1.0)
     airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
     of_field = _field_s(record) if gnss else None
     cuts += of_field[1:] if of_field else ()
+    for reset in ekf2.resets if gnss else ():
+        if reset.delta[2]:
+            cuts += [reset.time_s - 0.5, reset.time_s]
     found = []
     for low, high in pairwise(np.unique(np.clip(cuts, first, last))):
         inside = fused[(fused >= low) & (fused <= high)]
@@ -243,6 +290,23 @@ def find_stretches(
             within = of_field and of_field[0] <= states[at] and high <= of_field[1]
             found.append(_with_field(made, record, at, ekf2.step_s) if within else made)
     return tuple(found)
+
+
+def _breaks_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
+    """Beginnings and ends of what the model cannot follow.
+
+    Many clipped samples, which lose motion as a gap does, and resets of EKF2's height and vertical
+    velocity, which are published a while after.
+    """
+    breaks = [time for reset in ekf2.resets if reset.delta[2]
+              for time in (reset.time_s - RESET_LATE_S, reset.time_s)]  # fmt: skip
+    if "clipped" in imu:
+        times = imu.index.to_numpy()
+        clipped_s = times[imu["clipped"].to_numpy() > 0.0]
+        begin, end = (np.searchsorted(clipped_s, clipped_s + s) for s in (-0.5, 0.5))
+        many = clipped_s[end - begin > CLIPPED_SHARE / float(np.median(np.diff(times)))]
+        breaks += [*(many - 0.5), *(many + 0.5)]
+    return breaks
 
 
 def _shaken(imu: pd.DataFrame, record: FusionRecord, time_s: Array) -> Array:

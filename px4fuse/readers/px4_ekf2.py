@@ -22,6 +22,7 @@ from px4fuse.flight import (
     DELAYED_STATE_COLUMNS,
     DELAYED_VARIANCE_COLUMNS,
     EKF2_STEP_S,
+    FLOW_SHARE,
     GROUND_EFFECT,
     HORIZON_NOT_LOGGED,
     POSITION_COLUMNS,
@@ -328,6 +329,7 @@ def _read_record(
         ),
         vision_age_s=age[~age.index.duplicated()],
         field_gauss=_read_field(topics, step_s),
+        flow=_read_flow(topics),
         altitude_m=altitude_m,
         states={one: meant[one] for one in (GROUND_EFFECT, BAD_ACCELERATION) if one in meant},
         height_bias={
@@ -355,6 +357,26 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
     used = max(found, key=len)
     flags = at_times(bits["bits"].dropna(), used.index).astype(np.int64)
     return used.assign(fused_3d=(flags >> MAG_3D_BIT & 1).astype(float))
+
+
+def _read_flow(topics: Topics) -> pd.DataFrame:
+    """What optical flow measured: of the samples between two rows the mean, by the low pass."""
+    if any(topics.find((layout,)) is None for layout in px4.FLOW):
+        return pd.DataFrame()
+    speed, interval, noise = (topics.of_primary(layout).dropna() for layout in px4.FLOW)
+    interval_s = float(interval["interval_us"].median()) * 1e-6
+    samples = np.rint(np.diff(speed.index) / interval_s)
+    kept = ((1.0 - FLOW_SHARE) ** samples)[:, None]
+    low_passed = speed[["forward_m_s", "right_m_s"]].to_numpy()
+    newest = np.hypot(speed["newest_forward_m_s"], speed["newest_right_m_s"])
+    range_m = newest / np.hypot(speed["x_rad_s"], speed["y_rad_s"])
+    forward, right = ((low_passed[1:] - kept * low_passed[:-1]) / (1.0 - kept)).T
+    found = pd.DataFrame({
+        "forward_m_s": forward, "right_m_s": right, "samples": samples, "interval_s": interval_s,
+        "noise_m2_s2": (range_m**2)[1:] * np.interp(speed.index[1:], noise.index, noise["noise"]),
+    }, index=speed.index[1:])  # fmt: skip
+    found["noise_m2_s2"] = found["noise_m2_s2"].where(np.isfinite(found["noise_m2_s2"]))
+    return found[found["samples"] > 0.0].dropna()
 
 
 def _attitude_variance(quaternion: Array, variance: Array) -> Array:

@@ -35,6 +35,9 @@ def left_out_fixes(topics: Topics, gps: pd.DataFrame, ekf2: Ekf2 | Unavailable) 
     if isinstance(ekf2, Unavailable) or None in rows:
         return pd.DataFrame()
     position, velocity = (topics.of_primary(layout) for layout in px4.FUSED_FIXES)
+    # what a receiver sends without a fix has a row too
+    taken = position[["fused", "rejected"]].any(axis=1)
+    position = position.loc[taken].drop(columns=["fused", "rejected"])
     # rows are of half a prediction step before (estimator_interface.cpp)
     fixes = position.join(velocity, how="inner").dropna()
     # of the reference; else it has EKF2's bias in it

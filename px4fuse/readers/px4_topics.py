@@ -118,6 +118,19 @@ HEIGHT_BIAS = {
     "gnss_hgt": Layout("estimator_gnss_hgt_bias", _BIAS),
 }
 
+# Velocity of the body (FRD) that each sample of optical flow tells of, as EKF2 low-passes it, and
+# the rate that it is from: the range is what lies between them
+FLOW = (
+    Layout(
+        "estimator_optical_flow_vel",
+        elements(["forward_m_s", "right_m_s"], "vel_body_filtered")
+        | elements(["newest_forward_m_s", "newest_right_m_s"], "vel_body")
+        | elements(["x_rad_s", "y_rad_s"], "flow_rate_compensated"),
+    ),
+    Layout("vehicle_optical_flow", {"interval_us": "integration_timespan_us"}),
+    Layout("estimator_aid_src_optical_flow", {"noise": "observation_variance[0]"}),
+)
+
 _GPS_OPTIONAL = {
     "eph_m": "eph", "epv_m": "epv", "fix_type": "fix_type", "utc_us": "time_utc_usec",
     "published_us": "timestamp", "speed_accuracy_m_s": "s_variance_m_s",
@@ -151,7 +164,8 @@ GPS = (
 FUSED_FIXES = (
     Layout(
         "estimator_aid_src_gnss_pos",
-        {"latitude_deg": "observation[0]", "longitude_deg": "observation[1]"},  # v1.16
+        elements(["latitude_deg", "longitude_deg"], "observation")  # v1.16
+        | {"fused": "fused", "rejected": "innovation_rejected"},
     ),
     Layout("estimator_aid_src_gnss_vel", elements(VELOCITY_COLUMNS, "observation")),
 )
@@ -378,7 +392,7 @@ def topics() -> list[str]:
     groups = (
         IMU, ATTITUDE, LOCAL_POSITION, SENSOR_BIAS, SELECTOR, LAND_DETECTED, FLIGHT_MODE, FAILURE,
         BAROMETER, TRUTH_LOCAL, TRUTH_GLOBAL, TRUTH_ATTITUDE, AID_OBSERVATION_HORIZONTAL,
-        AID_OBSERVATION_VERTICAL, HEIGHT_BIAS.values(), *(track.layouts for track in _TRACKS),
+        AID_OBSERVATION_VERTICAL, HEIGHT_BIAS.values(), FLOW, *(track.layouts for track in _TRACKS),
     )  # fmt: skip
     named = {layout.topic for group in groups for layout in group}
     named |= {f"estimator_aid_src_{name}" for name in SOURCES}

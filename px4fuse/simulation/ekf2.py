@@ -21,19 +21,17 @@ import numpy as np
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.ekf2.heights import inside
 from px4fuse.ekf2.inputs import NO_LIMIT, Inputs, Received, Rules
-from px4fuse.ekf2.intervals import (
+from px4fuse.ekf2.model import delayed_states, run_variants
+from px4fuse.ekf2.output_predictor import follow_attitude, publish
+from px4fuse.ekf2.recursion import EAST, HEADING, LEVEL, NORTH, Run, Variant
+from px4fuse.ekf2.stretches import (
     ACCELEROMETER_BIAS,
+    GRAVITY_M_S2,
     GYRO_BIAS,
     POSITION,
     STATES,
     THETA,
     VELOCITY,
-)
-from px4fuse.ekf2.model import delayed_states, run_variants
-from px4fuse.ekf2.output_predictor import follow_attitude, publish
-from px4fuse.ekf2.recursion import EAST, HEADING, LEVEL, NORTH, Run, Variant
-from px4fuse.ekf2.stretches import (
-    GRAVITY_M_S2,
     Heights,
     Stretch,
     down_sampled,

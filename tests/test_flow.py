@@ -1,0 +1,246 @@
+"""Optical flow in the model of EKF2, and what the model cannot follow."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from exchange import replace
+from ulog_tools import gnss_log, stamps, topic
+
+from px4fuse.ekf2.flow import FlowSamples, fuse_flow, gather_flow, with_flow
+from px4fuse.ekf2.inputs import read_gnss
+from px4fuse.ekf2.model import Model, open_model, replay_settings
+from px4fuse.ekf2.whatif import what_if
+from px4fuse.flight import VELOCITY_COLUMNS, Ekf2, Flight, FusionRecord, Reset, Truth
+from px4fuse.readers import read_log
+from px4fuse.readers.px4_innovations import with_gnss
+from px4fuse.simulation.flights import simulate_flight
+from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.scenario import scenario_of
+
+INTERVAL_S, SHARE = 0.02, 0.1  # of EKF2's low pass, ekf.h
+
+
+def low_passed(raw: np.ndarray) -> np.ndarray:
+    """As EKF2's AlphaFilter."""
+    found = raw.copy()
+    for k in range(1, len(raw)):
+        found[k] = found[k - 1] + SHARE * (raw[k] - found[k - 1])
+    return found
+
+
+@cache
+def model() -> Model:
+    found = open_model(simulate_flight(scenario_of("outdoor", seed=3, passes=3), parse(())))
+    assert isinstance(found, Model)
+    return found
+
+
+def true_velocity(times: np.ndarray) -> np.ndarray:
+    truth = model().flight.truth
+    assert isinstance(truth, Truth)
+    return np.column_stack([np.interp(times, truth.samples.index, truth.samples[column])
+                            for column in VELOCITY_COLUMNS])  # fmt: skip
+
+
+def flow_of(noise_m_s: float = 0.0, every: int = 10) -> pd.DataFrame:
+    """What a log has of a flow at 50 Hz."""
+    (stretch,) = model().inputs.stretches
+    times = np.arange(stretch.time_s[0] + 1.0, stretch.time_s[-1] - 0.5, INTERVAL_S)
+    turn = stretch.rotation[np.searchsorted(stretch.time_s, times - 1e-9)]
+    raw = np.einsum("nji,nj->ni", turn, true_velocity(times))[:, :2]
+    raw += np.random.default_rng(1).normal(0.0, 1.0, raw.shape) * noise_m_s
+    kept = low_passed(raw)[::every]
+    decay = (1.0 - SHARE) ** every
+    mean = (kept[1:] - decay * kept[:-1]) / (1.0 - decay)
+    return pd.DataFrame({
+        "forward_m_s": mean[:, 0], "right_m_s": mean[:, 1], "samples": float(every),
+        "interval_s": INTERVAL_S, "noise_m2_s2": max(noise_m_s, 0.3) ** 2,
+    }, index=times[every::every])  # fmt: skip
+
+
+def flying(noise_m_s: float = 0.3) -> Model:
+    """The flight, with flow."""
+    inputs = model().inputs
+    stretches = tuple(with_flow(one, flow_of(noise_m_s), 3.0) for one in inputs.stretches)
+    return replace(model(), inputs=replace(inputs, stretches=stretches))
+
+
+def test_what_lies_between_two_rows_is_read_as_the_mean_of_all_samples(tmp_path: Path) -> None:
+    log = gnss_log("v1.16")
+    log["estimator_states"]["states"][:, :4] = [1.0, 0.0, 0.0, 0.0]
+    at = stamps(20.0, 50.0)
+    raw = np.random.default_rng(3).normal(0.0, 1.0, (len(at), 2))
+    rows = np.cumsum(np.tile([10, 10, 9, 11], 12))  # a logger that is late now and then
+    log.add(topic("estimator_optical_flow_vel", at[rows], {
+        "vel_body": raw[rows], "vel_body_filtered": low_passed(raw)[rows],
+        "flow_rate_compensated": raw[rows][:, ::-1] * [1.0, -1.0] / 6.0,
+    }))  # fmt: skip
+    log.add(topic("vehicle_optical_flow", at[::25], {
+        "integration_timespan_us": np.full(len(at[::25]), 20_000, np.uint32),
+    }))  # fmt: skip
+    log.add(topic("estimator_aid_src_optical_flow", at[::25], {
+        "observation_variance": np.full((len(at[::25]), 2), 0.04),
+    }))  # fmt: skip
+    ekf2 = read_log(log.write(tmp_path / "a.ulg")).ekf2
+    assert isinstance(ekf2, Ekf2)
+    assert isinstance(ekf2.record, FusionRecord)
+    flow = ekf2.record.flow
+    assert flow["samples"].tolist() == np.diff(rows).tolist()
+    assert flow["interval_s"].unique() == pytest.approx([INTERVAL_S])
+    np.testing.assert_allclose(flow["noise_m2_s2"], 0.04 * 6.0**2, rtol=1e-4)
+    for end, (forward, right) in zip(
+        rows[1:], flow[["forward_m_s", "right_m_s"]].to_numpy(), strict=True
+    ):
+        count = int(end - rows[np.searchsorted(rows, end) - 1])
+        weight = (1.0 - SHARE) ** np.arange(count)
+        mean = weight @ raw[end - np.arange(count)] / weight.sum()
+        assert [forward, right] == pytest.approx(mean.tolist(), abs=1e-4)
+
+
+@pytest.mark.parametrize("every", [1, 10])
+def test_flow_tells_the_velocity_at_the_event_after_it(every: int) -> None:
+    """Where the body moved since a sample is known from the IMU: corners are no innovations."""
+    (stretch,) = model().inputs.stretches
+    told = with_flow(stretch, flow_of(every=every), 3.0)
+    assert told.flow is not None
+    end = model().intervals[0].events.end
+    found = gather_flow(told, told.flow, end)
+    seen = found.number > 0.0
+    assert found.number.sum() == pytest.approx(len(flow_of(every=every)) * every, abs=12.0)
+    speed = true_velocity(stretch.time_s[end[seen]])
+    expected = np.einsum("kab,kb->ka", found.turn[seen], speed)
+    off = found.speed_m_s[seen] - expected
+    assert np.sqrt(np.mean(off**2)) < 0.03
+    assert np.ptp(expected, axis=0).min() > 0.7
+
+
+def test_the_mean_counts_as_often_as_it_has_samples_and_the_gate_is_of_one() -> None:
+    turn = np.eye(3)[None, :2]
+    x, P = np.zeros((1, 15)), np.diag(np.full(15, 1e-9))[None].copy()
+    P[0, 3:5, 3:5] = 0.25 * np.eye(2)
+    told = FlowSamples(np.array([[1.0, -0.5]]), turn, np.array([10.0]), np.array([0.8]))
+    after, left = fuse_flow(x, P, told, 3.0)
+    # 1/P = 1/P₀ + n/R
+    assert left[0, 3, 3] == pytest.approx(1.0 / (1.0 / 0.25 + 10.0 / 0.8), rel=1e-6)
+    assert after[0, 3:5] == pytest.approx(np.array([1.0, -0.5]) * left[0, 3, 3] * 10.0 / 0.8)
+    far = told._replace(speed_m_s=np.array([[3.1, 0.0]]))  # 3 σ of one sample are 3.07
+    np.testing.assert_array_equal(fuse_flow(x, P, far, 3.0)[0], x)
+    assert fuse_flow(x, P, far, 3.1)[0][0, 3] > 1.0
+    none = told._replace(number=np.zeros(1), noise_m2_s2=np.zeros(1), turn=np.zeros((1, 2, 3)))
+    np.testing.assert_array_equal(fuse_flow(x, P, none, 3.0)[0], x)
+
+
+def test_flow_carries_the_filter_without_gnss() -> None:
+    """A minute: by flow to a metre, by the IMU alone not to ten."""
+    lost = dict.fromkeys(("gnss_pos", "gnss_vel"), 40.0)
+    off = []
+    for carried in (flying(), model()):
+        (replay,) = replay_settings(carried, [{}], without=lost)
+        apart = replay.delayed[["north_m", "east_m"]] - model().flown.delayed[["north_m", "east_m"]]
+        off.append(float(np.hypot(*apart.loc[100.0:101.0].to_numpy().T).max()))
+    assert off[0] < 1.5
+    assert off[1] > 10.0
+    (alone,) = replay_settings(flying(), [{}], without={"optical_flow": 0.0})
+    (flown,) = replay_settings(model(), [{}])
+    pd.testing.assert_frame_equal(alone.delayed, flown.delayed)
+
+
+def stretches_s(flight: Flight) -> list[tuple[float, float]]:
+    found = open_model(flight)
+    assert isinstance(found, Model)
+    return [(float(one.time_s[0]), float(one.time_s[-1])) for one in found.inputs.stretches]
+
+
+def test_the_model_begins_again_after_resets_of_height_and_where_much_is_clipped() -> None:
+    flight = model().flight
+    ((start, end),) = stretches_s(flight)
+    assert isinstance(flight.ekf2, Ekf2)
+    assert isinstance(flight.imu, pd.DataFrame)
+    for delta, parted in (((0.0, 0.0, 1.0), True), ((1.0, 0.0, 0.0), False)):
+        reset = Reset(60.0, "velocity", delta)
+        found = stretches_s(replace(flight, ekf2=replace(flight.ekf2, resets=(reset,))))
+        assert len(found) == 1 + parted
+        if parted:
+            assert found[0] == (start, pytest.approx(59.5, abs=0.02))
+            assert 60.0 <= found[1][0] <= 61.5
+            assert found[1][1] == end
+    count = round(0.05 / float(np.median(np.diff(flight.imu.index))))
+    for clips, parted in ((count + 2, True), (count - 2, False)):
+        clipped = pd.Series(0, flight.imu.index)
+        at = int(np.searchsorted(flight.imu.index, 60.0))
+        clipped.iloc[at : at + clips] = 0b111
+        found = stretches_s(replace(flight, imu=flight.imu.assign(clipped=clipped)))
+        assert len(found) == 1 + parted
+        if parted:
+            assert found[0][1] == pytest.approx(59.5, abs=0.02)
+            assert found[1][0] > 60.5
+
+
+def test_fixes_that_come_while_ekf2_does_without_gnss_are_not_fused() -> None:
+    flight = model().flight
+    ekf2 = flight.ekf2
+    assert isinstance(ekf2, Ekf2)
+    assert isinstance(ekf2.record, FusionRecord)
+    meant = pd.Series([1.0, 0.0, 1.0], index=[0.0, 50.0, 60.0])
+    aids = {**ekf2.aids, "gnss_pos": replace(ekf2.aids["gnss_pos"], meant=meant)}
+    found = read_gnss(flight, with_gnss(replace(ekf2, aids=aids)), ekf2.record)
+    aids["gnss_pos"] = replace(ekf2.aids["gnss_pos"], meant=None)
+    every = read_gnss(flight, with_gnss(replace(ekf2, aids=aids)), ekf2.record)
+    delay_s = ekf2.record.parameters["EKF2_GPS_DELAY"] * 1e-3
+    measured_s = every.stamp_s - delay_s  # type: ignore[union-attr]
+    kept = (measured_s < 50.0) | (measured_s >= 60.0)
+    assert 0 < np.sum(~kept) < len(kept)
+    np.testing.assert_array_equal(found.stamp_s, every.stamp_s[kept])  # type: ignore[union-attr]
+
+
+# ---------------------------------------------------------------- flights of PX4's EKF2
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize(
+    ("name", "least"), [("v1.16.1_gps_stock_flow", 0.996), ("main202603_gps_outage_flow", 0.998)]
+)
+def test_flights_with_flow_are_replayed(name: str, least: float, shared_logs: Path) -> None:
+    found = open_model(read_log(shared_logs / "gps" / f"{name}.ulg"))
+    assert isinstance(found, Model)
+    agreement = found.agreement
+    assert agreement.good
+    for axis in agreement.gnss_pos.values():
+        assert axis.innovation_correlation > least
+        assert 0.99 < axis.s_ratio_p5 < axis.s_ratio_p95 < 1.01
+        assert axis.position_rms_difference_m < 0.03
+    if "outage" in name:
+        # of 50 samples a second the log tells of 47, and heading and scale of the flow drift
+        assert agreement.carried_difference_m == pytest.approx(0.5, abs=0.05)
+        assert set(agreement.doubtful) == {"optical_flow"}
+        lost_s, back_s = found.inputs.stretches[0].time_s[-1], found.inputs.stretches[1].time_s[0]
+        assert lost_s == pytest.approx(42.1, abs=0.2)  # 35.2 s after take-off
+        assert back_s == pytest.approx(74.0, abs=1.0)
+    else:
+        assert agreement.carried_difference_m is None
+        said = " ".join(
+            what_if(found, [{}], without=dict.fromkeys(("gnss_pos", "gnss_vel"), 60.0)).notes
+        )  # type: ignore[union-attr]
+        assert "Without gnss_pos from 60 s on" in said
+        assert "gives its position up" not in said
+
+
+@pytest.mark.reallogs
+def test_a_flight_that_crashes_is_followed_up_to_its_tumble(shared_logs: Path) -> None:
+    """Vertical velocity was reset at 47 s, and much of the IMU clipped at 26 and at 46 s."""
+    found = open_model(read_log(shared_logs / "real" / "PX4_flight-review-rs_ekf_failure.ulg"))
+    assert isinstance(found, Model)
+    ends = [(one.time_s[0], one.time_s[-1]) for one in found.inputs.stretches]
+    assert np.array(ends) == pytest.approx(np.array([(6.7, 24.7), (30.7, 44.2), (49.7, 67.4)]),
+                                           abs=0.1)  # fmt: skip
+    agreement = found.agreement
+    for axis in (*agreement.gnss_pos.values(), *agreement.gnss_hgt.values(),
+                 *agreement.baro_hgt.values()):  # fmt: skip
+        assert axis.innovation_correlation > 0.97
+        assert 0.99 < axis.s_ratio_p5 < axis.s_ratio_p95 < 1.01
+    assert agreement.doubtful == {}
