@@ -20,7 +20,19 @@ from px4fuse.ekf2.inputs import Inputs, Received
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.replay import Ekf2Replay, along, rms_to_truth
 from px4fuse.ekf2.stretches import Flow, Stretch
-from px4fuse.ekf2.walk import FLOWING, GATE, OUTPUT, SPEED, STEPS, Why, _coast, _variants, walk
+from px4fuse.ekf2.walk import (
+    ATTITUDE,
+    FIELD,
+    FLOWING,
+    GATE,
+    OUTPUT,
+    SPEED,
+    STEPS,
+    Why,
+    _coast,
+    _variants,
+    walk,
+)
 from px4fuse.ekf2.whatif import (
     AxisSummary,
     Summary,
@@ -149,10 +161,12 @@ def test_the_walk_changes_one_thing_after_the_other() -> None:
     assert found[0].stamp_offset_s == pytest.approx(-0.16)
     assert [one.settings["EKF2_GPS_P_NOISE"] for one in found] == [0.2] * 2 + [0.5] * 6
     flow = (made(Stretch, flow=made(Flow), heights=None),)
-    flowing = made(Inputs, **{**vars(gnss), "stretches": flow})
-    variants = _variants(made(Model, inputs=flowing), ours)
-    assert list(variants)[-3:] == [SPEED, FLOWING, GATE]
-    assert ["optical_flow" in one.without for one in variants.values()] == [True] * 7 + [False] * 2
+    more = {"stretches": flow, "settings": gnss.settings | {"EKF2_MAG_NOISE": 0.05}}
+    variants = _variants(made(Model, inputs=made(Inputs, **{**vars(gnss), **more})), ours)
+    assert list(variants)[-5:] == [ATTITUDE, FIELD, SPEED, FLOWING, GATE]
+    assert ["mag" in one.without for one in variants.values()] == [True] * 6 + [False] * 4
+    assert ["optical_flow" in one.without for one in variants.values()] == [True] * 8 + [False] * 2
+    assert [one.velocity for one in variants.values()] == [False] * 7 + [True] * 3
 
 
 def test_the_longest_run_of_rejections_is_said_with_how_far_it_led() -> None:

@@ -178,6 +178,7 @@ def _reasons(
             f"{settings.sigma_a_m_s2:.2g}, so EKF2 trusts {trusted}"
         ),
         ways.ATTITUDE: "EKF2 lets the positions correct its attitude, ours takes it as it is",
+        ways.FIELD: "EKF2 takes its heading from the magnetometer, ours as EKF2 published it",
         ways.SPEED: "EKF2 fuses the velocity of GNSS too, ours its position alone",
         ways.FLOWING: "EKF2 fuses optical flow too, ours positions alone",
         ways.GATE: f"EKF2's gate rejects {rejected:.1%} of the samples, ours takes all",

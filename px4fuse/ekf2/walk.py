@@ -26,7 +26,7 @@ from px4fuse.display import Shown
 from px4fuse.ekf2.model import Model, aids_of, delayed_variants
 from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import Ekf2Replay, Spans, along, rms_to_truth, settled
-from px4fuse.ekf2_parameters import FLOW, GNSS_POS
+from px4fuse.ekf2_parameters import FLOW, GNSS_POS, MAG
 from px4fuse.filter.kalman import Replay, state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Ekf2, Truth, Unavailable
@@ -42,11 +42,12 @@ NOISE = "measurement noise"
 BIASES = "accelerometer bias as a state"
 PROCESS = "process noise"
 ATTITUDE = "attitude and gyro bias as states"
+FIELD = "magnetometer"
 SPEED = "velocity of GNSS"
 FLOWING = "optical flow"
 GATE = "gate, missed samples, resets"
 OUTPUT = "output predictor"
-# SPEED and FLOWING come before GATE, where EKF2 fuses these
+# FIELD, SPEED and FLOWING come before GATE, where EKF2 fuses these
 STEPS = (SAMPLES, STAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
 COLUMNS = (POSITION_COLUMNS, VELOCITY_COLUMNS)
@@ -58,7 +59,7 @@ class Step(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     name : str
-        One of :data:`STEPS`, :data:`SPEED` or :data:`FLOWING`.
+        One of :data:`STEPS`, :data:`FIELD`, :data:`SPEED` or :data:`FLOWING`.
     position_mean_square_m2, velocity_mean_square_m2_s2 : float
         By how much it brings the track nearer to the logged one, in mean square; below 0: farther.
     position_moved_m : float
@@ -222,7 +223,7 @@ def walk(
                 for direction in directions.values()
             ]
         )
-        if stage in (ATTITUDE, SPEED, FLOWING):  # the last without a gate
+        if stage in (ATTITUDE, FIELD, SPEED, FLOWING):  # the last without a gate
             ungated = track
     spans = tuple((start, end) for start, end in parts if start < end)
     coast = _coast(flown, ungated, span, judged)
@@ -245,10 +246,9 @@ def _variants(model: Model, ours: Settings) -> dict[str, Variant]:
     taken_s = flown[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
     offset_s = ours.clock_offset_s - taken_s
     unmoved = {**own, **dict.fromkeys(aid.place, 0.0)}
-    still = {FLOW.name: 0.0}
     bare = Variant(
         own, biases=False, attitude=False, velocity=False, reported=False, gated=False,
-        without=still,
+        without=dict.fromkeys((MAG.name, FLOW.name), 0.0),
     )  # fmt: skip
     variants = {
         SAMPLES: replace(bare, settings=unmoved, stamp_offset_s=offset_s),
@@ -256,12 +256,15 @@ def _variants(model: Model, ours: Settings) -> dict[str, Variant]:
         NOISE: (noise := replace(bare, settings={**flown, **spread}, reported=True)),
         BIASES: replace(noise, biases=True),
         PROCESS: replace(noise, settings=flown, biases=True),
-        ATTITUDE: Variant(flown, velocity=False, gated=False, without=still),
+        ATTITUDE: (last := replace(noise, settings=flown, biases=True, attitude=True)),
     }
+    aids = aids_of(model.inputs)
+    if MAG.name in aids:
+        variants[FIELD] = last = replace(last, without={FLOW.name: 0.0})
     if received.velocity_m_s is not None:
-        variants[SPEED] = Variant(flown, gated=False, without=still)
-    if FLOW.name in aids_of(model.inputs):
-        variants[FLOWING] = Variant(flown, gated=False)
+        variants[SPEED] = last = replace(last, velocity=True)
+    if FLOW.name in aids:
+        variants[FLOWING] = replace(last, without={})
     return variants | {GATE: Variant(flown, as_logged=True)}
 
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from px4fuse.ekf2.model import Model, open_model, replay_settings
 from px4fuse.ekf2.replay import Agreement
-from px4fuse.ekf2.walk import FLOWING, SPEED, STEPS, walk
+from px4fuse.ekf2.walk import FIELD, FLOWING, SPEED, STEPS, walk
 from px4fuse.ekf2.whatif import Summary, WhatIf, what_if
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.readers import read_log
@@ -91,7 +91,7 @@ def waterfalls(models: dict[str, Model]) -> dict[str, float]:
     Returns what is left of each.
     """
     unexplained = {}
-    steps = (*STEPS[:-2], SPEED, FLOWING, *STEPS[-2:])
+    steps = (*STEPS[:-2], FIELD, SPEED, FLOWING, *STEPS[-2:])
     print("\nwhy EKF2 differs | total rms m | " + " | ".join(steps) + " | left")
     for name, model in models.items():
         found = walk(model)
