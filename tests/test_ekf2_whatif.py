@@ -19,7 +19,7 @@ from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.inputs import Inputs, Received
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.replay import Ekf2Replay, along, rms_to_truth
-from px4fuse.ekf2.walk import OUTPUT, STEPS, Why, _coast, _variants, walk
+from px4fuse.ekf2.walk import OUTPUT, STEPS, Why, _coast, on_the_way, walk
 from px4fuse.ekf2.whatif import (
     AxisSummary,
     Summary,
@@ -120,9 +120,9 @@ def test_a_run_of_another_time_is_not_walked_from(model: Model) -> None:
 def test_the_walk_changes_one_thing_after_the_other() -> None:
     flown = {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_NOISE_MD": 0.0, "EKF2_ACC_NOISE": 0.35}
     received = made(Received)
-    model = made(Model, inputs=made(Inputs, settings=flown, step_s=0.01, received=received))
+    flight = made(Inputs, settings=flown, step_s=0.01, received=received)
     ours = Settings(0.5, 0.2, 0.16, clock_offset_s=-0.05)
-    found = list(_variants(model, ours).values())
+    found = list(on_the_way(flight, ours).values())
     settings = [one.settings for one in found]
     assert [s["EKF2_ACC_NOISE"] for s in settings] == pytest.approx([2.0] * 4 + [0.35] * 3)
     assert [s["EKF2_EVP_NOISE"] for s in settings] == [0.2] * 2 + [0.3] * 5
@@ -137,7 +137,7 @@ def test_the_walk_changes_one_thing_after_the_other() -> None:
         Inputs, aid=GNSS_POS, step_s=0.01, received=made(Received, velocity_m_s=np.zeros((1, 3))),
         settings={"EKF2_ACC_NOISE": 0.35, "EKF2_GPS_P_NOISE": 0.5, "EKF2_GPS_DELAY": 110.0},
     )  # fmt: skip
-    found = list(_variants(made(Model, inputs=gnss), ours).values())
+    found = list(on_the_way(gnss, ours).values())
     assert [one.velocity for one in found] == [False] * 6 + [True] * 2
     assert [one.gated for one in found] == [False] * 7 + [True]
     # the delay was taken from the positions of GNSS that ours is given
