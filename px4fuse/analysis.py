@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +27,7 @@ from px4fuse.comparison.interventions import Intervention, interventions
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import no_source, prepare
 from px4fuse.comparison.remedy import asked_of_ekf2
-from px4fuse.comparison.why import why_ekf2_differs
+from px4fuse.comparison.why import to_walk, why_ekf2_differs
 from px4fuse.display import brief
 from px4fuse.ekf2.aids import AidResult, judge_aids
 from px4fuse.ekf2.model import Model, open_model
@@ -479,7 +479,7 @@ def explain(comparison: Comparison, progress: Progress = silent) -> Analysis:
     names = REPORTED if {"north", "east"} <= {line.name for line in comparison.lines} else None
     tuning, clock = noises_and_clock(comparison, progress, names)
     progress("replaying EKF2")
-    model = open_model(comparison.flight)
+    model = open_model(comparison.flight, partial(to_walk, comparison))
     why = why_ekf2_differs(comparison, model, clock)
     heading = turned_frame(comparison, tuning, clock, progress)
     progress("looking for a loop")

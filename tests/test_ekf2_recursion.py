@@ -189,7 +189,7 @@ def test_states_fused_in_turn_keep_the_innovations_of_before() -> None:
     P, nu, R = root @ np.swapaxes(root, 1, 2), rng.normal(size=(2, 6)), np.full((2, 6), 0.5)
     S = np.diagonal(P, axis1=1, axis2=2)[:, 3:9] + R
     taken = np.array([True, False])
-    x, left = _in_turn(np.zeros((2, 15)), P, nu, S, R, slice(3, 5), taken)
+    x, left = _in_turn(np.zeros((2, 15)), P, nu, S, R, slice(3, 5), taken[:, None])
     expected, state = P[0], np.zeros(15)
     for told, row in ((3, 6), (4, 7)):
         K = expected[:, row] / S[0, told]

@@ -30,7 +30,7 @@ from px4fuse.ekf2.walk import (
     STEPS,
     Why,
     _coast,
-    _variants,
+    on_the_way,
     walk,
 )
 from px4fuse.ekf2.whatif import (
@@ -134,11 +134,9 @@ def test_the_walk_changes_one_thing_after_the_other() -> None:
     flown = {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_NOISE_MD": 0.0, "EKF2_ACC_NOISE": 0.35}
     received = made(Received)
     plain = (made(Stretch, flow=None, heights=None),)
-    model = made(Model, inputs=made(
-        Inputs, settings=flown, step_s=0.01, received=received, stretches=plain,
-    ))  # fmt: skip
+    flight = made(Inputs, settings=flown, step_s=0.01, received=received, stretches=plain)
     ours = Settings(0.5, 0.2, 0.16, clock_offset_s=-0.05)
-    found = list(_variants(model, ours).values())
+    found = list(on_the_way(flight, ours).values())
     settings = [one.settings for one in found]
     assert [s["EKF2_ACC_NOISE"] for s in settings] == pytest.approx([2.0] * 4 + [0.35] * 3)
     assert [s["EKF2_EVP_NOISE"] for s in settings] == [0.2] * 2 + [0.3] * 5
@@ -154,7 +152,7 @@ def test_the_walk_changes_one_thing_after_the_other() -> None:
         settings={"EKF2_ACC_NOISE": 0.35, "EKF2_GPS_P_NOISE": 0.5, "EKF2_GPS_DELAY": 110.0},
         stretches=plain,
     )  # fmt: skip
-    found = list(_variants(made(Model, inputs=gnss), ours).values())
+    found = list(on_the_way(gnss, ours).values())
     assert [one.velocity for one in found] == [False] * 6 + [True] * 2
     assert [one.gated for one in found] == [False] * 7 + [True]
     # the delay was taken from the positions of GNSS that ours is given
@@ -162,7 +160,7 @@ def test_the_walk_changes_one_thing_after_the_other() -> None:
     assert [one.settings["EKF2_GPS_P_NOISE"] for one in found] == [0.2] * 2 + [0.5] * 6
     flow = (made(Stretch, flow=made(Flow), heights=None),)
     more = {"stretches": flow, "settings": gnss.settings | {"EKF2_MAG_NOISE": 0.05}}
-    variants = _variants(made(Model, inputs=made(Inputs, **{**vars(gnss), **more})), ours)
+    variants = on_the_way(made(Inputs, **{**vars(gnss), **more}), ours)
     assert list(variants)[-5:] == [ATTITUDE, FIELD, SPEED, FLOWING, GATE]
     assert ["mag" in one.without for one in variants.values()] == [True] * 6 + [False] * 4
     assert ["optical_flow" in one.without for one in variants.values()] == [True] * 8 + [False] * 2

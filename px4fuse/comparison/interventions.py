@@ -11,8 +11,8 @@ setting would only hide it.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -206,14 +206,18 @@ def interventions(
         filters += [_Ekf2(*known, model)] if fused and model.agreement.good else []
     rows: list[Intervention] = []
     for changed in filters:
-        for result in comparison.axes.values():
-            if changed.owner == "ekf2" and result.axis.name == "down":
-                continue
-            for of in _discrepancies(result.filters[changed.owner]):
-                tried = _tried(changed, result, of)
-                rows += tried
-                if cause := cause_of(tried, changed.owner, result.axis.name, of):
-                    rows += _apart(cause, result, changed)
+        asked = [
+            (result, of)
+            for result in comparison.axes.values()
+            if changed.owner == "kf" or result.axis.name != "down"
+            for of in _discrepancies(result.filters[changed.owner])
+        ]
+        changed.ahead([each for one in asked for each in changed.candidates(*one)])
+        for result, of in asked:
+            tried = _tried(changed, result, of)
+            rows += tried
+            if cause := cause_of(tried, changed.owner, result.axis.name, of):
+                rows += _apart(cause, result, changed)
     return tuple(rows)
 
 
@@ -322,6 +326,9 @@ class _Changed:
     @abstractmethod
     def of_filter(self, tuned: AxisTuning | None) -> list[Change]:
         """What else may be wrong; ``tuned`` where the variance is not larger than what is shown."""
+
+    def ahead(self, changes: Sequence[Change]) -> None:
+        """Make at once what is cheaper so."""
 
     def candidates(self, result: AxisComparison, of: Of) -> list[Change]:
         """What to try along an axis."""
@@ -432,9 +439,15 @@ class _Ekf2(_Changed):
     """EKF2 with changes, where the model agrees with the log and fused what was analysed."""
 
     model: Model
-    replays: dict[tuple[tuple[str, float], ...], Ekf2Replay] = field(default_factory=dict)
 
     owner = "ekf2"
+
+    def ahead(self, changes: Sequence[Change]) -> None:
+        """Replay together what changes parameters alone."""
+        of_parameters = [each for each in changes if each.keys() <= PARAMETERS.keys()]
+        distinct = {frozenset(each.items()): each for each in of_parameters}
+        replays = replay_settings(self.model, list(distinct.values()))
+        self.model.kept.update(zip(distinct, replays, strict=True))
 
     def of_stamps(self) -> list[Change]:
         """A delay is EKF2's own to set; there is none for stamps that are early."""
@@ -511,8 +524,8 @@ class _Ekf2(_Changed):
         """EKF2 with a change, each replayed once."""
         if not change:
             return self.model.flown
-        key = tuple(sorted(change.items()))
-        if key not in self.replays:
+        key = frozenset(change.items())
+        if key not in self.model.kept:
             settings = {name: value for name, value in change.items() if name in PARAMETERS}
             model = moved(self.model, change.get(TURN, 0.0), change.get(CLOCK, 0.0))
             left_out_s, tuned = None, tuned_for(self.tuning, HORIZONTAL)
@@ -521,5 +534,5 @@ class _Ekf2(_Changed):
                 of_source = self.comparison.source.origin.by_gnss
                 left_out_s = tuned.outlier_time_s - self.comparison.settings.clock_offset_s
                 left_out_s = left_out_s + (stamp if of_source else 0.0) + change.get(CLOCK, 0.0)
-            (self.replays[key],) = replay_settings(model, [settings], left_out_s)
-        return self.replays[key]
+            (self.model.kept[key],) = replay_settings(model, [settings], left_out_s)
+        return self.model.kept[key]

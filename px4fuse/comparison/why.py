@@ -15,11 +15,14 @@ from msgspec import structs
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.comparison.remedy import noise_used_m
 from px4fuse.ekf2 import walk as ways
+from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model
+from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import Spans, settled
 from px4fuse.ekf2.walk import Outside, Step, Why
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.kalman import state_at
+from px4fuse.filter.settings import Settings
 from px4fuse.flight import Unavailable
 
 # Filters whose errors differ by less are equally close to the truth
@@ -54,9 +57,7 @@ def why_ekf2_differs(
         return {"down": Unavailable(ways.WHAT, reason, "Analyse a horizontal axis too (--axis).")}
     if isinstance(model, Unavailable):
         return {name: structs.replace(model, what=ways.WHAT) for name in results}
-    settings = comparison.settings
-    if comparison.source.name != model.inputs.received.source:
-        settings = replace(settings, clock_offset_s=0.0)
+    settings = _settings(comparison, model.inputs)
     walked = ways.walk(model, settings, {name: axis.replay for name, axis in results.items()})
     if isinstance(walked, Unavailable):
         return dict.fromkeys(results, walked)
@@ -66,6 +67,17 @@ def why_ekf2_differs(
         outside = structs.replace(why, outside=_outside(results[name], why.spans_s))
         found[name] = with_words(outside, comparison.axes[name].axis.called, because)
     return found
+
+
+def to_walk(comparison: Comparison, inputs: Inputs) -> list[Variant]:
+    """The variants of EKF2 that :func:`why_ekf2_differs` asks for."""
+    return list(ways.on_the_way(inputs, _settings(comparison, inputs)).values())
+
+
+def _settings(comparison: Comparison, inputs: Inputs) -> Settings:
+    """Of our filter, whose clock offset is that of the source that was analysed."""
+    same = comparison.source.name == inputs.received.source
+    return comparison.settings if same else replace(comparison.settings, clock_offset_s=0.0)
 
 
 def _outside(result: AxisComparison, spans: Spans) -> Outside | None:

@@ -9,8 +9,8 @@ far it can be believed is measured on each log, see :mod:`px4fuse.ekf2.replay`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -64,6 +64,8 @@ MODEL_NOTE = (
 )
 MAX_HORIZON_S = 1.0  # EKF2_DELAY_MAX
 
+Besides = Callable[[Inputs], Sequence[Variant]]
+
 
 @dataclass(frozen=True)
 class Model:
@@ -77,29 +79,40 @@ class Model:
         Of each stretch, for the delay as flown.
     flown : Ekf2Replay
         With the parameters of the log.
+    obedient : Ekf2Replay
+        The same, rejecting and resetting where EKF2 did, as far as the log tells.
     agreement : Agreement
         Of ``flown`` with what the log holds.
+    runs : tuple of Run
+        Through each stretch: of both, and of the variants that were asked for besides.
+    kept : dict from (name, value) pairs of a change to Ekf2Replay
+        Replays that are asked for more than once.
     """
 
     flight: Flight
     inputs: Inputs
     intervals: tuple[Intervals, ...]
     flown: Ekf2Replay
+    obedient: Ekf2Replay
     agreement: Agreement
+    runs: tuple[Run, ...]
+    kept: dict[frozenset[tuple[str, float]], Ekf2Replay] = field(default_factory=dict, init=False)
 
     __repr__ = brief
 
 
-def open_model(flight: Flight) -> Model | Unavailable:
+def open_model(flight: Flight, besides: Besides = lambda _: ()) -> Model | Unavailable:
     """Make a flight ready for replays and replay it as flown, or say why the log cannot carry it.
 
     Parameters
     ----------
     flight : Flight
+    besides : callable
+        Gives the variants that will be asked for, which cost little when they run along.
     """
     doubtful: dict[str, str] = {}
     told: dict[str, Any] = {}
-    while not isinstance(model := _open(flight, doubtful), Unavailable):
+    while not isinstance(model := _open(flight, besides, doubtful), Unavailable):
         agreement = model.agreement
         if not agreement.doubtful:
             agreement = structs.replace(agreement, doubtful=doubtful, **told)
@@ -112,7 +125,7 @@ def open_model(flight: Flight) -> Model | Unavailable:
     return model
 
 
-def _open(flight: Flight, doubtful: Mapping[str, str]) -> Model | Unavailable:
+def _open(flight: Flight, besides: Besides, doubtful: Mapping[str, str]) -> Model | Unavailable:
     """The model without what is doubtful."""
     inputs = prepare(flight, doubtful)
     if isinstance(inputs, Unavailable):
@@ -127,19 +140,20 @@ def _open(flight: Flight, doubtful: Mapping[str, str]) -> Model | Unavailable:
         for stretch, each in zip(inputs.stretches, intervals, strict=True)
     )
     inputs = replace(inputs, stretches=stretches)
-    runs = run_variants(inputs, [flown], {timing: intervals})
-    replay = _assemble(inputs, runs, 0, {})
+    both = [flown, replace(flown, as_logged=True)]
+    more = [each for each in besides(inputs) if each not in both]
+    runs = run_variants(inputs, both + more, {timing: intervals})
+    replay, obedient = (_assemble(inputs, runs, at, {}) for at in range(2))
     agreement = agreement_with_log(flight, replay)
     if isinstance(agreement, Unavailable):
         return agreement
     share = max(agreement.rejected_share_logged, agreement.rejected_share_replayed)
     if share > REJECTING_SHARE and np.isfinite(inputs.received.rejected).any():
-        again = run_variants(inputs, [replace(flown, as_logged=True)], {timing: intervals})
-        obeyed = agreement_with_log(flight, _assemble(inputs, again, 0, {}))
+        obeyed = agreement_with_log(flight, obedient)
         if isinstance(obeyed, Agreement):
             agreement = with_obedient(agreement, obeyed)
     replay = structs.replace(replay, agreement=agreement)
-    return Model(flight, inputs, intervals, replay, agreement)
+    return Model(flight, inputs, intervals, replay, obedient, agreement, tuple(runs))
 
 
 def replay_settings(
@@ -189,7 +203,9 @@ def replay_settings(
             raise SettingsError(f"{name}: of this log the model fuses {', '.join(known)}{why}.")
     if not changes:
         return ()
-    obeys = left_out_s is not None
+    obeys, asked = left_out_s is not None, [frozenset(change.items()) for change in changes]
+    if not (obeys or without) and model.kept.keys() >= {*asked}:
+        return tuple(model.kept[change] for change in asked)
     if left_out_s is not None:
         row = same_sample(inputs.received.stamp_s, left_out_s)
         rejected = np.full(len(inputs.received.stamp_s), np.nan)
@@ -270,19 +286,16 @@ def moved(model: Model, turned_deg: float, later_s: float) -> Model:
     return replace(model, inputs=inputs, intervals=intervals)
 
 
-def delayed_variants(
-    model: Model, variants: Sequence[Variant]
-) -> tuple[Iterator[pd.DataFrame], Ekf2Replay]:
-    """Tracks of all but the last at their horizon, one at a time, and all that the last one did.
+def delayed_variants(model: Model, variants: Sequence[Variant]) -> Iterator[pd.DataFrame]:
+    """Tracks of all at their horizon, one at a time.
 
     What a filter publishes is as long again, and takes as long to make.
     """
-    runs, last = _run_model(model, variants), len(variants) - 1
-    tracks = (
-        pd.concat([_track(part, delayed_states(part, at)[0]) for part in runs])
-        for at in range(last)
-    )
-    return tracks, _assemble(model.inputs, runs, last, {})
+    runs: Sequence[Run] = model.runs
+    if any(variant not in runs[0].variants for variant in variants):
+        runs = _run_model(model, variants)
+    for at in map(runs[0].variants.index, variants):
+        yield pd.concat([_track(part, delayed_states(part, at)[0]) for part in runs])
 
 
 def _run_model(model: Model, variants: Sequence[Variant]) -> list[Run]:

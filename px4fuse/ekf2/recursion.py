@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.display import brief
 from px4fuse.ekf2.flow import FlowSamples, fuse_flow, gather_flow
 from px4fuse.ekf2.heights import MIN_GATE, MIN_SD, SENSORS, HeightFilter, barometer_samples
 from px4fuse.ekf2.inputs import Inputs, Rules
@@ -154,6 +155,8 @@ class Run:
     field: Array
     heights: HeightFilter | None = None
 
+    __repr__ = brief
+
 
 def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     inputs: Inputs, stretch: Stretch, variants: Sequence[Variant], intervals: Sequence[Intervals]
@@ -221,6 +224,8 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     states, spreads = np.empty((2, events + 1, size, x.shape[1]))
     states[0], spreads[0] = x, _diagonal(P)
     innovation, R = np.empty((2, size, 4))
+    told_of = slice(0 if has_speed else LEVEL.start, LEVEL.stop)
+    taken = np.zeros((size, LEVEL.stop), bool)
     for e in range(events):
         within = e % TOGETHER
         if not within:  # intervals are long: a few at a time
@@ -236,8 +241,7 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
         P[:, :STATES] = phi @ P[:, :STATES]
         P[:, :, :STATES] = P[:, :, :STATES] @ np.swapaxes(phi, 1, 2)
         P[:, :MOVED, :MOVED] += added[within]
-        spread = _diagonal(P)
-        biased = spread[:, BIASES.start :]
+        biased = _diagonal(P)[:, BIASES.start :]
         biased += (biased < drift_limit) * drifted[within]
         if floor is not None:
             _limit_bias(P, floor, biases)
@@ -245,13 +249,11 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
         if seen is not None and seen.number[e].any():
             field_now = FieldSamples(*(part[e] for part in seen))
             x, P, of_field[e] = fuse_field(x, P, field_now, knob[MAG.noise], knob[MAG.gate])
-            spread = _diagonal(P)
         if speeds is not None and flow is not None and speeds.number[e].any():
             x, P = fuse_flow(x, P, FlowSamples(*(part[e] for part in speeds)), flow.gate)
-            spread = _diagonal(P)
         if sampled[e]:
             nu = measured[e] - x[:, TOLD]
-            S = spread[:, TOLD] + noise[e]
+            S = _diagonal(P)[:, TOLD] + noise[e]
             innovations[e], variances[e] = np.where(active[e, :, None], (nu, S), np.nan)
             outside = nu * nu > gate2 * S
             moving = with_velocity[e] & ~(outside[:, SPEED].any(axis=1) & gated)
@@ -261,23 +263,20 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
                 if seen is None:
                     for row in range(HEADING):
                         _, P = _surer(P, row, own_attitude[e, :, row])
-                if has_speed:
-                    x, P = _in_turn(x, P, nu, S, noise[e], SPEED, moving)
-                x, P = _in_turn(x, P, nu, S, noise[e], LEVEL, fused[e])
-                spread = _diagonal(P)
+                taken[:, SPEED], taken[:, LEVEL] = moving[:, None], fused[e, :, None]
+                x, P = _in_turn(x, P, nu, S, noise[e], told_of, taken[:, told_of])
             else:
                 innovation[:, 2:] = nu[:, LEVEL]
                 R[fused[e], 2:] = noise[e, fused[e], LEVEL]
         if heights is not None:
             x, P = heights.fuse(e, x, P, measured[e, :, 5], noise[e, :, 5])
-            spread = _diagonal(P)
         elif seen is not None:  # only the height is EKF2's own, and held
             K, P = _surer(P, DOWN, own_variance[e, :, 1])
             x = x + K * (own[e, :, 1] - x[:, DOWN])[:, None]
             x[:, DOWN] = own[e, :, 1]
         if seen is None:
             np.subtract(own[e], x[:, OWN], out=innovation[:, :2])
-            R[:, :2] = _down_to(spread[:, OWN], own_variance[e])
+            R[:, :2] = _down_to(_diagonal(P)[:, OWN], own_variance[e])
             heading = np.where(attitude, x[:, HEADING] + innovation[:, 0], 0.0)
             if inputs.vision_height or heights is not None:
                 R[:, 1] = NOT_TAKEN
@@ -335,19 +334,22 @@ def _in_turn(
     """Fuse a part of a sample one after the other, by innovations and S of before the first.
 
     As fuseDirectStateMeasurement (``ekf_helper.cpp``), in Joseph's form, which bears a gain that is
-    not the optimal one.
+    not the optimal one: with c = PH' and K = wc it is P - KHP - (KHP)' + K(HPH' + R)K' = P - bcc',
+    b = w(2 - w(HPH' + R)). ``taken`` is of shape (S, k) or (S, 1).
     """
-    weight = taken[:, None] / S
-    for j in range(part.start, part.stop):
-        row = TOLD.start + j
-        column = P[:, :, row]
-        K = column * weight[:, j, None]
-        x = x + K * nu[:, j, None]
-        # P - KHP - (KHP)' + K(HPH' + R)K': one product and what it is turned, symmetric as P is
-        half = column - (0.5 * (column[:, row] + R[:, j]))[:, None] * K
-        taken_off = K[:, :, None] * half[:, None]
-        P = P - (taken_off + np.swapaxes(taken_off, 1, 2))
-    return x, P
+    nu, S, R = (each[:, part] for each in (nu, S, R))
+    weight = taken / S
+    square = weight * weight
+    b, rows = 2.0 * weight - square * R, slice(TOLD.start + part.start, TOLD.start + part.stop)
+    columns = P[:, rows].copy()
+    for j in range(nu.shape[1]):
+        column = columns[:, j]
+        told = column[:, rows]
+        b[:, j] -= square[:, j] * told[:, j]
+        columns[:, j + 1 :] -= (b[:, j, None] * told[:, j + 1 :])[:, :, None] * column[:, None]
+    x = x + ((weight * nu)[:, None] @ columns)[:, 0]
+    root = np.sqrt(b)[:, :, None] * columns
+    return x, P - np.swapaxes(root, 1, 2) @ root
 
 
 @dataclass

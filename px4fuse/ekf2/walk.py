@@ -23,6 +23,7 @@ import pandas as pd
 
 from px4fuse.arrays import Array
 from px4fuse.display import Shown
+from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, aids_of, delayed_variants
 from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import Ekf2Replay, Spans, along, rms_to_truth, settled
@@ -195,8 +196,8 @@ def walk(
         return model.agreement.doubted(WHAT)
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    variants = _variants(model, settings or Settings())
-    delayed, flown = delayed_variants(model, list(variants.values()))
+    variants = on_the_way(model.inputs, settings or Settings())
+    delayed, flown = delayed_variants(model, list(variants.values())), model.obedient
     judged, times = model.flown.judged_s, ekf2.state.index.to_numpy()
     inside = settled(times, judged)
     # all stages have the replay's times
@@ -215,7 +216,7 @@ def walk(
     directions = directions or {"north": np.eye(3)[0], "east": np.eye(3)[1]}
     ungated, stages = flown.delayed, []
     # one at a time: each is as long as the flight
-    tracks = chain(delayed, (flown.delayed, flown.published, ekf2.state))
+    tracks = chain(delayed, (flown.published, ekf2.state))
     for stage, track in zip((*variants, OUTPUT, "EKF2 as logged"), tracks, strict=True):
         stages.append(
             [
@@ -237,10 +238,10 @@ def walk(
     return found
 
 
-def _variants(model: Model, ours: Settings) -> dict[str, Variant]:
+def on_the_way(inputs: Inputs, ours: Settings) -> dict[str, Variant]:
     """The filter after each step but the last; from one to the next, one thing changes."""
-    flown, aid, received = model.inputs.settings, model.inputs.aid, model.inputs.received
-    spread = {"EKF2_ACC_NOISE": float(ours.sigma_a_m_s2 * np.sqrt(ours.dt_s / model.inputs.step_s))}
+    flown, aid, received = inputs.settings, inputs.aid, inputs.received
+    spread = {"EKF2_ACC_NOISE": float(ours.sigma_a_m_s2 * np.sqrt(ours.dt_s / inputs.step_s))}
     own = {**flown, **spread, aid.noise: ours.sigma_z_m}
     # from positions of GNSS, which ours is given, the delay was taken already
     taken_s = flown[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
@@ -258,7 +259,7 @@ def _variants(model: Model, ours: Settings) -> dict[str, Variant]:
         PROCESS: replace(noise, settings=flown, biases=True),
         ATTITUDE: (last := replace(noise, settings=flown, biases=True, attitude=True)),
     }
-    aids = aids_of(model.inputs)
+    aids = aids_of(inputs)
     if MAG.name in aids:
         variants[FIELD] = last = replace(last, without={FLOW.name: 0.0})
     if received.velocity_m_s is not None:
