@@ -1,7 +1,5 @@
 """One track fitted to another: lag by cross-correlation, then lag, yaw and origin."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

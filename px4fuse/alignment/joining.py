@@ -1,7 +1,5 @@
 """Two recordings of one flight on one clock: what one lacks, the other gives."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Tracks of a position file and of its references, on one time grid and in north, east, down."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 Python projects, integrates and judges EKF2; the page only replays our filter.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import msgspec

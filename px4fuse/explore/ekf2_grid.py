@@ -4,8 +4,6 @@ Only where the model of EKF2 agrees with the log, and only at the stops: nothing
 made up.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping
 from typing import Any

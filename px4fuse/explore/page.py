@@ -1,7 +1,5 @@
 """The page as one file: Bokeh, the flights' data, the engine and what moves them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from importlib.metadata import version
 from importlib.resources import files

@@ -1,7 +1,5 @@
 """What is wrong with the IMU, bias, clipping, gaps, too low a rate; and a vehicle that tumbled."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 

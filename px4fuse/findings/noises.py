@@ -6,8 +6,6 @@ fitted together, so that they are put right together: the one that is further of
 setting that nobody chose is advice, one step less severe than one that was.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeGuard

@@ -1,7 +1,5 @@
 """A cause that a replay has shown, in words: what it is, what it does, and what puts it right."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from px4fuse.analysis import Analysis

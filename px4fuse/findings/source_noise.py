@@ -3,8 +3,6 @@
 Neither filter has a state for it: R describes white noise of one size.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from itertools import pairwise
 

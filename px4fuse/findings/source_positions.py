@@ -5,8 +5,6 @@ How well a log can show a scale: six passes at 5 Hz and 0.10 m give it to 3.5 % 
 measure or the truth.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict
 
 import numpy as np

@@ -4,8 +4,6 @@ How well both filters did along the axis of the lab, then what weighs most: the 
 why EKF2 differs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 
 import numpy as np

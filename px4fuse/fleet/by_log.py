@@ -1,7 +1,5 @@
 """Rows of the fleet's table, one per axis, as one log each."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import PurePosixPath

@@ -1,7 +1,5 @@
 """What changed between two flights, or two settings of one flight: ``px4fuse diff``."""
 
-from __future__ import annotations
-
 import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """A fleet as one web page: a log per row, and on top what a fleet's owner asks."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Logs → the fleet's table: each log compared by a worker, its rows kept, the table written."""
 
-from __future__ import annotations
-
 import io
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator

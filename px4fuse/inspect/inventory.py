@@ -1,7 +1,5 @@
 """What is in a log, what can be done with it, and what to change before the next flight."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime

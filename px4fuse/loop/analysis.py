@@ -1,7 +1,5 @@
 """A loop from what was given: which part, where it ended, what it is scored against."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The paths of a loop: its closures judged, the path corrected in several ways, each scored."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Trajectories from files of their own, or out of a flight: odometry, EKF2, our filter, truth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args

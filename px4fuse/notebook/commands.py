@@ -1,7 +1,5 @@
 """``compare``, ``close_loop``, ``evaluate``, ``what_if``, ``report`` and ``explore`` in Python."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args

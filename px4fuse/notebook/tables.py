@@ -1,7 +1,5 @@
 """Results in words and as tables; importing this module teaches them both."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from textwrap import wrap
 from typing import Any

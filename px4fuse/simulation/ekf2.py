@@ -11,8 +11,6 @@ that what a student's filter is fed with does not depend on EKF2's parameters; t
 attitude is in estimator_states.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Scenario and mistakes to a flight: in memory, as ULog, and the answer for the instructor."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
