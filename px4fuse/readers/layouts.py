@@ -1,7 +1,5 @@
 """How a topic or message holds a quantity: the rows of which the tables of both formats consist."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 

@@ -4,8 +4,6 @@ Which message is what, its direction and its clock follow PX4's ``src/modules/ma
 v1.16) and MAVLink's ``common.xml``; ``mavlink_messages`` holds them as tables.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType

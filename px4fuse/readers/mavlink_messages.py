@@ -6,8 +6,6 @@ Sources: MAVLink ``common.xml``; PX4 ``src/modules/mavlink/mavlink_receiver.cpp`
 ``streams/*.hpp`` (v1.13 to v1.16).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple

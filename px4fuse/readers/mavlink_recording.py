@@ -1,7 +1,5 @@
 """One MAVLink recording with its vehicle chosen and its clocks settled."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

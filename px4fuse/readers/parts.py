@@ -1,7 +1,5 @@
 """What readers of all formats make alike: usable rows, stretches of time, what is missing."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

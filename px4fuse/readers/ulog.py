@@ -1,7 +1,5 @@
 """PX4 ULog to :class:`~px4fuse.flight.Flight`, for PX4 v1.9 to today."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
