@@ -272,11 +272,8 @@ def _(clock: ClockOffset) -> str:
 @frame.register
 def _(clock: ClockOffset) -> pd.DataFrame:
     """The whole flight first, then its consecutive parts."""
-    rows = [("flight", np.nan, np.nan, clock.offset_s, clock.sigma_s)]
-    rows += [
-        (f"part {at}", part.start_s, part.end_s, part.offset_s, part.sigma_s)
-        for at, part in enumerate(clock.parts, 1)
-    ]
+    rows = [{"part": "flight", "offset_s": clock.offset_s, "sigma_s": clock.sigma_s}]
+    rows += [{"part": f"part {at}"} | row(part) for at, part in enumerate(clock.parts, 1)]
     return pd.DataFrame(rows, columns=["part", "start_s", "end_s", "offset_s", "sigma_s"])
 
 
@@ -315,9 +312,7 @@ def _(trajectory: Trajectory) -> pd.DataFrame:
         trajectory.position_m, pd.Index(trajectory.time_s, name="time_s"), columns=names
     )
     if trajectory.rotation is not None:
-        x, y, z, w = trajectory.rotation.as_quat().T
-        for name, part in zip(QUATERNION_COLUMNS, (w, x, y, z), strict=True):
-            table[name] = part
+        table[QUATERNION_COLUMNS] = trajectory.rotation.as_quat(scalar_first=True)
     return table
 
 
