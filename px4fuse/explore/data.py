@@ -211,13 +211,15 @@ def _signals(
 
 def _others(analysis: Analysis, result: AxisComparison, packer: Packer) -> dict[str, Any]:
     """What stands beside our filter along one axis."""
+    name = result.axis.name
     return {
         "called": result.axis.called,
         "heading": result.axis.heading_deg,
         "note": result.axis.note,
         "direction": result.axis.direction.tolist(),
         "bands": _bands(len(result.axis.measurement_time_s), packer),
-        "map": _map_of(analysis, result.axis.name),
+        # the joint likelihood map of the horizontal axes where there is one, or its own
+        "map": HORIZONTAL if name != "down" and HORIZONTAL in analysis.tuning else name,
         "ekf2": _ekf2(analysis, result, packer),
         "truth": _truth(result, packer),
     }
@@ -288,11 +290,6 @@ def _frame(frame: pd.DataFrame, columns: list[str], packer: Packer) -> list[int]
     """Places of the times and of some columns."""
     values = [packer.add(frame[column].to_numpy(), COARSE) for column in columns]
     return [packer.add_times(frame.index.to_numpy()), *values]
-
-
-def _map_of(analysis: Analysis, name: str) -> str:
-    """Which likelihood map tells of an axis: the joint one of the horizontal axes, or its own."""
-    return HORIZONTAL if name != "down" and HORIZONTAL in analysis.tuning else name
 
 
 def _maps(analysis: Analysis) -> dict[str, Any]:

@@ -38,9 +38,12 @@ def initialise(graph: PoseGraph) -> PoseGraph:
     TrajectoryError
         If the graph falls into parts, or its edges do not determine its poses.
     """
-    if np.any(model.odometry_chain(graph) < 0):
+    chain = model.odometry_chain(graph)
+    if np.any(chain < 0):
         return _chordal(graph)
-    started = model.composed(graph)
+    steps = lie.chain(model.odometry_steps(graph, chain))
+    poses = lie.compose(graph.poses[:1], steps)
+    started = replace(graph, poses=poses, initialised=model.FROM_ODOMETRY)
     try:
         return min(started, _chordal(graph), key=model.cost)
     except TrajectoryError:  # rotations that only odometry tells

@@ -137,21 +137,6 @@ def observed_directions(information: Array) -> tuple[Array, Array]:
     return scale[:, None] * vectors[:, seen], 1.0 / values[seen]
 
 
-def ranks(information: Array) -> IntArray:
-    """Degrees of freedom of measurements: ranks of their information.
-
-    Parameters
-    ----------
-    information : ndarray, shape (m, d, d)
-
-    Returns
-    -------
-    ndarray of int, shape (m,)
-    """
-    made: IntArray = np.sum(np.linalg.eigvalsh(unit_diagonal(information)[1]) > OBSERVED, axis=1)
-    return made
-
-
 def unit_diagonal(matrices: Array) -> tuple[Array, Array]:
     """Roots of the diagonals of matrices, and the matrices divided by them; what is 0 stays 0."""
     scale = np.sqrt(np.clip(np.diagonal(matrices, axis1=-2, axis2=-1), 0.0, None))
@@ -187,13 +172,6 @@ def require_connected(graph: PoseGraph, used: BoolArray, what: str) -> None:
             f"{graph.ids[0]} by {what}",
             "Add an edge between the parts, or solve them one by one.",
         )
-
-
-def composed(graph: PoseGraph) -> PoseGraph:
-    """The same graph with poses along its odometry, which has no gap, from the first pose on."""
-    steps = odometry_steps(graph, odometry_chain(graph))
-    poses = lie.compose(graph.poses[:1], lie.chain(steps))
-    return replace(graph, poses=poses, initialised=FROM_ODOMETRY)
 
 
 def odometry_chain(graph: PoseGraph, without: IntArray | None = None) -> IntArray:
