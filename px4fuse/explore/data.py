@@ -33,7 +33,7 @@ from px4fuse.findings.causes import NOISES
 from px4fuse.findings.hidden_errors import hidden_error
 from px4fuse.findings.model import Finding, by_root
 from px4fuse.findings.story import story
-from px4fuse.flight import POSITION_COLUMNS, PositionTrack, Unavailable
+from px4fuse.flight import Columns, PositionTrack, Unavailable
 from px4fuse.request import ComparisonRequest, command_line
 
 # How far the stamps can be moved on the page; --clock-offset takes more
@@ -194,7 +194,7 @@ def _signals(
     """One axis: measurements as they were stamped, also beyond the segment, and acceleration."""
     segment = comparison.segment
     time = raw.samples.index.to_numpy()
-    value = along(raw.samples, POSITION_COLUMNS, axis.direction)
+    value = along(raw.samples, Columns.POSITION, axis.direction)
     reach = OFFSET_REACH_S + abs(comparison.settings.clock_offset_s)
     near = (time >= segment.start_s - reach) & (time <= segment.end_s + reach)
     near &= np.isfinite(value)
@@ -310,11 +310,11 @@ def _maps(analysis: Analysis) -> dict[str, Any]:
 def _plan(comparison: Comparison, packer: Packer) -> list[int] | str:
     """The source's track seen from above: places of time, north and east."""
     samples = within(comparison.source.samples, comparison.segment)
-    track = samples[POSITION_COLUMNS[:2]].dropna()
+    track = samples[Columns.POSITION[:2]].dropna()
     if not len(track):
         return "the source has no horizontal position"
     some = track.iloc[:: max(1, -(-len(track) // MAX_PLAN_POINTS))]
-    return _frame(some, POSITION_COLUMNS[:2], packer)
+    return _frame(some, Columns.POSITION[:2], packer)
 
 
 def _finding(finding: Finding) -> dict[str, Any]:

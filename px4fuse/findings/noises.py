@@ -50,7 +50,7 @@ from px4fuse.findings.since import (
     reason_words,
 )
 from px4fuse.findings.source_positions import hardly_moved
-from px4fuse.flight import POSITION_VARIANCE_COLUMNS, Unavailable, sample_rate
+from px4fuse.flight import Columns, Unavailable, sample_rate
 from px4fuse.plain import factor_words, number_words
 
 NOISE_OFF = 1.5  # times, in standard deviation; below, the tracks hardly change
@@ -305,7 +305,7 @@ def _above_stated(analysis: Analysis) -> str:
     """What to set where EKF2's parameter holds R above the accuracy that a receiver states."""
     name = aid_of(analysis).noise
     least_m = analysis.flight.log.parameters.get(name, float("nan"))
-    stated = within(analysis.source.samples, analysis.segment)[POSITION_VARIANCE_COLUMNS[0]]
+    stated = within(analysis.source.samples, analysis.segment)[Columns.POSITION_VARIANCE[0]]
     stated_m = float(np.sqrt(stated.median()))
     if not least_m > NOISE_FITS * stated_m:  # false for NaN too
         return ""

@@ -19,15 +19,7 @@ from px4fuse.filter.heading import HeadingError
 from px4fuse.filter.tuning import AxisTuning, Noise
 from px4fuse.findings import SEVERITIES, find
 from px4fuse.findings.story import story
-from px4fuse.flight import (
-    POSITION_COLUMNS,
-    QUATERNION_COLUMNS,
-    Ekf2,
-    Flight,
-    Truth,
-    Unavailable,
-    sample_rate,
-)
+from px4fuse.flight import Columns, Ekf2, Flight, Truth, Unavailable, sample_rate
 from px4fuse.loop.model import Loop
 from px4fuse.record import Record, written
 from px4fuse.report.evaluation import interval_words, summary
@@ -94,10 +86,10 @@ def _(flight: Flight) -> str:
 def _(flight: Flight) -> pd.DataFrame:
     """Positions, one below the other: ``track, time_s, north_m, east_m, down_m``."""
     parts = [
-        samples[POSITION_COLUMNS].reset_index().assign(track=name)
+        samples[Columns.POSITION].reset_index().assign(track=name)
         for name, samples in tracks(flight)
     ]
-    columns = ["track", "time_s", *POSITION_COLUMNS]
+    columns = ["track", "time_s", *Columns.POSITION]
     if not parts:
         return pd.DataFrame(columns=columns)
     return pd.concat(parts, ignore_index=True)[columns]
@@ -312,7 +304,7 @@ def _(trajectory: Trajectory) -> pd.DataFrame:
         trajectory.position_m, pd.Index(trajectory.time_s, name="time_s"), columns=names
     )
     if trajectory.rotation is not None:
-        table[QUATERNION_COLUMNS] = trajectory.rotation.as_quat(scalar_first=True)
+        table[Columns.QUATERNION] = trajectory.rotation.as_quat(scalar_first=True)
     return table
 
 

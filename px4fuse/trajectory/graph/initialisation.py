@@ -38,12 +38,9 @@ def initialise(graph: PoseGraph) -> PoseGraph:
     TrajectoryError
         If the graph falls into parts, or its edges do not determine its poses.
     """
-    chain = model.odometry_chain(graph)
-    if np.any(chain < 0):
+    if np.any(model.odometry_chain(graph) < 0):
         return _chordal(graph)
-    steps = lie.chain(model.odometry_steps(graph, chain))
-    poses = lie.compose(graph.poses[:1], steps)
-    started = replace(graph, poses=poses, initialised=model.FROM_ODOMETRY)
+    started = model.composed(graph)
     try:
         return min(started, _chordal(graph), key=model.cost)
     except TrajectoryError:  # rotations that only odometry tells

@@ -174,6 +174,13 @@ def require_connected(graph: PoseGraph, used: BoolArray, what: str) -> None:
         )
 
 
+def composed(graph: PoseGraph) -> PoseGraph:
+    """The same graph with poses along its odometry, which has no gap, from the first pose on."""
+    steps = odometry_steps(graph, odometry_chain(graph))
+    poses = lie.compose(graph.poses[:1], lie.chain(steps))
+    return replace(graph, poses=poses, initialised=FROM_ODOMETRY)
+
+
 def odometry_chain(graph: PoseGraph, without: IntArray | None = None) -> IntArray:
     """The edge that leads from each pose to the next, -1 where there is none.
 
