@@ -17,16 +17,11 @@ from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.explore.ekf2_grid import grid_data, judged_numbers
 from px4fuse.explore.packing import COARSE, Packer
+from px4fuse.filter import settings as allowed
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.consistency import CONFIDENCE, nis_band
 from px4fuse.filter.model import INITIAL_COVARIANCE
-from px4fuse.filter.settings import (
-    CLOCK_OFFSET_RANGE_S,
-    DT_RANGE_S,
-    SIGMA_A_RANGE_M_S2,
-    SIGMA_Z_RANGE_M,
-    Settings,
-)
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, along, imu_gaps, within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.causes import NOISES
@@ -127,10 +122,10 @@ def _grid(
 def ranges() -> dict[str, Any]:
     """What the settings may be, as the command line takes them, and the lesson's values."""
     return {
-        "sigma-a": list(SIGMA_A_RANGE_M_S2),
-        "sigma-z": list(SIGMA_Z_RANGE_M),
-        "dt": list(DT_RANGE_S),
-        "clock-offset": list(CLOCK_OFFSET_RANGE_S),
+        "sigma-a": list(allowed.SIGMA_A_RANGE_M_S2),
+        "sigma-z": list(allowed.SIGMA_Z_RANGE_M),
+        "dt": list(allowed.DT_RANGE_S),
+        "clock-offset": list(allowed.CLOCK_OFFSET_RANGE_S),
         "lesson": _settings(Settings()),
         "running": [RUNNING, *nis_band(RUNNING)],
         "hidden": [NEES_LARGE, CONTENT_NIS],
