@@ -1,7 +1,5 @@
 """Quaternions w, x, y, z as arrays of shape (..., 4); Hamilton product, as in PX4."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from px4fuse.arrays import Array
@@ -68,23 +66,26 @@ def skew(v: Array) -> Array:
     return from_elements((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
 
 
-def running(product: Callable[[Array, Array], Array], parts: Array) -> Array:
-    """Products of the first 1, 2, ..., n parts, shape (n, ...).
-
-    Doubles the length of what is composed, so that log2(n) passes over arrays do.
-    """
-    made, reach = parts.copy(), 1
-    while reach < len(made):
-        made[reach:] = product(made[:-reach], made[reach:])
-        reach *= 2
-    return made
-
-
 def running_product(turns: Array) -> Array:
-    """Products q_0, q_0 ⊗ q_1, q_0 ⊗ q_1 ⊗ q_2 and so on, shape (n, 4)."""
-    made = running(multiply, turns)
-    made /= np.linalg.norm(made, axis=1, keepdims=True)
-    return made
+    """Products q_0, q_0 ⊗ q_1, q_0 ⊗ q_1 ⊗ q_2 and so on, shape (n, 4).
+
+    In √n columns side by side, so that n products take about 2√n vectorised steps.
+    """
+    n = len(turns)
+    width = max(1, int(np.sqrt(n)))
+    rows = -(-n // width)
+    identity = np.array([1.0, 0.0, 0.0, 0.0])
+    padded = np.concatenate([turns, np.tile(identity, (rows * width - n, 1))])
+    # row r holds turns r·width to (r+1)·width
+    blocks = padded.reshape(rows, width, 4).copy()
+    for column in range(1, width):
+        blocks[:, column] = multiply(blocks[:, column - 1], blocks[:, column])
+    before = np.tile(identity, (rows, 1))
+    for row in range(1, rows):
+        before[row] = multiply(before[row - 1], blocks[row - 1, -1])
+    product = multiply(before[:, None, :], blocks).reshape(-1, 4)[:n]
+    unit: Array = product / np.linalg.norm(product, axis=1, keepdims=True)
+    return unit
 
 
 def interpolate(times: Array, known_times: Array, known: Array) -> Array:

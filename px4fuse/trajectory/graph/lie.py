@@ -14,7 +14,7 @@ from numpy.polynomial.polynomial import polyval
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array
-from px4fuse.trajectory.rotation import from_elements, running, skew
+from px4fuse.trajectory.rotation import from_elements, skew
 
 # Below this angle (rad) series replace quotients that cancel; five terms then reach 1e-14
 SMALL = 0.3
@@ -191,6 +191,8 @@ def _commutator(tangent: Array) -> Array:
 def chain(steps: Array) -> Array:
     """Poses along a chain of motions: the products of the first 0, 1, ..., n of them.
 
+    Doubles the length of what is composed, so that log2(n) passes over arrays do.
+
     Parameters
     ----------
     steps : ndarray, shape (n, 3) or (n, 7)
@@ -199,7 +201,12 @@ def chain(steps: Array) -> Array:
     -------
     ndarray, shape (n + 1, 3) or (n + 1, 7)
     """
-    return running(compose, np.vstack([identity(steps.shape[-1]), steps]))
+    made = np.vstack([identity(steps.shape[-1]), steps])
+    reach = 1
+    while reach < len(made):
+        made[reach:] = compose(made[:-reach], made[reach:])
+        reach *= 2
+    return made
 
 
 def _turn(pose: Array) -> Rotation:
