@@ -7,8 +7,6 @@ Source: PX4-Autopilot ``src/modules/ekf2/module.yaml`` and ``params_*.yaml`` (be
 ``ekf2_params.c``), read from v1.12 to main.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -15,8 +15,6 @@ as Python does, in backticks (`sigma_z_m`); the command line puts its options in
 (:func:`px4fuse.request.with_options`), prints it on standard error and ends with exit code 2.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 

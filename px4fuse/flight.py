@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 import pandas as pd
@@ -33,34 +33,57 @@ BURST_SHARE = 0.8
 # Methods of a ClockMap that know no time of measurement
 ARRIVAL_METHODS = ("arrival time", "receive time", "position in the stream")
 AXIS_NAMES: tuple[AxisName, AxisName, AxisName] = ("north", "east", "down")
-POSITION_COLUMNS = ["north_m", "east_m", "down_m"]
-VELOCITY_COLUMNS = ["north_m_s", "east_m_s", "down_m_s"]
-STATE_COLUMNS = POSITION_COLUMNS + VELOCITY_COLUMNS
-POSITION_VARIANCE_COLUMNS = ["north_m2", "east_m2", "down_m2"]
-VELOCITY_VARIANCE_COLUMNS = ["north_m2_s2", "east_m2_s2", "down_m2_s2"]
-SPECIFIC_FORCE_COLUMNS = ["forward_m_s2", "right_m_s2", "down_m_s2"]
-ANGULAR_RATE_COLUMNS = ["forward_rad_s", "right_rad_s", "down_rad_s"]
-QUATERNION_COLUMNS = ["w", "x", "y", "z"]
-ROTATION_VARIANCE_COLUMNS = ["forward_rad2", "right_rad2", "down_rad2"]
-# What EKF2's filter holds at its fusion horizon, whatever the PX4 release logs it as
-GYRO_BIAS_COLUMNS = [f"gyro_bias_{axis}_rad_s" for axis in ("forward", "right", "down")]
-ACCELEROMETER_BIAS_COLUMNS = [
-    f"accelerometer_bias_{axis}_m_s2" for axis in ("forward", "right", "down")
-]
-EARTH_FIELD_COLUMNS = [f"earth_field_{axis}_gauss" for axis in AXIS_NAMES]
-BODY_FIELD_COLUMNS = [f"body_field_{axis}_gauss" for axis in ("forward", "right", "down")]
-DELAYED_STATE_COLUMNS = [
-    *QUATERNION_COLUMNS, *VELOCITY_COLUMNS, *POSITION_COLUMNS, *GYRO_BIAS_COLUMNS,
-    *ACCELEROMETER_BIAS_COLUMNS, *EARTH_FIELD_COLUMNS, *BODY_FIELD_COLUMNS,
-]  # fmt: skip
-DELAYED_VARIANCE_COLUMNS = [
-    *(f"attitude_{axis}_rad2" for axis in AXIS_NAMES),
-    *VELOCITY_VARIANCE_COLUMNS,
-    *POSITION_VARIANCE_COLUMNS,
-    *(f"{name.removesuffix('_rad_s')}_rad2_s2" for name in GYRO_BIAS_COLUMNS),
-    *(f"{name.removesuffix('_m_s2')}_m2_s4" for name in ACCELEROMETER_BIAS_COLUMNS),
-    *(f"{name}2" for name in (*EARTH_FIELD_COLUMNS, *BODY_FIELD_COLUMNS)),
-]  # fmt: skip
+
+
+class Columns:
+    """Names of columns of all tables of a flight, with their units."""
+
+    POSITION: Final = ["north_m", "east_m", "down_m"]
+    VELOCITY: Final = ["north_m_s", "east_m_s", "down_m_s"]
+    STATE: Final = POSITION + VELOCITY
+    POSITION_VARIANCE: Final = ["north_m2", "east_m2", "down_m2"]
+    VELOCITY_VARIANCE: Final = ["north_m2_s2", "east_m2_s2", "down_m2_s2"]
+    SPECIFIC_FORCE: Final = ["forward_m_s2", "right_m_s2", "down_m_s2"]
+    ANGULAR_RATE: Final = ["forward_rad_s", "right_rad_s", "down_rad_s"]
+    QUATERNION: Final = ["w", "x", "y", "z"]
+    ROTATION_VARIANCE: Final = ["forward_rad2", "right_rad2", "down_rad2"]
+    # What EKF2's filter holds at its fusion horizon, whatever the PX4 release logs it as
+    GYRO_BIAS: Final = [f"gyro_bias_{axis}_rad_s" for axis in ("forward", "right", "down")]
+    ACCELEROMETER_BIAS: Final = [
+        f"accelerometer_bias_{axis}_m_s2" for axis in ("forward", "right", "down")
+    ]
+    EARTH_FIELD: Final = [f"earth_field_{axis}_gauss" for axis in AXIS_NAMES]
+    BODY_FIELD: Final = [f"body_field_{axis}_gauss" for axis in ("forward", "right", "down")]
+    DELAYED_STATE: Final = [
+        *QUATERNION, *VELOCITY, *POSITION, *GYRO_BIAS,
+        *ACCELEROMETER_BIAS, *EARTH_FIELD, *BODY_FIELD,
+    ]  # fmt: skip
+    DELAYED_VARIANCE: Final = [
+        *(f"attitude_{axis}_rad2" for axis in AXIS_NAMES),
+        *VELOCITY_VARIANCE,
+        *POSITION_VARIANCE,
+        *(f"{name.removesuffix('_rad_s')}_rad2_s2" for name in GYRO_BIAS),
+        *(f"{name.removesuffix('_m_s2')}_m2_s4" for name in ACCELEROMETER_BIAS),
+        *(f"{name}2" for name in (*EARTH_FIELD, *BODY_FIELD)),
+    ]  # fmt: skip
+
+
+# For who imports them one by one
+POSITION_COLUMNS = Columns.POSITION
+VELOCITY_COLUMNS = Columns.VELOCITY
+STATE_COLUMNS = Columns.STATE
+POSITION_VARIANCE_COLUMNS = Columns.POSITION_VARIANCE
+VELOCITY_VARIANCE_COLUMNS = Columns.VELOCITY_VARIANCE
+SPECIFIC_FORCE_COLUMNS = Columns.SPECIFIC_FORCE
+ANGULAR_RATE_COLUMNS = Columns.ANGULAR_RATE
+QUATERNION_COLUMNS = Columns.QUATERNION
+ROTATION_VARIANCE_COLUMNS = Columns.ROTATION_VARIANCE
+GYRO_BIAS_COLUMNS = Columns.GYRO_BIAS
+ACCELEROMETER_BIAS_COLUMNS = Columns.ACCELEROMETER_BIAS
+EARTH_FIELD_COLUMNS = Columns.EARTH_FIELD
+BODY_FIELD_COLUMNS = Columns.BODY_FIELD
+DELAYED_STATE_COLUMNS = Columns.DELAYED_STATE
+DELAYED_VARIANCE_COLUMNS = Columns.DELAYED_VARIANCE
 
 
 @dataclass(frozen=True)

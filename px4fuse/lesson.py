@@ -3,8 +3,6 @@
 Source: UAT 366, module 2, "SLAM and sensor fusion", Examples 1 and 2.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

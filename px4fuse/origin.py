@@ -1,7 +1,5 @@
 """Where a position comes from and how it got here, with all that follows from it."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from msgspec.structs import replace

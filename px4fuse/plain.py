@@ -1,7 +1,5 @@
 """Results as plain data: what JSON can hold, without NaN; and numbers as people read them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass

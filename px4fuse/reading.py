@@ -4,8 +4,6 @@ A device, a named pipe or a socket may never end or may block; a sparse file may
 memory. So a file is looked at before it is opened, and no more than its limit is read.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import stat

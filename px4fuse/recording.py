@@ -1,7 +1,5 @@
 """What a recording is: the log, its senders and clocks, and what was read from where."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal

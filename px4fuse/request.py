@@ -4,8 +4,6 @@ A request is what :func:`px4fuse.analysis.run` takes and what the results record
 can be made again without its command line.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

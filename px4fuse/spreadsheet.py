@@ -1,7 +1,5 @@
 """Text of strangers in tables for spreadsheets, where none of it is run as a formula."""
 
-from __future__ import annotations
-
 import re
 import unicodedata
 

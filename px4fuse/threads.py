@@ -1,7 +1,5 @@
 """One thread for linear algebra: the matrices here are small, and more threads only wait."""
 
-from __future__ import annotations
-
 # Read by libraries as they are loaded, before any code of ours runs
 ONE_THREAD = {
     "OMP_NUM_THREADS": "1",

@@ -1,7 +1,5 @@
 """Numbers as people type them, with the units that they may add."""
 
-from __future__ import annotations
-
 import re
 
 NAMES = {

@@ -1,7 +1,5 @@
 """Writing results so that a failed run leaves nothing behind and overwrites nothing."""
 
-from __future__ import annotations
-
 import errno
 import os
 import secrets

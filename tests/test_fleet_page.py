@@ -16,8 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_fleet import DAMAGED, NOT_LOGGED, STORY, VEHICLES, made_up
 
-from px4fuse.fleet.by_log import logs_of
-from px4fuse.fleet.page import html_text
+from px4fuse.fleet.page import html_text, logs_of
 from px4fuse.webpage.charts import Scale, tenths
 from px4fuse.webpage.frame import PAGE_ROWS
 

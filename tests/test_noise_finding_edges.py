@@ -56,7 +56,7 @@ def no_replay(monkeypatch: pytest.MonkeyPatch) -> None:
     def words(_: Any, changed: Settings, typed: str, unseen_nats: float | None = None) -> str:
         return f"[{typed}|{changed.sigma_z_m:g}|{changed.sigma_a_m_s2:g}|{unseen_nats}]."
 
-    monkeypatch.setattr(noises, "filter_words", words)
+    monkeypatch.setattr(noises.remedy, "filter_words", words)
 
 
 # ---------------------------------------------------------------- SIGMA_Z and SIGMA_A
@@ -280,7 +280,7 @@ def test_what_a_cause_asks_for(
         ((name, value),) = changes.items()
         return f"{{{name}: {value:g} {PARAMETERS[name].unit}|{helps.__name__}}}", True
 
-    monkeypatch.setattr(since, "remedy_words", words)
+    monkeypatch.setattr(since.remedy, "remedy_words", words)
     model = SimpleNamespace(inputs=SimpleNamespace(settings=dict.fromkeys(PARAMETERS, 1.0)))
     # what explains less, and what explains the other way, is none
     causes = (tried(owner, {"sigma_z_m": 7.0}, explains=0.4), tried(owner, change),

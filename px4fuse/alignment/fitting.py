@@ -1,7 +1,5 @@
 """One track fitted to another: lag by cross-correlation, then lag, yaw and origin."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -63,8 +61,6 @@ class Fit(Peak):
         Normalised covariance of reference and file before the yaw: its angle is the best yaw.
     horizontal_rms_m, rms_m : float
         Capped residual: per horizontal axis; and of the vector, with height where both have it.
-    overlap_s : float
-        From the first to the last sample that was used.
     """
 
     lag_sigma_s: float | None
@@ -74,7 +70,6 @@ class Fit(Peak):
     coherence: complex
     horizontal_rms_m: float
     rms_m: float
-    overlap_s: float
 
 
 def correlation_peak(file: OwnTrack, reference: OwnTrack, yaw_rad: float | None) -> Peak:
@@ -207,7 +202,6 @@ def least_squares_fit(
         coherence=coherence,
         horizontal_rms_m=float(horizontal_rms),
         rms_m=float(np.sqrt(2.0 * horizontal_rms**2 + vertical_rms**2)),
-        overlap_s=float(time[-1] - time[0]),
     )
 
 

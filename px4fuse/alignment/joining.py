@@ -1,7 +1,5 @@
 """Two recordings of one flight on one clock: what one lacks, the other gives."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
@@ -11,7 +9,7 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.errors import MissingDataError
-from px4fuse.flight import POSITION_COLUMNS, Ekf2, Flight, Unavailable, best_first
+from px4fuse.flight import Columns, Ekf2, Flight, Unavailable, best_first
 from px4fuse.readers.parts import missing_parts
 from px4fuse.recording import InputFile
 
@@ -130,8 +128,8 @@ def _agreement(flight: Flight, other: Flight) -> str:
         mine, theirs = flight.ekf2.state, other.ekf2.state
         at = theirs.index[(theirs.index >= mine.index[0]) & (theirs.index <= mine.index[-1])]
         if len(at) >= MIN_COMMON_SAMPLES:
-            ours = np.column_stack([np.interp(at, mine.index, mine[c]) for c in POSITION_COLUMNS])
-            apart = np.linalg.norm(ours - theirs.loc[at, POSITION_COLUMNS].to_numpy(), axis=1)
+            ours = np.column_stack([np.interp(at, mine.index, mine[c]) for c in Columns.POSITION])
+            apart = np.linalg.norm(ours - theirs.loc[at, Columns.POSITION].to_numpy(), axis=1)
             median = float(np.median(apart))
             if median > MAX_POSITION_DIFFERENCE_M:
                 raise MissingDataError(

@@ -1,7 +1,5 @@
 """The position file matched with EKF2 or the IMU, in the frame that fits, or refused."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import partial
 

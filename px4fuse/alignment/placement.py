@@ -10,8 +10,6 @@ clock is found in two steps: over all lags by masked cross-correlation through t
 reference: an EKF2 that was fed with late positions is late itself, and the clock offset with it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Literal

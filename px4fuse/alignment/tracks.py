@@ -1,7 +1,5 @@
 """Tracks of a position file and of its references, on one time grid and in north, east, down."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,14 +11,7 @@ from scipy.signal import butter, sosfiltfilt
 from px4fuse.arrays import Array, BoolArray, Complex
 from px4fuse.comparison.projection import continuous_state
 from px4fuse.filter.signals import Segment, ned_acceleration
-from px4fuse.flight import (
-    POSITION_COLUMNS,
-    POSITION_VARIANCE_COLUMNS,
-    Ekf2,
-    Flight,
-    PositionTrack,
-    Unavailable,
-)
+from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Unavailable
 from px4fuse.origin import GIVEN_FILE
 from px4fuse.readers.parts import finite_rows
 from px4fuse.trajectory.association import bracketed, gap_limit
@@ -129,11 +120,11 @@ def horizontal_range_m(track: OwnTrack) -> float:
 
 def _ekf2_track(state: pd.DataFrame) -> OwnTrack:
     """EKF2's position on the grid, smoothed."""
-    known = finite_rows(state, POSITION_COLUMNS[:2])
+    known = finite_rows(state, Columns.POSITION[:2])
     if len(known) < MIN_SAMPLES:
         raise NoMatchError("EKF2 has no horizontal position in this log")
     raw = OwnTrack(
-        known.index.to_numpy(), known[POSITION_COLUMNS].to_numpy(), np.ones(len(known), dtype=bool)
+        known.index.to_numpy(), known[Columns.POSITION].to_numpy(), np.ones(len(known), dtype=bool)
     )
     grid = on_grid(raw)
     smooth = gaussian_filter1d(grid.position_m, SMOOTHING_S / STEP_S, axis=0, mode="nearest")
@@ -157,7 +148,7 @@ def ekf2_references(flight: Flight) -> list[OwnTrack]:
     if resets:
         after = state.index.to_numpy()[:, None] >= np.array([reset.time_s for reset in resets])
         moved = after @ np.array([(*reset.delta[:2], 0.0) for reset in resets])
-        states.append(state.assign(**(state[POSITION_COLUMNS] - moved)))
+        states.append(state.assign(**(state[Columns.POSITION] - moved)))
     references = [_ekf2_track(state) for state in states]
     if max(map(horizontal_range_m, references)) < MIN_MOTION_M:
         raise NoMatchError("EKF2's position hardly moves")
@@ -191,7 +182,7 @@ def placed_samples(
         turn = np.array([[c, -s], [s, c]])
         position[:, :2] = position[:, :2] @ turn.T
         variance[:, :2] = variance[:, :2] @ (turn**2).T
-    columns = POSITION_COLUMNS + POSITION_VARIANCE_COLUMNS
+    columns = Columns.POSITION + Columns.POSITION_VARIANCE
     values = np.hstack([position + origin_m, variance])
     return pd.DataFrame(
         dict(zip(columns, values.T, strict=True)),

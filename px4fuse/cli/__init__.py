@@ -1,7 +1,5 @@
 """The command line: parses and prints; it computes nothing."""
 
-from __future__ import annotations
-
 import atexit
 import gc
 import importlib

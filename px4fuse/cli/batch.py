@@ -1,7 +1,5 @@
 """``px4fuse batch``: many logs become one table."""
 
-from __future__ import annotations
-
 import gc
 import sys
 import time

@@ -1,7 +1,5 @@
 """``px4fuse compare``: the main job."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any, Literal, get_args

@@ -1,7 +1,5 @@
 """``px4fuse diff``: what changed between two flights, or two settings of one."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Literal

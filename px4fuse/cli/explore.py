@@ -1,7 +1,5 @@
 """``px4fuse explore``: the filter's knobs, on a page that replays the flight."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """``px4fuse lesson``: the worked examples of the lesson."""
 
-from __future__ import annotations
-
 import click
 
 

@@ -1,7 +1,5 @@
 """``px4fuse practice``: flights with hidden mistakes, to find them by the knobs."""
 
-from __future__ import annotations
-
 import secrets
 import sys
 from pathlib import Path

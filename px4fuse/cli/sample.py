@@ -1,7 +1,5 @@
 """``px4fuse sample``: the sample flights, to try things on."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

@@ -1,7 +1,5 @@
 """``px4fuse sync``: the clock offset between position source and IMU."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

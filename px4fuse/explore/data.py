@@ -3,8 +3,6 @@
 Python projects, integrates and judges EKF2; the page only replays our filter.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import msgspec
@@ -19,23 +17,18 @@ from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.explore.ekf2_grid import grid_data, judged_numbers
 from px4fuse.explore.packing import COARSE, Packer
+from px4fuse.filter import settings as allowed
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.consistency import CONFIDENCE, nis_band
 from px4fuse.filter.model import INITIAL_COVARIANCE
-from px4fuse.filter.settings import (
-    CLOCK_OFFSET_RANGE_S,
-    DT_RANGE_S,
-    SIGMA_A_RANGE_M_S2,
-    SIGMA_Z_RANGE_M,
-    Settings,
-)
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, along, imu_gaps, within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.causes import NOISES
 from px4fuse.findings.hidden_errors import hidden_error
 from px4fuse.findings.model import Finding, by_root
 from px4fuse.findings.story import story
-from px4fuse.flight import POSITION_COLUMNS, PositionTrack, Unavailable
+from px4fuse.flight import Columns, PositionTrack, Unavailable
 from px4fuse.request import ComparisonRequest, command_line
 
 # How far the stamps can be moved on the page; --clock-offset takes more
@@ -129,10 +122,10 @@ def _grid(
 def ranges() -> dict[str, Any]:
     """What the settings may be, as the command line takes them, and the lesson's values."""
     return {
-        "sigma-a": list(SIGMA_A_RANGE_M_S2),
-        "sigma-z": list(SIGMA_Z_RANGE_M),
-        "dt": list(DT_RANGE_S),
-        "clock-offset": list(CLOCK_OFFSET_RANGE_S),
+        "sigma-a": list(allowed.SIGMA_A_RANGE_M_S2),
+        "sigma-z": list(allowed.SIGMA_Z_RANGE_M),
+        "dt": list(allowed.DT_RANGE_S),
+        "clock-offset": list(allowed.CLOCK_OFFSET_RANGE_S),
         "lesson": _settings(Settings()),
         "running": [RUNNING, *nis_band(RUNNING)],
         "hidden": [NEES_LARGE, CONTENT_NIS],
@@ -196,7 +189,7 @@ def _signals(
     """One axis: measurements as they were stamped, also beyond the segment, and acceleration."""
     segment = comparison.segment
     time = raw.samples.index.to_numpy()
-    value = along(raw.samples, POSITION_COLUMNS, axis.direction)
+    value = along(raw.samples, Columns.POSITION, axis.direction)
     reach = OFFSET_REACH_S + abs(comparison.settings.clock_offset_s)
     near = (time >= segment.start_s - reach) & (time <= segment.end_s + reach)
     near &= np.isfinite(value)
@@ -213,13 +206,15 @@ def _signals(
 
 def _others(analysis: Analysis, result: AxisComparison, packer: Packer) -> dict[str, Any]:
     """What stands beside our filter along one axis."""
+    name = result.axis.name
     return {
         "called": result.axis.called,
         "heading": result.axis.heading_deg,
         "note": result.axis.note,
         "direction": result.axis.direction.tolist(),
         "bands": _bands(len(result.axis.measurement_time_s), packer),
-        "map": _map_of(analysis, result.axis.name),
+        # the joint likelihood map of the horizontal axes where there is one, or its own
+        "map": HORIZONTAL if name != "down" and HORIZONTAL in analysis.tuning else name,
         "ekf2": _ekf2(analysis, result, packer),
         "truth": _truth(result, packer),
     }
@@ -292,11 +287,6 @@ def _frame(frame: pd.DataFrame, columns: list[str], packer: Packer) -> list[int]
     return [packer.add_times(frame.index.to_numpy()), *values]
 
 
-def _map_of(analysis: Analysis, name: str) -> str:
-    """Which likelihood map tells of an axis: the joint one of the horizontal axes, or its own."""
-    return HORIZONTAL if name != "down" and HORIZONTAL in analysis.tuning else name
-
-
 def _maps(analysis: Analysis) -> dict[str, Any]:
     """What the map of each axis shows; why not where there is none."""
     return {
@@ -315,11 +305,11 @@ def _maps(analysis: Analysis) -> dict[str, Any]:
 def _plan(comparison: Comparison, packer: Packer) -> list[int] | str:
     """The source's track seen from above: places of time, north and east."""
     samples = within(comparison.source.samples, comparison.segment)
-    track = samples[POSITION_COLUMNS[:2]].dropna()
+    track = samples[Columns.POSITION[:2]].dropna()
     if not len(track):
         return "the source has no horizontal position"
     some = track.iloc[:: max(1, -(-len(track) // MAX_PLAN_POINTS))]
-    return _frame(some, POSITION_COLUMNS[:2], packer)
+    return _frame(some, Columns.POSITION[:2], packer)
 
 
 def _finding(finding: Finding) -> dict[str, Any]:

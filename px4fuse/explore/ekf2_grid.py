@@ -4,8 +4,6 @@ Only where the model of EKF2 agrees with the log, and only at the stops: nothing
 made up.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping
 from typing import Any
@@ -23,7 +21,7 @@ from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.explore.packing import Packer
 from px4fuse.filter.consistency import Consistency, assess
 from px4fuse.filter.signals import within
-from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Ekf2, Unavailable
+from px4fuse.flight import Columns, Ekf2, Unavailable
 
 # As multiples of the noise as flown, and beside the delay (ms) and the gate as flown
 NOISES = (0.25, 0.5, 1.0, 2.0, 4.0)
@@ -132,7 +130,7 @@ def _state(replay: Ekf2Replay, drawn: pd.DataFrame, packer: Packer) -> dict[str,
     times, published = drawn.index.to_numpy(), replay.published
     made: dict[str, list[int]] = {"p": [], "v": [], "sp": [], "sv": []}
     for axis, position, velocity in zip(
-        HORIZONTAL, POSITION_COLUMNS[:2], VELOCITY_COLUMNS[:2], strict=True
+        HORIZONTAL, Columns.POSITION[:2], Columns.VELOCITY[:2], strict=True
     ):
         for name, column in (("p", position), ("v", velocity)):
             state = np.interp(times, published.index, published[column])
@@ -184,7 +182,7 @@ def _numbers(
     assert isinstance(flight.ekf2, Ekf2)
     times = flight.ekf2.state.index.to_numpy()
     times = times[settled(times, judged)]
-    position = along(replay.published, POSITION_COLUMNS, direction, times)
+    position = along(replay.published, Columns.POSITION, direction, times)
     error = rms_to_truth(flight, position, direction, times)
     if error is not None:
         made["truthP"] = error

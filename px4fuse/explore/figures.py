@@ -1,7 +1,5 @@
 """The page's plots, empty: the page fills them with what its settings give."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

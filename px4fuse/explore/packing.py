@@ -4,8 +4,6 @@ Values become integers of a fixed step, then differences, then planes of bytes, 
 ones are nearly all the same, then deflate and base64.
 """
 
-from __future__ import annotations
-
 import base64
 import zlib
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The page as one file: Bokeh, the flights' data, the engine and what moves them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from importlib.metadata import version
 from importlib.resources import files
@@ -95,7 +93,9 @@ def page_text(
         HTML of the questions.
     """
     code = {
-        "bokeh": _bokeh(),
+        # BokehJS itself, without widgets, tables and formulas; what follows it only sets a log
+        # level, and says so on the console
+        "bokeh": Resources(mode="inline", components=["bokeh"]).js_raw[0],
         "engine": _file("engine.js"),
         "script": "".join(_file(f"{name}.js") for name in (*SCRIPTS, practice, "page")),
     }
@@ -116,12 +116,6 @@ def page_text(
 
 def _file(name: str) -> str:
     return files("px4fuse.explore").joinpath(name).read_text(encoding="utf-8")
-
-
-def _bokeh() -> str:
-    """BokehJS itself; widgets, tables and formulas stay out."""
-    # what follows it only sets a log level, and says so on the console
-    return Resources(mode="inline", components=["bokeh"]).js_raw[0]
 
 
 PANELS = (

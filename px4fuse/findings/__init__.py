@@ -8,8 +8,6 @@ To add a finding: its file with a ``detect``, its name and place in ``causes.py`
 on which its rate is measured in ``tests/studies/rates.csv``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import cache
 from importlib import import_module

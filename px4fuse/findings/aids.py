@@ -3,8 +3,6 @@
 External vision's position is judged by the detectors of the lab, with what a replay shows.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from px4fuse.analysis import Analysis

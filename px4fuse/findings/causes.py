@@ -4,8 +4,6 @@ What a cause brings with it stands behind it, with its evidence, so that a repor
 per thing to put right.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 
 from msgspec.structs import replace

@@ -1,7 +1,5 @@
 """EKF2 did not use the source for horizontal position, or not all the time."""
 
-from __future__ import annotations
-
 from px4fuse.comparison.model import Comparison
 from px4fuse.findings.model import Found, error, share_on, spans_at, warning
 from px4fuse.flight import Ekf2, FusionRecord, Unavailable

@@ -1,7 +1,5 @@
 """EKF2's gate threw measurements away, or is so narrow that it must."""
 
-from __future__ import annotations
-
 import math
 
 from px4fuse.analysis import Analysis

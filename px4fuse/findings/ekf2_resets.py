@@ -1,7 +1,5 @@
 """EKF2's output jumped, or another instance took over."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from px4fuse.analysis import Analysis

@@ -5,8 +5,6 @@ share shows in no innovation. Normalised by the variance that the filter states,
 is the NEES (1 is consistent).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What is wrong with the IMU, bias, clipping, gaps, too low a rate; and a vehicle that tumbled."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 
@@ -9,7 +7,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.filter.causes import BIAS_M_S2, Explained
 from px4fuse.filter.signals import Segment, imu_gaps, within
 from px4fuse.findings.model import MOMENT_S, Found, finding, warning
-from px4fuse.flight import SPECIFIC_FORCE_COLUMNS, Ekf2, Flight, sample_rate
+from px4fuse.flight import Columns, Ekf2, Flight, sample_rate
 from px4fuse.record import Span
 from px4fuse.recording import LogInfo
 
@@ -79,7 +77,7 @@ def _ekf2_bias(analysis: Analysis) -> list[float] | None:
     ekf2 = analysis.flight.ekf2
     if not isinstance(ekf2, Ekf2) or not isinstance(ekf2.accelerometer_bias, pd.DataFrame):
         return None
-    inside = within(ekf2.accelerometer_bias, analysis.segment)[SPECIFIC_FORCE_COLUMNS]
+    inside = within(ekf2.accelerometer_bias, analysis.segment)[Columns.SPECIFIC_FORCE]
     return None if inside.empty else [float(median) for median in inside.median()]
 
 

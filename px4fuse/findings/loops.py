@@ -1,7 +1,5 @@
 """What a loop shows: false closures, drift beyond what was stated, and what was assumed."""
 
-from __future__ import annotations
-
 from px4fuse.analysis import Analysis
 from px4fuse.findings.model import Finding, Found, error, info, warning
 from px4fuse.loop.model import LANDING, Closure, Loop

@@ -1,7 +1,5 @@
 """What the log lacks: EKF2, an acceleration, innovations, the position as it arrived."""
 
-from __future__ import annotations
-
 import pandas as pd
 
 from px4fuse.analysis import Analysis

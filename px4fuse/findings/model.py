@@ -1,7 +1,5 @@
 """What a finding is, and the words that several of them share."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from typing import Annotated, Literal

@@ -6,8 +6,6 @@ fitted together, so that they are put right together: the one that is further of
 setting that nobody chose is advice, one step less severe than one that was.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeGuard
@@ -16,6 +14,7 @@ import numpy as np
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison import remedy
 from px4fuse.comparison.interventions import (
     OF_SETTINGS,
     SIGMA_A,
@@ -27,14 +26,7 @@ from px4fuse.comparison.interventions import (
     tuned_for,
 )
 from px4fuse.comparison.model import FILTERS, AxisComparison, Comparison, FilterName
-from px4fuse.comparison.remedy import (
-    aid_of,
-    filter_words,
-    noise_helps,
-    not_replayed,
-    remedy_words,
-    settings_words,
-)
+from px4fuse.comparison.remedy import aid_of
 from px4fuse.ekf2_parameters import BAROMETER, BAROMETER_NOISE_M, PARAMETERS
 from px4fuse.filter.consistency import SIGMA_OFF, Consistency
 from px4fuse.filter.settings import Settings
@@ -43,17 +35,11 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings.causes import CAUSE, ELSEWHERE, NOISE
 from px4fuse.findings.hidden_errors import hidden_errors
 from px4fuse.findings.model import Finding, Found, Severity, error, finding, lowered
-from px4fuse.findings.since import (
-    OPTIONS,
-    UNITS,
-    cure_words,
-    ekf2_cure_words,
-    kind_of,
-    reason_words,
-)
+from px4fuse.findings.since import cure_words, ekf2_cure_words, kind_of, reason_words
 from px4fuse.findings.source_positions import hardly_moved
-from px4fuse.flight import POSITION_VARIANCE_COLUMNS, Unavailable, sample_rate
+from px4fuse.flight import Columns, Unavailable, sample_rate
 from px4fuse.plain import factor_words, number_words
+from px4fuse.request import OPTIONS
 
 NOISE_OFF = 1.5  # times, in standard deviation; below, the tracks hardly change
 NOISE_OFF_ERROR = 4.0  # times: the gain is a different one
@@ -113,8 +99,9 @@ def try_out(
         What such settings gain on data that they were not found on (nats), where that is known.
     """
     rounded: dict[str, Any] = {name: float(f"{value:.3g}") for name, value in values.items()}
-    typed = " ".join(f"{OPTIONS[name]} {value:g}" for name, value in rounded.items())
-    return filter_words(comparison, replace(comparison.settings, **rounded), typed + more, unseen)
+    typed = " ".join(f"{OPTIONS[name].name} {value:g}" for name, value in rounded.items())
+    settings = replace(comparison.settings, **rounded)
+    return remedy.filter_words(comparison, settings, typed + more, unseen)
 
 
 class Off(NamedTuple):
@@ -160,9 +147,9 @@ def settings_off(analysis: Analysis) -> Found:
     if SIGMA_Z in values and tuned.sigma_z.value is None:
         values[SIGMA_Z] = max(values[SIGMA_Z], SMALLEST_SIGMA_Z_M)
     unseen = None if isinstance(tuned.held_out, Unavailable) else tuned.held_out.gain_nats
-    remedy, first = try_out(analysis, values, unseen=unseen), None
+    cure, first = try_out(analysis, values, unseen=unseen), None
     for name in worst_first:
-        (value, size, severity), noise, unit = off[name], asked[name], UNITS[name]
+        (value, size, severity), noise, unit = off[name], asked[name], OPTIONS[name].unit
         label, side = name[:7], "small" if chosen[name] < value else "large"
         least, most, range_ = "at least ", "at most ", ""
         if noise.value is not None:
@@ -175,7 +162,7 @@ def settings_off(analysis: Analysis) -> Found:
             f"{side}",
             f": the innovations ({tuned.name}) ask for {most}{value:.3g} {unit}{range_}. "
             f"{READINGS[label, side]}",
-            remedy,
+            cure,
             {
                 "chosen": chosen[name],
                 "most_likely": value,
@@ -268,19 +255,19 @@ def _of_group(analysis: Analysis, owner: FilterName, group: str, members: list[M
     tuned = tuned_for(analysis.tuning, result.axis.name)
     stated = "overstated" if over else "understated"
     if over and analysis.source.origin.may_drift:
-        severity, remedy, cause = "info", AGAINST_DRIFT, ELSEWHERE
+        severity, cure, cause = "info", AGAINST_DRIFT, ELSEWHERE
     elif over and analysis.source.origin.is_gnss:
         air = analysis.source.aid(result.axis.name) == BAROMETER
-        remedy = _above_stated(analysis) if owner == "ekf2" and not air else ""
-        cause = NOISE if remedy else ELSEWHERE
+        cure = _above_stated(analysis) if owner == "ekf2" and not air else ""
+        cause = NOISE if cure else ELSEWHERE
         slow = AGAINST_SLOW_ERRORS.format("a barometer" if air else "GNSS")
-        severity, remedy = severity if remedy else "info", remedy or slow
+        severity, cure = severity if cure else "info", cure or slow
     elif over and any(hidden.owner == owner for hidden in hidden_errors(analysis)):
-        remedy, cause = AGAINST_TRUTH, ELSEWHERE
+        cure, cause = AGAINST_TRUTH, ELSEWHERE
     else:
         found = cause_of(analysis.causes, owner, result.axis.name)
-        cause, remedy = kind_of(analysis, found), _remedy(analysis, owner, result, tuned, found)
-        severity = "info" if remedy == AGAINST_TRUTH else severity
+        cause, cure = kind_of(analysis, found), _remedy(analysis, owner, result, tuned, found)
+        severity = "info" if cure == AGAINST_TRUTH else severity
     evidence: dict[str, float | str] = {
         "axis": result.axis.name,
         "sigma_factor": statement.sigma_factor,
@@ -298,7 +285,7 @@ def _of_group(analysis: Analysis, owner: FilterName, group: str, members: list[M
         f"{factor_words(factor)} times in σ along {result.axis.name}",
         f" (mean NIS {number_words(statement.nis_mean)}, consistent is {low:.2f} to {high:.2f}; "
         f"{group}).",
-        remedy,
+        cure,
         evidence,
     )
 
@@ -307,13 +294,13 @@ def _above_stated(analysis: Analysis) -> str:
     """What to set where EKF2's parameter holds R above the accuracy that a receiver states."""
     name = aid_of(analysis).noise
     least_m = analysis.flight.log.parameters.get(name, float("nan"))
-    stated = within(analysis.source.samples, analysis.segment)[POSITION_VARIANCE_COLUMNS[0]]
+    stated = within(analysis.source.samples, analysis.segment)[Columns.POSITION_VARIANCE[0]]
     stated_m = float(np.sqrt(stated.median()))
     if not least_m > NOISE_FITS * stated_m:  # false for NaN too
         return ""
     held = f"{name} {least_m:g} m holds R above what the receiver states ({stated_m:.2g} m)"
-    words, _ = remedy_words(
-        analysis.ekf2_model, {name: float(f"{stated_m:.2g}")}, noise_helps,
+    words, _ = remedy.remedy_words(
+        analysis.ekf2_model, {name: float(f"{stated_m:.2g}")}, remedy.noise_helps,
         why=f"{held}: where you trust the receiver, ", otherwise=f"{held}.",
     )  # fmt: skip
     return words
@@ -392,13 +379,13 @@ def _not_replayed(analysis: Analysis, result: AxisComparison, tuned: AxisTuning 
     if not (ratio < 1.0 / NOISE_FITS if statement.sigma_factor > 1.0 else ratio > NOISE_FITS):
         return (
             f"{said}: that is not it. Look at the clock ({aid.delay}) and at EKF2's process noise "
-            f"(EKF2_ACC_NOISE). {not_replayed(why)}"
+            f"(EKF2_ACC_NOISE). {remedy.not_replayed(why)}"
         )
     changes = {aid.noise: float(f"{noise_m:.2g}")}
     set_m = analysis.flight.log.parameters.get(aid.noise, np.inf)
     if aid.noise_mode and used_m > NOISE_FITS * set_m:
         changes[aid.noise_mode] = 1.0
-    return f"{said}: set {settings_words(changes)}. {not_replayed(why)}"
+    return f"{said}: set {remedy.settings_words(changes)}. {remedy.not_replayed(why)}"
 
 
 def ekf2_noise_m(result: AxisComparison) -> float:

@@ -1,7 +1,5 @@
 """What the log says of itself: loss, restarts, and what it cannot hold."""
 
-from __future__ import annotations
-
 import pandas as pd
 
 from px4fuse.analysis import Analysis

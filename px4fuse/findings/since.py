@@ -1,35 +1,17 @@
 """A cause that a replay has shown, in words: what it is, what it does, and what puts it right."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.interventions import (
-    ALONG,
-    CLOCK,
-    FORWARD,
-    OUTLIERS,
-    RIGHT,
-    SIGMA_A,
-    SIGMA_Z,
-    TURN,
-    Intervention,
-)
-from px4fuse.comparison.remedy import (
-    COMMAND,
-    aid_of,
-    delay_helps,
-    noise_helps,
-    rejects_less,
-    remedy_words,
-    settings_words,
-)
+from px4fuse.comparison import interventions as changed
+from px4fuse.comparison import remedy
+from px4fuse.comparison.interventions import Intervention
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.heading import HeadingError
 from px4fuse.findings import causes as kinds
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital, length_words, number_words
+from px4fuse.request import OPTIONS
 
 # Findings that say the same as the first sentence does, by what is changed
 TOLD_BY: Mapping[str, frozenset[str]] = {
@@ -39,21 +21,19 @@ TOLD_BY: Mapping[str, frozenset[str]] = {
     kinds.GATE: frozenset(("ekf2_gate_small",)),
     kinds.ACCELEROMETER: frozenset(("accelerometer_bias",)),
 }
-OPTIONS = {SIGMA_Z: "--sigma-z", SIGMA_A: "--sigma-a", CLOCK: "--clock-offset"}
-UNITS = {SIGMA_A: "m/s²", SIGMA_Z: "m"}
 # What a change of a kind is there for; else to bring the mean NIS nearer to 1
-HELPS = {kinds.CLOCK: delay_helps, kinds.GATE: rejects_less}
+HELPS = {kinds.CLOCK: remedy.delay_helps, kinds.GATE: remedy.rejects_less}
 
 
 def kind_of(analysis: Analysis, cause: Intervention | None) -> str:
     """What sort of cause it is, as findings name it: of the source where there are two."""
     if cause is None:
         return kinds.ELSEWHERE
-    aid = aid_of(analysis)
+    aid = remedy.aid_of(analysis)
     of = {
-        OUTLIERS: kinds.OUTLIERS, CLOCK: kinds.CLOCK, aid.delay: kinds.CLOCK, TURN: kinds.FRAME,
-        FORWARD: kinds.ACCELEROMETER, SIGMA_Z: kinds.NOISE, aid.noise: kinds.NOISE,
-        aid.gate: kinds.GATE,
+        changed.OUTLIERS: kinds.OUTLIERS, changed.CLOCK: kinds.CLOCK, aid.delay: kinds.CLOCK,
+        changed.TURN: kinds.FRAME, changed.FORWARD: kinds.ACCELEROMETER,
+        changed.SIGMA_Z: kinds.NOISE, aid.noise: kinds.NOISE, aid.gate: kinds.GATE,
     }  # fmt: skip
     return next((kind for name, kind in of.items() if name in cause.change), kinds.PROCESS)
 
@@ -70,7 +50,7 @@ def reason_words(analysis: Analysis, cause: Intervention) -> str:
 
 def change_words(analysis: Analysis, cause: Intervention) -> str:
     """What is wrong, as a clause: what was changed to see what it does."""
-    said = [_one(analysis, cause, name) for name in cause.change if name not in ALONG]
+    said = [_one(analysis, cause, name) for name in cause.change if name not in changed.ALONG]
     return " and ".join(said)
 
 
@@ -90,25 +70,26 @@ def share_words(cause: Intervention) -> str:
 def cure_words(analysis: Analysis, cause: Intervention) -> str:
     """What to do about a cause."""
     parts, change = [], dict(cause.change)
-    if change.pop(OUTLIERS, None):
+    if change.pop(changed.OUTLIERS, None):
         gnss = analysis.source.origin.is_gnss
         where = "place of the antenna" if gnss else "line of sight, anchor survey"
         parts.append(f"remove the outliers ({where}) rather than raise a noise for them")
-    if change.pop(FORWARD, None) is not None:
+    if change.pop(changed.FORWARD, None) is not None:
         parts.append("calibrate the accelerometer and the level horizon")
-        change.pop(RIGHT)
-    if turn_deg := change.pop(TURN, None):
+        change.pop(changed.RIGHT)
+    if turn_deg := change.pop(changed.TURN, None):
         # GNSS knows north
         parts.append(
             f"calibrate the magnetometer, away from metal and motors ({turn_deg:+.0f}°)"
             if analysis.source.origin.is_gnss
             else f"turn the positions by {turn_deg:+.0f}° before they are sent"
         )
-    typed = [f"{option} {change.pop(name):g}" for name, option in OPTIONS.items() if name in change]
+    settings = (changed.SIGMA_Z, changed.SIGMA_A, changed.CLOCK)
+    typed = [f"{OPTIONS[name].name} {change.pop(name):g}" for name in settings if name in change]
     if change:
-        parts.append(f"set {settings_words(change)}")
+        parts.append(f"set {remedy.settings_words(change)}")
     if typed:
-        parts.append(f"type {COMMAND} {' '.join(typed)}")
+        parts.append(f"type {remedy.COMMAND} {' '.join(typed)}")
     return f"{capital(', and '.join(parts))}."
 
 
@@ -128,8 +109,8 @@ def ekf2_cure_words(analysis: Analysis, cause: Intervention) -> str:
     """What to do about a cause of EKF2's, with what a parameter would do to all of the flight."""
     if not cause.change.keys() <= PARAMETERS.keys():
         return cure_words(analysis, cause)
-    words, _ = remedy_words(
-        analysis.ekf2_model, cause.change, HELPS.get(kind_of(analysis, cause), noise_helps),
+    words, _ = remedy.remedy_words(
+        analysis.ekf2_model, cause.change, HELPS.get(kind_of(analysis, cause), remedy.noise_helps),
         otherwise=f"{capital(reason_words(analysis, cause))}.",
     )  # fmt: skip
     return words
@@ -139,23 +120,23 @@ def _one(analysis: Analysis, cause: Intervention, name: str) -> str:
     """What is wrong, for one of the things that were changed."""
     value, settings = cause.change[name], analysis.settings
     match name:
-        case "outliers_left_out":
+        case changed.OUTLIERS:
             return f"{value:.0f} position{'s are outliers' if value > 1 else ' is an outlier'}"
-        case "clock_offset_s":
+        case changed.CLOCK:
             missing_s = value - (settings.clock_offset_s if cause.filter == "kf" else 0.0)
             return f"the stamps are {abs(missing_s):.2g} s {'late' if missing_s < 0 else 'early'}"
-        case "bias_forward_m_s2":
-            right = cause.change[RIGHT]
+        case changed.FORWARD:
+            right = cause.change[changed.RIGHT]
             return f"the accelerometer reads {value:+.2f} m/s² too much forward, {right:+.2f} right"
-        case "turned_deg":
+        case changed.TURN:
             drifts = isinstance(analysis.heading, HeadingError) and analysis.heading.drifts
             what, turn_deg = "the positions are turned", -value
             if analysis.source.origin.is_gnss:
                 what, turn_deg = "EKF2's heading is off", value
             return f"{what} by {turn_deg:+.0f}°{' on average' * drifts}"
-        case "sigma_a_m_s2" | "sigma_z_m":
-            label = name[:7].upper()
-            return f"{label} is {getattr(settings, name):g} instead of {value:.2g} {UNITS[name]}"
+        case changed.SIGMA_A | changed.SIGMA_Z:
+            label, unit = name[:7].upper(), OPTIONS[name].unit
+            return f"{label} is {getattr(settings, name):g} instead of {value:.2g} {unit}"
     assert not isinstance(analysis.ekf2_model, Unavailable)  # it was replayed
     flown, unit = analysis.ekf2_model.inputs.settings[name], PARAMETERS[name].unit
     unit = unit.replace("^2", "²").replace("^3", "³")

@@ -1,7 +1,5 @@
 """The source's stamps are late or early against the IMU, and EKF2_EV_DELAY is not that delay."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from px4fuse.analysis import Analysis

@@ -1,7 +1,5 @@
 """The source's frame is not north, or is turned against the vehicle's heading, or EKF2's drifts."""
 
-from __future__ import annotations
-
 from px4fuse.analysis import Analysis
 from px4fuse.ekf2_parameters import GNSS_POS
 from px4fuse.filter.heading import DRIFT_P, HeadingError

@@ -4,8 +4,6 @@ Where exactly every second or third sample was kept, the intervals are as regula
 slower source, and no log can tell the two apart.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from px4fuse.analysis import Analysis

@@ -3,8 +3,6 @@
 Neither filter has a state for it: R describes white noise of one size.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from itertools import pairwise
 
@@ -20,7 +18,7 @@ from px4fuse.findings.causes import WHITE_BEYOND
 from px4fuse.findings.model import Found, error, info, warning
 from px4fuse.findings.noises import NOISE_FITS, ekf2_noise_m
 from px4fuse.findings.source_positions import LAG_NATS, hardly_moved
-from px4fuse.flight import POSITION_COLUMNS, Unavailable
+from px4fuse.flight import Columns, Unavailable
 from px4fuse.plain import number_words
 
 COLOURED_NATS = 5.0  # a likelihood ratio of 150 for two more numbers; 1 of 400 clean flights
@@ -86,7 +84,7 @@ def repeats(analysis: Analysis) -> Found:
     """Positions that are the one before, sent again, while the vehicle moves."""
     if hardly_moved(analysis):
         return
-    sent = within(analysis.source.samples, analysis.segment)[POSITION_COLUMNS].dropna().to_numpy()
+    sent = within(analysis.source.samples, analysis.segment)[Columns.POSITION].dropna().to_numpy()
     again = np.all(np.diff(sent, axis=0) == 0.0, axis=1)
     count, share = int(again.sum()), float(again.mean()) if len(again) else 0.0
     if count < MIN_REPEATS or share < REPEATS:

@@ -5,8 +5,6 @@ How well a log can show a scale: six passes at 5 Hz and 0.10 m give it to 3.5 % 
 measure or the truth.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict
 
 import numpy as np
@@ -22,7 +20,7 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.imu import MIN_IMU_RATE_HZ, too_slow
 from px4fuse.findings.model import Found, finding, moments, times, warning
 from px4fuse.findings.source_stamps import arrivals
-from px4fuse.flight import POSITION_COLUMNS, POSITION_VARIANCE_COLUMNS, Unavailable
+from px4fuse.flight import Columns, Unavailable
 from px4fuse.plain import factor_words
 
 MOTION_RANGE_M = 0.5  # 5 to 95 %; a hovering drone with 0.1 m UWB stays below
@@ -200,7 +198,7 @@ def stated_variance(analysis: Analysis) -> Found:
     smooths = isinstance(analysis.smoothing, Unavailable) or low_pass(analysis) is not None
     if smooths or not isinstance(tuned, AxisTuning) or not source.origin.is_vision:
         return
-    reported = within(source.samples, analysis.segment)[POSITION_VARIANCE_COLUMNS[:2]].dropna()
+    reported = within(source.samples, analysis.segment)[Columns.POSITION_VARIANCE[:2]].dropna()
     noise, low, high = tuned.sigma_z.value, tuned.sigma_z.low, tuned.sigma_z.high
     if reported.empty or noise is None or low is None or high is None:
         return
@@ -242,7 +240,7 @@ def _error_m(analysis: Analysis) -> float | None:
 def motion_range_m(comparison: Comparison) -> float:
     """Larger horizontal extent of the source in the segment, 5 to 95 %."""
     inside = within(comparison.source.samples, comparison.segment)
-    low, high = inside[POSITION_COLUMNS[:2]].quantile([0.05, 0.95]).to_numpy()
+    low, high = inside[Columns.POSITION[:2]].quantile([0.05, 0.95]).to_numpy()
     return float(np.max(high - low))
 
 
@@ -251,7 +249,7 @@ def hardly_moved(comparison: Comparison) -> bool:
 
     The noise is told by second differences, which know no steady motion.
     """
-    inside = within(comparison.source.samples, comparison.segment)[POSITION_COLUMNS[:2]].dropna()
+    inside = within(comparison.source.samples, comparison.segment)[Columns.POSITION[:2]].dropna()
     noise_m = np.median(np.abs(np.diff(inside.to_numpy(), 2, axis=0)), axis=0) / SECOND_DIFFERENCE
     return motion_range_m(comparison) < max(MOTION_RANGE_M, NOISE_RANGE * float(noise_m.max()))
 

@@ -1,7 +1,5 @@
 """The sender's time stamps tell no time, or the time of arrival instead of the measurement."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 

@@ -4,23 +4,14 @@ How well both filters did along the axis of the lab, then what weighs most: the 
 why EKF2 differs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 
 import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.interventions import (
-    EXPLAINS,
-    OF_SETTINGS,
-    Intervention,
-    Of,
-    beyond_claim,
-    cause_of,
-    tried_on,
-)
+from px4fuse.comparison import interventions
+from px4fuse.comparison.interventions import Intervention, Of, cause_of, tried_on
 from px4fuse.comparison.model import FILTERS, AgainstTruth, AxisComparison, Difference, FilterName
 from px4fuse.ekf2.walk import Why
 from px4fuse.filter.kalman import state_at
@@ -76,7 +67,7 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
     known = TOLD_FIRST
     for cause in filter(None, since.values()):
         known |= TOLD_BY.get(kind_of(analysis, cause), frozenset())
-    if since["kf"] is not None and not OF_SETTINGS.isdisjoint(since["kf"].change):
+    if since["kf"] is not None and not interventions.OF_SETTINGS.isdisjoint(since["kf"].change):
         known |= SETTINGS
     causes = [
         one for one in findings
@@ -101,7 +92,7 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
 
 def _wrong(analysis: Analysis, owner: FilterName) -> Of:
     """What of a filter asks for a cause: an error larger than it claims, or its variance."""
-    return "nees" if beyond_claim(analysis.main.filters[owner]) else "nis"
+    return "nees" if interventions.beyond_claim(analysis.main.filters[owner]) else "nis"
 
 
 def _verdict(analysis: Analysis, ours: str, ekf2: str) -> str:
@@ -212,7 +203,7 @@ def _closer(analysis: Analysis, causes: Mapping[FilterName, Intervention | None]
         each
         for owner, cause in causes.items()
         for each in tried_on(analysis.causes, owner, analysis.main.axis.name, "apart")
-        if cause is not None and each.explains >= EXPLAINS
+        if cause is not None and each.explains >= interventions.EXPLAINS
     ]
     if told:
         most = max(told, key=lambda each: each.explains)

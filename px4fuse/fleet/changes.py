@@ -1,7 +1,5 @@
 """What changed between two flights, or two settings of one flight: ``px4fuse diff``."""
 
-from __future__ import annotations
-
 import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -20,23 +18,11 @@ from px4fuse.fleet import measures
 from px4fuse.fleet.inputs import DiffInput, Progress, read_inputs
 from px4fuse.fleet.measures import FALSE_DISCOVERY_RATE, LEAST_RATIO, Contrast, Number, at
 from px4fuse.report.changes import change_line
-from px4fuse.results.contract import (
-    CHANGES,
-    AidsResults,
-    ChangeResults,
-    Compared,
-    ComparisonResults,
-    FindingChange,
-    Judgement,
-    NumberChange,
-    Status,
-    TextChange,
-    Which,
-)
+from px4fuse.results import contract
 from px4fuse.results.model import provenance, schema_of
 
 # What stands first of the significant changes; and of these, causes before what they bring
-_ORDER: tuple[Judgement, ...] = ("worse", "better", "changed", "")
+_ORDER: tuple[contract.Judgement, ...] = ("worse", "better", "changed", "")
 _CAUSES = ("tuning", "clock", "heading")
 # What is compared as text, and where it stands in the results; the segment of one flight alone
 _SETTINGS = {
@@ -54,7 +40,7 @@ _FLIGHT = {
     "position source": "source.name",
     "px4fuse": "provenance.px4fuse",
 }
-Results = ComparisonResults | AidsResults
+Results = contract.ComparisonResults | contract.AidsResults
 MAX_LINE, MAX_CHANGES, MAX_DRAWN = 160, 4, 20
 
 
@@ -69,7 +55,7 @@ class Changes(Shown):
     a, b : DiffInput
     """
 
-    results: ChangeResults
+    results: contract.ChangeResults
     a: DiffInput
     b: DiffInput
 
@@ -135,8 +121,8 @@ def diff(a: str | Path, b: str | Path, *, progress: Progress = lambda _: None) -
 def changes(a: DiffInput, b: DiffInput) -> Changes:
     """Hold two comparisons against each other."""
     paired = a.results.log.sha256 == b.results.log.sha256
-    found = ChangeResults(
-        schema=schema_of(CHANGES),
+    found = contract.ChangeResults(
+        schema=schema_of(contract.CHANGES),
         a=_compared(a),
         b=_compared(b),
         paired=paired,
@@ -157,7 +143,7 @@ def changes(a: DiffInput, b: DiffInput) -> Changes:
 
 def number_changes(
     first: Mapping[str, Number], second: Mapping[str, Number], *, paired: bool
-) -> tuple[NumberChange, ...]:
+) -> tuple[contract.NumberChange, ...]:
     """How each number of two changed, significant changes first.
 
     Parameters
@@ -185,11 +171,11 @@ def number_changes(
 def _change(
     path: str, a: Number | None, b: Number | None, found: Contrast | None, q: float | None,
     paired: bool,
-) -> NumberChange:  # fmt: skip
+) -> contract.NumberChange:  # fmt: skip
     number = a or b
     assert number is not None
     measure = number.measure
-    status: Status = "not tested"
+    status: contract.Status = "not tested"
     if a is None or b is None:
         status = "only in A" if b is None else "only in B"
     elif paired:
@@ -197,7 +183,7 @@ def _change(
         status = "differs" if moved else "same"
     elif q is not None:
         status = "significant" if q < FALSE_DISCOVERY_RATE else "within chance"
-    judgement: Judgement = ""
+    judgement: contract.Judgement = ""
     if status in ("differs", "significant"):
         # between two flights the distance from the best must differ by more than chance too
         least = found.half if found and not paired else 0.0
@@ -205,7 +191,7 @@ def _change(
         if found and abs(found.farther) > least:
             judgement = "worse" if found.farther > 0.0 else "better"
     within = None if found is None or q is None else found.interval
-    return NumberChange(
+    return contract.NumberChange(
         path=path,
         label=measure.label,
         unit=measure.unit,
@@ -222,7 +208,7 @@ def _change(
     )
 
 
-def _rank(change: NumberChange, found: Contrast | None) -> tuple[int, bool, float]:
+def _rank(change: contract.NumberChange, found: Contrast | None) -> tuple[int, bool, float]:
     is_cause = change.path.startswith(_CAUSES)
     # what is the same differs by the last digits of a machine, if at all
     moved = 0.0
@@ -231,9 +217,9 @@ def _rank(change: NumberChange, found: Contrast | None) -> tuple[int, bool, floa
     return _ORDER.index(change.judgement), not is_cause, -moved
 
 
-def _compared(side: DiffInput) -> Compared:
+def _compared(side: DiffInput) -> contract.Compared:
     log = side.results.log
-    return Compared(
+    return contract.Compared(
         given=side.given,
         kind=side.kind,
         log=log.name,
@@ -245,18 +231,18 @@ def _compared(side: DiffInput) -> Compared:
 # ------------------------------------------------------------- what else is not the same, in words
 
 
-def _texts(a: Results, b: Results, *, paired: bool) -> Iterator[TextChange]:
+def _texts(a: Results, b: Results, *, paired: bool) -> Iterator[contract.TextChange]:
     """Settings, parameters of PX4 and facts about the flight that are not the same."""
     places = {**_SETTINGS, **(_SEGMENT if paired else {}), **_FLIGHT}
     for what, place in places.items():
         if (first := at(a, place)) != (second := at(b, place)):
             kind: Literal["setting", "flight"]
             kind = "setting" if place.startswith("settings.") else "flight"
-            yield TextChange(kind, what, _plain(first), _plain(second))
+            yield contract.TextChange(kind, what, _plain(first), _plain(second))
     one, other = _parameters(a), _parameters(b)
     for name in sorted(one.keys() | other.keys()):
-        if one.get(name) != other.get(name):
-            yield TextChange("parameter", name, _plain(one.get(name)), _plain(other.get(name)))
+        if (first := one.get(name)) != (second := other.get(name)):
+            yield contract.TextChange("parameter", name, _plain(first), _plain(second))
 
 
 def _parameters(found: Results) -> dict[str, float]:
@@ -271,18 +257,18 @@ def _plain(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _findings(a: Results, b: Results) -> Iterator[FindingChange]:
+def _findings(a: Results, b: Results) -> Iterator[contract.FindingChange]:
     """Findings that only one of the two has, as a cause or as a consequence."""
-    both: tuple[tuple[Results, Results, Which], ...]
+    both: tuple[tuple[Results, Results, contract.Which], ...]
     both = ((b, a, "B"), (a, b, "A"))
     for mine, other, only_in in both:
         known = {one.id for one in other.findings}
         for one in mine.findings:
             if one.id not in known:
-                yield FindingChange(one.id, one.severity, one.message, only_in)
+                yield contract.FindingChange(one.id, one.severity, one.message, only_in)
 
 
-def _sentences(found: ChangeResults) -> Iterator[str]:
+def _sentences(found: contract.ChangeResults) -> Iterator[str]:
     """What changed, in a few sentences."""
     judgements = Counter(change.judgement for change in found.numbers)
     changed = judgements.total() - judgements[""]

@@ -13,17 +13,14 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from importlib import metadata
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from px4fuse.errors import Px4FuseError, SettingsError
 from px4fuse.results.reading import one_line
-from px4fuse.verification.workers import Failed
+from px4fuse.verification.workers import Failed, Job, Result
 
 if TYPE_CHECKING:
     from distributed import Client
-
-Job = TypeVar("Job")
-Result = TypeVar("Result")
 
 CONNECT_S = 15.0
 # Jobs that a cluster's worker takes at once: to import what they need takes a process 2 s

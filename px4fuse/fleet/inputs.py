@@ -1,7 +1,5 @@
 """What ``diff`` compares: a log, the results attached to a report, or results as JSON."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a worker does with one log: reads it where it lies and gives back rows and files."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path

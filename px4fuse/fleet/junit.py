@@ -1,7 +1,5 @@
 """A fleet's table as JUnit XML: a test case per log, for what shows the tests of a vehicle."""
 
-from __future__ import annotations
-
 from collections import Counter
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 

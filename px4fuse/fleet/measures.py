@@ -7,8 +7,6 @@ innovations comes from chi-square with so many of them as are independent, and t
 known.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

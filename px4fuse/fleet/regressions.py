@@ -6,8 +6,6 @@ flights that its vehicle made with the same settings, axis by axis: worse is wha
 range in which the next such flight is expected.
 """
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from pathlib import Path

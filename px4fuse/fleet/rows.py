@@ -1,7 +1,5 @@
 """Results of a comparison → rows of the fleet's table, and how that table is written."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from typing import Any

@@ -1,7 +1,5 @@
 """Logs → the fleet's table: each log compared by a worker, its rows kept, the table written."""
 
-from __future__ import annotations
-
 import io
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
@@ -92,16 +90,8 @@ class _Run:
 def batch(
     paths: str | Path | Iterable[str | Path],
     output: str | Path | None = None,
-    *,
-    reports: bool = False,
-    timeout_s: float = TIMEOUT_S,
-    baseline: pd.DataFrame | None = None,
-    scheduler: str | None = None,
-    workers: int | None = None,
-    memory_gb: float = MEMORY_BYTES / 1e9,
-    progress: Progress = lambda what, done, of: None,
-    **settings: Any,
-) -> pd.DataFrame:
+    *, reports: bool = False, **how: Any,
+) -> pd.DataFrame:  # fmt: skip
     """Compare many logs, on this computer or a Dask cluster.
 
     In a session with a Dask client of its own (``distributed.Client``), that one's cluster does
@@ -128,8 +118,8 @@ def batch(
         Address space for one log, of which libraries take 0.6 GB; Linux alone enforces it.
     progress : callable
         Told what is being done, how many logs are done, and of how many.
-    **settings
-        Fields of :class:`px4fuse.ComparisonRequest`, as ``sigma_z_m``.
+    **how
+        The above by name, and fields of :class:`px4fuse.ComparisonRequest`, as ``sigma_z_m``.
 
     Returns
     -------
@@ -145,18 +135,8 @@ def batch(
     """
     given = (paths,) if isinstance(paths, str | Path) else paths
     with TemporaryDirectory(prefix="px4fuse-") as scratch:
-        fleet = run(
-            map(str, given),
-            Path(scratch if output is None else output),
-            reports=reports and output is not None,
-            timeout_s=timeout_s,
-            baseline=baseline,
-            scheduler=scheduler,
-            workers=workers,
-            memory_gb=memory_gb,
-            progress=progress,
-            **settings,
-        )
+        folder = Path(scratch if output is None else output)
+        fleet = run(map(str, given), folder, reports=reports and output is not None, **how)
     return fleet.table if output is not None else fleet.table.assign(results="", report="")
 
 

@@ -1,7 +1,5 @@
 """What ``px4fuse batch`` prints when it is done."""
 
-from __future__ import annotations
-
 from rich.console import Console
 from rich.text import Text
 

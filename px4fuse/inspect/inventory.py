@@ -1,7 +1,5 @@
 """What is in a log, what can be done with it, and what to change before the next flight."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime
@@ -19,15 +17,7 @@ from px4fuse.errors import MissingDataError, Px4FuseError
 from px4fuse.filter.signals import IMU_GAP_INTERVALS, IMU_GAP_S, Segment, ned_acceleration, within
 from px4fuse.findings import ekf2_not_fusing, imu, missing, named, recording
 from px4fuse.findings.source_intervals import longest_s
-from px4fuse.flight import (
-    VELOCITY_COLUMNS,
-    Ekf2,
-    Flight,
-    PositionTrack,
-    Truth,
-    Unavailable,
-    sample_rate,
-)
+from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable, sample_rate
 from px4fuse.inspect.tables import NO_POSITION, absent
 from px4fuse.plain import capital, plain
 from px4fuse.recording import Stream
@@ -346,7 +336,7 @@ def _done(compared: Comparison) -> dict[str, tuple[object, str]]:
     counts = [f"{n} {len(f)}" for n, f in innovations.items() if isinstance(f, pd.DataFrame)]
     judged = [axis.filters["ekf2"] for axis in compared.axes.values()]
     what = "position only"
-    if isinstance(truth, Truth) and truth.samples[VELOCITY_COLUMNS].notna().any(axis=None):
+    if isinstance(truth, Truth) and truth.samples[Columns.VELOCITY].notna().any(axis=None):
         what = "position and velocity"
     return {
         "EKF2 states": (first.difference, f"{_count(first.ekf2_state)} of position and velocity"),

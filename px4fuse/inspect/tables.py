@@ -1,7 +1,5 @@
 """A flight as tidy tables, each column described in a data dictionary."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A loop from what was given: which part, where it ended, what it is scored against."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -9,18 +7,11 @@ import numpy as np
 from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.flight import Flight, Truth, Unavailable
+from px4fuse.loop import part
 from px4fuse.loop.closure import key_frame_spacing_m, key_frames, upright
 from px4fuse.loop.corrections import by_distance, judge, score_all, solve_all
 from px4fuse.loop.model import LANDING, KnownEnd, Loop, OdometryNoise
 from px4fuse.loop.odometry import Claim, pose_graph
-from px4fuse.loop.part import (
-    assumed_end,
-    chosen_part,
-    heading_change_deg,
-    measured_end,
-    part_of,
-    true_end,
-)
 from px4fuse.loop.tracks import LoopSource, odometry_of, trajectory_of
 from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie
@@ -73,12 +64,12 @@ def analyse(
 
     given = (request.start_s, request.end_s)
     start, end = (None if time_s is None else stamp(time_s) for time_s in given)
-    segment, at_rest = chosen_part(flight, trajectory, start, end)
+    segment, at_rest = part.chosen_part(flight, trajectory, start, end)
     truth = None if flight is None or trajectory.kind == "truth" else truth_of(flight)
     whole = upright(trajectory)
-    path = part_of(whole, segment, at_rest)
+    path = part.part_of(whole, segment, at_rest)
     real = truth if request.came_back and request.landed_at is None else None
-    by_truth = None if real is None else true_end(path, real, segment, at_rest)
+    by_truth = None if real is None else part.true_end(path, real, segment, at_rest)
     known = _known_end(path, request, by_truth)
     claims: list[Claim] = [
         (GivenClosure(stamp(one.time_1_s), stamp(one.time_2_s), one.sigma_m), None)
@@ -97,12 +88,12 @@ def analyse(
         notes.append(f"the truth does not tell where it ended: {by_truth}")
     judged = judge(graph, claims)
     solved, judged = solve_all(path, nodes, graph, judged, progress)
-    end_m, heading = path.position_m[-1] - path.position_m[0], heading_change_deg(path)
+    end_m, heading = path.position_m[-1] - path.position_m[0], part.heading_change_deg(path)
     missed = known if isinstance(known, Unavailable) else end_m - known.displacement
     heading_error = _heading_error(known, heading)
     landing = judged[0] if judged and judged[0].source == LANDING else None
     spread = by_distance(path, distance, missed, heading_error, landing)
-    references = tuple(part for part in (truth, reference) if part is not None)
+    references = tuple(one for one in (truth, reference) if one is not None)
     error = error_axes = None
     if not isinstance(missed, Unavailable):
         error, error_axes = float(np.linalg.norm(missed)), by_axis(path.frame, missed)
@@ -144,12 +135,12 @@ def _known_end(
     if request.landed_at is not None:
         if not request.came_back:
             raise SettingsError("`landed_at` and `came_back` exclude each other", "Leave one out.")
-        return measured_end(path, request.landed_at)
+        return part.measured_end(path, request.landed_at)
     if not request.came_back:
         return Unavailable(
             "misclosure", "the vehicle is not said to have come back", "Leave out --open."
         )
-    return by_truth if isinstance(by_truth, KnownEnd) else assumed_end(path)
+    return by_truth if isinstance(by_truth, KnownEnd) else part.assumed_end(path)
 
 
 def _is_absolute(trajectory: Trajectory, flight: Flight) -> bool:
@@ -230,7 +221,7 @@ def loop_in(flight: Flight, progress: Callable[[str], None] = lambda _: None) ->
         reason = odometry.reason if isinstance(odometry, Unavailable) else str(error).rstrip(".")
         remedy = "A loop is measured on visual-inertial odometry, sent as ODOMETRY."
         return Unavailable("loop closure", reason, remedy)
-    segment, _ = chosen_part(flight, trajectory, None, None)
+    segment, _ = part.chosen_part(flight, trajectory, None, None)
     time = trajectory.time_s
     inside = trajectory.position_m[(time >= segment.start_s) & (time <= segment.end_s)]
     extent = gap = 0.0

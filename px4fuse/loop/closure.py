@@ -3,8 +3,6 @@
 Positions have z down here (NED, or forward-right-down at the start); see :func:`upright`.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The paths of a loop: its closures judged, the path corrected in several ways, each scored."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -150,53 +148,43 @@ def score_all(
     odometry: Trajectory, made: Mapping[Way, Corrected], references: tuple[Trajectory, ...]
 ) -> dict[Way, CorrectedPath | Unavailable]:
     """The odometry, and every path, scored; the clocks are matched once, on the odometry."""
-    raw = _scored("uncorrected", odometry, odometry, None, references, {})
-    offsets = {
-        name: score.time_offset.offset_s
-        for name, score in raw.scores.items()
-        if isinstance(score, Evaluation) and score.time_offset.offset_s is not None
-    }
-    found: dict[Way, CorrectedPath | Unavailable] = {"uncorrected": raw}
-    for way, one in made.items():
-        same = found.get("pose_graph_all")
-        if isinstance(one, Unavailable):
-            found[way] = one
-        elif isinstance(same, CorrectedPath) and one[1] is same.solution:
-            found[way] = structs.replace(same, name=NAMES[way])
-        else:
-            found[way] = _scored(way, odometry, *one, references, offsets)
-    return found
+    offsets: dict[str, float] = {}
 
-
-def _scored(
-    way: Way,
-    odometry: Trajectory,
-    corrected: Trajectory,
-    solution: Solution | None,
-    references: tuple[Trajectory, ...],
-    offsets: Mapping[str, float],
-) -> CorrectedPath:
-    """A path, how far it moved, and its score against every reference."""
-    scores: dict[str, Evaluation | Unavailable] = {}
-    for reference in references:
-        same_clock = 0.0 if reference.sha256 == corrected.sha256 else None
+    def score(path: Trajectory, reference: Trajectory) -> Evaluation | Unavailable:
+        same_clock = 0.0 if reference.sha256 == path.sha256 else None
         known = offsets.get(reference.name, same_clock)
         try:
-            scores[reference.name] = evaluate(corrected, reference, time_offset_s=known)
+            return evaluate(path, reference, time_offset_s=known)
         except Px4FuseError as error:
-            scores[reference.name] = Unavailable(
-                f"score against {reference.name}", str(error), "Give another --reference."
-            )
-    moved: Array = np.linalg.norm(corrected.position_m - odometry.position_m, axis=1)
-    costs: dict[str, Any] = {} if solution is None else structs.asdict(written(solution))
-    costs.pop("dropped", None)
-    return CorrectedPath(
-        name=NAMES[way],
-        trajectory=corrected,
-        moved_m=moved,
-        moved_max_m=float(moved.max()),
-        moved_rms_m=float(np.sqrt(np.mean(moved**2))),
-        scores=scores,
-        solution=solution,
-        **costs,
-    )
+            what = f"score against {reference.name}"
+            return Unavailable(what, str(error), "Give another --reference.")
+
+    def scored(way: Way, path: Trajectory, solution: Solution | None) -> CorrectedPath:
+        moved: Array = np.linalg.norm(path.position_m - odometry.position_m, axis=1)
+        costs: dict[str, Any] = {} if solution is None else structs.asdict(written(solution))
+        costs.pop("dropped", None)
+        return CorrectedPath(
+            name=NAMES[way],
+            trajectory=path,
+            moved_m=moved,
+            moved_max_m=float(moved.max()),
+            moved_rms_m=float(np.sqrt(np.mean(moved**2))),
+            scores={reference.name: score(path, reference) for reference in references},
+            solution=solution,
+            **costs,
+        )
+
+    raw = scored("uncorrected", odometry, None)
+    for name, one in raw.scores.items():
+        if isinstance(one, Evaluation) and one.time_offset.offset_s is not None:
+            offsets[name] = one.time_offset.offset_s
+    found: dict[Way, CorrectedPath | Unavailable] = {"uncorrected": raw}
+    for way, corrected in made.items():
+        same = found.get("pose_graph_all")
+        if isinstance(corrected, Unavailable):
+            found[way] = corrected
+        elif isinstance(same, CorrectedPath) and corrected[1] is same.solution:
+            found[way] = structs.replace(same, name=NAMES[way])
+        else:
+            found[way] = scored(way, *corrected)
+    return found

@@ -1,7 +1,5 @@
 """What is known of a loop, as it is computed and written: ends, closures, corrected paths."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal

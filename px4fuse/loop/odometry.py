@@ -1,7 +1,5 @@
 """How odometry drifts, and the pose graph that follows from it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which part of a trajectory is the loop, and where the vehicle really ended."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

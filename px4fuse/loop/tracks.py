@@ -1,7 +1,5 @@
 """Trajectories from files of their own, or out of a flight: odometry, EKF2, our filter, truth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
@@ -15,18 +13,7 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.projection import continuous_state
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
-from px4fuse.flight import (
-    AXIS_NAMES,
-    POSITION_COLUMNS,
-    POSITION_VARIANCE_COLUMNS,
-    QUATERNION_COLUMNS,
-    ROTATION_VARIANCE_COLUMNS,
-    Ekf2,
-    Flight,
-    PositionTrack,
-    Truth,
-    Unavailable,
-)
+from px4fuse.flight import AXIS_NAMES, Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.readers.parts import finite_rows
 from px4fuse.readers.text_table import text_of
@@ -96,7 +83,7 @@ def _ours(flight: Flight) -> Trajectory:
     position = pd.DataFrame(
         {
             column: result.replay.steps["position_m"]
-            for column, result in zip(POSITION_COLUMNS, compared.axes.values(), strict=True)
+            for column, result in zip(Columns.POSITION, compared.axes.values(), strict=True)
         }
     )
     used = compared.settings
@@ -116,17 +103,17 @@ def _trajectory(
     frame: Frame = "NED",
 ) -> Trajectory:
     """Poses at the times of the positions, the orientation interpolated to them (slerp)."""
-    samples = finite_rows(samples, POSITION_COLUMNS)
+    samples = finite_rows(samples, Columns.POSITION)
     rotation, rotation_variance = None, None
     if isinstance(orientation, pd.DataFrame):
         known = orientation.index.to_numpy()
         inside = samples[(samples.index >= known[0]) & (samples.index <= known[-1])]
         if len(inside) >= MIN_POSES:
             samples = inside
-            quaternions = orientation[QUATERNION_COLUMNS].to_numpy(copy=True)
+            quaternions = orientation[Columns.QUATERNION].to_numpy(copy=True)
             turns = Rotation.from_quat(quaternions, scalar_first=True)
             rotation = Slerp(known, turns)(samples.index.to_numpy())
-            reported = _whole(orientation, ROTATION_VARIANCE_COLUMNS)
+            reported = _whole(orientation, Columns.ROTATION_VARIANCE)
             if reported is not None:
                 columns = [np.interp(samples.index, known, column) for column in reported.T]
                 rotation_variance = np.column_stack(columns)
@@ -138,11 +125,11 @@ def _trajectory(
         name=f"{flight.log.name}:{part}",
         kind=part,
         time_s=samples.index.to_numpy(np.float64),
-        position_m=samples[POSITION_COLUMNS].to_numpy(np.float64),
+        position_m=samples[Columns.POSITION].to_numpy(np.float64),
         rotation=rotation,
         frame=frame,
         unix_offset_s=flight.log.start_unix_s,
-        position_variance_m2=_whole(samples, POSITION_VARIANCE_COLUMNS),
+        position_variance_m2=_whole(samples, Columns.POSITION_VARIANCE),
         rotation_variance_rad2=rotation_variance,
         sha256=flight.log.sha256,
         size_bytes=flight.log.bytes,

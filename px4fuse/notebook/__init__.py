@@ -4,8 +4,6 @@ Importing this package teaches every result its words, its table and its picture
 (:mod:`px4fuse.display`).
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from px4fuse.display import Shown, draw

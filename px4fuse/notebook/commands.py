@@ -1,11 +1,10 @@
 """``compare``, ``close_loop``, ``evaluate``, ``what_if``, ``report`` and ``explore`` in Python."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from px4fuse import request
 from px4fuse.analysis import Analysis, run, run_what_if
 from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.model import Model, open_model
@@ -17,22 +16,6 @@ from px4fuse.loop.analysis import analyse
 from px4fuse.loop.model import Loop
 from px4fuse.loop.tracks import LoopSource, read_source
 from px4fuse.readers import read_log
-from px4fuse.request import (
-    AUTO,
-    DT_S,
-    SIGMA_A_M_S2,
-    AxisName,
-    ComparisonRequest,
-    FrameName,
-    GivenClosure,
-    HeightName,
-    InputName,
-    Landing,
-    LoopRequest,
-    PositionFile,
-    SourceKind,
-    WhatIfRequest,
-)
 from px4fuse.trajectory import evaluation
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.model import Trajectory
@@ -45,19 +28,19 @@ Progress = Callable[[str], None]
 def compare(
     log: Pathlike | Flight,
     *,
-    sigma_a_m_s2: float = SIGMA_A_M_S2,
+    sigma_a_m_s2: float = request.SIGMA_A_M_S2,
     sigma_z_m: float | None = None,
-    dt_s: float = DT_S,
-    input: InputName | None = None,  # noqa: A002 - the name of the setting
+    dt_s: float = request.DT_S,
+    input: request.InputName | None = None,  # noqa: A002 - the name of the setting
     clock_offset_s: float | Literal["auto"] | None = None,
-    axes: AxisName | Sequence[AxisName] = (),
+    axes: request.AxisName | Sequence[request.AxisName] = (),
     heading_deg: float | None = None,
     start_s: float | None = None,
     end_s: float | None = None,
     position_source: str | None = None,
-    source_kind: SourceKind | None = None,
-    height: HeightName | None = None,
-    position: Pathlike | PositionFile | None = None,
+    source_kind: request.SourceKind | None = None,
+    height: request.HeightName | None = None,
+    position: Pathlike | request.PositionFile | None = None,
     mavlink: Pathlike | None = None,
     system: int | None = None,
     progress: Progress = lambda _: None,
@@ -104,7 +87,7 @@ def compare(
         A file cannot be read, the flight lacks what was asked for, or a setting is out of range.
     """
     given = locals()  # arguments are called as the fields of the request
-    known, named = get_args(AxisName), (axes,) if isinstance(axes, str) else tuple(axes)
+    known, named = get_args(request.AxisName), (axes,) if isinstance(axes, str) else tuple(axes)
     if unknown := set(named).difference(known):
         raise SettingsError(f"`axes` {unknown.pop()!r}: choose from {', '.join(known)}.")
     if isinstance(log, Flight) and (position, mavlink, system) != (None, None, None):
@@ -113,18 +96,18 @@ def compare(
             "been read",
             "Give the path of its log.",
         )
-    if isinstance(clock_offset_s, str) and clock_offset_s != AUTO:
+    if isinstance(clock_offset_s, str) and clock_offset_s != request.AUTO:
         raise SettingsError(f"`clock_offset_s` {clock_offset_s!r}: give seconds, or 'auto'.")
-    asked = {name: given[name] for name in ComparisonRequest.__struct_fields__}
+    asked = {name: given[name] for name in request.ComparisonRequest.__struct_fields__}
     asked |= {"log": log.log.name if isinstance(log, Flight) else str(log), "axes": named}
     if mavlink is not None:
         asked["mavlink"] = str(mavlink)
     if isinstance(position, str | Path):
-        asked["position"] = PositionFile(path=str(position))
+        asked["position"] = request.PositionFile(path=str(position))
     if isinstance(clock_offset_s, int):
         asked["clock_offset_s"] = float(clock_offset_s)
-    request = ComparisonRequest(**asked)
-    return run(request, progress, log if isinstance(log, Flight) else None)
+    flight = log if isinstance(log, Flight) else None
+    return run(request.ComparisonRequest(**asked), progress, flight)
 
 
 def evaluate(
@@ -165,12 +148,12 @@ def close_loop(
     end_s: float | None = None,
     landed_at: tuple[float, float] | tuple[float, float, float] | None = None,
     came_back: bool = True,
-    closures: Sequence[GivenClosure] = (),
+    closures: Sequence[request.GivenClosure] = (),
     reference: Pathlike | Trajectory | None = None,
     position_drift_m: float = 1.0,
     heading_drift_deg: float = 3.0,
     key_frames_m: float | None = None,
-    frame: FrameName | None = None,
+    frame: request.FrameName | None = None,
     progress: Progress = lambda _: None,
 ) -> Loop:
     """Measure how far a loop fails to close, and correct its path.
@@ -208,11 +191,11 @@ def close_loop(
         LoopSource(source, None)
         if isinstance(source, Trajectory)
         else read_source(str(source), frame=frame),
-        LoopRequest(
+        request.LoopRequest(
             source=str(source),
             start_s=start_s,
             end_s=end_s,
-            landed_at=None if landed_at is None else Landing(*landed_at),
+            landed_at=None if landed_at is None else request.Landing(*landed_at),
             came_back=came_back,
             closures=tuple(closures),
             position_drift_m=position_drift_m,
@@ -278,8 +261,8 @@ def explore(analysis: Analysis, path: Pathlike) -> Path:
     """
     from px4fuse.explore.page import html_text  # noqa: PLC0415 - Bokeh takes its time
 
-    target, request = _ending(path, ".html"), _request(analysis)
-    write_all({target: html_text([(analysis, find(analysis), request)]).encode()})
+    target, asked = _ending(path, ".html"), _request(analysis)
+    write_all({target: html_text([(analysis, find(analysis), asked)]).encode()})
     return target
 
 
@@ -290,7 +273,7 @@ def _ending(path: Pathlike, ending: str) -> Path:
     return target
 
 
-def _request(analysis: Analysis) -> ComparisonRequest:
+def _request(analysis: Analysis) -> request.ComparisonRequest:
     if analysis.request is None:
         raise SettingsError(
             "this analysis does not say what was asked for", "Make it with px4fuse.compare."
@@ -325,7 +308,7 @@ def what_if(
     if not isinstance(flight, Flight):
         flight = read_log(flight)
     if changes is None and not without:
-        return run_what_if(WhatIfRequest(log=flight.log.name), flight=flight).whatif
+        return run_what_if(request.WhatIfRequest(log=flight.log.name), flight=flight).whatif
     model = log if isinstance(log, Model) else open_model(flight)
     if isinstance(model, Unavailable):
         raise MissingDataError(f"{model.what}: {model.reason}", model.remedy)

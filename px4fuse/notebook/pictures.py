@@ -1,7 +1,5 @@
 """Results as pictures, in the colours of the report."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from textwrap import fill
 from typing import Any

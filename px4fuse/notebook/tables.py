@@ -1,7 +1,5 @@
 """Results in words and as tables; importing this module teaches them both."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from textwrap import wrap
 from typing import Any
@@ -21,15 +19,7 @@ from px4fuse.filter.heading import HeadingError
 from px4fuse.filter.tuning import AxisTuning, Noise
 from px4fuse.findings import SEVERITIES, find
 from px4fuse.findings.story import story
-from px4fuse.flight import (
-    POSITION_COLUMNS,
-    QUATERNION_COLUMNS,
-    Ekf2,
-    Flight,
-    Truth,
-    Unavailable,
-    sample_rate,
-)
+from px4fuse.flight import Columns, Ekf2, Flight, Truth, Unavailable, sample_rate
 from px4fuse.loop.model import Loop
 from px4fuse.record import Record, written
 from px4fuse.report.evaluation import interval_words, summary
@@ -96,10 +86,10 @@ def _(flight: Flight) -> str:
 def _(flight: Flight) -> pd.DataFrame:
     """Positions, one below the other: ``track, time_s, north_m, east_m, down_m``."""
     parts = [
-        samples[POSITION_COLUMNS].reset_index().assign(track=name)
+        samples[Columns.POSITION].reset_index().assign(track=name)
         for name, samples in tracks(flight)
     ]
-    columns = ["track", "time_s", *POSITION_COLUMNS]
+    columns = ["track", "time_s", *Columns.POSITION]
     if not parts:
         return pd.DataFrame(columns=columns)
     return pd.concat(parts, ignore_index=True)[columns]
@@ -274,11 +264,8 @@ def _(clock: ClockOffset) -> str:
 @frame.register
 def _(clock: ClockOffset) -> pd.DataFrame:
     """The whole flight first, then its consecutive parts."""
-    rows = [("flight", np.nan, np.nan, clock.offset_s, clock.sigma_s)]
-    rows += [
-        (f"part {at}", part.start_s, part.end_s, part.offset_s, part.sigma_s)
-        for at, part in enumerate(clock.parts, 1)
-    ]
+    rows = [{"part": "flight", "offset_s": clock.offset_s, "sigma_s": clock.sigma_s}]
+    rows += [{"part": f"part {at}"} | row(part) for at, part in enumerate(clock.parts, 1)]
     return pd.DataFrame(rows, columns=["part", "start_s", "end_s", "offset_s", "sigma_s"])
 
 
@@ -317,9 +304,7 @@ def _(trajectory: Trajectory) -> pd.DataFrame:
         trajectory.position_m, pd.Index(trajectory.time_s, name="time_s"), columns=names
     )
     if trajectory.rotation is not None:
-        x, y, z, w = trajectory.rotation.as_quat().T
-        for name, part in zip(QUATERNION_COLUMNS, (w, x, y, z), strict=True):
-            table[name] = part
+        table[Columns.QUATERNION] = trajectory.rotation.as_quat(scalar_first=True)
     return table
 
 

@@ -1,7 +1,5 @@
 """Readers: one file per format, picked by content, not by suffix."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from px4fuse.errors import LogError, SettingsError

@@ -1,7 +1,5 @@
 """Pose graphs in g2o's text format, in the plane and in space."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

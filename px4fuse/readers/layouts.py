@@ -1,11 +1,9 @@
 """How a topic or message holds a quantity: the rows of which the tables of both formats consist."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS
+from px4fuse.flight import Columns
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,7 @@ def fields(columns: list[str], names: str) -> dict[str, str]:
     return dict(zip(columns, names.split(), strict=True))
 
 
-XYZ, VELOCITY = fields(POSITION_COLUMNS, "x y z"), fields(VELOCITY_COLUMNS, "vx vy vz")
+XYZ, VELOCITY = fields(Columns.POSITION, "x y z"), fields(Columns.VELOCITY, "vx vy vz")
 POSITION_AND_VELOCITY = XYZ | VELOCITY
 GLOBAL_COLUMNS = ["latitude_deg", "longitude_deg", "altitude_m"]
 GLOBAL = fields(GLOBAL_COLUMNS, "lat lon alt")

@@ -4,8 +4,6 @@ Which message is what, its direction and its clock follow PX4's ``src/modules/ma
 v1.16) and MAVLink's ``common.xml``; ``mavlink_messages`` holds them as tables.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -15,17 +13,7 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, REPORTED, settings_in_force
-from px4fuse.flight import (
-    AXIS_NAMES,
-    POSITION_VARIANCE_COLUMNS,
-    QUATERNION_COLUMNS,
-    STATE_COLUMNS,
-    VELOCITY_VARIANCE_COLUMNS,
-    Ekf2,
-    Flight,
-    FlightMode,
-    Unavailable,
-)
+from px4fuse.flight import AXIS_NAMES, Columns, Ekf2, Flight, FlightMode, Unavailable
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import mavlink_senders as senders
 from px4fuse.readers import parts
@@ -37,7 +25,7 @@ from px4fuse.readers.px4_positions import barometer
 from px4fuse.readers.ulog_topics import NO_SELECTOR, dropped_note
 from px4fuse.recording import LogInfo, Unused
 
-VARIANCE_COLUMNS = POSITION_VARIANCE_COLUMNS + VELOCITY_VARIANCE_COLUMNS
+VARIANCE_COLUMNS = Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE
 # MAV_PARAM_TYPE: below, an integer
 PARAMETER_REAL = 9
 
@@ -134,7 +122,7 @@ def _read_imu(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
 
 def _read_attitude(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
     layout = max(messages.ATTITUDE, key=lambda layout: len(recording.rows(layout.topic)))
-    attitude = parts.with_attitude(recording.read(layout))[QUATERNION_COLUMNS]
+    attitude = parts.with_attitude(recording.read(layout))[Columns.QUATERNION]
     if len(attitude) < 2:
         *some, last = (layout.topic for layout in messages.ATTITUDE)
         return Unavailable("attitude", f"no usable {', '.join(some)} or {last}", remedy)
@@ -160,7 +148,7 @@ def _read_ekf2(
             "EKF2", "no ODOMETRY or LOCAL_POSITION_NED of the autopilot", remedies["state"]
         )
     samples = recording.read(layout)
-    state = samples[STATE_COLUMNS].dropna()
+    state = samples[Columns.STATE].dropna()
     if len(state) < 2:
         return Unavailable("EKF2", f"{message} holds no finite state", "Wait for EKF2 to start.")
     recording.came_from("ekf2_state", message)
@@ -218,7 +206,7 @@ def _variance_by_accuracy(recording: Recording) -> pd.DataFrame:
     variance = pd.DataFrame(np.nan, index=accuracy.index, columns=VARIANCE_COLUMNS)
     variance["north_m2"] = variance["east_m2"] = accuracy["horizontal_m"] ** 2 / 2.0
     variance["down_m2"] = accuracy["vertical_m"] ** 2
-    return variance[(variance[POSITION_VARIANCE_COLUMNS] > 0.0).all(axis=1)]
+    return variance[(variance[Columns.POSITION_VARIANCE] > 0.0).all(axis=1)]
 
 
 def _read_airborne(

@@ -8,8 +8,6 @@ once with the field tables of pymavlink's dialect.
 Sources: MAVLink developer guide, "Packet Serialization"; pymavlink's generated dialects.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

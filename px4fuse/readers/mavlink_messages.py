@@ -6,25 +6,13 @@ Sources: MAVLink ``common.xml``; PX4 ``src/modules/mavlink/mavlink_receiver.cpp`
 ``streams/*.hpp`` (v1.13 to v1.16).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
 from scipy import constants
 
-from px4fuse.flight import (
-    ANGULAR_RATE_COLUMNS,
-    POSITION_VARIANCE_COLUMNS,
-    QUATERNION_COLUMNS,
-    RECORD_NOT_LOGGED,
-    ROTATION_VARIANCE_COLUMNS,
-    SPECIFIC_FORCE_COLUMNS,
-    VELOCITY_COLUMNS,
-    VELOCITY_VARIANCE_COLUMNS,
-    Unavailable,
-)
+from px4fuse.flight import RECORD_NOT_LOGGED, Columns, Unavailable
 from px4fuse.origin import MOTION_CAPTURE, RECEIVED, Origin
 from px4fuse.readers.layouts import (
     GLOBAL,
@@ -111,7 +99,7 @@ def remedies_of(autopilot: str) -> tuple[Mapping[str, str], Unavailable]:
     }, RECORD_NOT_LOGGED
 
 
-_IMU_COLUMNS = SPECIFIC_FORCE_COLUMNS + ANGULAR_RATE_COLUMNS
+_IMU_COLUMNS = Columns.SPECIFIC_FORCE + Columns.ANGULAR_RATE
 _IMU_FIELDS = fields(_IMU_COLUMNS, "xacc yacc zacc xgyro ygyro zgyro")
 # milli-g and mrad/s
 _MILLI = dict(zip(_IMU_COLUMNS, [constants.g * 1e-3] * 3 + [1e-3] * 3, strict=True))
@@ -129,25 +117,25 @@ OWN_MESSAGES = (
 _ANGLES = {"roll": "roll", "pitch": "pitch", "yaw": "yaw"}
 # Equally dense ones are taken in this order
 ATTITUDE = (
-    Layout("ATTITUDE_QUATERNION", {name: f"q{i}" for i, name in enumerate(QUATERNION_COLUMNS, 1)}),
+    Layout("ATTITUDE_QUATERNION", {name: f"q{i}" for i, name in enumerate(Columns.QUATERNION, 1)}),
     Layout("ATTITUDE", _ANGLES),
-    Layout("ODOMETRY", elements(QUATERNION_COLUMNS, "q")),
+    Layout("ODOMETRY", elements(Columns.QUATERNION, "q")),
 )
 
 
 def _pose(covariance: str) -> dict[str, str]:
     """Variances of position and orientation, which stand on the diagonal of a covariance."""
-    return elements(POSITION_VARIANCE_COLUMNS, covariance, POSE_DIAGONAL) | elements(
-        ROTATION_VARIANCE_COLUMNS, covariance, ROTATION_DIAGONAL
+    return elements(Columns.POSITION_VARIANCE, covariance, POSE_DIAGONAL) | elements(
+        Columns.ROTATION_VARIANCE, covariance, ROTATION_DIAGONAL
     )
 
 
 ODOMETRY = Layout(
     "ODOMETRY",
     POSITION_AND_VELOCITY
-    | elements(QUATERNION_COLUMNS, "q")
+    | elements(Columns.QUATERNION, "q")
     | _pose("pose_covariance")
-    | elements(VELOCITY_VARIANCE_COLUMNS, "velocity_covariance", POSE_DIAGONAL)
+    | elements(Columns.VELOCITY_VARIANCE, "velocity_covariance", POSE_DIAGONAL)
     | {name: name for name in ("frame_id", "child_frame_id", "reset_counter")},
 )
 # EKF2's state, that with variances first
@@ -160,8 +148,8 @@ ACCURACY = Layout(
 TRUTH = (
     Layout(
         "HIL_STATE_QUATERNION",
-        GLOBAL | VELOCITY | elements(QUATERNION_COLUMNS, "attitude_quaternion"),
-        scale=GLOBAL_SCALE | dict.fromkeys(VELOCITY_COLUMNS, 1e-2),
+        GLOBAL | VELOCITY | elements(Columns.QUATERNION, "attitude_quaternion"),
+        scale=GLOBAL_SCALE | dict.fromkeys(Columns.VELOCITY, 1e-2),
     ),
     Layout("SIMSTATE", fields(GLOBAL_COLUMNS[:2], "lat lng"), scale=GLOBAL_SCALE),
 )
@@ -216,7 +204,7 @@ POSITION_INPUTS = (
     PositionInput("ODOMETRY_MOCAP", ODOMETRY, "time_usec", MOTION_CAPTURE, _MOCAP, 6),
     PositionInput(
         "ATT_POS_MOCAP",
-        Layout("ATT_POS_MOCAP", XYZ | elements(QUATERNION_COLUMNS, "q") | _pose("covariance")),
+        Layout("ATT_POS_MOCAP", XYZ | elements(Columns.QUATERNION, "q") | _pose("covariance")),
         "time_usec", MOTION_CAPTURE, _MOCAP,
     ),
 )  # fmt: skip

@@ -9,18 +9,7 @@ import pandas as pd
 from msgspec import structs
 from scipy import constants
 
-from px4fuse.flight import (
-    POSITION_COLUMNS,
-    POSITION_VARIANCE_COLUMNS,
-    QUATERNION_COLUMNS,
-    ROTATION_VARIANCE_COLUMNS,
-    STATE_COLUMNS,
-    VELOCITY_COLUMNS,
-    PositionTrack,
-    Truth,
-    Unavailable,
-    best_first,
-)
+from px4fuse.flight import Columns, PositionTrack, Truth, Unavailable, best_first
 from px4fuse.origin import GNSS, with_orientation
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import px4_positions
@@ -106,9 +95,9 @@ def _read_track(
         reference = messages.FRAMES_OF_REFERENCE.get(int(samples["frame_id"].iloc[-1]))
         frame = "unknown" if reference is None else reference.name
     if source.drops_covariance:
-        samples[POSITION_VARIANCE_COLUMNS + ROTATION_VARIANCE_COLUMNS] = np.nan
+        samples[Columns.POSITION_VARIANCE + Columns.ROTATION_VARIANCE] = np.nan
     orientation = orientation_of(samples)
-    samples = px4_positions.clean_positions(samples, POSITION_COLUMNS)
+    samples = px4_positions.clean_positions(samples, Columns.POSITION)
     if len(samples) < px4_positions.MIN_TRACK_SAMPLES:
         reason = f"{len(samples)} finite samples are too few"
         return (Unavailable(f"position source {name}", reason, remedy, source=name),)
@@ -149,14 +138,14 @@ def _read_gnss(recording: Recording, layout: Layout, delay_s: float) -> Position
     if len(fixes) < px4_positions.MIN_TRACK_SAMPLES:
         return None
     samples = projected(fixes, local_origin(recording))
-    accuracy = fixes[["eph_m", "eph_m", "epv_m"]].set_axis(POSITION_VARIANCE_COLUMNS, axis=1) ** 2
+    accuracy = fixes[["eph_m", "eph_m", "epv_m"]].set_axis(Columns.POSITION_VARIANCE, axis=1) ** 2
     return PositionTrack(
         name=layout.topic,
         origin=structs.replace(
             GNSS, automatic=bool(recording.read(messages.GLOBAL_STATE)["latitude_deg"].any())
         ),
         description="GNSS position",
-        samples=px4_positions.clean_positions(samples.join(accuracy), POSITION_COLUMNS),
+        samples=px4_positions.clean_positions(samples.join(accuracy), Columns.POSITION),
         frame="NED",
         clock=f"{BOOT_CLOCK}, less {1e3 * delay_s:g} ms",
         topics=(layout.topic,),
@@ -180,7 +169,7 @@ def local_origin(recording: Recording) -> tuple[float, float, float] | None:
     if len(sent):
         latitude, longitude, altitude = sent[GLOBAL_COLUMNS].iloc[-1]
         return float(latitude), float(longitude), float(altitude)
-    state = recording.read(messages.STATES[-1])[POSITION_COLUMNS]
+    state = recording.read(messages.STATES[-1])[Columns.POSITION]
     both = pd.merge_asof(
         recording.read(messages.GLOBAL_STATE), state, left_index=True, right_index=True,
         direction="nearest", tolerance=SAME_STATE_S,  # type: ignore[arg-type]
@@ -188,7 +177,7 @@ def local_origin(recording: Recording) -> tuple[float, float, float] | None:
     both = both[both["latitude_deg"] != 0.0]
     if both.empty:
         return None
-    geo, local = both[GLOBAL_COLUMNS].to_numpy(), both[POSITION_COLUMNS].to_numpy()
+    geo, local = both[GLOBAL_COLUMNS].to_numpy(), both[Columns.POSITION].to_numpy()
     places = [
         np.concatenate([np.ravel(unproject(-north, -east, (at[0], at[1]))), [at[2] + down]])
         for at, (north, east, down) in zip(geo, local, strict=True)
@@ -214,14 +203,14 @@ def read_truth(
         samples = samples.dropna(subset=GLOBAL_COLUMNS[:2])
         if not samples["latitude_deg"].any():
             continue
-        samples = samples.reindex(columns=[*GLOBAL_COLUMNS, *VELOCITY_COLUMNS, *QUATERNION_COLUMNS])
-        if not samples[VELOCITY_COLUMNS].to_numpy().any():
+        samples = samples.reindex(columns=[*GLOBAL_COLUMNS, *Columns.VELOCITY, *Columns.QUATERNION])
+        if not samples[Columns.VELOCITY].to_numpy().any():
             # not sent: a vehicle that never moves has no use for truth
-            samples[VELOCITY_COLUMNS] = np.nan
+            samples[Columns.VELOCITY] = np.nan
         recording.came_from("truth", layout.topic, clock=RECEIPT_CLOCK)
         origin = local_origin(recording) if positions and positions[0].origin.is_gnss else None
-        state = pd.concat([projected(samples, origin), samples[VELOCITY_COLUMNS]], axis=1)
-        return Truth(layout.topic, state[STATE_COLUMNS], attitude_of(samples))
+        state = pd.concat([projected(samples, origin), samples[Columns.VELOCITY]], axis=1)
+        return Truth(layout.topic, state[Columns.STATE], attitude_of(samples))
     captured = px4_positions.motion_capture(positions, "ATT_POS_MOCAP")
     if captured is None:
         return Unavailable(

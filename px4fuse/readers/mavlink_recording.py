@@ -1,7 +1,5 @@
 """One MAVLink recording with its vehicle chosen and its clocks settled."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,15 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, IntArray
-from px4fuse.flight import (
-    POSITION_COLUMNS,
-    POSITION_VARIANCE_COLUMNS,
-    QUATERNION_COLUMNS,
-    ROTATION_VARIANCE_COLUMNS,
-    STATE_COLUMNS,
-    VELOCITY_COLUMNS,
-    VELOCITY_VARIANCE_COLUMNS,
-)
+from px4fuse.flight import Columns
 from px4fuse.readers.layouts import Layout
 from px4fuse.readers.mavlink_clocks import UNIX_FROM_S, Line, least_delay, tells_time
 from px4fuse.readers.mavlink_frames import LONGEST_FRAME, Frames, message_name, wire_layout
@@ -145,7 +135,7 @@ class Recording:
             copy=False,
         )
         if "roll" in samples:
-            samples[QUATERNION_COLUMNS] = _quaternions_of_angles(samples)
+            samples[Columns.QUATERNION] = _quaternions_of_angles(samples)
         return _in_ned(samples) if "frame_id" in samples else samples
 
     def _keep(self, name: str, boot_s: Array) -> IntArray:
@@ -199,32 +189,32 @@ def _in_ned(samples: pd.DataFrame) -> pd.DataFrame:
     (``streams/ODOMETRY.hpp``). Orientations are given up where the frame is not NED or FRD: what
     such a sender calls its body is not known.
     """
-    turned = np.linalg.norm(samples[QUATERNION_COLUMNS].to_numpy(), axis=1) > MIN_NORM
-    orientation = QUATERNION_COLUMNS + ROTATION_VARIANCE_COLUMNS
+    turned = np.linalg.norm(samples[Columns.QUATERNION].to_numpy(), axis=1) > MIN_NORM
+    orientation = Columns.QUATERNION + Columns.ROTATION_VARIANCE
     made = samples.copy()
-    made[STATE_COLUMNS + POSITION_VARIANCE_COLUMNS] = np.nan
-    made[VELOCITY_VARIANCE_COLUMNS + orientation] = np.nan
+    made[Columns.STATE + Columns.POSITION_VARIANCE] = np.nan
+    made[Columns.VELOCITY_VARIANCE + orientation] = np.nan
     used = {*samples["frame_id"].unique(), *samples["child_frame_id"].unique()}
     for number in used & FRAMES_OF_REFERENCE.keys():
         _, order, signs, turns = FRAMES_OF_REFERENCE[number]
         own = samples[(samples["frame_id"] == number) & (not turns)]
-        position = own[POSITION_COLUMNS].to_numpy()[:, order]
-        variance = own[POSITION_VARIANCE_COLUMNS].to_numpy()[:, order]
-        made.loc[own.index, POSITION_COLUMNS] = position * signs
-        made.loc[own.index, POSITION_VARIANCE_COLUMNS] = variance
+        position = own[Columns.POSITION].to_numpy()[:, order]
+        variance = own[Columns.POSITION_VARIANCE].to_numpy()[:, order]
+        made.loc[own.index, Columns.POSITION] = position * signs
+        made.loc[own.index, Columns.POSITION_VARIANCE] = variance
         if min(signs) > 0.0:
             made.loc[own.index, orientation] = own[orientation]
         moving = samples[(samples["child_frame_id"] == number) & (turned | (not turns))]
-        speed = moving[VELOCITY_COLUMNS].to_numpy()[:, order] * signs
-        spread = moving[VELOCITY_VARIANCE_COLUMNS].to_numpy()[:, order]
+        speed = moving[Columns.VELOCITY].to_numpy()[:, order] * signs
+        spread = moving[Columns.VELOCITY_VARIANCE].to_numpy()[:, order]
         if turns and len(moving):
-            quaternion = moving[QUATERNION_COLUMNS].to_numpy(copy=True)
+            quaternion = moving[Columns.QUATERNION].to_numpy(copy=True)
             rotation = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
             speed = np.einsum("nij,nj->ni", rotation, speed)
             # diagonal of R diag(s) Rᵀ
             spread = np.einsum("nij,nj->ni", rotation**2, spread)
-        made.loc[moving.index, VELOCITY_COLUMNS] = speed
-        made.loc[moving.index, VELOCITY_VARIANCE_COLUMNS] = spread
+        made.loc[moving.index, Columns.VELOCITY] = speed
+        made.loc[moving.index, Columns.VELOCITY_VARIANCE] = spread
     return made
 
 

@@ -1,7 +1,5 @@
 """Senders of a MAVLink recording: which one is the autopilot, and whose clock is which."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 

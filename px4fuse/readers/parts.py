@@ -1,21 +1,12 @@
 """What readers of all formats make alike: usable rows, stretches of time, what is missing."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray
-from px4fuse.flight import (
-    QUATERNION_COLUMNS,
-    ROTATION_VARIANCE_COLUMNS,
-    Ekf2,
-    FlightMode,
-    Truth,
-    Unavailable,
-)
+from px4fuse.flight import Columns, Ekf2, FlightMode, Truth, Unavailable
 
 # No position, velocity, acceleration or angle of a flight in SI units comes near it
 DAMAGED = 1e9
@@ -84,7 +75,7 @@ def finite_rows(samples: pd.DataFrame, columns: list[str], limit: float = DAMAGE
 
 def with_attitude(samples: pd.DataFrame) -> pd.DataFrame:
     """Rows of a frame with a quaternion ``w, x, y, z``; one of norm 0 means "not given"."""
-    norm: Array = np.linalg.norm(samples[QUATERNION_COLUMNS].to_numpy(), axis=1)
+    norm: Array = np.linalg.norm(samples[Columns.QUATERNION].to_numpy(), axis=1)
     return samples[(norm > MIN_NORM) & (norm < DAMAGED)]
 
 
@@ -97,15 +88,15 @@ def orientation_of(samples: pd.DataFrame) -> pd.DataFrame | None:
         With the columns ``w, x, y, z`` where the sender gave quaternions, and perhaps
         ``forward_rad2, right_rad2, down_rad2``, of which 0 means "not given" (``EKF2.cpp``).
     """
-    found = with_attitude(samples.reindex(columns=QUATERNION_COLUMNS + ROTATION_VARIANCE_COLUMNS))
-    quaternions = found[QUATERNION_COLUMNS]
+    found = with_attitude(samples.reindex(columns=Columns.QUATERNION + Columns.ROTATION_VARIANCE))
+    quaternions = found[Columns.QUATERNION]
     if len(found) < 2 or (quaternions == quaternions.iloc[0]).to_numpy().all():
         return None
-    variances = found[ROTATION_VARIANCE_COLUMNS]
+    variances = found[Columns.ROTATION_VARIANCE]
     return found.assign(**variances.where(variances > 0))
 
 
 def attitude_of(samples: pd.DataFrame | None) -> pd.DataFrame | None:
     """Quaternions of :func:`orientation_of` alone."""
     found = None if samples is None else orientation_of(samples)
-    return None if found is None else found[QUATERNION_COLUMNS]
+    return None if found is None else found[Columns.QUATERNION]

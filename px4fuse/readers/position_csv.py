@@ -6,8 +6,6 @@ and units are detected. Every decision is stated, and every decision that a pers
 correct has an option.
 """
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import io

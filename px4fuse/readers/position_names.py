@@ -1,7 +1,5 @@
 """What the names of columns mean in position logs: "x_m", "position.x", "East [mm]", "bag_time"."""
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence

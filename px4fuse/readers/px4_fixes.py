@@ -1,7 +1,5 @@
 """Fixes of GNSS that EKF2 took and the logger left out, from what EKF2 logs of them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 

@@ -1,7 +1,5 @@
 """EKF2's innovations of a position source, per axis, from what a log has of its aids."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

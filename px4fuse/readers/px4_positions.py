@@ -13,11 +13,7 @@ from px4fuse.arrays import Array
 from px4fuse.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, Aid, settings_in_force
 from px4fuse.flight import (
     AXIS_NAMES,
-    POSITION_COLUMNS,
-    POSITION_VARIANCE_COLUMNS,
-    STATE_COLUMNS,
-    VELOCITY_COLUMNS,
-    VELOCITY_VARIANCE_COLUMNS,
+    Columns,
     Ekf2,
     PositionTrack,
     Truth,
@@ -74,8 +70,8 @@ def clean_positions(samples: pd.DataFrame, axes: list[str]) -> pd.DataFrame:
 
     A variance of 0 becomes NaN: PX4 reads it as not given (``EKF2.cpp``).
     """
-    found = finite_rows(samples.reindex(columns=POSITION_COLUMNS + POSITION_VARIANCE_COLUMNS), axes)
-    given = found[POSITION_VARIANCE_COLUMNS]
+    found = finite_rows(samples.reindex(columns=Columns.POSITION + Columns.POSITION_VARIANCE), axes)
+    given = found[Columns.POSITION_VARIANCE]
     return found.assign(**given.where(given > 0))
 
 
@@ -86,7 +82,7 @@ def _track(
     used: tuple[str, ...],
     *,
     turns: bool = False,
-    needed: list[str] = POSITION_COLUMNS,
+    needed: list[str] = Columns.POSITION,
     frame: str = "NED",
     clock: str = AUTOPILOT_CLOCK,
     **more: Any,
@@ -163,7 +159,7 @@ def _read_kept(topics: Topics, turns: bool) -> PositionTrack | Unavailable:
     samples = _later(samples, _delay_s(topics) + 0.5 * target_step_s(topics))
     return _track(
         topics, px4.KEPT_OBSERVATION, samples, tuple(used),
-        turns=turns, needed=POSITION_COLUMNS[:2], notes=notes,
+        turns=turns, needed=Columns.POSITION[:2], notes=notes,
     )  # fmt: skip
 
 
@@ -204,7 +200,7 @@ def _rebuild(topics: Topics, ekf2: Ekf2 | Unavailable, turns: bool) -> PositionT
     if isinstance(ekf2, Unavailable):
         return _unavailable(px4.RECONSTRUCTION, "no EKF2 output")
     tracks = {}
-    for axis, column in zip(AXIS_NAMES, POSITION_COLUMNS, strict=True):
+    for axis, column in zip(AXIS_NAMES, Columns.POSITION, strict=True):
         innovations = ekf2.innovations[axis]
         if isinstance(innovations, pd.DataFrame):
             tracks[column] = innovations["innovation_m"] + np.interp(
@@ -212,14 +208,14 @@ def _rebuild(topics: Topics, ekf2: Ekf2 | Unavailable, turns: bool) -> PositionT
             )
     if not {"north_m", "east_m"} <= tracks.keys():
         return _unavailable(px4.RECONSTRUCTION, "EKF2 fused no horizontal external vision position")
-    samples = pd.DataFrame({name: tracks[name] for name in POSITION_COLUMNS[:2]})
+    samples = pd.DataFrame({name: tracks[name] for name in Columns.POSITION[:2]})
     notes: tuple[str, ...] = ()
     if "down_m" in tracks:
         samples, notes = _with_height(samples, tracks["down_m"].to_frame("down_m"))
     return _track(
         topics, px4.RECONSTRUCTION, _later(samples, _delay_s(topics)),
         ("vehicle_local_position", *ekf2.innovation_topics),
-        turns=turns, needed=POSITION_COLUMNS[:2], notes=notes,
+        turns=turns, needed=Columns.POSITION[:2], notes=notes,
         clock=f"EKF2's time plus {EV_POS.delay}; late by up to one interval of the source",
     )  # fmt: skip
 
@@ -326,7 +322,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
         samples["down_m2"] = gps["epv_m"].to_numpy() ** 2
     # together, so that a damaged fix takes its velocity with it
     samples = samples.assign(**_velocity(gps).set_axis(samples.index))
-    samples = finite_rows(samples, POSITION_COLUMNS)
+    samples = finite_rows(samples, Columns.POSITION)
     rate_hz, notes = sample_rate(samples), tuple[str, ...]()
     if rate_hz < THINNED_HZ and not len(left_out):
         made, notes = rebuilt_fixes(samples, ekf2, delay_ms * 1e-3)
@@ -347,7 +343,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
         more["place_m"] = tuple(gps[px4.ANTENNA_COLUMNS].iloc[-1].tolist())
     found = _track(
         topics, px4.GPS_POSITION, samples, (layout.topic,), clock=clock, notes=notes,
-        velocity=samples[VELOCITY_COLUMNS + VELOCITY_VARIANCE_COLUMNS], age_s=delay_ms * 1e-3,
+        velocity=samples[Columns.VELOCITY + Columns.VELOCITY_VARIANCE], age_s=delay_ms * 1e-3,
         **more,
     )  # fmt: skip
     if isinstance(found, Unavailable):
@@ -365,9 +361,9 @@ def barometer(altitude_m: pd.Series[float] | None, delay_s: float = 0.0) -> pd.D
 
 def _velocity(gps: pd.DataFrame) -> pd.DataFrame:
     """Velocity of GNSS, and the square of its accuracy as the receiver states it, on each axis."""
-    velocity = gps.reindex(columns=VELOCITY_COLUMNS)
+    velocity = gps.reindex(columns=Columns.VELOCITY)
     accuracy = gps.get("speed_accuracy_m_s", np.nan)
-    return velocity.assign(**dict.fromkeys(VELOCITY_VARIANCE_COLUMNS, accuracy**2))
+    return velocity.assign(**dict.fromkeys(Columns.VELOCITY_VARIANCE, accuracy**2))
 
 
 def read_truth(
@@ -388,7 +384,7 @@ def read_truth(
             local = _about_origin(local, projected(geo, _local_origin(topics)))
         return Truth(px4.TRUTH_LOCAL[0].topic, local, attitude)
     if geo is not None and len(geo):
-        velocity = geo.reindex(columns=VELOCITY_COLUMNS)
+        velocity = geo.reindex(columns=Columns.VELOCITY)
         samples = projected(geo, _local_origin(topics)).join(velocity)
         return Truth(px4.TRUTH_GLOBAL[0].topic, samples, attitude)
     captured = motion_capture(positions, "vehicle_mocap_odometry")
@@ -404,7 +400,7 @@ def read_truth(
 def _about_origin(local: pd.DataFrame, there: pd.DataFrame) -> pd.DataFrame:
     """Local positions about the origin of others of the same path (median of what they differ)."""
     moved = local.copy()
-    for column in POSITION_COLUMNS:
+    for column in Columns.POSITION:
         at = np.interp(there.index, local.index, local[column], left=np.nan, right=np.nan)
         shift = (there[column] - at).median()
         moved[column] += shift if np.isfinite(shift) else 0.0
@@ -413,7 +409,7 @@ def _about_origin(local: pd.DataFrame, there: pd.DataFrame) -> pd.DataFrame:
 
 def captured_truth(track: PositionTrack) -> Truth:
     """Motion capture as the truth."""
-    state = track.samples.reindex(columns=STATE_COLUMNS)
+    state = track.samples.reindex(columns=Columns.STATE)
     return Truth(track.name, state, attitude_of(track.orientation))
 
 

@@ -5,8 +5,6 @@ whose topic holds all its ``columns``; ``optional`` columns are read where they 
 from PX4-Autopilot's ``msg/*.msg`` at the release tags that its comments name.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 Position files, trajectories and pose graphs (g2o) are such tables.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, field
 from typing import Any

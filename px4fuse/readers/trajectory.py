@@ -6,8 +6,6 @@ is ``time, x, y, z, qw, qx, qy, qz, ...`` in nanoseconds between commas (Burri 2
 was lost. Which one it is shows in the content. Every decision is stated in the notes.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 import re

@@ -1,7 +1,5 @@
 """PX4 ULog to :class:`~px4fuse.flight.Flight`, for PX4 v1.9 to today."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -9,15 +7,7 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.ekf2_parameters import BAROMETER
-from px4fuse.flight import (
-    ANGULAR_RATE_COLUMNS,
-    MODES_NOT_LOGGED,
-    SPECIFIC_FORCE_COLUMNS,
-    Flight,
-    FlightMode,
-    Truth,
-    Unavailable,
-)
+from px4fuse.flight import MODES_NOT_LOGGED, Columns, Flight, FlightMode, Truth, Unavailable
 from px4fuse.readers import parts
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.px4_ekf2 import read_ekf2
@@ -149,7 +139,7 @@ def _read_imu(topics: Topics) -> pd.DataFrame | None:
         time_us = np.rint(imu.index.to_numpy() * 1e6 + offset_us[imu.index].to_numpy())
         keep = increasing(time_us.astype(np.int64) + topics.zero_us)
         imu = imu.iloc[keep].set_axis(pd.Index(time_us[keep] * 1e-6, name="time_s"))
-    columns = SPECIFIC_FORCE_COLUMNS + ANGULAR_RATE_COLUMNS
+    columns = Columns.SPECIFIC_FORCE + Columns.ANGULAR_RATE
     return parts.finite_rows(imu, columns, parts.BEYOND_IMU)
 
 

@@ -5,8 +5,6 @@ docs.px4.io. pyulog looks for the next message byte by byte, half a second for a
 it is given whole messages only.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Mapping

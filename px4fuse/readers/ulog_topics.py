@@ -4,8 +4,6 @@ pyulog does the parsing; this module decides what of it can be trusted. Time sta
 go back or jump hours away exist in real logs, and so do topics that were subscribed to twice.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import io

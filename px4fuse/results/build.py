@@ -1,7 +1,5 @@
 """What a command found → results, as the contract has them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any

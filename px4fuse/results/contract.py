@@ -4,8 +4,6 @@ Everything that px4fuse writes with a major version is read by the same major ve
 raises the minor one.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """What all results share: their schema's name, whose report it is, and what made it."""
 
-from __future__ import annotations
-
 import platform
 from importlib import metadata
 from typing import Annotated, Literal

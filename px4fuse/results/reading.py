@@ -1,7 +1,5 @@
 """Results read back, strictly and within bounds: they may come from a stranger."""
 
-from __future__ import annotations
-
 import json
 import unicodedata
 from functools import cache

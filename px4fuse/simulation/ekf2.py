@@ -11,10 +11,8 @@ that what a student's filter is fed with does not depend on EKF2's parameters; t
 attitude is in estimator_states.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -40,7 +38,7 @@ from px4fuse.ekf2.stretches import (
 )
 from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid, settings_in_force
 from px4fuse.simulation import sensors
-from px4fuse.simulation.ekf2_topics import TopicTrack, ekf2_topics
+from px4fuse.simulation.ekf2_topics import VEHICLE_AID_SOURCE_HZ, TopicTrack, ekf2_topics
 from px4fuse.simulation.mistakes import Mistakes
 from px4fuse.simulation.motion import Motion, attitude
 from px4fuse.simulation.scenario import Scenario
@@ -73,14 +71,6 @@ REST_SD = np.repeat([0.05, 0.0005, 0.06], 3)
 HEADING_SD_RAD, HEIGHT_SD_M = 0.03, 0.15
 # Fine enough that variances are logged between the samples of a UWB too
 MAX_INTERVAL_S = 0.1
-
-
-@dataclass(frozen=True)
-class Others:
-    """The complete topics of what else EKF2 takes outdoors, whatever of them is logged."""
-
-    magnetometer: Topic
-    barometer: Topic
 
 
 def _fused(scenario: Scenario) -> tuple[Aid, ...]:
@@ -120,31 +110,26 @@ def fly(
     motion: Motion,
     imu: Topic,
     source: sensors.SensedPositions,
-    others: Others | None,
+    others: tuple[Topic, ...],
     flown: Mapping[str, int | float],
-    at_rest: tuple[Array, Array],
-    aid_source_hz: float = 0.0,
 ) -> tuple[Topic, ...]:
     """EKF2's topics of a flight, those that it had anything to say in.
 
     Parameters
     ----------
-    imu, source, others : Topic, SensedPositions, Others or None
-        As EKF2 received them, whatever of them is logged.
+    imu, source, others : Topic, SensedPositions, tuple of Topic
+        As EKF2 received them, whatever of them is logged; outdoors magnetometer and barometer.
     flown : mapping
         Parameters of the log.
-    at_rest : (ndarray, ndarray), each of shape (3,)
-        What accelerometer (m/s²) and gyro (rad/s) measure on average before the log begins.
-    aid_source_hz : float
-        To what estimator_aid_src_ev_pos is thinned; 0 leaves it.
     """
     aid, aids = scenario.aid, _fused(scenario)
-    stretch, time_us, nominal = _stretch(scenario, mistakes, motion, imu, at_rest)
+    stretch, time_us, nominal = _stretch(scenario, mistakes, motion, imu)
     known = {name: float(np.float32(v)) for name, v in flown.items()}
-    if others is not None:
-        stretch = replace(stretch, heights=_heights(stretch, others.barometer))
+    if others:
+        magnetometer, barometer = others
+        stretch = replace(stretch, heights=_heights(stretch, barometer))
         if not known[MAG.switch]:
-            stretch = _with_field(stretch, others.magnetometer)
+            stretch = _with_field(stretch, magnetometer)
     settings = settings_in_force(known, *aids)
     rules = GNSS_RULES if aid == GNSS_POS else RULES
     step_s = float(np.median(stretch.step_s))
@@ -165,15 +150,12 @@ def fly(
     )
     done = run_variants(inputs, [Variant(settings)], {})[0]
     track = _track(inputs, done, time_us, nominal)
+    aid_source_hz = VEHICLE_AID_SOURCE_HZ if mistakes.no_vvo else 0.0
     return ekf2_topics(inputs, done, track, scenario.attitude_rate_hz, aid_source_hz)
 
 
 def _stretch(
-    scenario: Scenario,
-    mistakes: Mistakes,
-    motion: Motion,
-    imu: Topic,
-    at_rest: tuple[Array, Array],
+    scenario: Scenario, mistakes: Mistakes, motion: Motion, imu: Topic
 ) -> tuple[Stretch, IntArray, Array]:
     """The whole flight in prediction steps about the true attitude, and that attitude."""
     time_us = imu.fields["timestamp"].astype(np.int64) - sensors.START_US
@@ -192,6 +174,7 @@ def _stretch(
     beyond = multiply(nominal, conjugate(gyro))
     error = np.zeros((len(time), 3))
     error[:, HEADING] = sensors.attitude_error(scenario, mistakes, time).as_rotvec()[:, HEADING]
+    at_rest = sensors.at_rest(scenario, mistakes, motion, REST_S)
     state, covariance = _standing(rotation[0], *at_rest, float(error[0, HEADING]))
     variance = np.diagonal(covariance).copy()
     deviation = np.sqrt(variance)

@@ -1,7 +1,5 @@
 """What a flight of EKF2's model looks like in the topics of PX4 v1.16."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

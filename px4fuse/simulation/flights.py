@@ -1,7 +1,5 @@
 """Scenario and mistakes to a flight: in memory, as ULog, and the answer for the instructor."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -19,7 +17,7 @@ from px4fuse.readers.px4_topics import IMU
 from px4fuse.readers.ulog_topics import NOTE_KEY, Topics
 from px4fuse.recording import LogInfo
 from px4fuse.simulation import ekf2, sensors
-from px4fuse.simulation.ekf2_topics import MAGNETOMETER_HZ, VEHICLE_AID_SOURCE_HZ
+from px4fuse.simulation.ekf2_topics import MAGNETOMETER_HZ
 from px4fuse.simulation.mistakes import MISTAKES, Mistakes, as_typed, made
 from px4fuse.simulation.motion import Motion, plan
 from px4fuse.simulation.scenario import Scenario
@@ -90,26 +88,20 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
     ]
     if not mistakes.no_vvo:
         topics.append(positions.topic)
-    others = None
+    others: tuple[Topic, ...] = ()
     if scenario.aid == GNSS_POS:
-        others = ekf2.Others(
-            sensors.magnetometer(scenario, mistakes, motion), sensors.barometer(scenario, motion)
-        )
-        topics.append(sensors.at_rate(others.magnetometer, MAGNETOMETER_HZ))
-        topics.append(others.barometer)
+        barometer = sensors.barometer(scenario, motion)
+        others = (sensors.magnetometer(scenario, mistakes, motion), barometer)
+        topics += [sensors.at_rate(others[0], MAGNETOMETER_HZ), barometer]
     if scenario.truth:
         topics.append(sensors.ground_truth(scenario, motion))
     for topic in topics:
         if len(topic.fields["timestamp"]) < 2:
             raise SettingsError(f"with these mistakes nothing is left of {topic.name}.")
     if scenario.ekf2:
-        standing = sensors.at_rest(scenario, mistakes, motion, ekf2.REST_S)
-        aid_source_hz = VEHICLE_AID_SOURCE_HZ if mistakes.no_vvo else 0.0
-        made_by_ekf2 = ekf2.fly(
-            scenario, mistakes, motion, imu, positions, others, parameters, standing, aid_source_hz
-        )
-        names = {topic.name for topic in made_by_ekf2}
-        topics = [*(topic for topic in topics if topic.name not in names), *made_by_ekf2]
+        own = ekf2.fly(scenario, mistakes, motion, imu, positions, others, parameters)
+        names = {topic.name for topic in own}
+        topics = [*(topic for topic in topics if topic.name not in names), *own]
     return Simulation(scenario, mistakes, motion, positions, tuple(topics), parameters)
 
 

@@ -4,8 +4,6 @@ Values are typed with their unit (``0.08``, ``80ms``, ``5%``, ``8s,40s``) or lef
 clear case.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType

@@ -1,7 +1,5 @@
 """What is flown, and with which sensors."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields

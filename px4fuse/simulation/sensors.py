@@ -1,7 +1,5 @@
 """What the sensors make of the truth, as PX4 v1.16 logs it, mistakes included."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum

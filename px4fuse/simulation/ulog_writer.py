@@ -3,8 +3,6 @@
 Source: ULog file format, version 1, https://docs.px4.io/main/en/dev_log/ulog_file_format
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ world is its first key frame may be turned in any way (six), and a single camera
 scale (seven).
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

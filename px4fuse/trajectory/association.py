@@ -1,7 +1,5 @@
 """Two trajectories at the same times."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Literal
 

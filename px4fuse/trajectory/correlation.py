@@ -1,7 +1,5 @@
 """Two series correlated over all lags at once, with gaps in both; and a series with itself."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import TypeVar
 

@@ -4,8 +4,6 @@ The absolute trajectory error is the distance of each pose to the reference afte
 relative pose error compares motions over a fixed distance or time, and so does not add up.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Quaternions w, x, y, z as arrays of shape (..., 4); Hamilton product, as in PX4."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from px4fuse.arrays import Array

@@ -3,8 +3,6 @@
 Errors are correlated from pose to pose, so intervals are by a bootstrap over blocks.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -4,8 +4,6 @@ Rows are JSON, and the script draws a hundred of them at a time, so that thousan
 Without scripts the page shows its first rows as a plain table.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

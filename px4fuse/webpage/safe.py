@@ -1,7 +1,5 @@
 """Text and numbers from data, so that they do nothing in a web page."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """A pose graph from a file: its closures judged, and the graph solved with and without doubt."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """How well odometry alone knows one pose from another, and whether a closure agrees with it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

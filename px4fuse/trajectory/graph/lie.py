@@ -9,8 +9,6 @@ Sources: Barfoot 2017, State Estimation for Robotics, chapter 7 and section 8.3;
 Atchuthan 2018, A micro Lie theory for state estimation in robotics, for the plane.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.polynomial.polynomial import polyval
 from scipy.spatial.transform import Rotation

@@ -137,21 +137,6 @@ def observed_directions(information: Array) -> tuple[Array, Array]:
     return scale[:, None] * vectors[:, seen], 1.0 / values[seen]
 
 
-def ranks(information: Array) -> IntArray:
-    """Degrees of freedom of measurements: ranks of their information.
-
-    Parameters
-    ----------
-    information : ndarray, shape (m, d, d)
-
-    Returns
-    -------
-    ndarray of int, shape (m,)
-    """
-    made: IntArray = np.sum(np.linalg.eigvalsh(unit_diagonal(information)[1]) > OBSERVED, axis=1)
-    return made
-
-
 def unit_diagonal(matrices: Array) -> tuple[Array, Array]:
     """Roots of the diagonals of matrices, and the matrices divided by them; what is 0 stays 0."""
     scale = np.sqrt(np.clip(np.diagonal(matrices, axis1=-2, axis2=-1), 0.0, None))

@@ -255,7 +255,8 @@ def _gnc(
     problem: _GraphProblem, start: Residuals, plain: _Descent, doubtful: BoolArray
 ) -> tuple[_Descent, Array]:
     """Truncated least squares over the doubtful edges, from two starts."""
-    freedom = model.ranks(problem.graph.information)
+    _, scaled = model.unit_diagonal(problem.graph.information)
+    freedom = np.sum(np.linalg.eigvalsh(scaled) > model.OBSERVED, axis=1)
     bound = np.full(len(doubtful), np.inf)
     price = np.zeros(len(doubtful))
     told = doubtful & (freedom > 0)
