@@ -179,8 +179,6 @@ class Entry:
     flags : tuple of str
         All that an instructor should look at: on who this is and what counts, on the counting
         report, and on what it has in common with others.
-    pseudonym : str
-        What the class page shows instead of name, id and names of files; "" to show them.
     """
 
     student: str
@@ -196,7 +194,6 @@ class Entry:
     of: float = 0.0
     email: str = ""
     flags: tuple[str, ...] = ()
-    pseudonym: str = ""
 
     @property
     def files(self) -> tuple[Graded, ...]:
@@ -206,7 +203,7 @@ class Entry:
     @property
     def called(self) -> str:
         """What the class page calls the student."""
-        return self.pseudonym or self.student or self.student_id or "no name"
+        return self.student or self.student_id or "no name"
 
 
 def columns(entries: Sequence[Entry]) -> tuple[tuple[str, ...], tuple[str, ...]]:
