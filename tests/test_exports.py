@@ -119,7 +119,7 @@ def test_a_german_table_has_its_separator_and_comma(tmp_path) -> None:
     text = "Matrikelnummer;Name;Punkte;Kommentar\n0042;Jane Doe;;\n"
     sheet = table(tmp_path, text, "cp1252")
     made, _ = filled(sheet, ENTRIES, Register(PEOPLE), "", TEXTS)
-    assert made.content() == b"Matrikelnummer;Name;Punkte;Kommentar\n0042;Jane Doe;87.5;\n"
+    assert made.content() == b"Matrikelnummer;Name;Punkte;Kommentar\r\n0042;Jane Doe;87.5;\r\n"
     moodle = MOODLE.replace(",100.00,", ',"100,00",')
     sheet = table(tmp_path, moodle)
     made, _ = filled(sheet, ENTRIES, register(sheet), "", TEXTS)

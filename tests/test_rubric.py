@@ -61,14 +61,7 @@ BAD = {
     ),
     "unknown parameter": (NOTES + "min_letters = 3", "unknown field `min_letters` - at item 1"),
     "the third": (NOTES + NOTES.replace("T", "U") + NUMBER + "at_most = 'x'", "at item 3, at_most"),
-    "sections of an earlier rubric": (
-        ITEM + 'check = "sections"',
-        "item 1, check: it is gone; delete the item",
-    ),
-    "the flight of an earlier rubric": (
-        ITEM + 'check = "flight"',
-        'write check = "number" with the path',
-    ),
+    "a check of an earlier rubric": (ITEM + 'check = "sections"', "Invalid value 'sections'"),
     "number without bound": (NUMBER, "give at_least, at_most or both"),
     "bounds exchanged": (NUMBER + "at_least = 2\nat_most = 1", "in this order"),
     "zero on the good side": (NUMBER + "at_most = 2\nzero_at = 1", "zero_at beyond"),

@@ -20,15 +20,18 @@ MAX_STEM = 48
 RESERVED = {"con", "prn", "aux", "nul"} | {f"{n}{i}" for n in ("com", "lpt") for i in range(10)}
 # Column titles, letters and digits only, best first. The university's own id; Canvas's "ID",
 # Moodle's "Identifier" and ILIAS's "User ID" are the platform's
-ID_COLUMNS = (
-    "studentid", "studentnumber", "studentno", "idnumber", "matriculationnumber", "matriculation",
-    "matrikelnummer", "matrikelnr", "orgdefinedid", "sisuserid", "sid", "id", "number",
-)  # fmt: skip
-LOGIN_COLUMNS = ("username", "login", "sisloginid", "loginid", "user", "benutzername")
-EMAIL_COLUMNS = ("emailaddress", "email", "mail", "emailadresse")
-NAME_COLUMNS = ("name", "fullname", "studentname", "displayname", "student")
-FIRST_NAME_COLUMNS = ("firstname", "givenname", "forename", "vorname")
-LAST_NAME_COLUMNS = ("lastname", "surname", "familyname", "nachname")
+COLUMNS = {
+    "student_id": (
+        "studentid", "studentnumber", "studentno", "idnumber", "matriculationnumber",
+        "matriculation", "matrikelnummer", "matrikelnr", "orgdefinedid", "sisuserid", "sid", "id",
+        "number",
+    ),
+    "login": ("username", "login", "sisloginid", "loginid", "user", "benutzername"),
+    "email": ("emailaddress", "email", "mail", "emailadresse"),
+    "name": ("name", "fullname", "studentname", "displayname", "student"),
+    "first": ("firstname", "givenname", "forename", "vorname"),
+    "last": ("lastname", "surname", "familyname", "nachname"),
+}  # fmt: skip
 # Of Canvas, above the students
 NOT_STUDENTS = ("pointspossible", "studenttest")
 
@@ -82,15 +85,14 @@ def people_of_sheet(sheet: Sheet) -> tuple[Person, ...]:
     SettingsError
         No column tells who somebody is, or two rows have the same id.
     """
-    known = (_ids(sheet), LOGIN_COLUMNS, EMAIL_COLUMNS, NAME_COLUMNS, LAST_NAME_COLUMNS)
-    if not any(sheet.column(titles) is not None for titles in known):
+    if all(sheet.column(titles) is None for titles in COLUMNS.values()):
         raise SettingsError(
             f"{sheet.path}: no column tells who a student is",
             "Give one a title such as id, email or name.",
         )
     rows: dict[str, int] = {}
     people = []
-    for number, row in zip(sheet.numbers, sheet.rows, strict=True):
+    for number, row in enumerate(sheet.rows, start=2):
         person = person_of_row(sheet, row)
         if person is None:
             continue
@@ -130,35 +132,19 @@ def read_roster(path: Path) -> tuple[Person, ...]:
 
 def person_of_row(sheet: Sheet, row: Sequence[str]) -> Person | None:
     """The student in a row of a table; None for a row without one."""
-    parts = (sheet.cell(row, titles) for titles in (FIRST_NAME_COLUMNS, LAST_NAME_COLUMNS))
-    whole = sheet.cell(row, NAME_COLUMNS) or " ".join(filter(None, parts))
-    if re.sub(r"\W", "", whole.casefold()) in NOT_STUDENTS:
+    said = {what: one_line(sheet.cell(row, titles), MAX_NAME) for what, titles in COLUMNS.items()}
+    name = said["name"] or f"{said['first']} {said['last']}".strip()
+    if re.sub(r"\W", "", name.casefold()) in NOT_STUDENTS:
         return None
-    name, email, login, student_id = (
-        one_line(text, MAX_NAME)
-        for text in (
-            whole,
-            sheet.cell(row, EMAIL_COLUMNS),
-            sheet.cell(row, LOGIN_COLUMNS),
-            sheet.cell(row, _ids(sheet)),
-        )
-    )
     numbers = {}
     if participant := re.search(r"\d+$", sheet.cell(row, ("identifier",))):
         numbers["moodle"] = participant[0]
-    if _is_canvas(sheet) and (user := sheet.cell(row, ("id",))):
-        numbers["canvas"] = user
-    found = Person(student_id or login or email, name, email, login, numbers)
-    return found if found.student_id or name or numbers else None
-
-
-def _is_canvas(sheet: Sheet) -> bool:
-    return sheet.column(("sisuserid", "sisloginid")) is not None
-
-
-def _ids(sheet: Sheet) -> list[str]:
-    """Titles of the university's ids."""
-    return [name for name in ID_COLUMNS if name != "id" or not _is_canvas(sheet)]
+    if sheet.column(("sisuserid", "sisloginid")) is not None:
+        numbers |= {"canvas": user} if (user := sheet.cell(row, ("id",))) else {}
+        said["student_id"] = one_line(sheet.cell(row, ("sisuserid",)), MAX_NAME)
+    student_id = said["student_id"] or said["login"] or said["email"]
+    found = Person(student_id, name, said["email"], said["login"], numbers)
+    return found if student_id or name or numbers else None
 
 
 def file_stem(student_id: str) -> str | None:

@@ -44,7 +44,7 @@ def read_overrides(path: Path) -> Overrides:
             f"{path}: no column {', '.join(missing)}", f"Its columns are {', '.join(TITLES)}."
         )
     found: dict[str, dict[str, Override]] = defaultdict(dict)
-    for number, row in zip(sheet.numbers, sheet.rows, strict=True):
+    for number, row in enumerate(sheet.rows, start=2):
         student, item, points, comment = (
             sheet.cell(row, (title,)).removeprefix("'") for title in TITLES
         )

@@ -37,22 +37,17 @@ from px4fuse.verification.model import Refused
 MAX_ENTRIES = 10_000
 # Of the table of contents, which zipfile reads in one piece before it can be counted
 MAX_DIRECTORY_BYTES = 4_000_000
-# Of all that is in one zip file, whose entries may share their bytes; and of the zip files in it
+# Of all that is in one zip file, whose entries may share their bytes
 MAX_TOTAL_BYTES = 4_000_000_000
-MAX_INNER_BYTES = 500_000_000
-# Of a zip file that a student handed in, and of an export of a class in a folder
+# Of a zip file in a folder: of one that a student may have handed in, and of an export of a class
 MAX_PDFS, MAX_CLASS_PDFS = 50, 200
 # PDFs are compressed inside; what still shrinks a hundred times is empty
 MAX_RATIO = 100
 MAX_NAME = 200
 # The year that stands where a program knew no time
 ZIP_EPOCH = 1980
-# Zip files may hold zip files, which may not hold more
-MAX_DEPTH = 2
 
 _TOO_LARGE = f"larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB."
-# Between a zip file's entry and the entry of the zip file in it; no name can hold it
-_INSIDE = "\0"
 _ENCRYPTED = 1
 _UTF8 = 0x800
 
@@ -88,13 +83,15 @@ class _Search:
     def take(self, place: Submission, inside: str, opened: Callable[[], IO[bytes]]) -> None:
         """Look at a file by what its name says it is.
 
-        Whatever is wrong with a zip file is a note and ends no search. ``inside`` is what names of
+        A zip file that a student handed in stands among the PDFs, and is none: it is not opened.
+        Whatever is wrong with another is a note and ends no search. ``inside`` is what names of
         files in it begin with.
         """
         end = place.name.lower()[-4:]
-        if end == ".pdf":
+        students = place.entry or origin_of(place.name).platform
+        if end == ".pdf" or (end == ".zip" and students):
             self.found.setdefault((place.file, place.entry), place)
-        elif _depth(place) >= MAX_DEPTH or (end != ".zip" and not _is_metadata(place.name)):
+        elif end != ".zip" and not _is_metadata(place.name):
             self.others += 1
         else:
             try:
@@ -108,7 +105,6 @@ class _Search:
                 self.notes.append(f"{_shown(place.name)}: passed over: {_why(error)}")
 
     def _take_zip(self, place: Submission, inside: str, stream: IO[bytes]) -> None:
-        depth = _depth(place)
         with _archive(stream) as archive:
             entries = [one for one in archive.infolist() if not one.is_dir()]
             # zipfile gives no more than the declared size
@@ -120,21 +116,14 @@ class _Search:
                     f"{_shown(place.name)}: {len(entries) - len(last)} entries have the name of "
                     "another one; only the last of each name was read."
                 )
-            left, before = MAX_INNER_BYTES, len(self.found)
+            before = len(self.found)
             for name, one in last.items():
                 label = _label(one)
-                if any(map(_hidden, label.split("/"))):
-                    continue
-                if label.lower().endswith(".zip") and (left := left - one.file_size) < 0:
-                    raise _EntryError("it holds too many zip files.")
-                whole = inside + label
-                inner = Submission(place.file, name, whole, _time(one))
-                if depth:  # a student set the clock of what is in a zip file in another one
-                    inner = replace(inner, entry=f"{place.entry}{_INSIDE}{name}", time=place.time)
-                self.take(inner, f"{whole}/", partial(_unpacked, archive, name))
+                if not any(map(_hidden, label.split("/"))):
+                    inner = Submission(place.file, name, inside + label, _time(one))
+                    self.take(inner, "", partial(_unpacked, archive, name))
         new = [*self.found.items()][before:]
-        students = depth or origin_of(place.name).platform
-        export = not students and any(origin_of(one.name).platform for _, one in new)
+        export = any(origin_of(one.name).platform for _, one in new)
         most = MAX_CLASS_PDFS if export else MAX_PDFS
         if inside and len(new) > most:  # the class would wait for them
             self.found = dict([*self.found.items()][:before])
@@ -193,21 +182,16 @@ def read(submission: Submission) -> bytes | Refused:
     """Bytes of a submission, at most :data:`~px4fuse.verification.intake.MAX_BYTES` of them."""
     try:
         with submission.file.open("rb") as file:
-            stream: IO[bytes] = file
-            for entry in filter(None, submission.entry.split(_INSIDE)):
-                with _archive(stream) as archive:
-                    stream = _unpacked(archive, entry)
-            content = stream.read(MAX_BYTES + 1)
+            if submission.entry:
+                with _archive(file) as archive:
+                    content = _unpacked(archive, submission.entry).read()
+            else:
+                content = file.read(MAX_BYTES + 1)
         if len(content) > MAX_BYTES:
             raise _EntryError(_TOO_LARGE)
     except _UNREADABLE as error:
         return Refused(f"{one_line(submission.name, MAX_NAME)}: {_why(error)}")
     return content
-
-
-def _depth(place: Submission) -> int:
-    """In how many zip files it lies."""
-    return place.entry.count(_INSIDE) + bool(place.entry)
 
 
 def _is_metadata(name: str) -> bool:
