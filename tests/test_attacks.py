@@ -269,7 +269,7 @@ NO_END: dict[str, Any] = {
 
 
 def looped(truth: Any, notes: str, request: dict[str, Any], loop: dict[str, Any]) -> Graded:
-    """What the two items on loops give."""
+    """What the item on the loop gives."""
     values = {f"request__{name}": value for name, value in request.items()}
     values |= {f"loop__{name}": value for name, value in loop.items()}
     form = {"log_sha256": SHA256, "mistakes": [{"kind": "open-end"}] if notes else []}
@@ -277,7 +277,7 @@ def looped(truth: Any, notes: str, request: dict[str, Any], loop: dict[str, Any]
     key = truth and AnswerKey("loop", (Answer("s01", "", "", LOOP["track"]["sha256"], *truth),))
     verdict = Verdict("verified", (), True, page_status="same")
     made = assess(results, verdict, read_rubric(None), key)
-    items = tuple(item for item in made.items if "losure" in item.title or "Loop" in item.title)
+    items = tuple(item for item in made.items if "Loop" in item.title)
     return Graded("a.pdf", "", "", verdict, items, made.flags, made.pending)
 
 
