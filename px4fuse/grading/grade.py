@@ -13,7 +13,7 @@ from px4fuse.assignment.key import AnswerKey
 from px4fuse.assignment.roster import Person, people_of_sheet, person_of_row
 from px4fuse.grading import submissions
 from px4fuse.grading.entries import Course, class_entries
-from px4fuse.grading.exports import grade_column, kind_of
+from px4fuse.grading.exports import grade_column
 from px4fuse.grading.flags import own_flags
 from px4fuse.grading.lateness import moodle_time
 from px4fuse.grading.model import Entry, Graded, Submission
@@ -124,7 +124,7 @@ def register_of(course: Course, key: AnswerKey | None) -> Register:
     for others in listed:
         register.add(others)
     for sheet in course.worksheets:
-        for row in sheet.rows if kind_of(sheet) == "moodle" else ():
+        for row in sheet.rows:
             time = moodle_time(sheet.cell(row, ("lastmodifiedsubmission",)))
             person = person_of_row(sheet, row)
             place = register.place(person) if person else None
