@@ -42,15 +42,13 @@ NO_COMPARISON: Scored = (0.0, "Your report compares no filters.")
 
 
 class VerifiedItem(RubricItem, frozen=True, kw_only=True, tag="verified"):
-    """The numbers were computed again and agree; ``without_log`` where a file is not at hand."""
-
-    without_log: Share = 0.5
+    """The numbers were computed again and agree."""
 
     def score(self, evidence: Evidence) -> Scored:
-        """All or nothing but for a missing file."""
+        """All or nothing."""
         verdict = evidence.verdict
-        share = self.without_log if verdict.waits_for_file else verdict.status == "verified"
-        return share, f"Verification says: {verdict.status}{reason_of(verdict)}."
+        said = f"Verification says: {verdict.status}{reason_of(verdict)}."
+        return float(verdict.status == "verified"), said
 
 
 class StudentItem(RubricItem, frozen=True, kw_only=True, tag="student"):

@@ -119,11 +119,6 @@ class Verdict:
     missing: str = ""
 
     @property
-    def waits_for_file(self) -> bool:
-        """Whether nothing is wrong with the report, but a file of it is not at hand."""
-        return self.status == "cannot verify" and bool(self.missing)
-
-    @property
     def what_to_do(self) -> str:
         """What whoever verifies it can do; "" for nothing."""
         if not self.missing:

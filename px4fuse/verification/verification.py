@@ -84,20 +84,6 @@ class Numbers:
     pairs: tuple[tuple[float, float], ...]
     compared: int
 
-    @property
-    def reason(self) -> str:
-        """What was found, as a sentence."""
-        if not self.differing:
-            return (
-                f"the log gives all {self.compared} values again (within {RELATIVE:g}, estimates "
-                f"within {ESTIMATE_RELATIVE:g})"
-            )
-        first = ", ".join(one.path for one in self.differences[:3])
-        more = ", …" * (self.differing > 3)
-        return (
-            f"{self.differing} of {self.compared} values are not what the log gives: {first}{more}"
-        )
-
 
 def verify(
     report: Report,
@@ -161,7 +147,13 @@ def _with_log(report: Report, again: Recomputed) -> Verdict:
     numbers = compare_results(to_plain(report.results), to_plain(again.results))
     alike = _rounding(numbers.pairs)
     pages = compare_pages(report.pdf, redrawn, lambda one, other: same_words(one, other, alike))
-    reasons = [numbers.reason]
+    first = ", ".join(one.path for one in numbers.differences[:3]) + ", …" * (numbers.differing > 3)
+    reasons = [
+        f"{numbers.differing} of {numbers.compared} values are not what the log gives: {first}"
+        if numbers.differing
+        else f"the log gives all {numbers.compared} values again (within {RELATIVE:g}, estimates "
+        f"within {ESTIMATE_RELATIVE:g})"
+    ]
     page_status: PageStatus = "not compared"
     differing: tuple[PageDifference, ...] = ()
     if isinstance(pages, Unavailable):
