@@ -8,7 +8,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.grading.rubric import AnyItem, parse_rubric, read_rubric, rubric_text
 
 ITEM = '[[item]]\ntitle = "T"\npoints = 5\n'
-NOTES = ITEM + 'check = "student"\n'
+NOTES = ITEM + 'check = "verified"\n'
 NUMBER = ITEM + 'check = "number"\npath = "a.b"\n'
 
 
@@ -37,8 +37,8 @@ def test_copy_of_the_default_is_the_default(tmp_path):
 
 
 def test_parameters_left_out_have_their_defaults():
-    (item,) = parse_rubric(NOTES, "x").items
-    assert (item.name, item.report) == (True, "any")
+    (item,) = parse_rubric(ITEM + 'check = "clock"\n', "x").items
+    assert (item.margin_s, item.report) == (0.03, "any")
     (item,) = parse_rubric(NUMBER + "at_most = 1\n", "x").items
     assert isinstance(item.at_most, float)
 

@@ -83,9 +83,6 @@ REJECTED = changed(LOOP, loop__closures=[{**LOOP["loop"]["closures"][0], "accept
 # Check, results, parameters, the points of 1, and what the comment says
 CHECKED = [
     ("verified", EXAMPLE, {}, 1.0, "verified (all 900"),
-    ("student", changed(student={"name": "Ann", "id": "7", "notes": ""}), {}, 1.0, "Ann, 7"),
-    ("student", changed(student__name="Ann"), {}, 0.5, "--id"),
-    ("student", EXAMPLE, {}, 0.0, "--student"),
     ("tuning", EXAMPLE, {"settings": ["sigma_z_m"]}, 1.0, "within"),
     ("tuning", EXAMPLE, {}, 0.86, "SIGMA_A"),
     ("tuning", changed(settings__sigma_a_m_s2=0.1), {"settings": ["sigma_a_m_s2"]}, 0.0, "below"),
@@ -157,7 +154,7 @@ TRUTH = FormTruth(
 
 
 def key(*mistakes, sha256=SHA, **values):
-    answer = Answer("s01", "Ann", "s01.ulg", sha256, {}, mistakes, (), form=TRUTH, **values)
+    answer = Answer("s01", "Ann", "s01.ulg", sha256, {}, mistakes, form=TRUTH, **values)
     other = Answer("s02", "Bob", "s02.ulg", "b" * 64)
     return AnswerKey("aisle", (answer, other))
 

@@ -40,7 +40,6 @@ def fly(
         sha256=sha256,
         scenario=plain(asdict(drawn.scenario)),
         mistakes=drawn.typed,
-        findings=drawn.findings,
         truth={name: float(known[name]) for name in TRUTH},
         difficulty=drawn.difficulty,
         form=truth_of(simulation, sha256),

@@ -51,24 +51,6 @@ class VerifiedItem(RubricItem, frozen=True, kw_only=True, tag="verified"):
         return float(verdict.status == "verified"), said
 
 
-class StudentItem(RubricItem, frozen=True, kw_only=True, tag="student"):
-    """The report says whose it is, by ``name`` and ``id`` as far as they are asked for."""
-
-    name: bool = True
-    id: bool = True
-
-    def score(self, evidence: Evidence) -> Scored:
-        """Share of what is asked for."""
-        student = evidence.results.student
-        asked = {"name (--student)": student.name} if self.name else {}
-        asked |= {"student id (--id)": student.id} if self.id else {}
-        missing = [what for what, value in asked.items() if not text_of(value)]
-        if missing:
-            said = " and ".join(missing)
-            return 1.0 - len(missing) / len(asked), f"Your report does not give your {said}."
-        return 1.0, f"Your report names {', '.join(map(text_of, asked.values())) or 'nobody'}."
-
-
 class NumberItem(RubricItem, frozen=True, kw_only=True, tag="number"):
     """A number of the report is between bounds; where ``path`` has several the worst counts.
 

@@ -13,7 +13,7 @@ from px4fuse.assignment.sheet import Sheet
 from px4fuse.grading.class_table import number
 from px4fuse.grading.flags import class_flags
 from px4fuse.grading.lateness import LateRule, in_zone_of
-from px4fuse.grading.model import INSTRUCTOR, Entry, Graded, Item, Override, Submission
+from px4fuse.grading.model import Entry, Graded, Item, Override, Submission
 from px4fuse.grading.overrides import TOTAL, Overrides, matched
 from px4fuse.grading.roster import Register
 from px4fuse.results.reading import one_line
@@ -101,7 +101,7 @@ def class_entries(
             strangers.append(replace(attempt[2], flags=(note, *attempt[2].flags)))
     made = [
         _chosen(attempts[at], course) if attempts[at]
-        else Entry(person.name, person.student_id, None, email=person.email)
+        else Entry(person.name, person.student_id, None)
         for at, person in enumerate(everyone.people)
     ]  # fmt: skip
     made += strangers
@@ -177,7 +177,6 @@ def _attempt(
         "" if time is None else time.strftime(SHOWN),
         late_s,
         course.late.deduction(late_s, graded.of) if course.late and late_s else 0.0,
-        email=person.email,
         flags=tuple(flags),
     )
     stamps = (time.timestamp() if time else 0.0, packed.timestamp() if packed else 0.0)
@@ -256,7 +255,7 @@ def _overruled(item: Item, said: Override | None) -> Item:
     """An item with the instructor's points and comment in place of, or behind, the rules'."""
     if said is None:
         return item
-    comment = f"{item.comment} {INSTRUCTOR}{said.comment}" if said.comment else item.comment
+    comment = f"{item.comment} Your instructor: {said.comment}" if said.comment else item.comment
     if said.points is None:
         return replace(item, comment=comment)
     if said.points != item.points:

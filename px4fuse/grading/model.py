@@ -11,9 +11,6 @@ from px4fuse.answers import Answers
 from px4fuse.grading.platforms import NOBODY, ExportOrigin
 from px4fuse.verification.model import Verdict
 
-# Before the instructor's own words behind a comment of the rules
-INSTRUCTOR = "Your instructor: "
-
 
 @dataclass(frozen=True)
 class Submission:
@@ -174,8 +171,6 @@ class Entry:
         What is entered as the grade; None while pending or missing.
     of : float
         The most that there is to have.
-    email : str
-        As the roster says.
     flags : tuple of str
         All that an instructor should look at: on who this is and what counts, on the counting
         report, and on what it has in common with others.
@@ -192,7 +187,6 @@ class Entry:
     comment: str = ""
     total: float | None = None
     of: float = 0.0
-    email: str = ""
     flags: tuple[str, ...] = ()
 
     @property
