@@ -170,11 +170,10 @@ def test_what_is_not_finite_too_long_or_too_much() -> None:
     text = html_text([odd], "Class", "px4fuse 1")
     assert "nan" not in text.lower().split("<script>")[0]
     assert len(text) < 16 * MAX_CHARACTERS
-    apart = tuple(Mismatch(f"axes.{n}", "1.0", "2.0") for n in range(60))
+    apart = (Mismatch("axes.49", "1.0", "2.0"),)
     one = Graded("a.pdf", "Ada", "1", Verdict("numbers differ", ("60.",), True, apart))
     text = html_text([Entry("Ada", "1", one)], "Class", "px4fuse 1")
-    assert "and 10 more" in text
-    assert ("axes.49" in text, "axes.50" in text) == (True, False)
+    assert '["axes.49","1.0","2.0"]' in text
 
 
 PEOPLE = (

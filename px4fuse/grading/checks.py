@@ -13,7 +13,7 @@ from typing import Annotated, ClassVar, Literal
 from msgspec import Meta
 from scipy.stats import chi2
 
-from px4fuse.comparison.model import AgainstTruth, FilterName, FilterSummary
+from px4fuse.comparison.model import AgainstTruth
 from px4fuse.filter.clock import Clock
 from px4fuse.filter.consistency import SIGMA_OFF, HorizontalNis
 from px4fuse.filter.tuning import HORIZONTAL
@@ -142,38 +142,28 @@ SIGMAS: dict[Sigma, tuple[str, str, str]] = {
 
 
 class TuningItem(RubricItem, frozen=True, kw_only=True, tag="tuning"):
-    """Chosen noises are what the data ask for; none of the points from ``factor`` off."""
+    """A chosen noise is what the data ask for; none of the points from ``factor`` off."""
 
-    settings: Annotated[tuple[Sigma, ...], Meta(min_length=1)] = tuple(SIGMAS)
-    axis: Text = HORIZONTAL
+    setting: Sigma
     factor: Factor = 2.0
 
     def score(self, evidence: Evidence) -> Scored:
-        """Mean over the settings."""
-        comparison = evidence.comparison
-        if comparison is None:
+        """1 in the interval, falling to 0 at ``factor`` from its end."""
+        if evidence.comparison is None:
             return NO_COMPARISON
-        factor = self.factor
-        return _mean(_tuned(evidence, comparison, one, self.axis, factor) for one in self.settings)
-
-
-def _mean(found: Iterator[Scored]) -> Scored:
-    shares, said = zip(*found, strict=True)
-    return sum(shares) / len(shares), f"{capital('; '.join(said))}."
+        share, said = _tuned(evidence, evidence.comparison, self.setting, self.factor)
+        return share, f"{capital(said)}."
 
 
 def _tuned(
-    evidence: Evidence,
-    comparison: ComparisonResults,
-    name: Sigma,
-    axis: str = HORIZONTAL,
-    factor: float = 2.0,
+    evidence: Evidence, comparison: ComparisonResults, name: Sigma, factor: float = 2.0
 ) -> Scored:
     label, unit, option = SIGMAS[name]
     chosen: float = getattr(comparison.settings, name)
-    interval = getattr(comparison.tuning.get(axis), f"{ASKED[name]}_interval", None)
+    tuned = comparison.tuning.get(HORIZONTAL)
+    interval = getattr(tuned, f"{ASKED[name]}_interval", None)
     if interval is None or interval[1] is None:
-        why = evidence.why_absent(f"tuning.{axis}")
+        why = evidence.why_absent(f"tuning.{HORIZONTAL}")
         return 0.0, f"your report has no interval for {label}{why}"
     low, high = interval
     if name == "sigma_z_m" and evidence.has("source_may_drift"):
@@ -201,39 +191,29 @@ def _error_m(comparison: ComparisonResults) -> float:
 
 
 class ConsistencyItem(RubricItem, frozen=True, kw_only=True, tag="consistent"):
-    """A filter is consistent, or no setting makes it so; no points from ``factor`` in σ on."""
+    """The filter is consistent, or no setting makes it so; no points from ``factor`` in σ on."""
 
-    filter: FilterName = "kf"
-    axes: Annotated[tuple[Text, ...], Meta(min_length=1)] = (HORIZONTAL,)
     factor: Factor = SIGMA_OFF
 
     def score(self, evidence: Evidence) -> Scored:
-        """Mean over the axes."""
+        """By the verdict on both horizontal axes together."""
         comparison = evidence.comparison
         if comparison is None:
             return NO_COMPARISON
-        return _mean(self._of_axis(evidence, comparison, axis) for axis in self.axes)
-
-    def _of_axis(self, evidence: Evidence, comparison: ComparisonResults, axis: str) -> Scored:
-        owner = "your filter" if self.filter == "kf" else "EKF2"
-        path, filters = HORIZONTAL, comparison.horizontal
-        if axis != HORIZONTAL:
-            analysed = comparison.axes.get(axis)  # type: ignore[call-overload]
-            path, filters = f"axes.{axis}.filters", analysed.filters if analysed else {}
-        judged = filters.get(self.filter)
-        if not isinstance(judged, FilterSummary | HorizontalNis):
-            why = evidence.why_absent(f"{path}.{self.filter}")
-            return 0.0, f"there is no verdict on {owner} ({axis}){why}"
+        judged = comparison.horizontal.get("kf")
+        if not isinstance(judged, HorizontalNis):
+            why = evidence.why_absent(f"{HORIZONTAL}.kf")
+            return 0.0, f"There is no verdict on your filter{why}."
         if judged.verdict == "consistent":
-            return 1.0, f"{owner} is consistent ({axis})"
-        said = f"{judged.verdict} {factor_words(judged.times_off)} times in σ ({owner}, {axis})"
+            return 1.0, "Your filter is consistent."
+        said = f"{capital(judged.verdict)} {factor_words(judged.times_off)} times in σ"
         if all(_tuned(evidence, comparison, name)[0] == 1.0 for name in SIGMAS):
             return 1.0, (
-                f"{said}, with the noises that the data ask for: what is left no setting fixes"
+                f"{said}, with the noises that the data ask for: what is left no setting fixes."
             )
         return falling(judged.times_off, self.factor), (
             f"{said}: look at what the tuning page asks for, and for what the model does not "
-            "explain"
+            "explain."
         )
 
 

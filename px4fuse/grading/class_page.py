@@ -33,8 +33,6 @@ LOOKS: dict[str, tuple[str, str]] = {
     MISSING: ("open", "–"),
 }
 STATUSES = tuple(LOOKS)
-# Of one submission, on the page; all of it stands in the report
-MAX_DIFFERENCES = 50
 SHOWN = (*STATUSES, "pending", "to read", "flagged", "late", "said by you")
 
 
@@ -167,23 +165,15 @@ def _comment(entry: Entry) -> Part:
 def _details(entry: Entry, one: Graded) -> Iterator[Part]:
     """What a row unfolds to, as long as nobody is to be hidden."""
     verdict = one.verdict
-    differ = [
-        (each.path, each.recorded, each.recomputed)
-        for each in verdict.differences[:MAX_DIFFERENCES]
-    ]
-    more = len(verdict.differences) - MAX_DIFFERENCES
+    differ = [(each.path, each.recorded, each.recomputed) for each in verdict.differences]
     items = [(item.title, number(item.points), number(item.of), item.comment) for item in one.items]
     named = [f"{name}: {'' if found else 'not '}named" for name, found in one.mistakes.items()]
     attempts = [f"{other.submission}: {other.status}" for other in entry.others]
     yield frame.listed("Flags", entry.flags, warn=True)
     yield frame.listed("Pending: what you can do", [one.pending] if one.pending else [], warn=True)
     yield frame.listed("Verification", verdict.reasons)
-    yield frame.tabled(
-        "Numbers that differ",
-        ("Where", "Report", "New run") if differ else (),
-        differ,
-        after=f"and {more} more" if more > 0 else "",
-    )
+    heads = ("Where", "Report", "New run") if differ else ()
+    yield frame.tabled("The first numbers that differ", heads, differ)
     title = "Points (proposed)" if one.pending else "Points"
     yield frame.tabled(title, ("Item", "Points", "Of", "Comment") if items else (), items, (1, 2))
     yield _comment(entry)

@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Literal
 
-from px4fuse.assignment.roster import Person
+from px4fuse.assignment.roster import Person, Register
 from px4fuse.assignment.sheet import Sheet
 from px4fuse.grading.class_table import number
 from px4fuse.grading.flags import class_flags
 from px4fuse.grading.lateness import LateRule, in_zone_of
 from px4fuse.grading.model import Entry, Graded, Item, Override, Submission
 from px4fuse.grading.overrides import TOTAL, Overrides, matched
-from px4fuse.grading.roster import Register
 from px4fuse.results.reading import one_line
 
 SHOWN = "%Y-%m-%d %H:%M"
@@ -91,7 +90,7 @@ def class_entries(
     if register.people:
         note = "Not in the roster."
     for one, submission in zip(graded, submissions, strict=True):
-        place = everyone.by_platform(submission.origin)
+        place = everyone.place(submission.origin.person)
         if place is None:
             place = everyone.place(Person(one.student_id, one.student))
         attempt = _attempt(one, submission, course, place, everyone)

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from px4fuse.assignment.key import AnswerKey
-from px4fuse.assignment.roster import Person, people_of_sheet, person_of_row
+from px4fuse.assignment.roster import Person, Register, people_of_sheet, person_of_row
 from px4fuse.grading import submissions
 from px4fuse.grading.entries import Course, class_entries
 from px4fuse.grading.exports import grade_column
@@ -20,7 +20,6 @@ from px4fuse.grading.model import Entry, Graded, Submission
 from px4fuse.grading.outputs import write_class
 from px4fuse.grading.overrides import NAME, read_overrides
 from px4fuse.grading.records import RECORDS, verified
-from px4fuse.grading.roster import Register
 from px4fuse.grading.rubric import Rubric
 from px4fuse.grading.scoring import assess, refused
 from px4fuse.reading import files_by_sha256, max_log_bytes
@@ -146,7 +145,7 @@ def grade_all(
     """Verify, or recall, and score every file, each within bounds; and how many were recalled."""
     jobs = []
     for submission in found:
-        place = register.by_platform(submission.origin)
+        place = register.place(submission.origin.person)
         owner = "" if place is None else register.people[place].student_id
         jobs.append((submission, owner))
     scored = partial(

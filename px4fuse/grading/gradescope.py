@@ -202,7 +202,7 @@ def run_autograder(folder: Path, late: LateRule | None) -> None:
             key=lambda one: -1.0 if one.total is None else one.total,
         )
         text = returned_text(entry)
-        if register.people and register.by_platform(origin) is None:
+        if register.people and register.place(origin.person) is None:
             name = origin.person.name or "(none)"
             unknown = f"The answer key has nobody of the name {name}: compare the report's."
             entry = replace(entry, flags=(unknown, *entry.flags))

@@ -9,7 +9,7 @@ from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 
-from px4fuse.assignment.roster import distinct, file_names
+from px4fuse.assignment.roster import Register, distinct, file_names
 from px4fuse.assignment.sheet import Sheet, read_sheet
 from px4fuse.grading import exports
 from px4fuse.grading.class_page import html_text
@@ -19,7 +19,6 @@ from px4fuse.grading.feedback import returned_text
 from px4fuse.grading.model import Entry, Graded
 from px4fuse.grading.overrides import NAME, TEMPLATE
 from px4fuse.grading.records import HANDED_IN, PAGE, RECORDS, REDRAWN, file_of
-from px4fuse.grading.roster import Register
 from px4fuse.spreadsheet import neutral, neutral_id
 from px4fuse.writing import write_all
 
