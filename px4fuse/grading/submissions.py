@@ -26,7 +26,6 @@ from px4fuse.grading.platforms import (
     METADATA,
     ExportOrigin,
     gradescope_metadata,
-    origin_of,
     origins_of,
 )
 from px4fuse.reading import files_below
@@ -39,8 +38,6 @@ MAX_ENTRIES = 10_000
 MAX_DIRECTORY_BYTES = 4_000_000
 # Of all that is in one zip file, whose entries may share their bytes
 MAX_TOTAL_BYTES = 4_000_000_000
-# Of a zip file in a folder: of one that a student may have handed in, and of an export of a class
-MAX_PDFS, MAX_CLASS_PDFS = 50, 200
 # PDFs are compressed inside; what still shrinks a hundred times is empty
 MAX_RATIO = 100
 MAX_NAME = 200
@@ -80,32 +77,31 @@ class _Search:
     notes: list[str] = field(default_factory=list)
     others: int = 0
 
-    def take(self, place: Submission, inside: str, opened: Callable[[], IO[bytes]]) -> None:
+    @contextmanager
+    def _whole(self, name: str) -> Iterator[None]:
+        """Whatever is wrong with a zip file or with metadata is a note and ends no search."""
+        try:
+            yield
+        except _UNREADABLE as error:
+            self.notes.append(f"{_shown(name)}: passed over: {_why(error)}")
+
+    def take(self, place: Submission, opened: Callable[[], IO[bytes]]) -> None:
         """Look at a file by what its name says it is.
 
         A zip file that a student handed in stands among the PDFs, and is none: it is not opened.
-        Whatever is wrong with another is a note and ends no search. ``inside`` is what names of
-        files in it begin with.
         """
-        end = place.name.lower()[-4:]
-        students = place.entry or origin_of(place.name).platform
-        if end == ".pdf" or (end == ".zip" and students):
+        if place.name.lower().endswith((".pdf", ".zip")):
             self.found.setdefault((place.file, place.entry), place)
-        elif end != ".zip" and not _is_metadata(place.name):
+        elif not _is_metadata(place.name):
             self.others += 1
         else:
-            try:
-                with opened() as stream:
-                    if end == ".zip":
-                        self._take_zip(place, inside, stream)
-                    else:
-                        text = stream.read(MAX_BYTES).decode("utf-8", errors="replace")
-                        self.people |= gradescope_metadata(text)
-            except _UNREADABLE as error:
-                self.notes.append(f"{_shown(place.name)}: passed over: {_why(error)}")
+            with self._whole(place.name), opened() as stream:
+                text = stream.read(MAX_BYTES).decode("utf-8", errors="replace")
+                self.people |= gradescope_metadata(text)
 
-    def _take_zip(self, place: Submission, inside: str, stream: IO[bytes]) -> None:
-        with _archive(stream) as archive:
+    def take_export(self, path: Path) -> None:
+        """Look at what is in a zip file."""
+        with self._whole(path.name), path.open("rb") as file, _archive(file) as archive:
             entries = [one for one in archive.infolist() if not one.is_dir()]
             # zipfile gives no more than the declared size
             if sum(one.file_size for one in entries) > MAX_TOTAL_BYTES:
@@ -113,21 +109,14 @@ class _Search:
             last = {one.filename: one for one in entries}
             if len(last) < len(entries):
                 self.notes.append(
-                    f"{_shown(place.name)}: {len(entries) - len(last)} entries have the name of "
+                    f"{_shown(path.name)}: {len(entries) - len(last)} entries have the name of "
                     "another one; only the last of each name was read."
                 )
-            before = len(self.found)
             for name, one in last.items():
                 label = _label(one)
                 if not any(map(_hidden, label.split("/"))):
-                    inner = Submission(place.file, name, inside + label, _time(one))
-                    self.take(inner, "", partial(_unpacked, archive, name))
-        new = [*self.found.items()][before:]
-        export = any(origin_of(one.name).platform for _, one in new)
-        most = MAX_CLASS_PDFS if export else MAX_PDFS
-        if inside and len(new) > most:  # the class would wait for them
-            self.found = dict([*self.found.items()][:before])
-            raise _EntryError(f"it holds more than {most} PDFs; give it itself if it is a class's.")
+                    place = Submission(path.resolve(), name, label, _time(one))
+                    self.take(place, partial(_unpacked, archive, name))
 
 
 def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, ...]]:
@@ -136,7 +125,8 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
     Parameters
     ----------
     paths : sequence of Path
-        PDFs, zip files, and folders, which are searched with their subfolders. Gradescope's
+        PDFs, folders, which are searched with their subfolders, and zip files as platforms export
+        them; a zip file in one of these was handed in by a student. Gradescope's
         ``submission_metadata.yml`` is read where it stands beside the submissions, never inside
         one.
 
@@ -154,12 +144,16 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
     """
     search = _Search()
     for path in paths:
+        if path.is_file() and path.name.lower().endswith(".zip"):
+            search.take_export(path)
+            continue
         for file, name in _files(path, search.notes):
-            inside = f"{name}/" if path.is_dir() else ""
-            search.take(Submission(file, "", name), inside, partial(io.FileIO, file))
+            search.take(Submission(file, "", name), partial(io.FileIO, file))
     notes = search.notes
     if search.others:
         notes.append(f"Files passed over that are not PDFs: {search.others}.")
+    if zips := sum(one.name.lower().endswith(".zip") for one in search.found.values()):
+        notes.append(f"Zip files not opened: {zips}; give a platform's export by its own name.")
     if not search.found:
         raise SettingsError(
             one_line(" ".join(["No PDF was found in what was given.", *notes]), 500)
