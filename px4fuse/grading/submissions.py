@@ -5,29 +5,22 @@ Nothing is unpacked to disk. Names from a zip file are shown and never used as p
 
 from __future__ import annotations
 
-import io
 import re
 import stat
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import IO
 
 from px4fuse.assignment.roster import distinct
 from px4fuse.errors import SettingsError
 from px4fuse.grading.model import Submission
-from px4fuse.grading.platforms import (
-    METADATA,
-    ExportOrigin,
-    gradescope_metadata,
-    origins_of,
-)
+from px4fuse.grading.platforms import METADATA, ExportOrigin, gradescope_metadata, origins_of
 from px4fuse.reading import files_below
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification.intake import MAX_BYTES
@@ -68,57 +61,6 @@ def _why(error: Exception) -> str:
     return f"it cannot be read ({why})."
 
 
-@dataclass
-class _Search:
-    """What a search has met: PDFs by where they are, people of Gradescope, and what it says."""
-
-    found: dict[tuple[Path, str], Submission] = field(default_factory=dict)
-    people: dict[str, ExportOrigin] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-    others: int = 0
-
-    @contextmanager
-    def _whole(self, name: str) -> Iterator[None]:
-        """Whatever is wrong with a zip file or with metadata is a note and ends no search."""
-        try:
-            yield
-        except _UNREADABLE as error:
-            self.notes.append(f"{_shown(name)}: passed over: {_why(error)}")
-
-    def take(self, place: Submission, opened: Callable[[], IO[bytes]]) -> None:
-        """Look at a file by what its name says it is.
-
-        A zip file that a student handed in stands among the PDFs, and is none: it is not opened.
-        """
-        if place.name.lower().endswith((".pdf", ".zip")):
-            self.found.setdefault((place.file, place.entry), place)
-        elif not _is_metadata(place.name):
-            self.others += 1
-        else:
-            with self._whole(place.name), opened() as stream:
-                text = stream.read(MAX_BYTES).decode("utf-8", errors="replace")
-                self.people |= gradescope_metadata(text)
-
-    def take_export(self, path: Path) -> None:
-        """Look at what is in a zip file."""
-        with self._whole(path.name), path.open("rb") as file, _archive(file) as archive:
-            entries = [one for one in archive.infolist() if not one.is_dir()]
-            # zipfile gives no more than the declared size
-            if sum(one.file_size for one in entries) > MAX_TOTAL_BYTES:
-                raise _EntryError(f"it unpacks to more than {MAX_TOTAL_BYTES // 10**9} GB.")
-            last = {one.filename: one for one in entries}
-            if len(last) < len(entries):
-                self.notes.append(
-                    f"{_shown(path.name)}: {len(entries) - len(last)} entries have the name of "
-                    "another one; only the last of each name was read."
-                )
-            for name, one in last.items():
-                label = _label(one)
-                if not any(map(_hidden, label.split("/"))):
-                    place = Submission(path.resolve(), name, label, _time(one))
-                    self.take(place, partial(_unpacked, archive, name))
-
-
 def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, ...]]:
     """Find the PDFs in files, folders and zip files, and who handed them in by their names.
 
@@ -142,24 +84,33 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
     SettingsError
         A path does not exist, or there is no PDF in any of them.
     """
-    search = _Search()
+    notes: list[str] = []
+    found: dict[tuple[Path, str], Submission] = {}
+    people: dict[str, ExportOrigin] = {}
+    others = zips = 0
     for path in paths:
-        if path.is_file() and path.name.lower().endswith(".zip"):
-            search.take_export(path)
-            continue
-        for file, name in _files(path, search.notes):
-            search.take(Submission(file, "", name), partial(io.FileIO, file))
-    notes = search.notes
-    if search.others:
-        notes.append(f"Files passed over that are not PDFs: {search.others}.")
-    if zips := sum(one.name.lower().endswith(".zip") for one in search.found.values()):
+        export = path.is_file() and path.name.lower().endswith(".zip")
+        for place in (_exported if export else _files)(path, notes):
+            end = place.name.lower()[-4:]
+            if end in (".pdf", ".zip"):
+                found.setdefault((place.file, place.entry), place)
+                zips += end == ".zip"
+            elif not _is_metadata(place.name):
+                others += 1
+            elif isinstance(content := read(place), Refused):
+                notes.append(content.reason)
+            else:
+                people |= gradescope_metadata(content.decode("utf-8", errors="replace"))
+    if others:
+        notes.append(f"Files passed over that are not PDFs: {others}.")
+    if zips:
         notes.append(f"Zip files not opened: {zips}; give a platform's export by its own name.")
-    if not search.found:
+    if not found:
         raise SettingsError(
             one_line(" ".join(["No PDF was found in what was given.", *notes]), 500)
         )
     order = sorted(
-        search.found.values(), key=lambda one: (one.name.casefold(), one.name, one.file, one.entry)
+        found.values(), key=lambda one: (one.name.casefold(), one.name, one.file, one.entry)
     )
     names = distinct(_shown(one.name) for one in order)
     exports = [
@@ -167,7 +118,7 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
     ]
     made = (
         replace(one, name=name, origin=origin)
-        for one, name, origin in zip(order, names, origins_of(exports, search.people), strict=True)
+        for one, name, origin in zip(order, names, origins_of(exports, people), strict=True)
     )
     return tuple(made), tuple(notes)
 
@@ -178,7 +129,7 @@ def read(submission: Submission) -> bytes | Refused:
         with submission.file.open("rb") as file:
             if submission.entry:
                 with _archive(file) as archive:
-                    content = _unpacked(archive, submission.entry).read()
+                    content = _unpacked(archive, submission.entry)
             else:
                 content = file.read(MAX_BYTES + 1)
         if len(content) > MAX_BYTES:
@@ -216,10 +167,33 @@ def _archive(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
         yield archive
 
 
-def _files(path: Path, notes: list[str]) -> Iterator[tuple[Path, str]]:
+def _exported(path: Path, notes: list[str]) -> list[Submission]:
+    """What is in a zip file; nothing, and a note, where it cannot be read."""
+    try:
+        with path.open("rb") as file, _archive(file) as archive:
+            entries = [one for one in archive.infolist() if not one.is_dir()]
+        # zipfile gives no more than the declared size
+        if sum(one.file_size for one in entries) > MAX_TOTAL_BYTES:
+            raise _EntryError(f"it unpacks to more than {MAX_TOTAL_BYTES // 10**9} GB.")
+    except _UNREADABLE as error:
+        notes.append(f"{_shown(path.name)}: passed over: {_why(error)}")
+        return []
+    last = {one.filename: one for one in entries}
+    if len(last) < len(entries):
+        notes.append(
+            f"{_shown(path.name)}: {len(entries) - len(last)} entries have the name of another "
+            "one; only the last of each name was read."
+        )
+    places = (
+        Submission(path.resolve(), name, _label(one), _time(one)) for name, one in last.items()
+    )
+    return [place for place in places if not any(map(_hidden, place.name.split("/")))]
+
+
+def _files(path: Path, notes: list[str]) -> Iterator[Submission]:
     """Regular files with their names for people, without hidden ones."""
     if path.is_file():
-        yield path.resolve(), path.name
+        yield Submission(path.resolve(), "", path.name)
         return
     if not path.is_dir():
         raise SettingsError(f"{one_line(str(path), MAX_NAME)}: no regular file, and no folder.")
@@ -236,7 +210,7 @@ def _files(path: Path, notes: list[str]) -> Iterator[tuple[Path, str]]:
         except (OSError, RuntimeError):  # it leads nowhere, or in a circle
             inside = False
         if inside:
-            yield resolved, name.as_posix()
+            yield Submission(resolved, "", name.as_posix())
         outside += not inside
     if outside:
         notes.append(
@@ -271,7 +245,7 @@ def _label(entry: zipfile.ZipInfo) -> str:
     return "/".join(part for part in parts if part not in ("", ".", "..") and part[1:] != ":")
 
 
-def _unpacked(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
+def _unpacked(archive: zipfile.ZipFile, name: str) -> bytes:
     """Content of an entry, if it is one that a learning platform would write."""
     entry = archive.getinfo(name)
     small = entry.file_size <= max(1_000_000, MAX_RATIO * entry.compress_size)
@@ -287,7 +261,7 @@ def _unpacked(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
         if wrong:
             raise _EntryError(why)
     # zipfile gives no more than the declared size
-    return io.BytesIO(archive.read(entry))
+    return archive.read(entry)
 
 
 def _shown(name: str) -> str:
