@@ -101,7 +101,7 @@ def verified(
     parts: dict[str, bytes] = {}
     if verdict.pages or not verdict.redrawn:
         handed_in = bounded(partial(pictures, page=page - 1), pdf, TIMEOUT_S, MEMORY_BYTES)
-        if isinstance(handed_in, tuple):
+        if isinstance(handed_in, tuple) and handed_in:
             parts[HANDED_IN] = handed_in[0]
     if verdict.redrawn:
         drawn = pictures(verdict.redrawn)

@@ -30,12 +30,12 @@ import importlib
 import io
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing
 from dataclasses import dataclass
 from difflib import SequenceMatcher
 from functools import partial
 from itertools import zip_longest
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -74,6 +74,7 @@ FAILURES = (
 )  # fmt: skip
 
 NumbersAlike = Callable[[str, str], bool]
+Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
@@ -122,9 +123,16 @@ def looks(pdf: bytes, most: int = 1000) -> tuple[Look | Unavailable, ...] | Unav
     Unavailable stands for a page that cannot be drawn, and for all of them where the file cannot be
     read or pypdfium2 is not installed.
     """
+    return _of_pages(pdf, _look, slice(most))
+
+
+def _of_pages(
+    pdf: bytes, make: Callable[[Any, int], Made], which: slice
+) -> tuple[Made, ...] | Unavailable:
+    """What is made of some pages of a document of pypdfium2."""
     try:
-        with opened(pdf) as document:
-            return tuple(_look(document, page) for page in range(min(len(document), most)))
+        with closing(importlib.import_module("pypdfium2").PdfDocument(pdf)) as document:
+            return tuple(make(document, page) for page in range(len(document))[which])
     except FAILURES as error:
         return undrawn(error)
 
@@ -206,33 +214,13 @@ def pictures(pdf: bytes, page: int | None = None) -> tuple[bytes, ...] | Unavail
     Returns
     -------
     tuple of bytes or Unavailable
-        PNGs of at most :data:`MAX_PIXELS`, in :data:`COLOURS`.
+        PNGs of at most :data:`MAX_PIXELS`, in :data:`COLOURS`; none for a page that is not there.
     """
-    try:
-        with opened(pdf) as document:
-            every = range(len(document))
-            if page is not None and page not in every:
-                raise ValueError(f"there is no page {page + 1}")
-            shown = every if page is None else [page]
-            return tuple(_small_png(rendered(document[at], WIDTH_PX)) for at in shown)
-    except FAILURES as error:
-        return undrawn(error)
+    return _of_pages(pdf, _picture, slice(None) if page is None else slice(page, page + 1))
 
 
-@contextmanager
-def opened(pdf: bytes) -> Iterator[Any]:
-    """A document of pypdfium2.
-
-    Raises
-    ------
-    one of FAILURES
-        It cannot be read, or pypdfium2 is not installed (ImportError).
-    """
-    document = importlib.import_module("pypdfium2").PdfDocument(pdf)
-    try:
-        yield document
-    finally:
-        document.close()
+def _picture(document: Any, page: int) -> bytes:
+    return _small_png(rendered(document[page], WIDTH_PX))
 
 
 def undrawn(error: BaseException) -> Unavailable:
