@@ -7,7 +7,6 @@ import unicodedata
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import datetime
 from pathlib import Path
 
 from px4fuse.assignment.key import MAX_STUDENTS, folded, only_place, same_id
@@ -33,6 +32,8 @@ COLUMNS = {
     "first": ("firstname", "givenname", "forename", "vorname"),
     "last": ("lastname", "surname", "familyname", "nachname"),
 }  # fmt: skip
+# What another list may know besides
+ADDED = ("name", "email", "login", "submitted")
 # Of Canvas, above the students
 NOT_STUDENTS = ("pointspossible", "studenttest")
 
@@ -49,6 +50,8 @@ class Person:
         By which Blackboard and ILIAS know the student.
     numbers : mapping
         Platform to the number that it gave the student.
+    submitted : str
+        When Moodle's worksheet says that the student handed in, in its words.
     """
 
     student_id: str
@@ -56,6 +59,7 @@ class Person:
     email: str = ""
     login: str = ""
     numbers: dict[str, str] = field(default_factory=dict)
+    submitted: str = ""
 
     @property
     def file(self) -> str:
@@ -144,19 +148,16 @@ def person_of_row(sheet: Sheet, row: Sequence[str]) -> Person | None:
         numbers |= {"canvas": user} if (user := sheet.cell(row, ("id",))) else {}
         said["student_id"] = one_line(sheet.cell(row, ("sisuserid",)), MAX_NAME)
     student_id = said["student_id"] or said["login"] or said["email"]
-    found = Person(student_id, name, said["email"], said["login"], numbers)
+    submitted = sheet.cell(row, ("lastmodifiedsubmission",))
+    found = Person(student_id, name, said["email"], said["login"], numbers, submitted)
     return found if student_id or name or numbers else None
 
 
 class Register:
-    """The class, to be asked who somebody is; without people where nothing says who is in it.
-
-    ``times`` is when Moodle says that the person at a place handed in.
-    """
+    """The class, to be asked who somebody is; without people where nothing says who is in it."""
 
     def __init__(self, people: Iterable[Person] = ()) -> None:
         self.people = list(people)
-        self.times: dict[int, datetime] = {}
 
     def add(self, others: Iterable[Person]) -> None:
         """What another list knows of the same people; who is not among them is left out."""
@@ -164,13 +165,9 @@ class Register:
             place = self.place(other)
             if place is not None:
                 known = self.people[place]
-                self.people[place] = replace(
-                    known,
-                    name=known.name or other.name,
-                    email=known.email or other.email,
-                    login=known.login or other.login,
-                    numbers={**other.numbers, **known.numbers},
-                )
+                whole = {name: getattr(known, name) or getattr(other, name) for name in ADDED}
+                numbers = {**other.numbers, **known.numbers}
+                self.people[place] = replace(known, numbers=numbers, **whole)
 
     def place(self, other: Person) -> int | None:
         """Where somebody stands of whom another list knows: by number, id, email, login or name."""

@@ -12,7 +12,7 @@ from px4fuse.assignment.roster import Person, Register
 from px4fuse.assignment.sheet import Sheet
 from px4fuse.grading.class_table import number
 from px4fuse.grading.flags import class_flags
-from px4fuse.grading.lateness import LateRule, in_zone_of
+from px4fuse.grading.lateness import LateRule, in_zone_of, moodle_time
 from px4fuse.grading.model import Entry, Graded, Item, Override, Submission
 from px4fuse.grading.overrides import TOTAL, Overrides, matched
 from px4fuse.results.reading import one_line
@@ -144,7 +144,8 @@ def _attempt(
     """One file as if it were the only one of its student."""
     origin, due = submission.origin, course.due
     platform = origin.platform.capitalize()
-    said = origin.time or (None if place is None else register.times.get(place))
+    person = Person(graded.student_id) if place is None else register.people[place]
+    said = origin.time or moodle_time(person.submitted)
     time, packed = (one and in_zone_of(one, due) for one in (said, submission.time))
     late_s = None
     flags = []
@@ -167,7 +168,6 @@ def _attempt(
             f"The report gives the id of {other.student_id} ({other.name or 'no name'}), but "
             f"{platform} says who handed it in."
         )
-    person = Person(graded.student_id) if place is None else register.people[place]
     entry = Entry(
         person.name or one_line(graded.student or origin.person.name, 200),
         person.student_id,
