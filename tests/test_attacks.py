@@ -113,10 +113,8 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     (sha256,) = honest.files
     truth = truth_of(simulation, sha256)
     answers = (
-        Answer(
-            "s01", "Ada", "s01.ulg", sha256, {}, MISTAKES, (), {"duration_s": 70.0}, None, truth
-        ),
-        Answer("s02", "Bob", "s02.ulg", "b" * 64, {}, (), ()),
+        Answer("s01", "Ada", "s01.ulg", sha256, {}, MISTAKES, {"duration_s": 70.0}, None, truth),
+        Answer("s02", "Bob", "s02.ulg", "b" * 64),
     )
     return Flight(honest, AnswerKey("aisle", answers))
 
@@ -254,8 +252,8 @@ def test_pages_that_were_painted_over(flight: Flight, honest: Graded, rubric: Ru
 
 # ------------------------------------------------------------------ loops
 
-OPEN = {"vio_drift": 0.012}, ("open-end=6m",), ("false_loop_closure",), {"closure_error_m": 6.0}
-CLOSED = {"vio_drift": 0.012}, (), (), {"closure_error_m": 0.0}
+OPEN = {"vio_drift": 0.012}, ("open-end=6m",), {"closure_error_m": 6.0}
+CLOSED = {"vio_drift": 0.012}, (), {"closure_error_m": 0.0}
 ELSEWHERE = "The loop is open: the vehicle landed elsewhere, 6 m from where it took off."
 REJECTED = {"closures": [{**LOOP["loop"]["closures"][0], "p": 1e-9, "d2": 60.0, "accepted": False}],
             "closure_error_m": 6.2}  # fmt: skip
@@ -269,7 +267,7 @@ NO_END: dict[str, Any] = {
 
 
 def looped(truth: Any, notes: str, request: dict[str, Any], loop: dict[str, Any]) -> Graded:
-    """What the two items on loops give."""
+    """What the item on the loop gives."""
     values = {f"request__{name}": value for name, value in request.items()}
     values |= {f"loop__{name}": value for name, value in loop.items()}
     form = {"log_sha256": SHA256, "mistakes": [{"kind": "open-end"}] if notes else []}
@@ -277,7 +275,7 @@ def looped(truth: Any, notes: str, request: dict[str, Any], loop: dict[str, Any]
     key = truth and AnswerKey("loop", (Answer("s01", "", "", LOOP["track"]["sha256"], *truth),))
     verdict = Verdict("verified", (), True, page_status="same")
     made = assess(results, verdict, read_rubric(None), key)
-    items = tuple(item for item in made.items if "losure" in item.title or "Loop" in item.title)
+    items = tuple(item for item in made.items if "Loop" in item.title)
     return Graded("a.pdf", "", "", verdict, items, made.flags, made.pending)
 
 

@@ -10,7 +10,7 @@ from class_tools import graded
 from exchange import replace
 
 from px4fuse.answers import Answers, Claim
-from px4fuse.assignment.roster import Person
+from px4fuse.assignment.roster import Person, Register
 from px4fuse.errors import SettingsError
 from px4fuse.grading.class_page import _boxes
 from px4fuse.grading.entries import Course, class_entries
@@ -19,7 +19,6 @@ from px4fuse.grading.lateness import due_time, late_rule
 from px4fuse.grading.model import Override, Submission
 from px4fuse.grading.overrides import read_overrides
 from px4fuse.grading.platforms import origin_of
-from px4fuse.grading.roster import Register
 from px4fuse.verification.model import Verdict
 
 DUE = due_time("2026-11-20 12:00:00 +01:00")

@@ -9,11 +9,10 @@ from pathlib import Path
 import pytest
 from class_tools import entry
 
-from px4fuse.assignment.roster import Person, people_of_sheet
+from px4fuse.assignment.roster import Person, Register, people_of_sheet
 from px4fuse.assignment.sheet import read_sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.exports import filled, grade_column
-from px4fuse.grading.roster import Register
 
 # As mod/assign/gradingtable.php of Moodle writes it
 MOODLE = (
@@ -119,7 +118,7 @@ def test_a_german_table_has_its_separator_and_comma(tmp_path) -> None:
     text = "Matrikelnummer;Name;Punkte;Kommentar\n0042;Jane Doe;;\n"
     sheet = table(tmp_path, text, "cp1252")
     made, _ = filled(sheet, ENTRIES, Register(PEOPLE), "", TEXTS)
-    assert made.content() == b"Matrikelnummer;Name;Punkte;Kommentar\n0042;Jane Doe;87.5;\n"
+    assert made.content() == b"Matrikelnummer;Name;Punkte;Kommentar\r\n0042;Jane Doe;87.5;\r\n"
     moodle = MOODLE.replace(",100.00,", ',"100,00",')
     sheet = table(tmp_path, moodle)
     made, _ = filled(sheet, ENTRIES, register(sheet), "", TEXTS)

@@ -59,7 +59,7 @@ def handed_in(tmp_path: Path) -> Path:
     locked.encrypt("secret")
     with (folder / "locked.pdf").open("wb") as file:
         locked.write(file)
-    with zipfile.ZipFile(folder / "more.zip", "w") as archive:
+    with zipfile.ZipFile(tmp_path / "more.zip", "w") as archive:
         archive.write(REPORT, "../../escaped/<img src=x onerror=alert(1)>.pdf")
     return folder
 
@@ -67,7 +67,7 @@ def handed_in(tmp_path: Path) -> Path:
 def test_everything_that_was_handed_in_stands_in_the_table(handed_in, tmp_path) -> None:
     output = tmp_path / "class"
     before = {path for path in tmp_path.rglob("*") if not path.is_relative_to(output)}
-    outcome = grade([handed_in], [], read_rubric(None), output, processes=2)
+    outcome = grade([handed_in, tmp_path / "more.zip"], [], read_rubric(None), output, processes=2)
     assert {path for path in tmp_path.rglob("*") if not path.is_relative_to(output)} == before
     assert len(outcome.graded) == 6
     table = rows(output)
@@ -146,7 +146,14 @@ def test_only_what_changed_is_done_again(handed_in, tmp_path) -> None:
     output = tmp_path / "class"
 
     def reused(title: str = "") -> int:
-        return grade([handed_in], [], read_rubric(None), output, processes=2, title=title).reused
+        return grade(
+            [handed_in, tmp_path / "more.zip"],
+            [],
+            read_rubric(None),
+            output,
+            processes=2,
+            title=title,
+        ).reused
 
     assert reused() == 2  # of one report there are three copies
     assert reused("Lab 4") == 6
@@ -160,7 +167,7 @@ def test_only_what_changed_is_done_again(handed_in, tmp_path) -> None:
         record.write_text('{"made_with": {"verdict": 3}}')
     assert reused() == 2
     (output / "overrides (1).csv").write_text("id,item,points,comment\n")
-    again = grade([handed_in], [], read_rubric(None), output)
+    again = grade([handed_in, tmp_path / "more.zip"], [], read_rubric(None), output)
     assert "overrides (1).csv: not read; only overrides.csv is." in again.notes
 
 

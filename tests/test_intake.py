@@ -125,7 +125,7 @@ def test_a_report_that_was_saved_again():
 @pytest.mark.parametrize(
     ("pdf", "said"),
     [
-        (b"", "not a PDF."),
+        (b"", "not a PDF: hand in the file that px4fuse wrote."),
         (b"%PDF-1.4 and no more", "cut off"),
         (REAL[: len(REAL) // 2], "cut off"),
         (REAL[:300_000] + b"\n%%EOF\n", DAMAGED),

@@ -21,7 +21,12 @@ from explore_tools import ask, axe, serious, settle, show
 from hypothesis import given
 from hypothesis import strategies as st
 
-from px4fuse.assignment.practice import (
+from px4fuse.cli import cli
+from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.model import AxisComparison, Comparison
+from px4fuse.filter.settings import Settings
+from px4fuse.flight import Flight, Unavailable
+from px4fuse.practice import (
     CHOICES,
     FLOWN,
     NOISY_UWB,
@@ -31,11 +36,6 @@ from px4fuse.assignment.practice import (
     draw,
     practice_text,
 )
-from px4fuse.cli import cli
-from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.model import AxisComparison, Comparison
-from px4fuse.filter.settings import Settings
-from px4fuse.flight import Flight, Unavailable
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from px4fuse.assignment.roster import Person, read_people
+from px4fuse.assignment.roster import Person, Register, read_people
 from px4fuse.grading.platforms import ExportOrigin
-from px4fuse.grading.roster import Register
 
 MOODLE = (
     'Identifier,"Full name","ID number","Email address",Status,Grade,"Maximum Grade"\r\n'
@@ -73,11 +72,10 @@ def at(platform: str, number: str = "", name: str = "", **more: str) -> ExportOr
         (at("gradescope", "7", email="Jane@X.edu"), 0),
         (at("moodle", "99", "Kim Min"), None),  # two of that name
         (at("moodle", "99", "Jane"), None),
-        (ExportOrigin(person=Person("", "Jane Doe")), None),
     ],
 )
 def test_whose_a_file_is_by_what_the_platform_says(origin, place) -> None:
-    assert CLASS.by_platform(origin) == place
+    assert CLASS.place(origin.person) == place
 
 
 @pytest.mark.parametrize(

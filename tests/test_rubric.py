@@ -8,7 +8,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.grading.rubric import AnyItem, parse_rubric, read_rubric, rubric_text
 
 ITEM = '[[item]]\ntitle = "T"\npoints = 5\n'
-NOTES = ITEM + 'check = "student"\n'
+NOTES = ITEM + 'check = "verified"\n'
 NUMBER = ITEM + 'check = "number"\npath = "a.b"\n'
 
 
@@ -37,8 +37,8 @@ def test_copy_of_the_default_is_the_default(tmp_path):
 
 
 def test_parameters_left_out_have_their_defaults():
-    (item,) = parse_rubric(NOTES, "x").items
-    assert (item.name, item.report) == (True, "any")
+    (item,) = parse_rubric(ITEM + 'check = "clock"\n', "x").items
+    assert (item.margin_s, item.report) == (0.03, "any")
     (item,) = parse_rubric(NUMBER + "at_most = 1\n", "x").items
     assert isinstance(item.at_most, float)
 
@@ -61,19 +61,15 @@ BAD = {
     ),
     "unknown parameter": (NOTES + "min_letters = 3", "unknown field `min_letters` - at item 1"),
     "the third": (NOTES + NOTES.replace("T", "U") + NUMBER + "at_most = 'x'", "at item 3, at_most"),
-    "sections of an earlier rubric": (
-        ITEM + 'check = "sections"',
-        "item 1, check: it is gone; delete the item",
-    ),
-    "the flight of an earlier rubric": (
-        ITEM + 'check = "flight"',
-        'write check = "number" with the path',
-    ),
+    "a check of an earlier rubric": (ITEM + 'check = "sections"', "Invalid value 'sections'"),
     "number without bound": (NUMBER, "give at_least, at_most or both"),
     "bounds exchanged": (NUMBER + "at_least = 2\nat_most = 1", "in this order"),
     "zero on the good side": (NUMBER + "at_most = 2\nzero_at = 1", "zero_at beyond"),
     "zero on the other good side": (NUMBER + "at_least = 0\nzero_at = 1", "zero_at beyond"),
-    "nothing required": (ITEM + 'check = "consistent"\naxes = []', "length >= 1"),
+    "a parameter of an earlier rubric": (
+        ITEM + 'check = "consistent"\naxes = []',
+        "unknown field `axes` - at item 1",
+    ),
     "but for capitals": (NOTES + NOTES.replace("T", "t"), "the title 't' is another item's"),
     "as the sum": (NOTES.replace("T", "Total"), "the title 'Total' is that of the sum"),
     "two alike": (NOTES + NOTES, "the title 'T' is another item's"),

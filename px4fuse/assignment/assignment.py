@@ -40,7 +40,6 @@ def fly(
         sha256=sha256,
         scenario=plain(asdict(drawn.scenario)),
         mistakes=drawn.typed,
-        findings=drawn.findings,
         truth={name: float(known[name]) for name in TRUTH},
         difficulty=drawn.difficulty,
         form=truth_of(simulation, sha256),
@@ -56,18 +55,13 @@ def key_path(folder: Path, given: Path | None) -> Path:
         It would be among the students' files.
     """
     whole = folder.resolve()
-    if given is None:
-        if not whole.name:
-            raise OutputError(f"{folder}: give a folder of its own with -o.")
-        # what was typed may be "." or "..", which have no name
-        beside = folder.parent if folder.name not in ("", "..") else whole.parent
-        return beside / f"{whole.name}_answers.json"
-    if whole == given.resolve() or whole in given.resolve().parents:
+    path = given or whole.parent / f"{whole.name}_answers.json"
+    if whole in (path.resolve(), *path.resolve().parents):
         raise OutputError(
-            f"{given}: is in the students' folder, where they would find it. Give another place "
+            f"{path}: is in the students' folder, where they would find it. Give another place "
             "with --answer."
         )
-    return given
+    return path
 
 
 def assign(

@@ -158,11 +158,6 @@ class Drawn:
     typed: tuple[str, ...]
     difficulty: float
 
-    @property
-    def findings(self) -> tuple[str, ...]:
-        """Ids of the findings that name the mistakes."""
-        return tuple(choice.finding for choice in self.chosen)
-
 
 def uniform(secret: bytes, student_id: str, kind: Kinds, label: str) -> float:
     """A number in [0, 1) that only those who know the secret can tell."""

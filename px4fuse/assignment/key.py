@@ -42,8 +42,6 @@ class Answer(msgspec.Struct, frozen=True, rename={"student_id": "id"}):
         What was flown: the fields of :class:`px4fuse.simulation.scenario.Scenario`.
     mistakes : tuple of str
         As ``px4fuse simulate --mistake`` takes them; empty for a flight without one.
-    findings : tuple of str
-        Ids of the findings that name them.
     truth : dict
         Numbers that the log does not say: ``sigma_z_m``, ``sigma_a_m_s2`` and
         ``clock_offset_to_add_s`` among them.
@@ -59,7 +57,6 @@ class Answer(msgspec.Struct, frozen=True, rename={"student_id": "id"}):
     sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
     scenario: dict[str, str | int | float | bool | None] = {}
     mistakes: _Texts = ()
-    findings: _Texts = ()
     truth: dict[str, _Number] = {}
     difficulty: _Number | None = None
     form: FormTruth | None = None

@@ -1,15 +1,15 @@
-"""The class list that a learning platform exports: who is in the class."""
+"""The class list that a learning platform exports: who is in the class, and who somebody is."""
 
 from __future__ import annotations
 
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from px4fuse.assignment.key import MAX_STUDENTS, folded
+from px4fuse.assignment.key import MAX_STUDENTS, folded, only_place, same_id
 from px4fuse.assignment.sheet import Sheet, read_sheet
 from px4fuse.errors import SettingsError
 from px4fuse.results.reading import one_line
@@ -20,15 +20,20 @@ MAX_STEM = 48
 RESERVED = {"con", "prn", "aux", "nul"} | {f"{n}{i}" for n in ("com", "lpt") for i in range(10)}
 # Column titles, letters and digits only, best first. The university's own id; Canvas's "ID",
 # Moodle's "Identifier" and ILIAS's "User ID" are the platform's
-ID_COLUMNS = (
-    "studentid", "studentnumber", "studentno", "idnumber", "matriculationnumber", "matriculation",
-    "matrikelnummer", "matrikelnr", "orgdefinedid", "sisuserid", "sid", "id", "number",
-)  # fmt: skip
-LOGIN_COLUMNS = ("username", "login", "sisloginid", "loginid", "user", "benutzername")
-EMAIL_COLUMNS = ("emailaddress", "email", "mail", "emailadresse")
-NAME_COLUMNS = ("name", "fullname", "studentname", "displayname", "student")
-FIRST_NAME_COLUMNS = ("firstname", "givenname", "forename", "vorname")
-LAST_NAME_COLUMNS = ("lastname", "surname", "familyname", "nachname")
+COLUMNS = {
+    "student_id": (
+        "studentid", "studentnumber", "studentno", "idnumber", "matriculationnumber",
+        "matriculation", "matrikelnummer", "matrikelnr", "orgdefinedid", "sisuserid", "sid", "id",
+        "number",
+    ),
+    "login": ("username", "login", "sisloginid", "loginid", "user", "benutzername"),
+    "email": ("emailaddress", "email", "mail", "emailadresse"),
+    "name": ("name", "fullname", "studentname", "displayname", "student"),
+    "first": ("firstname", "givenname", "forename", "vorname"),
+    "last": ("lastname", "surname", "familyname", "nachname"),
+}  # fmt: skip
+# What another list may know besides
+ADDED = ("name", "email", "login", "submitted")
 # Of Canvas, above the students
 NOT_STUDENTS = ("pointspossible", "studenttest")
 
@@ -45,6 +50,8 @@ class Person:
         By which Blackboard and ILIAS know the student.
     numbers : mapping
         Platform to the number that it gave the student.
+    submitted : str
+        When Moodle's worksheet says that the student handed in, in its words.
     """
 
     student_id: str
@@ -52,6 +59,7 @@ class Person:
     email: str = ""
     login: str = ""
     numbers: dict[str, str] = field(default_factory=dict)
+    submitted: str = ""
 
     @property
     def file(self) -> str:
@@ -82,15 +90,14 @@ def people_of_sheet(sheet: Sheet) -> tuple[Person, ...]:
     SettingsError
         No column tells who somebody is, or two rows have the same id.
     """
-    known = (_ids(sheet), LOGIN_COLUMNS, EMAIL_COLUMNS, NAME_COLUMNS, LAST_NAME_COLUMNS)
-    if not any(sheet.column(titles) is not None for titles in known):
+    if all(sheet.column(titles) is None for titles in COLUMNS.values()):
         raise SettingsError(
             f"{sheet.path}: no column tells who a student is",
             "Give one a title such as id, email or name.",
         )
     rows: dict[str, int] = {}
     people = []
-    for number, row in zip(sheet.numbers, sheet.rows, strict=True):
+    for number, row in enumerate(sheet.rows, start=2):
         person = person_of_row(sheet, row)
         if person is None:
             continue
@@ -130,35 +137,72 @@ def read_roster(path: Path) -> tuple[Person, ...]:
 
 def person_of_row(sheet: Sheet, row: Sequence[str]) -> Person | None:
     """The student in a row of a table; None for a row without one."""
-    parts = (sheet.cell(row, titles) for titles in (FIRST_NAME_COLUMNS, LAST_NAME_COLUMNS))
-    whole = sheet.cell(row, NAME_COLUMNS) or " ".join(filter(None, parts))
-    if re.sub(r"\W", "", whole.casefold()) in NOT_STUDENTS:
+    said = {what: one_line(sheet.cell(row, titles), MAX_NAME) for what, titles in COLUMNS.items()}
+    name = said["name"] or f"{said['first']} {said['last']}".strip()
+    if re.sub(r"\W", "", name.casefold()) in NOT_STUDENTS:
         return None
-    name, email, login, student_id = (
-        one_line(text, MAX_NAME)
-        for text in (
-            whole,
-            sheet.cell(row, EMAIL_COLUMNS),
-            sheet.cell(row, LOGIN_COLUMNS),
-            sheet.cell(row, _ids(sheet)),
-        )
-    )
     numbers = {}
     if participant := re.search(r"\d+$", sheet.cell(row, ("identifier",))):
         numbers["moodle"] = participant[0]
-    if _is_canvas(sheet) and (user := sheet.cell(row, ("id",))):
-        numbers["canvas"] = user
-    found = Person(student_id or login or email, name, email, login, numbers)
-    return found if found.student_id or name or numbers else None
+    if sheet.column(("sisuserid", "sisloginid")) is not None:
+        numbers |= {"canvas": user} if (user := sheet.cell(row, ("id",))) else {}
+        said["student_id"] = one_line(sheet.cell(row, ("sisuserid",)), MAX_NAME)
+    student_id = said["student_id"] or said["login"] or said["email"]
+    submitted = sheet.cell(row, ("lastmodifiedsubmission",))
+    found = Person(student_id, name, said["email"], said["login"], numbers, submitted)
+    return found if student_id or name or numbers else None
 
 
-def _is_canvas(sheet: Sheet) -> bool:
-    return sheet.column(("sisuserid", "sisloginid")) is not None
+class Register:
+    """The class, to be asked who somebody is; without people where nothing says who is in it."""
+
+    def __init__(self, people: Iterable[Person] = ()) -> None:
+        self.people = list(people)
+
+    def add(self, others: Iterable[Person]) -> None:
+        """What another list knows of the same people; who is not among them is left out."""
+        for other in others:
+            place = self.place(other)
+            if place is not None:
+                known = self.people[place]
+                whole = {name: getattr(known, name) or getattr(other, name) for name in ADDED}
+                numbers = {**other.numbers, **known.numbers}
+                self.people[place] = replace(known, numbers=numbers, **whole)
+
+    def place(self, other: Person) -> int | None:
+        """Where somebody stands of whom another list knows: by number, id, email, login or name."""
+        looks: tuple[Callable[[Person], bool], ...] = (
+            *(
+                lambda one, at=platform, said=said: _same(one.numbers.get(at, ""), said)
+                for platform, said in other.numbers.items()
+            ),
+            lambda one: _same(one.student_id, other.student_id),
+            lambda one: same_id(one.student_id, other.student_id),
+            lambda one: _same(one.email, other.email),
+            # Blackboard's user name and ILIAS's login are ids where the roster has no other
+            lambda one: _same(one.login or one.student_id, other.login),
+            lambda one: same_name(one.name, other.name),
+        )
+        return only_place(self.people, looks)
 
 
-def _ids(sheet: Sheet) -> list[str]:
-    """Titles of the university's ids."""
-    return [name for name in ID_COLUMNS if name != "id" or not _is_canvas(sheet)]
+def _same(known: str, said: str) -> bool:
+    return folded(known) == folded(said) != ""
+
+
+def same_name(one: str, other: str) -> bool:
+    """Whether two names have the same words in any order, or run together as Canvas has them.
+
+    >>> same_name("Ada Lovelace", "Lovelace, Ada"), same_name("Ada Lovelace", "lovelaceada")
+    (True, True)
+    >>> same_name("Ada", "ada lovelace"), same_name("", "")
+    (False, False)
+    """
+    mine, theirs = (re.findall(r"[^\W_]+", folded(name)) for name in (one, other))
+    short, long = sorted((mine, theirs), key=len)
+    turned = ("".join(long[at:] + long[:at]) for at in range(len(long)))
+    together = len(short) == 1 < len(long) and short[0] in turned
+    return bool(short) and (sorted(mine) == sorted(theirs) or together)
 
 
 def file_stem(student_id: str) -> str | None:

@@ -1,8 +1,8 @@
-"""Tables that a learning platform or a person wrote, read so that they can be written as they were.
+"""Tables that a learning platform or a person wrote, read so that they can be given back.
 
 Spreadsheets and platforms differ in encoding (UTF-8 with and without a byte order mark, UTF-16,
-Windows-1252), separator and quotes. What is filled in and given back has to be what the platform
-gave, but for the cells that are filled.
+Windows-1252) and separator. What is filled in and given back says what the platform gave, but for
+the cells that are filled.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ from px4fuse.reading import read_whole
 
 MAX_BYTES = 20_000_000
 SEPARATORS = ",;\t|"
-_MARKS = ((codecs.BOM_UTF8, "utf-8"), (codecs.BOM_UTF16_LE, "utf-16-le"),
-          (codecs.BOM_UTF16_BE, "utf-16-be"))  # fmt: skip
+# By byte order mark
+_ENCODINGS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
+              (codecs.BOM_UTF16_BE, "utf-16"))  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -34,23 +35,13 @@ class Sheet:
         Titles of the columns.
     rows : tuple of tuple of str
         Each as long as ``head``, or longer.
-    numbers : tuple of int
-        Line of each row in the file, for messages.
-    mark : bytes
-        Byte order mark; empty without.
-    quoted : bool
-        Whether every cell stands in quotes.
     """
 
     path: Path
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
-    numbers: tuple[int, ...] = ()
-    mark: bytes = b""
     encoding: str = "utf-8"
     separator: str = ","
-    line_end: str = "\r\n"
-    quoted: bool = False
 
     def column(self, titles: Sequence[str]) -> int | None:
         """Place of the first of these titles that is there, letters and digits compared."""
@@ -64,23 +55,17 @@ class Sheet:
 
     @property
     def text(self) -> str:
-        """The table with its own separator, quotes and line ends."""
+        """The table as CSV (RFC 4180), with its own separator."""
         out = io.StringIO()
-        writer = csv.writer(
-            out,
-            delimiter=self.separator,
-            lineterminator=self.line_end,
-            quoting=csv.QUOTE_ALL if self.quoted else csv.QUOTE_MINIMAL,
-        )
-        writer.writerows((self.head, *self.rows))
+        csv.writer(out, delimiter=self.separator).writerows((self.head, *self.rows))
         return out.getvalue()
 
     def content(self) -> bytes:
         """The file again, in its own encoding."""
         try:
-            return self.mark + self.text.encode(self.encoding)
+            return self.text.encode(self.encoding)
         except UnicodeEncodeError:  # feedback holds more signs than a Windows code page
-            return codecs.BOM_UTF8 + self.text.encode()
+            return self.text.encode("utf-8-sig")
 
 
 def bare(title: str) -> str:
@@ -105,11 +90,9 @@ def read_sheet(path: Path) -> Sheet:
     )
     if content.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")):
         raise SettingsError(f"{path}: a spreadsheet", "Save it as CSV.")
-    mark, encoding = next(
-        ((mark, name) for mark, name in _MARKS if content.startswith(mark)), (b"", "utf-8")
-    )
+    encoding = next((name for mark, name in _ENCODINGS if content.startswith(mark)), "utf-8")
     try:
-        text = content.removeprefix(mark).decode(encoding)
+        text = content.decode(encoding)
     except UnicodeDecodeError:  # as spreadsheets on Windows save it
         encoding = "cp1252"
         text = content.decode(encoding, errors="replace")
@@ -119,22 +102,11 @@ def read_sheet(path: Path) -> Sheet:
     # quoted cells may hold any of them
     separator = max(SEPARATORS, key=re.sub(r'"[^"]*"', "", header).count)
     try:
-        reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
-        lines = [(reader.line_num, cells) for cells in reader]
+        lines = [*csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)]
     except csv.Error as error:
         raise SettingsError(f"{path}: not a CSV file ({error}).") from error
-    lines = [(number, cells) for number, cells in lines if any(map(str.strip, cells))]
-    if not lines:
+    head, *rows = [cells for cells in lines if any(map(str.strip, cells))] or [[]]
+    if not head:
         raise SettingsError(f"{path}: empty", "Give a CSV file with a header.")
-    (_, head), *rows = lines
-    return Sheet(
-        path,
-        tuple(head),
-        tuple((*cells, *[""] * (len(head) - len(cells))) for _, cells in rows),
-        tuple(number for number, _ in rows),
-        mark,
-        encoding,
-        separator,
-        "\r\n" if "\r\n" in text else "\n",
-        quoted=header.startswith('"') and header.count('"') >= 2 * len(head),
-    )
+    filled = (tuple(cells + [""] * (len(head) - len(cells))) for cells in rows)
+    return Sheet(path, tuple(head), tuple(filled), encoding, separator)

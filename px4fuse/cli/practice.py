@@ -35,7 +35,7 @@ def practice(
     check_targets([target])
     ctx.meta[OPENED] = sys.stdout.isatty() if opened is None else opened
     with progress(target) as step:
-        from px4fuse.assignment.practice import practice_text
+        from px4fuse.practice import practice_text
 
         content = practice_text(seed, level, flights, step).encode()
     finish({target: content})

@@ -7,13 +7,13 @@ rests on), and of a loop. A check is its class here, and an item of rubric.toml 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, ClassVar, Literal
 
 from msgspec import Meta
 from scipy.stats import chi2
 
-from px4fuse.comparison.model import AgainstTruth, FilterName, FilterSummary
+from px4fuse.comparison.model import AgainstTruth
 from px4fuse.filter.clock import Clock
 from px4fuse.filter.consistency import SIGMA_OFF, HorizontalNis
 from px4fuse.filter.tuning import HORIZONTAL
@@ -30,7 +30,7 @@ from px4fuse.grading.evidence import (
     text_of,
     values_at,
 )
-from px4fuse.loop.model import Correction, LoopPart, Way
+from px4fuse.loop.model import Closure, Correction, LoopPart, Way
 from px4fuse.plain import capital, factor_words, length_words, p_words
 from px4fuse.record import Maybe, Share
 from px4fuse.results.contract import ASKED, ComparisonResults, LoopResults
@@ -42,33 +42,13 @@ NO_COMPARISON: Scored = (0.0, "Your report compares no filters.")
 
 
 class VerifiedItem(RubricItem, frozen=True, kw_only=True, tag="verified"):
-    """The numbers were computed again and agree; ``without_log`` where a file is not at hand."""
-
-    without_log: Share = 0.5
+    """The numbers were computed again and agree."""
 
     def score(self, evidence: Evidence) -> Scored:
-        """All or nothing but for a missing file."""
+        """All or nothing."""
         verdict = evidence.verdict
-        share = self.without_log if verdict.waits_for_file else verdict.status == "verified"
-        return share, f"Verification says: {verdict.status}{reason_of(verdict)}."
-
-
-class StudentItem(RubricItem, frozen=True, kw_only=True, tag="student"):
-    """The report says whose it is, by ``name`` and ``id`` as far as they are asked for."""
-
-    name: bool = True
-    id: bool = True
-
-    def score(self, evidence: Evidence) -> Scored:
-        """Share of what is asked for."""
-        student = evidence.results.student
-        asked = {"name (--student)": student.name} if self.name else {}
-        asked |= {"student id (--id)": student.id} if self.id else {}
-        missing = [what for what, value in asked.items() if not text_of(value)]
-        if missing:
-            said = " and ".join(missing)
-            return 1.0 - len(missing) / len(asked), f"Your report does not give your {said}."
-        return 1.0, f"Your report names {', '.join(map(text_of, asked.values())) or 'nobody'}."
+        said = f"Verification says: {verdict.status}{reason_of(verdict)}."
+        return float(verdict.status == "verified"), said
 
 
 class NumberItem(RubricItem, frozen=True, kw_only=True, tag="number"):
@@ -162,38 +142,28 @@ SIGMAS: dict[Sigma, tuple[str, str, str]] = {
 
 
 class TuningItem(RubricItem, frozen=True, kw_only=True, tag="tuning"):
-    """Chosen noises are what the data ask for; none of the points from ``factor`` off."""
+    """A chosen noise is what the data ask for; none of the points from ``factor`` off."""
 
-    settings: Annotated[tuple[Sigma, ...], Meta(min_length=1)] = tuple(SIGMAS)
-    axis: Text = HORIZONTAL
+    setting: Sigma
     factor: Factor = 2.0
 
     def score(self, evidence: Evidence) -> Scored:
-        """Mean over the settings."""
-        comparison = evidence.comparison
-        if comparison is None:
+        """1 in the interval, falling to 0 at ``factor`` from its end."""
+        if evidence.comparison is None:
             return NO_COMPARISON
-        factor = self.factor
-        return _mean(_tuned(evidence, comparison, one, self.axis, factor) for one in self.settings)
-
-
-def _mean(found: Iterator[Scored]) -> Scored:
-    shares, said = zip(*found, strict=True)
-    return sum(shares) / len(shares), f"{capital('; '.join(said))}."
+        share, said = _tuned(evidence, evidence.comparison, self.setting, self.factor)
+        return share, f"{capital(said)}."
 
 
 def _tuned(
-    evidence: Evidence,
-    comparison: ComparisonResults,
-    name: Sigma,
-    axis: str = HORIZONTAL,
-    factor: float = 2.0,
+    evidence: Evidence, comparison: ComparisonResults, name: Sigma, factor: float = 2.0
 ) -> Scored:
     label, unit, option = SIGMAS[name]
     chosen: float = getattr(comparison.settings, name)
-    interval = getattr(comparison.tuning.get(axis), f"{ASKED[name]}_interval", None)
+    tuned = comparison.tuning.get(HORIZONTAL)
+    interval = getattr(tuned, f"{ASKED[name]}_interval", None)
     if interval is None or interval[1] is None:
-        why = evidence.why_absent(f"tuning.{axis}")
+        why = evidence.why_absent(f"tuning.{HORIZONTAL}")
         return 0.0, f"your report has no interval for {label}{why}"
     low, high = interval
     if name == "sigma_z_m" and evidence.has("source_may_drift"):
@@ -221,39 +191,29 @@ def _error_m(comparison: ComparisonResults) -> float:
 
 
 class ConsistencyItem(RubricItem, frozen=True, kw_only=True, tag="consistent"):
-    """A filter is consistent, or no setting makes it so; no points from ``factor`` in σ on."""
+    """The filter is consistent, or no setting makes it so; no points from ``factor`` in σ on."""
 
-    filter: FilterName = "kf"
-    axes: Annotated[tuple[Text, ...], Meta(min_length=1)] = (HORIZONTAL,)
     factor: Factor = SIGMA_OFF
 
     def score(self, evidence: Evidence) -> Scored:
-        """Mean over the axes."""
+        """By the verdict on both horizontal axes together."""
         comparison = evidence.comparison
         if comparison is None:
             return NO_COMPARISON
-        return _mean(self._of_axis(evidence, comparison, axis) for axis in self.axes)
-
-    def _of_axis(self, evidence: Evidence, comparison: ComparisonResults, axis: str) -> Scored:
-        owner = "your filter" if self.filter == "kf" else "EKF2"
-        path, filters = HORIZONTAL, comparison.horizontal
-        if axis != HORIZONTAL:
-            analysed = comparison.axes.get(axis)  # type: ignore[call-overload]
-            path, filters = f"axes.{axis}.filters", analysed.filters if analysed else {}
-        judged = filters.get(self.filter)
-        if not isinstance(judged, FilterSummary | HorizontalNis):
-            why = evidence.why_absent(f"{path}.{self.filter}")
-            return 0.0, f"there is no verdict on {owner} ({axis}){why}"
+        judged = comparison.horizontal.get("kf")
+        if not isinstance(judged, HorizontalNis):
+            why = evidence.why_absent(f"{HORIZONTAL}.kf")
+            return 0.0, f"There is no verdict on your filter{why}."
         if judged.verdict == "consistent":
-            return 1.0, f"{owner} is consistent ({axis})"
-        said = f"{judged.verdict} {factor_words(judged.times_off)} times in σ ({owner}, {axis})"
+            return 1.0, "Your filter is consistent."
+        said = f"{capital(judged.verdict)} {factor_words(judged.times_off)} times in σ"
         if all(_tuned(evidence, comparison, name)[0] == 1.0 for name in SIGMAS):
             return 1.0, (
-                f"{said}, with the noises that the data ask for: what is left no setting fixes"
+                f"{said}, with the noises that the data ask for: what is left no setting fixes."
             )
         return falling(judged.times_off, self.factor), (
             f"{said}: look at what the tuning page asks for, and for what the model does not "
-            "explain"
+            "explain."
         )
 
 
@@ -301,8 +261,10 @@ TAPE_M = 0.5
 FAR_OFF = 4.0
 # What odometry indoors reaches, the defaults of px4fuse loop: after 100 m
 USUAL_DRIFT_M, USUAL_HEADING_DEG = 1.0, 3.0
-# Chance of an end that fits this well or better
-TOO_GOOD = 0.001
+# Chance of an end that fits this well or better, and from which on an error is as usual
+TOO_GOOD, USUAL_P = 0.001, 0.05
+# Of an end left open where no key says where it landed, and of a correction without a reference
+OPEN_UNKNOWN, WITHOUT_REFERENCE = 0.8, 0.5
 
 
 def contradictions(evidence: Evidence) -> Iterator[str]:
@@ -360,73 +322,86 @@ def _assumed_closed(evidence: Evidence) -> Iterator[str]:
         )
 
 
-def _open_end(evidence: Evidence) -> Scored:
-    """What the words "it did not come back" are worth, and why."""
-    landed = _landed_m(evidence)
-    if landed is not None and landed <= TAPE_M:
-        return 0.0, "but your vehicle landed where it took off"
-    if evidence.claims(OPEN):
-        return 1.0, "as your form says"
-    return 0.5, "but your form does not say that it landed elsewhere"
-
-
 class LoopItem(RubricItem, frozen=True, kw_only=True, tag="loop"):
-    """The loop was measured, and the path corrected where that is right; a third for each step.
+    """The loop was measured, its end is taken for what it is, and the path corrected if it closes.
 
-    ``without_reference`` is the share of the last third where nothing tells the ATE.
+    A quarter for measuring, one for a closure error that the odometry's usual drift explains, one
+    for correcting, one for a path that became better by it; where the end is rightly open the last
+    three for saying so.
     """
 
-    without_reference: Share = 0.5
-
     def score(self, evidence: Evidence) -> Scored:
-        """Thirds for measuring, for correcting, and for a path that became better by it."""
+        """Quarters; the first alone where an option contradicts the log or the key."""
         results, loop = evidence.results, evidence.results.loop
-        request = results.request if isinstance(results, LoopResults) else None
-        opened = request is not None and not request.came_back
+        opened = isinstance(results, LoopResults) and not results.request.came_back
         if not isinstance(loop, LoopPart) or (loop.closure_error_m is None and not opened):
             why = absence(loop.known_end if isinstance(loop, LoopPart) else loop)
             return 0.0, f"Your report measures no loop{why}."
         if loop.absolute:
             return 0.0, "Your loop is on a track that does not drift; measure it on odometry."
-        wrong = [*contradictions(evidence)]
-        left_open = opened and not loop.closures
-        accepted = any(one.accepted for one in loop.closures)
-        rejected = bool(loop.closures) and not wrong and not accepted
-        said = f"You measured a closure error of {loop.closure_error_m or 0.0:.3g} m"
+        off, path = length_words(loop.closure_error_m or 0.0), length_words(loop.path_length_m)
+        said = f"You measured a closure error of {off} in {path}"
         if opened:
             said = "You left the end open (--open)"
-        if left_open or rejected:
-            share, why = _open_end(evidence)
-            worth = (1.0 + 2.0 * share) / 3.0 if share or rejected else 0.0
-            false = "; the closure was rejected as false" if rejected else ""
+        accepted = [one for one in loop.closures if one.accepted]
+        wrong = [*contradictions(evidence), *(_assumed_closed(evidence) if accepted else ())]
+        if wrong and loop.closures:
+            return 0.25, f"{said}. {wrong[0]}"
+        if not accepted:
+            share, why = _open_end(evidence, loop)
+            false = "; the closure was rejected as false" if loop.closures else ""
+            worth = (1.0 + 3.0 * share) / 4.0 if share or loop.closures else 0.0
             return worth, f"{said}{false}, {why}."
-        wrong += _assumed_closed(evidence)
-        if wrong:
-            return 1 / 3, f"{said}. {wrong[0]}"
-        share, comment = self._corrected(loop.corrections)
-        return (1.0 + share) / 3.0, f"{said}{comment}"
+        closed, usual = _closed(evidence, accepted)
+        corrected, comment = _corrected(loop.corrections)
+        return (1.0 + closed + corrected) / 4.0, f"{said}, {usual}{comment}"
 
-    def _corrected(self, corrections: Mapping[Way, Maybe[Correction]]) -> Scored:
-        """One for a corrected path and one for an ATE below the uncorrected one."""
-        ways: tuple[Way, ...] = ("by_distance_plain", "by_distance", "pose_graph_gated")
-        done = [one for one in map(corrections.get, ways) if isinstance(one, Correction)]
-        if not done:
-            return 0.0, ", but the path is not corrected."
-        before = _ates(corrections.get("uncorrected"))
-        pairs = [
-            (before[name], now) for one in done for name, now in _ates(one).items()
-            if before.get(name)
-        ]  # fmt: skip
-        if not pairs:
-            return 1.0 + self.without_reference, (
-                " and corrected the path, but not against a reference: with --reference its error "
-                "would show."
-            )
-        was, now = min(pairs, key=lambda pair: pair[1] / pair[0])
-        changed = f" and corrected the path, whose ATE went from {was:.3g} m to {now:.3g} m"
-        if now < was:
-            return 2.0, f"{changed}."
-        return 1.0, f"{changed}: explain why the correction makes it worse."
+
+def _open_end(evidence: Evidence, loop: LoopPart) -> Scored:
+    """What the words "it did not come back" are worth, and why."""
+    landed = _landed_m(evidence)
+    if landed is not None and landed <= TAPE_M:
+        return 0.0, "but your vehicle landed where it took off"
+    if evidence.claims(OPEN):
+        known = landed is not None or loop.closures
+        return 1.0 if known else OPEN_UNKNOWN, "as your form says"
+    return 0.5, "but your form does not say that it landed elsewhere"
+
+
+def _closed(evidence: Evidence, accepted: Sequence[Closure]) -> Scored:
+    """By the chance of such an error, which a larger drift that was stated does not make usual."""
+    results = evidence.results
+    scale = max(_stated_drift(results), 1.0) ** 2 if isinstance(results, LoopResults) else 1.0
+    p = min(float(chi2.sf(one.d2 * scale, one.degrees_of_freedom)) for one in accepted)
+    if p >= USUAL_P:
+        return 1.0, f"as odometry that drifts as usual may have ({p_words(p)})"
+    share = falling(USUAL_P / p, USUAL_P / GATE_ALPHA) if p > 0.0 else 0.0
+    return share, (
+        f"more than the odometry's usual drift explains ({p_words(p)}; look for what made it "
+        "drift, or whether it landed elsewhere)"
+    )
+
+
+def _corrected(corrections: Mapping[Way, Maybe[Correction]]) -> Scored:
+    """One for a corrected path and one for an ATE below the uncorrected one."""
+    ways: tuple[Way, ...] = ("by_distance_plain", "by_distance", "pose_graph_gated")
+    done = [one for one in map(corrections.get, ways) if isinstance(one, Correction)]
+    if not done:
+        return 0.0, ", but the path is not corrected."
+    before = _ates(corrections.get("uncorrected"))
+    pairs = [
+        (before[name], now) for one in done for name, now in _ates(one).items() if before.get(name)
+    ]  # fmt: skip
+    if not pairs:
+        return 1.0 + WITHOUT_REFERENCE, (
+            ", and corrected the path, but not against a reference: with --reference its error "
+            "would show."
+        )
+    was, now = min(pairs, key=lambda pair: pair[1] / pair[0])
+    changed = f", and corrected the path, whose ATE went from {was:.3g} m to {now:.3g} m"
+    if now < was:
+        return 2.0, f"{changed}."
+    return 1.0, f"{changed}: explain why the correction makes it worse."
 
 
 def _ates(correction: object) -> dict[str, float]:
@@ -435,46 +410,3 @@ def _ates(correction: object) -> dict[str, float]:
     return {
         name: one.ate.translation_m.rmse for name, one in scores.items() if isinstance(one, Score)
     }
-
-
-class ClosureItem(RubricItem, frozen=True, kw_only=True, tag="closure"):
-    """The closure error is one that the odometry's drift explains, or the end is rightly open.
-
-    Attributes
-    ----------
-    enough_p : float
-        Chance of such an error from which on there are all points.
-    open_unknown : float
-        Share for an end left open where no key says where it landed.
-    """
-
-    enough_p: Annotated[float, Meta(ge=0.002, le=1.0)] = 0.05
-    open_unknown: Share = 0.5
-
-    def score(self, evidence: Evidence) -> Scored:
-        """By the chance of such an error; none where the gate rejects it."""
-        results, loop = evidence.results, evidence.results.loop
-        if not isinstance(loop, LoopPart) or not isinstance(results, LoopResults):
-            return 0.0, f"Your report measures no loop{absence(loop)}."
-        for wrong in contradictions(evidence):
-            return 0.0, wrong
-        accepted = [one for one in loop.closures if one.accepted]
-        if not results.request.came_back or not accepted:
-            share, why = _open_end(evidence)
-            if _landed_m(evidence) is None and not loop.closures:
-                share = min(share, self.open_unknown)
-            return share if evidence.claims(OPEN) else 0.0, f"Your loop is not closed, {why}."
-        for wrong in _assumed_closed(evidence):
-            return 0.0, wrong
-        # a larger drift that was stated explains any error
-        scale = max(_stated_drift(results), 1.0) ** 2
-        p = min(float(chi2.sf(one.d2 * scale, one.degrees_of_freedom)) for one in accepted)
-        off, path = length_words(loop.closure_error_m or 0.0), length_words(loop.path_length_m)
-        said = f"Your closure error is {off} in {path}"
-        if p >= self.enough_p:
-            return 1.0, f"{said}, as odometry that drifts as usual may have ({p_words(p)})."
-        share = falling(self.enough_p / p, self.enough_p / GATE_ALPHA) if p > 0.0 else 0.0
-        return share, (
-            f"{said}, more than the odometry's usual drift explains ({p_words(p)}); look for what "
-            "made it drift, or whether it landed elsewhere."
-        )

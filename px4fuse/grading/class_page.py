@@ -1,8 +1,7 @@
 """A class as one web page: a student per row, and on top what an instructor asks.
 
 Nothing that a student wrote can act: see :mod:`px4fuse.webpage`. Pictures of pages
-and PDFs stand in folders beside the page and are loaded as they are unfolded; where names are
-hidden there are none.
+and PDFs stand in folders beside the page and are loaded as they are unfolded.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from px4fuse.answers import form_rows
-from px4fuse.grading.anonymous import Veil
 from px4fuse.grading.class_table import number
 from px4fuse.grading.model import Entry, Graded, Item, Override, columns
 from px4fuse.grading.overrides import TOTAL
@@ -35,8 +33,6 @@ LOOKS: dict[str, tuple[str, str]] = {
     MISSING: ("open", "–"),
 }
 STATUSES = tuple(LOOKS)
-# Of one submission, on the page; all of it stands in the report
-MAX_DIFFERENCES = 50
 SHOWN = (*STATUSES, "pending", "to read", "flagged", "late", "said by you")
 
 
@@ -46,8 +42,7 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
     Parameters
     ----------
     entries : sequence of Entry
-        One per student. Where they have pseudonyms, no name, id or file's name is on the page, and
-        their order is that of the pseudonyms, which says nothing of the names.
+        One per student.
     made_with : str
         Name and version of the program.
 
@@ -56,8 +51,6 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
     str
         Write it as UTF-8. The same for the same input: no dates of today.
     """
-    entries = sorted(entries, key=lambda entry: entry.pseudonym)
-    veil = Veil(entries)
     items, numbers = columns(entries)
     counts = Counter(tag for entry in entries for tag in _tags(entry))
     tags = (*SHOWN, *sorted(tag for tag in counts if tag not in SHOWN))
@@ -66,7 +59,7 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
         title=title,
         subtitle=f"{len(entries)} {'student' if len(entries) == 1 else 'students'}, graded with "
         f"{made_with}",
-        above=_above(entries, counts, veil),
+        above=_above(entries, counts),
         noun=("student", "students"),
         columns=(
             Column("Student"),
@@ -75,10 +68,10 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
             Column("Points", "number"),
             Column("Handed in", "line", narrow="desk"),
             Column("Flags", "rank", narrow="desk"),
-            *(Column(veil.hide(name), "number", "items") for name in items),
-            *(Column(veil.hide(name), "number", "numbers") for name in numbers),
+            *(Column(name, "number", "items") for name in items),
+            *(Column(name, "number", "numbers") for name in numbers),
         ),
-        rows=[_row(entry, items, numbers, veil) for entry in entries],
+        rows=[_row(entry, items, numbers) for entry in entries],
         filters=[("Status", [("", f"Everyone ({len(entries)})"), *options])],
         groups=(("items", "Points of each item"), ("numbers", "Numbers")),
         placeholder="name, id, file, flag",
@@ -86,7 +79,7 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
     )
 
 
-def _above(entries: Sequence[Entry], counts: Mapping[str, int], veil: Veil) -> str:
+def _above(entries: Sequence[Entry], counts: Mapping[str, int]) -> str:
     """What stands above the table: counts, the points of all, and those of each item."""
     totals = [entry.total for entry in entries if entry.total is not None]
     most = max((entry.of for entry in entries if entry.of > 0.0), default=1.0)
@@ -104,11 +97,11 @@ def _above(entries: Sequence[Entry], counts: Mapping[str, int], veil: Veil) -> s
         entries=cells,
         totals=tenths(totals, most) if totals else (),
         most=number_words(most),
-        items=list(_items(graded, veil)),
+        items=list(_items(graded)),
     )
 
 
-def _items(graded: Sequence[Graded], veil: Veil) -> Iterator[tuple[Any, ...]]:
+def _items(graded: Sequence[Graded]) -> Iterator[tuple[Any, ...]]:
     """Distribution of points per item, as they count: a row of the table each."""
     found: dict[str, list[Item]] = defaultdict(list)
     for one in graded:
@@ -118,7 +111,7 @@ def _items(graded: Sequence[Graded], veil: Veil) -> Iterator[tuple[Any, ...]]:
         shares = [item.points / item.of if item.of else 0.0 for item in items]
         mean, most = statistics.fmean(i.points for i in items), max(i.of for i in items)
         none, full = sum(share <= 0.0 for share in shares), sum(share >= 1.0 for share in shares)
-        yield veil.hide(title), tenths(shares, 1.0), mean, number(most), none, full
+        yield title, tenths(shares, 1.0), mean, number(most), none, full
 
 
 def _status(entry: Entry) -> str:
@@ -134,33 +127,34 @@ def _tags(entry: Entry) -> list[str]:
     return tags + ["said by you"] * bool(entry.overrides or entry.comment)
 
 
-def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str], veil: Veil) -> Row:
+def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str]) -> Row:
     """One student."""
     one = entry.counting
     status = _status(entry)
     look, sign = LOOKS[status]
     count = len(entry.flags)
     few = f"{count} flag{'s' if count > 1 else ''}" if count else ""
-    file = one.submission if one and not entry.pseudonym else ""
+    file = one.submission if one else ""
     late_s = entry.late_s or 0.0
     minutes = f"{math.ceil(late_s / 60.0)} min late" if late_s else ""
     late = f"{late_s / 3600.0:.1f} h late" if late_s >= 3600.0 else minutes
     points = {item.title: item.points for item in one.items} if one else {}
     held = one.numbers if one else {}
     cells = (
-        Cell(entry.called, entry.pseudonym or entry.student or None, file),
-        frame.words("" if entry.pseudonym else entry.student_id),
+        Cell(entry.called, entry.student or None, file),
+        frame.words(entry.student_id),
         Cell(f"{sign} {status}", float(STATUSES.index(status)), few, look),
         _points(entry),
         frame.words(entry.handed_in, late),
-        Cell(veil.hide("\n".join(entry.flags)), float(count), "", "flags"),
+        Cell("\n".join(entry.flags), float(count), "", "flags"),
         *(frame.figure(points.get(name)) for name in items),
         *(frame.figure(held.get(name)) for name in numbers),
     )
     nothing = (frame.listed("Missing", ["Nothing was handed in."]), _comment(entry))
-    details = map(veil.of_part, _details(entry, one) if one else nothing)
-    boxes = () if entry.pseudonym else (_boxes(entry),)
-    beside = _beside(entry, one) if one and not entry.pseudonym else ()
+    details = _details(entry, one) if one else nothing
+    # who has neither id nor file cannot be named in overrides.csv
+    boxes = (_boxes(entry),) if entry.student_id or file else ()
+    beside = _beside(entry, one) if one else ()
     return Row(cells, tuple(_tags(entry)), (*details, *boxes), beside)
 
 
@@ -171,26 +165,15 @@ def _comment(entry: Entry) -> Part:
 def _details(entry: Entry, one: Graded) -> Iterator[Part]:
     """What a row unfolds to, as long as nobody is to be hidden."""
     verdict = one.verdict
-    differ = [
-        (each.path, each.recorded, each.recomputed)
-        for each in verdict.differences[:MAX_DIFFERENCES]
-    ]
-    more = len(verdict.differences) - MAX_DIFFERENCES
+    differ = [(each.path, each.recorded, each.recomputed) for each in verdict.differences]
     items = [(item.title, number(item.points), number(item.of), item.comment) for item in one.items]
     named = [f"{name}: {'' if found else 'not '}named" for name, found in one.mistakes.items()]
-    attempts = [
-        f"{f'attempt {place}' if entry.pseudonym else other.submission}: {other.status}"
-        for place, other in enumerate(entry.others, start=1)
-    ]
+    attempts = [f"{other.submission}: {other.status}" for other in entry.others]
     yield frame.listed("Flags", entry.flags, warn=True)
     yield frame.listed("Pending: what you can do", [one.pending] if one.pending else [], warn=True)
     yield frame.listed("Verification", verdict.reasons)
-    yield frame.tabled(
-        "Numbers that differ",
-        ("Where", "Report", "New run") if differ else (),
-        differ,
-        after=f"and {more} more" if more > 0 else "",
-    )
+    heads = ("Where", "Report", "New run") if differ else ()
+    yield frame.tabled("The first numbers that differ", heads, differ)
     title = "Points (proposed)" if one.pending else "Points"
     yield frame.tabled(title, ("Item", "Points", "Of", "Comment") if items else (), items, (1, 2))
     yield _comment(entry)

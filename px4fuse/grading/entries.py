@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Literal
 
-from px4fuse.assignment.roster import Person
+from px4fuse.assignment.roster import Person, Register
 from px4fuse.assignment.sheet import Sheet
 from px4fuse.grading.class_table import number
 from px4fuse.grading.flags import class_flags
-from px4fuse.grading.lateness import LateRule, in_zone_of
-from px4fuse.grading.model import INSTRUCTOR, Entry, Graded, Item, Override, Submission
+from px4fuse.grading.lateness import LateRule, in_zone_of, moodle_time
+from px4fuse.grading.model import Entry, Graded, Item, Override, Submission
 from px4fuse.grading.overrides import TOTAL, Overrides, matched
-from px4fuse.grading.roster import Register
 from px4fuse.results.reading import one_line
 
 SHOWN = "%Y-%m-%d %H:%M"
@@ -91,7 +90,7 @@ def class_entries(
     if register.people:
         note = "Not in the roster."
     for one, submission in zip(graded, submissions, strict=True):
-        place = everyone.by_platform(submission.origin)
+        place = everyone.place(submission.origin.person)
         if place is None:
             place = everyone.place(Person(one.student_id, one.student))
         attempt = _attempt(one, submission, course, place, everyone)
@@ -101,7 +100,7 @@ def class_entries(
             strangers.append(replace(attempt[2], flags=(note, *attempt[2].flags)))
     made = [
         _chosen(attempts[at], course) if attempts[at]
-        else Entry(person.name, person.student_id, None, email=person.email)
+        else Entry(person.name, person.student_id, None)
         for at, person in enumerate(everyone.people)
     ]  # fmt: skip
     made += strangers
@@ -145,7 +144,8 @@ def _attempt(
     """One file as if it were the only one of its student."""
     origin, due = submission.origin, course.due
     platform = origin.platform.capitalize()
-    said = origin.time or (None if place is None else register.times.get(place))
+    person = Person(graded.student_id) if place is None else register.people[place]
+    said = origin.time or moodle_time(person.submitted)
     time, packed = (one and in_zone_of(one, due) for one in (said, submission.time))
     late_s = None
     flags = []
@@ -168,7 +168,6 @@ def _attempt(
             f"The report gives the id of {other.student_id} ({other.name or 'no name'}), but "
             f"{platform} says who handed it in."
         )
-    person = Person(graded.student_id) if place is None else register.people[place]
     entry = Entry(
         person.name or one_line(graded.student or origin.person.name, 200),
         person.student_id,
@@ -177,7 +176,6 @@ def _attempt(
         "" if time is None else time.strftime(SHOWN),
         late_s,
         course.late.deduction(late_s, graded.of) if course.late and late_s else 0.0,
-        email=person.email,
         flags=tuple(flags),
     )
     stamps = (time.timestamp() if time else 0.0, packed.timestamp() if packed else 0.0)
@@ -256,7 +254,7 @@ def _overruled(item: Item, said: Override | None) -> Item:
     """An item with the instructor's points and comment in place of, or behind, the rules'."""
     if said is None:
         return item
-    comment = f"{item.comment} {INSTRUCTOR}{said.comment}" if said.comment else item.comment
+    comment = f"{item.comment} Your instructor: {said.comment}" if said.comment else item.comment
     if said.points is None:
         return replace(item, comment=comment)
     if said.points != item.points:

@@ -22,33 +22,25 @@ import html
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
 
 from px4fuse.assignment.key import folded
-from px4fuse.assignment.roster import person_of_row
+from px4fuse.assignment.roster import Register, person_of_row
 from px4fuse.assignment.sheet import Sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.class_table import decimal, number
 from px4fuse.grading.model import Entry
-from px4fuse.grading.roster import Register
 from px4fuse.plain import few_words
 from px4fuse.results.reading import one_line
 from px4fuse.spreadsheet import neutral
 
 GRADE = ("grade", "bewertung", "points", "punkte", "mark", "note", "score")
 MAX_GRADE = ("maximumgrade", "hoechstebewertung", "höchstebewertung")
-COMMENTS = ("feedbackcomments", "feedbackalskommentar", "feedbacktolearner", "feedback", "comment")
-CANVAS = re.compile(r"^(?P<title>.*) \((?P<id>\d+)\)$")
+# Read as HTML, and read as text
+HTML_COMMENTS = ("feedbackcomments", "feedbackalskommentar")
+COMMENTS = (*HTML_COMMENTS, "feedbacktolearner", "feedback", "comment")
+ASSIGNMENT = re.compile(r" \(\d+\)$")
 # Never written into: of Canvas, what it computes
 READ_ONLY = "(read only)"
-
-
-def kind_of(sheet: Sheet) -> Literal["moodle", "canvas", "other"]:
-    """Which platform a table is from."""
-    if sheet.column(("identifier",)) is not None and sheet.column(GRADE) is not None:
-        return "moodle"
-    canvas = sheet.column(("student",)) is not None and any(map(CANVAS.match, sheet.head))
-    return "canvas" if canvas else "other"
 
 
 def grade_column(sheet: Sheet, wanted: str) -> int:
@@ -64,24 +56,24 @@ def grade_column(sheet: Sheet, wanted: str) -> int:
     SettingsError
         There is none, or several and none was named.
     """
-    kind = kind_of(sheet)
     titles = {
-        at: title.rpartition(" (")[0] if kind == "canvas" else title
+        at: title
         for at, title in enumerate(sheet.head)
-        if (kind != "canvas" or CANVAS.match(title))
-        and not any(READ_ONLY in row[at] for row in sheet.rows[:3])
+        if not any(READ_ONLY in row[at] for row in sheet.rows[:3])
     }
-    usual = [*titles]
-    if kind != "canvas":
-        usual = [at for at in [sheet.column(GRADE)] if at is not None]
+    usual = sheet.column(GRADE)
+    assignments = [at for at in titles if ASSIGNMENT.search(titles[at])]
     named = [at for at, title in titles.items()
-             if folded(wanted) in (folded(title), folded(sheet.head[at]))]  # fmt: skip
+             if folded(wanted) in (folded(title), folded(ASSIGNMENT.sub("", title)))]  # fmt: skip
+    found = assignments if usual is None else [usual]
     # the title may be meant for another table than Moodle's
-    found = named if wanted and (named or kind != "moodle") else usual
+    if wanted and (named or sheet.column(("identifier",)) is None):
+        found = named
     if len(found) == 1:
         return found[0]
     several = "several columns for the grade" if found else "no column for the grade"
-    others = one_line(", ".join(one_line(title, 40) for title in titles.values()), 300)
+    shown = (ASSIGNMENT.sub("", titles[at]) for at in assignments or titles)
+    others = one_line(", ".join(one_line(title, 40) for title in shown), 300)
     raise SettingsError(f"{sheet.path}: {several}", f"Name one with --column: {others}.")
 
 
@@ -108,8 +100,8 @@ def filled(
     SettingsError
         From :func:`grade_column`.
     """
-    place, kind = grade_column(sheet, column), kind_of(sheet)
-    comments = sheet.column(COMMENTS)
+    place, comments = grade_column(sheet, column), sheet.column(COMMENTS)
+    as_read = neutral if sheet.column(HTML_COMMENTS) is None else as_html
     cells = [list(row) for row in sheet.rows]
     comma = any(re.fullmatch(r"\d+,\d+", cell.strip()) for row in cells for cell in row)
     notes, seen = [], set()
@@ -128,10 +120,9 @@ def filled(
                 f"{sheet.path.name}: {number(total)} points of {_who(entries[at])} are more than "
                 f"the platform's {number(most)}, and will not be taken: change its maximum."
             )
-        said = number(total)
-        row[place] = said.replace(".", ",") if comma and kind == "moodle" else said
+        row[place] = number(total).replace(".", "," if comma else ".")
         if comments is not None and comments != place:
-            row[comments] = as_html(feedback[at]) if kind != "other" else neutral(feedback[at])
+            row[comments] = as_read(feedback[at])
     left = [_who(entries[at]) for at in range(len(register.people))
             if at not in seen and entries[at].total is not None]  # fmt: skip
     if left:

@@ -10,17 +10,15 @@ from functools import partial
 from pathlib import Path
 
 from px4fuse.assignment.key import AnswerKey
-from px4fuse.assignment.roster import Person, people_of_sheet, person_of_row
+from px4fuse.assignment.roster import Person, Register, people_of_sheet
 from px4fuse.grading import submissions
 from px4fuse.grading.entries import Course, class_entries
-from px4fuse.grading.exports import grade_column, kind_of
+from px4fuse.grading.exports import grade_column
 from px4fuse.grading.flags import own_flags
-from px4fuse.grading.lateness import moodle_time
 from px4fuse.grading.model import Entry, Graded, Submission
 from px4fuse.grading.outputs import write_class
 from px4fuse.grading.overrides import NAME, read_overrides
 from px4fuse.grading.records import RECORDS, verified
-from px4fuse.grading.roster import Register
 from px4fuse.grading.rubric import Rubric
 from px4fuse.grading.scoring import assess, refused
 from px4fuse.reading import files_by_sha256, max_log_bytes
@@ -123,13 +121,6 @@ def register_of(course: Course, key: AnswerKey | None) -> Register:
     register = Register(people)
     for others in listed:
         register.add(others)
-    for sheet in course.worksheets:
-        for row in sheet.rows if kind_of(sheet) == "moodle" else ():
-            time = moodle_time(sheet.cell(row, ("lastmodifiedsubmission",)))
-            person = person_of_row(sheet, row)
-            place = register.place(person) if person else None
-            if time is not None and place is not None:
-                register.times[place] = time
     return register
 
 
@@ -146,7 +137,7 @@ def grade_all(
     """Verify, or recall, and score every file, each within bounds; and how many were recalled."""
     jobs = []
     for submission in found:
-        place = register.by_platform(submission.origin)
+        place = register.place(submission.origin.person)
         owner = "" if place is None else register.people[place].student_id
         jobs.append((submission, owner))
     scored = partial(

@@ -21,6 +21,7 @@ from dataclasses import replace
 from datetime import datetime
 from importlib import metadata
 from pathlib import Path
+from string import Template
 from typing import Any
 
 import msgspec
@@ -40,24 +41,7 @@ from px4fuse.reading import files_by_sha256, read_log_bytes, read_text
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.writing import write_all
 
-SETUP = """#!/usr/bin/env bash
-# Run once, when the autograder is uploaded: a Python of its own, with the versions of the machine
-# that wrote this, so that the numbers and pages are the same to the last digit.
-set -euo pipefail
-apt-get update
-apt-get install -y python3-venv
-python3 -m venv /opt/uv
-/opt/uv/bin/pip install uv
-/opt/uv/bin/uv venv --python {python} /opt/px4fuse
-/opt/uv/bin/uv pip install --python /opt/px4fuse/bin/python \\
-    --requirement /autograder/source/requirements.txt
-"""
-RUN = """#!/usr/bin/env bash
-# Run for every submission: its PDF is read within bounds, and nothing in it is executed.
-export PYTHONPATH=/autograder/source
-exec /opt/px4fuse/bin/python -P -m px4fuse grade --gradescope /autograder{options}
-"""
-EXECUTABLE = ("setup.sh", "run_autograder")
+SCRIPTS = {"setup.sh": "setup.sh", "run_autograder": "run_autograder.sh"}
 VISIBLE = "after_due_date"
 MAX_METADATA = 5_000_000
 
@@ -140,13 +124,19 @@ def autograder_zip(
     text = rubric_text() if rubric is None else rubric.read_text(encoding="utf-8-sig")
     python = ".".join(platform.python_version_tuple()[:2])
     options = f' --late "{late.text}"' if late else ""
+    package = Path(__file__).parents[1]
+    scripts = {
+        name: Template((package / "grading" / file).read_text(encoding="utf-8"))
+        for name, file in SCRIPTS.items()
+    }
     about = metadata.distribution("px4fuse")
     described = about.read_text("METADATA") or about.read_text("PKG-INFO") or ""
-    package = Path(__file__).parents[1]
-    modules = [path for path in sorted(package.rglob("*")) if "__pycache__" not in path.parts]
+    modules = (path for path in sorted(package.rglob("*")) if "__pycache__" not in path.parts)
     contents = {
-        "setup.sh": SETUP.format(python=python).encode(),
-        "run_autograder": RUN.format(options=options).encode(),
+        **{
+            name: script.substitute(python=python, options=options).encode()
+            for name, script in scripts.items()
+        },
         "requirements.txt": "".join(f"{one}\n" for one in sorted(set(_requirements()))).encode(),
         f"px4fuse-{about.version}.dist-info/METADATA": described.encode(),
         **{
@@ -164,7 +154,7 @@ def autograder_zip(
         for name, content in contents.items():
             entry = zipfile.ZipInfo(name)  # without the time of today
             entry.compress_type = zipfile.ZIP_DEFLATED
-            entry.external_attr = (0o100755 if name in EXECUTABLE else 0o100644) << 16
+            entry.external_attr = (0o100755 if name in SCRIPTS else 0o100644) << 16
             archive.writestr(entry, content)
     return out.getvalue()
 
@@ -212,7 +202,7 @@ def run_autograder(folder: Path, late: LateRule | None) -> None:
             key=lambda one: -1.0 if one.total is None else one.total,
         )
         text = returned_text(entry)
-        if register.people and register.by_platform(origin) is None:
+        if register.people and register.place(origin.person) is None:
             name = origin.person.name or "(none)"
             unknown = f"The answer key has nobody of the name {name}: compare the report's."
             entry = replace(entry, flags=(unknown, *entry.flags))

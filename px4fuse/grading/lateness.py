@@ -19,10 +19,6 @@ _RULE = re.compile(
     r"(?P<rate>\d+(?:\.\d+)?)\s*%\s*/\s*(?P<unit>day|hour)"
     r"(?:\s+up to\s+(?P<most>\d+(?:\.\d+)?)\s*%)?"
 )
-# Day, hour and minute, second, zone: of what is left out the end counts
-_DUE = re.compile(
-    r"(\d{4}-\d\d?-\d\d?)(?:[T ]+(\d\d?:\d\d)(:\d\d)?)?\s*(Z|[+-]\d\d:?\d\d|[A-Za-z]\S*)?"
-)
 # Moodle's strftimedaydatetime in English, with hours of twelve and of twenty-four
 _MOODLE_FORMATS = ("%A, %d %B %Y, %I:%M %p", "%A, %d %B %Y, %H:%M")
 
@@ -85,23 +81,21 @@ def due_time(text: str) -> datetime:
     SettingsError
         It is not such a time.
     """
-    match = _DUE.fullmatch(text.strip())
+    words = text.split()
     try:
-        if match is None:
-            raise ValueError(text)
-        day, clock, seconds, zone = match.groups()
-        form = "%Y-%m-%d %H:%M:%S"
-        found = datetime.strptime(f"{day} {clock or '23:59'}{seconds or ':59'}", form)
-        if zone is None:
-            return found.astimezone()
-        offset = zone == "Z" or zone[0] in "+-"
-        known = datetime.strptime(zone, "%z").tzinfo if offset else ZoneInfo(zone)
+        zone = ZoneInfo(words.pop()) if words and words[-1][0].isalpha() else None
+        found = datetime.fromisoformat("T".join(words[:2]) + "".join(words[2:]))
     except (ZoneInfoNotFoundError, ValueError, OSError) as error:
         raise SettingsError(
             f"--due {text!r}: give a time such as '2026-11-20 23:59', with or without a time zone "
             "('+01:00' or 'Europe/Berlin') behind it."
         ) from error
-    return found.replace(tzinfo=known)
+    clock = re.search(r"\d\d:\d\d(:\d\d)?", text)
+    if clock is None:
+        found = found.replace(hour=23, minute=59)
+    if clock is None or clock[1] is None:
+        found = found.replace(second=59)
+    return found.replace(tzinfo=zone) if zone else found if found.tzinfo else found.astimezone()
 
 
 def in_zone_of(time: datetime, due: datetime | None) -> datetime:

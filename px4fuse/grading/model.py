@@ -11,9 +11,6 @@ from px4fuse.answers import Answers
 from px4fuse.grading.platforms import NOBODY, ExportOrigin
 from px4fuse.verification.model import Verdict
 
-# Before the instructor's own words behind a comment of the rules
-INSTRUCTOR = "Your instructor: "
-
 
 @dataclass(frozen=True)
 class Submission:
@@ -174,13 +171,9 @@ class Entry:
         What is entered as the grade; None while pending or missing.
     of : float
         The most that there is to have.
-    email : str
-        As the roster says.
     flags : tuple of str
         All that an instructor should look at: on who this is and what counts, on the counting
         report, and on what it has in common with others.
-    pseudonym : str
-        What the class page shows instead of name, id and names of files; "" to show them.
     """
 
     student: str
@@ -194,9 +187,7 @@ class Entry:
     comment: str = ""
     total: float | None = None
     of: float = 0.0
-    email: str = ""
     flags: tuple[str, ...] = ()
-    pseudonym: str = ""
 
     @property
     def files(self) -> tuple[Graded, ...]:
@@ -206,7 +197,7 @@ class Entry:
     @property
     def called(self) -> str:
         """What the class page calls the student."""
-        return self.pseudonym or self.student or self.student_id or "no name"
+        return self.student or self.student_id or "no name"
 
 
 def columns(entries: Sequence[Entry]) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -9,17 +9,16 @@ from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 
-from px4fuse.assignment.roster import distinct, file_names
+from px4fuse.assignment.roster import Register, distinct, file_names
 from px4fuse.assignment.sheet import Sheet, read_sheet
 from px4fuse.grading import exports
 from px4fuse.grading.class_page import html_text
 from px4fuse.grading.class_table import csv_text
 from px4fuse.grading.entries import Course
 from px4fuse.grading.feedback import returned_text
-from px4fuse.grading.model import Entry
+from px4fuse.grading.model import Entry, Graded
 from px4fuse.grading.overrides import NAME, TEMPLATE
 from px4fuse.grading.records import HANDED_IN, PAGE, RECORDS, REDRAWN, file_of
-from px4fuse.grading.roster import Register
 from px4fuse.spreadsheet import neutral, neutral_id
 from px4fuse.writing import write_all
 
@@ -108,7 +107,7 @@ def _with_files(entry: Entry, stem: str, output: Path) -> Entry:
 
 
 def _pseudonyms(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]:
-    """Entries under other names, and the list of who is who.
+    """Entries under other names, in the order of these, and the list of who is who.
 
     A second run keeps the pseudonyms of the first; their order says nothing of the names.
     """
@@ -126,5 +125,22 @@ def _pseudonyms(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]
         kept[who] = next(free), new[who]
     ordered = sorted(kept.items(), key=lambda pair: pair[1])
     rows = ((name, neutral_id(who), neutral(student)) for who, (name, student) in ordered)
-    made = [replace(entry, pseudonym=kept[_identity(entry)][0]) for entry in entries]
-    return made, "\ufeff" + Sheet(path, NAMES_HEAD, tuple(rows)).text
+    made = [nameless(entry, kept[_identity(entry)][0]) for entry in entries]
+    listed = "\ufeff" + Sheet(path, NAMES_HEAD, tuple(rows)).text
+    return sorted(made, key=lambda entry: entry.student), listed
+
+
+def nameless(entry: Entry, pseudonym: str) -> Entry:
+    """What may be shown to others: states, points and the form, and no text that anybody wrote."""
+    one = entry.counting
+    if one is not None:
+        one = Graded(
+            "", "", "", replace(one.verdict, reasons=(), differences=()),
+            tuple(replace(item, comment="") for item in one.items),
+            pending=one.pending and "Its points are pending.",
+            form=one.form, numbers=one.numbers, mistakes=one.mistakes,
+        )  # fmt: skip
+    return Entry(
+        pseudonym, "", one, (), entry.handed_in, entry.late_s, entry.deduction,
+        total=entry.total, of=entry.of, flags=("Flagged.",) * bool(entry.flags),
+    )  # fmt: skip

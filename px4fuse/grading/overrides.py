@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from px4fuse.assignment.key import folded, only_place, same_id
+from px4fuse.assignment.key import folded
+from px4fuse.assignment.roster import Person, Register
 from px4fuse.assignment.sheet import read_sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.class_table import decimal
@@ -44,7 +45,7 @@ def read_overrides(path: Path) -> Overrides:
             f"{path}: no column {', '.join(missing)}", f"Its columns are {', '.join(TITLES)}."
         )
     found: dict[str, dict[str, Override]] = defaultdict(dict)
-    for number, row in zip(sheet.numbers, sheet.rows, strict=True):
+    for number, row in enumerate(sheet.rows, start=2):
         student, item, points, comment = (
             sheet.cell(row, (title,)).removeprefix("'") for title in TITLES
         )
@@ -74,9 +75,14 @@ def matched(
     """
     said: list[dict[str, Override]] = [{} for _ in entries]
     whole = max((one.of for entry in entries for one in entry.files), default=MOST)
+    files = (entry.counting.submission if entry.counting else "" for entry in entries)
+    people = Register(
+        Person(entry.student_id, login=file) for entry, file in zip(entries, files, strict=True)
+    )
     notes = []
     for student, rows in overrides.items():
-        place = _place(entries, student)
+        # by the very id, the id but for leading zeros, or the file's name
+        place = people.place(Person(student, login=student))
         if place is None:
             notes.append(f"{NAME}: nobody has the id {one_line(student, 40) or '(empty)'}.")
             continue
@@ -96,13 +102,3 @@ def matched(
                 said[place][title] = override
             notes += [f"{NAME}: {one_line(student, 40)} {wrong}."] if wrong else []
     return said, tuple(notes)
-
-
-def _place(entries: Sequence[Entry], student: str) -> int | None:
-    """Whose row it is: by the very id, the id but for leading zeros, or the file's name."""
-    looks: tuple[Callable[[Entry], bool], ...] = (
-        lambda entry: folded(entry.student_id) == folded(student) != "",
-        lambda entry: same_id(entry.student_id, student),
-        lambda entry: entry.counting is not None and entry.counting.submission == student,
-    )
-    return only_place(entries, looks)

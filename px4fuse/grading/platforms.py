@@ -53,7 +53,6 @@ _PARTS = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")
 TIME_IN_NAMES = "%Y-%m-%d-%H-%M-%S"
 _SUBMISSION = re.compile(r"^(?:submission_)?(\d+)(?:\.pdf)?:\s*\n((?:[ -].*\n?)*)", re.MULTILINE)
 _SUBMITTERS = re.compile(r"^  :submitters:\s*\n((?:  - .*\n?|    .*\n?)*)", re.MULTILINE)
-_MAX_METADATA = 20_000_000
 
 
 UNKNOWN = Person("")
@@ -162,7 +161,7 @@ def gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
     '12'
     """
     found = {}
-    for number, block in _SUBMISSION.findall(text[:_MAX_METADATA].replace("\r\n", "\n")):
+    for number, block in _SUBMISSION.findall(text.replace("\r\n", "\n")):
         people = _SUBMITTERS.search(block)
         name, student_id, email = (
             _value(people[1] if people else "", rf"  (?:- |  ):{key}")

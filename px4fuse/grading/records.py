@@ -9,16 +9,16 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
-from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 
 import msgspec
 
 from px4fuse.errors import ResultsError
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, files_named, to_json
+from px4fuse.results.model import provenance
 from px4fuse.results.reading import read_results
 from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import Refused, Verdict
@@ -33,7 +33,6 @@ RECORDS = "records"
 # Pictures stand in files that the class page loads when a row is unfolded: three hundred reports
 # have a hundred megabytes of them
 HANDED_IN, REDRAWN, PAGE = ".handed-in.png", ".pdf", ".page-{:03}.png"
-MADE_WITH = ("px4fuse", "numpy", "scipy", "matplotlib", "pypdfium2", "pillow")
 
 
 @dataclass(frozen=True)
@@ -102,7 +101,7 @@ def verified(
     parts: dict[str, bytes] = {}
     if verdict.pages or not verdict.redrawn:
         handed_in = bounded(partial(pictures, page=page - 1), pdf, TIMEOUT_S, MEMORY_BYTES)
-        if isinstance(handed_in, tuple):
+        if isinstance(handed_in, tuple) and handed_in:
             parts[HANDED_IN] = handed_in[0]
     if verdict.redrawn:
         drawn = pictures(verdict.redrawn)
@@ -125,11 +124,9 @@ def _files(results: str, logs: Mapping[str, Path], handed_out: frozenset[str]) -
 
 @cache
 def _versions() -> dict[str, str]:
-    found = dict.fromkeys(MADE_WITH, "")
-    for name in MADE_WITH:
-        with suppress(metadata.PackageNotFoundError):  # pictures are an extra
-            found[name] = metadata.version(name)
-    return found
+    here = provenance("")
+    drawn = f"{find_spec('pypdfium2') is not None}"  # pictures are an extra
+    return {**here.libraries, "px4fuse": here.px4fuse, "pictures": drawn}
 
 
 def _keep(records: Path, sha256: str, kept: VerificationRecord, parts: Mapping[str, bytes]) -> None:

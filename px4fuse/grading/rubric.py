@@ -26,13 +26,6 @@ from px4fuse.results.reading import one_line
 DEFAULT = "rubric.toml"
 MAX_RUBRIC_BYTES = 1_000_000
 HELP = "px4fuse grade --write-rubric FILE.toml writes one that explains itself."
-# Checks of earlier rubrics, and what to write instead
-GONE = {
-    "sections": "it is gone; delete the item (a verified report has its pages), or write check = "
-    '"number" with the path of what must be there',
-    "flight": 'it is gone; write check = "number" with the path "axes.*.updates.count" or '
-    '"loop.path_length_m"',
-}
 
 if TYPE_CHECKING:
     AnyItem = RubricItem
@@ -108,8 +101,7 @@ def parse_rubric(text: str, where: str) -> Rubric:
     # ValueError: not TOML, or an integer of a million digits
     except (msgspec.ValidationError, ValueError, RecursionError) as error:
         said = re.sub(r"`\$\.item\[(\d+)\]\.?([^`]*)`", _place, str(error))
-        gone = next((f": {new}" for old, new in GONE.items() if f"value {old!r}" in said), "")
-        raise SettingsError(f"{where}: {one_line(said, 300)}{gone}", HELP) from error
+        raise SettingsError(f"{where}: {one_line(said, 300)}", HELP) from error
 
 
 def _place(path: re.Match[str]) -> str:

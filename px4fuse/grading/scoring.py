@@ -81,7 +81,7 @@ def _fate(evidence: Evidence, rubric: Rubric) -> tuple[Doubtful, str]:
     # of each doubt what the rubric says, why there are no points, and what can be done
     doubts: list[tuple[Doubtful, str, str]] = []
     if verdict.status != "verified":
-        todo = verdict.what_to_do or f"Look at it yourself: it could not be verified{reason}."
+        todo = verdict.remedy or f"Look at it yourself: it could not be verified{reason}."
         doubts.append((rubric.unverified, f"your report could not be verified{reason}", todo))
     elif verdict.page_status == "differ":
         why = "pages of your PDF are not those that px4fuse draws from the log"

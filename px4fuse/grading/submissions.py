@@ -5,30 +5,22 @@ Nothing is unpacked to disk. Names from a zip file are shown and never used as p
 
 from __future__ import annotations
 
-import io
 import re
 import stat
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import IO
 
 from px4fuse.assignment.roster import distinct
 from px4fuse.errors import SettingsError
 from px4fuse.grading.model import Submission
-from px4fuse.grading.platforms import (
-    METADATA,
-    ExportOrigin,
-    gradescope_metadata,
-    origin_of,
-    origins_of,
-)
+from px4fuse.grading.platforms import METADATA, ExportOrigin, gradescope_metadata, origins_of
 from px4fuse.reading import files_below
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification.intake import MAX_BYTES
@@ -37,22 +29,15 @@ from px4fuse.verification.model import Refused
 MAX_ENTRIES = 10_000
 # Of the table of contents, which zipfile reads in one piece before it can be counted
 MAX_DIRECTORY_BYTES = 4_000_000
-# Of all that is in one zip file, whose entries may share their bytes; and of the zip files in it
+# Of all that is in one zip file, whose entries may share their bytes
 MAX_TOTAL_BYTES = 4_000_000_000
-MAX_INNER_BYTES = 500_000_000
-# Of a zip file that a student handed in, and of an export of a class in a folder
-MAX_PDFS, MAX_CLASS_PDFS = 50, 200
 # PDFs are compressed inside; what still shrinks a hundred times is empty
 MAX_RATIO = 100
 MAX_NAME = 200
 # The year that stands where a program knew no time
 ZIP_EPOCH = 1980
-# Zip files may hold zip files, which may not hold more
-MAX_DEPTH = 2
 
 _TOO_LARGE = f"larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB."
-# Between a zip file's entry and the entry of the zip file in it; no name can hold it
-_INSIDE = "\0"
 _ENCRYPTED = 1
 _UTF8 = 0x800
 
@@ -76,78 +61,14 @@ def _why(error: Exception) -> str:
     return f"it cannot be read ({why})."
 
 
-@dataclass
-class _Search:
-    """What a search has met: PDFs by where they are, people of Gradescope, and what it says."""
-
-    found: dict[tuple[Path, str], Submission] = field(default_factory=dict)
-    people: dict[str, ExportOrigin] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-    others: int = 0
-
-    def take(self, place: Submission, inside: str, opened: Callable[[], IO[bytes]]) -> None:
-        """Look at a file by what its name says it is.
-
-        Whatever is wrong with a zip file is a note and ends no search. ``inside`` is what names of
-        files in it begin with.
-        """
-        end = place.name.lower()[-4:]
-        if end == ".pdf":
-            self.found.setdefault((place.file, place.entry), place)
-        elif _depth(place) >= MAX_DEPTH or (end != ".zip" and not _is_metadata(place.name)):
-            self.others += 1
-        else:
-            try:
-                with opened() as stream:
-                    if end == ".zip":
-                        self._take_zip(place, inside, stream)
-                    else:
-                        text = stream.read(MAX_BYTES).decode("utf-8", errors="replace")
-                        self.people |= gradescope_metadata(text)
-            except _UNREADABLE as error:
-                self.notes.append(f"{_shown(place.name)}: passed over: {_why(error)}")
-
-    def _take_zip(self, place: Submission, inside: str, stream: IO[bytes]) -> None:
-        depth = _depth(place)
-        with _archive(stream) as archive:
-            entries = [one for one in archive.infolist() if not one.is_dir()]
-            # zipfile gives no more than the declared size
-            if sum(one.file_size for one in entries) > MAX_TOTAL_BYTES:
-                raise _EntryError(f"it unpacks to more than {MAX_TOTAL_BYTES // 10**9} GB.")
-            last = {one.filename: one for one in entries}
-            if len(last) < len(entries):
-                self.notes.append(
-                    f"{_shown(place.name)}: {len(entries) - len(last)} entries have the name of "
-                    "another one; only the last of each name was read."
-                )
-            left, before = MAX_INNER_BYTES, len(self.found)
-            for name, one in last.items():
-                label = _label(one)
-                if any(map(_hidden, label.split("/"))):
-                    continue
-                if label.lower().endswith(".zip") and (left := left - one.file_size) < 0:
-                    raise _EntryError("it holds too many zip files.")
-                whole = inside + label
-                inner = Submission(place.file, name, whole, _time(one))
-                if depth:  # a student set the clock of what is in a zip file in another one
-                    inner = replace(inner, entry=f"{place.entry}{_INSIDE}{name}", time=place.time)
-                self.take(inner, f"{whole}/", partial(_unpacked, archive, name))
-        new = [*self.found.items()][before:]
-        students = depth or origin_of(place.name).platform
-        export = not students and any(origin_of(one.name).platform for _, one in new)
-        most = MAX_CLASS_PDFS if export else MAX_PDFS
-        if inside and len(new) > most:  # the class would wait for them
-            self.found = dict([*self.found.items()][:before])
-            raise _EntryError(f"it holds more than {most} PDFs; give it itself if it is a class's.")
-
-
 def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, ...]]:
     """Find the PDFs in files, folders and zip files, and who handed them in by their names.
 
     Parameters
     ----------
     paths : sequence of Path
-        PDFs, zip files, and folders, which are searched with their subfolders. Gradescope's
+        PDFs, folders, which are searched with their subfolders, and zip files as platforms export
+        them; a zip file in one of these was handed in by a student. Gradescope's
         ``submission_metadata.yml`` is read where it stands beside the submissions, never inside
         one.
 
@@ -163,20 +84,33 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
     SettingsError
         A path does not exist, or there is no PDF in any of them.
     """
-    search = _Search()
+    notes: list[str] = []
+    found: dict[tuple[Path, str], Submission] = {}
+    people: dict[str, ExportOrigin] = {}
+    others = zips = 0
     for path in paths:
-        for file, name in _files(path, search.notes):
-            inside = f"{name}/" if path.is_dir() else ""
-            search.take(Submission(file, "", name), inside, partial(io.FileIO, file))
-    notes = search.notes
-    if search.others:
-        notes.append(f"Files passed over that are not PDFs: {search.others}.")
-    if not search.found:
+        export = path.is_file() and path.name.lower().endswith(".zip")
+        for place in (_exported if export else _files)(path, notes):
+            end = place.name.lower()[-4:]
+            if end in (".pdf", ".zip"):
+                found.setdefault((place.file, place.entry), place)
+                zips += end == ".zip"
+            elif not _is_metadata(place.name):
+                others += 1
+            elif isinstance(content := read(place), Refused):
+                notes.append(content.reason)
+            else:
+                people |= gradescope_metadata(content.decode("utf-8", errors="replace"))
+    if others:
+        notes.append(f"Files passed over that are not PDFs: {others}.")
+    if zips:
+        notes.append(f"Zip files not opened: {zips}; give a platform's export by its own name.")
+    if not found:
         raise SettingsError(
             one_line(" ".join(["No PDF was found in what was given.", *notes]), 500)
         )
     order = sorted(
-        search.found.values(), key=lambda one: (one.name.casefold(), one.name, one.file, one.entry)
+        found.values(), key=lambda one: (one.name.casefold(), one.name, one.file, one.entry)
     )
     names = distinct(_shown(one.name) for one in order)
     exports = [
@@ -184,7 +118,7 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
     ]
     made = (
         replace(one, name=name, origin=origin)
-        for one, name, origin in zip(order, names, origins_of(exports, search.people), strict=True)
+        for one, name, origin in zip(order, names, origins_of(exports, people), strict=True)
     )
     return tuple(made), tuple(notes)
 
@@ -193,21 +127,16 @@ def read(submission: Submission) -> bytes | Refused:
     """Bytes of a submission, at most :data:`~px4fuse.verification.intake.MAX_BYTES` of them."""
     try:
         with submission.file.open("rb") as file:
-            stream: IO[bytes] = file
-            for entry in filter(None, submission.entry.split(_INSIDE)):
-                with _archive(stream) as archive:
-                    stream = _unpacked(archive, entry)
-            content = stream.read(MAX_BYTES + 1)
+            if submission.entry:
+                with _archive(file) as archive:
+                    content = _unpacked(archive, submission.entry)
+            else:
+                content = file.read(MAX_BYTES + 1)
         if len(content) > MAX_BYTES:
             raise _EntryError(_TOO_LARGE)
     except _UNREADABLE as error:
         return Refused(f"{one_line(submission.name, MAX_NAME)}: {_why(error)}")
     return content
-
-
-def _depth(place: Submission) -> int:
-    """In how many zip files it lies."""
-    return place.entry.count(_INSIDE) + bool(place.entry)
 
 
 def _is_metadata(name: str) -> bool:
@@ -238,10 +167,33 @@ def _archive(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
         yield archive
 
 
-def _files(path: Path, notes: list[str]) -> Iterator[tuple[Path, str]]:
+def _exported(path: Path, notes: list[str]) -> list[Submission]:
+    """What is in a zip file; nothing, and a note, where it cannot be read."""
+    try:
+        with path.open("rb") as file, _archive(file) as archive:
+            entries = [one for one in archive.infolist() if not one.is_dir()]
+        # zipfile gives no more than the declared size
+        if sum(one.file_size for one in entries) > MAX_TOTAL_BYTES:
+            raise _EntryError(f"it unpacks to more than {MAX_TOTAL_BYTES // 10**9} GB.")
+    except _UNREADABLE as error:
+        notes.append(f"{_shown(path.name)}: passed over: {_why(error)}")
+        return []
+    last = {one.filename: one for one in entries}
+    if len(last) < len(entries):
+        notes.append(
+            f"{_shown(path.name)}: {len(entries) - len(last)} entries have the name of another "
+            "one; only the last of each name was read."
+        )
+    places = (
+        Submission(path.resolve(), name, _label(one), _time(one)) for name, one in last.items()
+    )
+    return [place for place in places if not any(map(_hidden, place.name.split("/")))]
+
+
+def _files(path: Path, notes: list[str]) -> Iterator[Submission]:
     """Regular files with their names for people, without hidden ones."""
     if path.is_file():
-        yield path.resolve(), path.name
+        yield Submission(path.resolve(), "", path.name)
         return
     if not path.is_dir():
         raise SettingsError(f"{one_line(str(path), MAX_NAME)}: no regular file, and no folder.")
@@ -258,7 +210,7 @@ def _files(path: Path, notes: list[str]) -> Iterator[tuple[Path, str]]:
         except (OSError, RuntimeError):  # it leads nowhere, or in a circle
             inside = False
         if inside:
-            yield resolved, name.as_posix()
+            yield Submission(resolved, "", name.as_posix())
         outside += not inside
     if outside:
         notes.append(
@@ -293,7 +245,7 @@ def _label(entry: zipfile.ZipInfo) -> str:
     return "/".join(part for part in parts if part not in ("", ".", "..") and part[1:] != ":")
 
 
-def _unpacked(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
+def _unpacked(archive: zipfile.ZipFile, name: str) -> bytes:
     """Content of an entry, if it is one that a learning platform would write."""
     entry = archive.getinfo(name)
     small = entry.file_size <= max(1_000_000, MAX_RATIO * entry.compress_size)
@@ -309,7 +261,7 @@ def _unpacked(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
         if wrong:
             raise _EntryError(why)
     # zipfile gives no more than the declared size
-    return io.BytesIO(archive.read(entry))
+    return archive.read(entry)
 
 
 def _shown(name: str) -> str:

@@ -163,7 +163,7 @@ def attached_results(pdf: bytes, name: str) -> Results:
 def _check_file(pdf: bytes) -> None:
     for wrong, why in (
         (len(pdf) > MAX_BYTES, f"larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB."),
-        (not pdf.startswith(b"%PDF-"), "not a PDF."),
+        (not pdf.startswith(b"%PDF-"), "not a PDF: hand in the file that px4fuse wrote."),
         (b"%%EOF" not in pdf[-2048:], "cut off: the end of the PDF is missing. Hand it in again."),
     ):
         if wrong:

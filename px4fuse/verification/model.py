@@ -35,8 +35,8 @@ class Report:
 class Refused:
     """A submission that cannot be read as a report, and why: one sentence for a person.
 
-    ``remedy`` is what whoever verifies it can do; "" where nothing helps but another file, and
-    ``missing`` the name of a file that would help.
+    ``remedy`` is what whoever verifies it can do, "" where nothing helps; ``missing`` the name of a
+    file that would help.
     """
 
     reason: str
@@ -117,19 +117,6 @@ class Verdict:
     redrawn: bytes = field(default=b"", repr=False)
     remedy: str = ""
     missing: str = ""
-
-    @property
-    def waits_for_file(self) -> bool:
-        """Whether nothing is wrong with the report, but a file of it is not at hand."""
-        return self.status == "cannot verify" and bool(self.missing)
-
-    @property
-    def what_to_do(self) -> str:
-        """What whoever verifies it can do; "" for nothing."""
-        if not self.missing:
-            return self.remedy
-        other = "If it is a log of yours, add" if self.status == "other log" else "Add"
-        return f"{other} {self.missing} to --logs."
 
     @property
     def outcome(self) -> str:

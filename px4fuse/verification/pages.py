@@ -30,12 +30,12 @@ import importlib
 import io
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing
 from dataclasses import dataclass
 from difflib import SequenceMatcher
 from functools import partial
 from itertools import zip_longest
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -57,12 +57,11 @@ SIZE_PX = 2
 MAX_PAGE_TEXT = 1_000_000
 # For the pages of a PDF that was handed in; libraries take 0.6 GB of the address space
 TIMEOUT_S, MEMORY_BYTES = 10.0, 1_000_000_000
-# Less where a page is very long, or its picture does not fit into MAX_PICTURE_BYTES
+# Less where a page is very long
 WIDTH_PX = 700
 # Enough to keep our blue, EKF2's orange and the severities apart, with smooth letters
 COLOURS = 16
-# A page of text and lines at 700 pixels takes 15 to 55 kB; a photograph is made smaller
-MAX_PICTURE_BYTES = 60_000
+# A page of text and lines at 700 pixels takes 15 to 55 kB, any at most half a byte per pixel
 MAX_PIXELS = 2_000_000
 MAX_DRAWN_COLOURS = 20_000
 # PDF's own limit is 14,400 points, or 200 inches
@@ -75,6 +74,7 @@ FAILURES = (
 )  # fmt: skip
 
 NumbersAlike = Callable[[str, str], bool]
+Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
@@ -123,9 +123,16 @@ def looks(pdf: bytes, most: int = 1000) -> tuple[Look | Unavailable, ...] | Unav
     Unavailable stands for a page that cannot be drawn, and for all of them where the file cannot be
     read or pypdfium2 is not installed.
     """
+    return _of_pages(pdf, _look, slice(most))
+
+
+def _of_pages(
+    pdf: bytes, make: Callable[[Any, int], Made], which: slice
+) -> tuple[Made, ...] | Unavailable:
+    """What is made of some pages of a document of pypdfium2."""
     try:
-        with opened(pdf) as document:
-            return tuple(_look(document, page) for page in range(min(len(document), most)))
+        with closing(importlib.import_module("pypdfium2").PdfDocument(pdf)) as document:
+            return tuple(make(document, page) for page in range(len(document))[which])
     except FAILURES as error:
         return undrawn(error)
 
@@ -207,33 +214,13 @@ def pictures(pdf: bytes, page: int | None = None) -> tuple[bytes, ...] | Unavail
     Returns
     -------
     tuple of bytes or Unavailable
-        PNGs of at most :data:`MAX_PICTURE_BYTES`.
+        PNGs of at most :data:`MAX_PIXELS`, in :data:`COLOURS`; none for a page that is not there.
     """
-    try:
-        with opened(pdf) as document:
-            every = range(len(document))
-            if page is not None and page not in every:
-                raise ValueError(f"there is no page {page + 1}")
-            shown = every if page is None else [page]
-            return tuple(_small_png(rendered(document[at], WIDTH_PX)) for at in shown)
-    except FAILURES as error:
-        return undrawn(error)
+    return _of_pages(pdf, _picture, slice(None) if page is None else slice(page, page + 1))
 
 
-@contextmanager
-def opened(pdf: bytes) -> Iterator[Any]:
-    """A document of pypdfium2.
-
-    Raises
-    ------
-    one of FAILURES
-        It cannot be read, or pypdfium2 is not installed (ImportError).
-    """
-    document = importlib.import_module("pypdfium2").PdfDocument(pdf)
-    try:
-        yield document
-    finally:
-        document.close()
+def _picture(document: Any, page: int) -> bytes:
+    return _small_png(rendered(document[page], WIDTH_PX))
 
 
 def undrawn(error: BaseException) -> Unavailable:
@@ -265,15 +252,9 @@ def rendered(sheet: Any, width_px: float) -> Image.Image:
 
 
 def _small_png(image: Image.Image) -> bytes:
-    while True:
-        # Choosing by coverage is truer to text and lines, and takes minutes on a photograph
-        drawn = image.getcolors(MAX_DRAWN_COLOURS) is not None
-        method = Image.Quantize.MAXCOVERAGE if drawn else Image.Quantize.FASTOCTREE
-        reduced = image.quantize(COLOURS, method, dither=Image.Dither.NONE)
-        out = io.BytesIO()
-        reduced.save(out, "PNG")
-        if out.tell() <= MAX_PICTURE_BYTES:
-            return out.getvalue()
-        ratio = min(0.9, math.sqrt(MAX_PICTURE_BYTES / out.tell()))
-        width, height = (max(1, int(ratio * side)) for side in image.size)
-        image = image.resize((width, height), Image.Resampling.LANCZOS)
+    # Choosing by coverage is truer to text and lines, and takes minutes on a photograph
+    drawn = image.getcolors(MAX_DRAWN_COLOURS) is not None
+    method = Image.Quantize.MAXCOVERAGE if drawn else Image.Quantize.FASTOCTREE
+    out = io.BytesIO()
+    image.quantize(COLOURS, method, dither=Image.Dither.NONE).save(out, "PNG")
+    return out.getvalue()

@@ -24,6 +24,7 @@ from px4fuse.results.model import LIBRARIES, Provenance
 from px4fuse.results.reading import one_line
 from px4fuse.verification.model import Refused
 
+ADD = "Add {} to --logs."
 ASK = "Ask how the report was made, and for the log and all files that it was made from."
 NOT_OURS = "the recorded request is not one that px4fuse can have made"
 # A flight of ten minutes has 60,000 steps of it, which take half a minute
@@ -35,7 +36,7 @@ class FileMissingError(ResultsError):
     """A file that a report rests on is not among those given; ``missing`` is what it is called."""
 
     def __init__(self, text: str, missing: str) -> None:
-        super().__init__(text)
+        super().__init__(text, ADD.format(missing))
         self.missing = missing
 
 

@@ -33,7 +33,7 @@ from px4fuse.verification.model import (
     Verdict,
 )
 from px4fuse.verification.pages import NumbersAlike, compare_pages
-from px4fuse.verification.rerun import Recomputed
+from px4fuse.verification.rerun import ADD, Recomputed
 
 LIMIT = "A verified report proves that its numbers belong to the log, not who wrote them."
 NO_LOG = "no log was given, so that no number could be computed again"
@@ -84,20 +84,6 @@ class Numbers:
     pairs: tuple[tuple[float, float], ...]
     compared: int
 
-    @property
-    def reason(self) -> str:
-        """What was found, as a sentence."""
-        if not self.differing:
-            return (
-                f"the log gives all {self.compared} values again (within {RELATIVE:g}, estimates "
-                f"within {ESTIMATE_RELATIVE:g})"
-            )
-        first = ", ".join(one.path for one in self.differences[:3])
-        more = ", …" * (self.differing > 3)
-        return (
-            f"{self.differing} of {self.compared} values are not what the log gives: {first}{more}"
-        )
-
 
 def verify(
     report: Report,
@@ -134,13 +120,14 @@ def verify(
         return _unknown(Refused(why, f"Run it with px4fuse {named}."))
     name = one_line(rerun.log_name(report.results), 80) or "its log"
     if not logs:
-        return _unknown(Refused(NO_LOG, missing=name))
+        return _unknown(Refused(NO_LOG, ADD.format(name), name))
     files = logs if isinstance(logs, Mapping) else files_by_sha256(logs)
     sha256 = rerun.log_sha256(report.results)
     if sha256 not in files:
         asked = one_line(sha256, 64) or "none"
         reason = f"none of the {len(files)} files given is the log, whose SHA-256 is {asked}"
-        return Verdict("other log", (reason,), with_log=False, missing=name)
+        remedy = f"If it is a log of yours, a{ADD.format(name)[1:]}"
+        return Verdict("other log", (reason,), False, remedy=remedy, missing=name)
     if report.results.student.notes.count("\n") > MAX_NOTES_LINES:
         reason = f"its notes have more than {MAX_NOTES_LINES} lines, which is no report"
         return _unknown(Refused(reason, rerun.ASK))
@@ -161,7 +148,13 @@ def _with_log(report: Report, again: Recomputed) -> Verdict:
     numbers = compare_results(to_plain(report.results), to_plain(again.results))
     alike = _rounding(numbers.pairs)
     pages = compare_pages(report.pdf, redrawn, lambda one, other: same_words(one, other, alike))
-    reasons = [numbers.reason]
+    first = ", ".join(one.path for one in numbers.differences[:3]) + ", …" * (numbers.differing > 3)
+    reasons = [
+        f"{numbers.differing} of {numbers.compared} values are not what the log gives: {first}"
+        if numbers.differing
+        else f"the log gives all {numbers.compared} values again (within {RELATIVE:g}, estimates "
+        f"within {ESTIMATE_RELATIVE:g})"
+    ]
     page_status: PageStatus = "not compared"
     differing: tuple[PageDifference, ...] = ()
     if isinstance(pages, Unavailable):

@@ -13,8 +13,8 @@ import pickle
 import signal
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
@@ -57,8 +57,13 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()
         self.process = context.Process(target=_serve, args=(theirs, function, memory_bytes))
-        with _environment():
+        before = dict(os.environ)
+        os.environ.update(_ENVIRONMENT)
+        try:
             self.process.start()
+        finally:
+            os.environ.clear()
+            os.environ.update(before)
         theirs.close()  # so that the pipe ends when the process does
         self.ready = False
         self.job = job
@@ -171,20 +176,6 @@ def _received(worker: _Worker) -> tuple[bool, Any]:
     except Exception as error:  # noqa: BLE001
         return False, Failed(f"its result could not be read ({type(error).__name__}).")
     return answer
-
-
-@contextmanager
-def _environment() -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in _ENVIRONMENT}
-    os.environ.update(_ENVIRONMENT)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 def _serve(pipe: Connection, function: Callable[[Any], Any], memory_bytes: int | None) -> None:

@@ -57,7 +57,7 @@
     for (const [title, value] of lines) made.append(make("dt", title), isolated("dd", value));
     return made;
   };
-  const table = (heads, lines, numeric, after) => {
+  const table = (heads, lines, numeric) => {
     const made = make("table");
     const head = made.createTHead().insertRow();
     heads.forEach((title, column) => {
@@ -71,7 +71,7 @@
         isolated("td", text, numeric.includes(column) ? "n" : "")));
     }
     const box = make("div", "", "scroll");
-    box.append(made, make("small", after));
+    box.append(made);
     return box;
   };
   const links = (lines) => {

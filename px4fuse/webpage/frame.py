@@ -123,10 +123,9 @@ def tabled(
     heads: Sequence[str],
     rows: Sequence[Sequence[str]],
     numeric: Sequence[int] = (),
-    after: str = "",
 ) -> Part:
     """A small table; ``numeric`` are the columns that end flush."""
-    return ["table", title, heads, rows, list(numeric), after]
+    return ["table", title, heads, rows, list(numeric)]
 
 
 def links(title: str, rows: Sequence[tuple[str, str]]) -> Part:
