@@ -23,6 +23,7 @@ import pandas as pd
 import psutil
 import pytest
 from batch_tools import environment, started, tiny_log, tiny_logs
+from class_tools import in_turn
 from click.testing import CliRunner
 from made_up_fleet import DAMAGED, made_up
 from msgspec import structs
@@ -52,6 +53,12 @@ PX4FUSE = [sys.executable, "-m", "px4fuse", "batch"]
 def one_worker(monkeypatch) -> None:
     """Unless a test asks for more: each takes two seconds to start, on cores that others use."""
     monkeypatch.setattr(os, "cpu_count", lambda: 1)
+
+
+@pytest.fixture
+def in_this_process(monkeypatch) -> None:
+    """For tests of what surrounds the processes."""
+    monkeypatch.setattr(run, "run_bounded", in_turn)
 
 
 @pytest.fixture
@@ -87,6 +94,7 @@ def command(*arguments: str | Path) -> Any:
 # ------------------------------------------------------------------ the table
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_every_log_is_in_the_table_with_its_numbers_or_its_line(tmp_path):
     logs = tiny_logs(tmp_path / "logs", 1)
     (logs / "inner").mkdir()
@@ -163,6 +171,7 @@ def test_absent_numbers_are_empty_and_texts_are_no_formulas(tmp_path):
     assert "flight-?.ulg" in csv_bytes(table).decode()
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_logs_without_a_position_are_not_judged_but_known(tmp_path):
     log = gnss_log("v1.16").write(tmp_path / "a.ulg")
     row = px4fuse.batch(log, tmp_path / "out").loc[0]
@@ -175,6 +184,7 @@ def test_logs_without_a_position_are_not_judged_but_known(tmp_path):
 
 
 @pytest.mark.reallogs
+@pytest.mark.usefixtures("in_this_process")
 def test_a_flight_on_gnss_has_its_rows(shared_logs):
     (log,) = shared_logs.glob("simulated/*no_uwb.ulg")
     table = px4fuse.batch(log)
@@ -185,7 +195,7 @@ def test_a_flight_on_gnss_has_its_rows(shared_logs):
 # ------------------------------------------------------------------ resuming
 
 
-@pytest.mark.usefixtures("remembered")
+@pytest.mark.usefixtures("remembered", "in_this_process")
 def test_a_second_run_does_only_what_is_new(flights, tmp_path, monkeypatch):
     logs, output = tmp_path / "logs", tmp_path / "out"
     shutil.copytree(flights, logs)
@@ -287,7 +297,7 @@ def test_a_log_that_changes_while_it_is_read_says_so(flights, tmp_path, monkeypa
     assert row["reason"] == "it changed while it was read"
 
 
-@pytest.mark.usefixtures("remembered")
+@pytest.mark.usefixtures("remembered", "in_this_process")
 @pytest.mark.parametrize("ends", [KeyboardInterrupt, OutputError])
 def test_what_ends_a_run_keeps_what_is_done(flights, undisturbed, tmp_path, monkeypatch, ends):
     write_all, written = run.write_all, []
@@ -329,6 +339,7 @@ def test_two_runs_in_one_folder(tmp_path):
     }
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_junk_in_hundreds_costs_a_line_each(tmp_path):
     folder = tmp_path / "logs"
     folder.mkdir()
