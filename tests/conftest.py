@@ -64,10 +64,12 @@ MANY_OBJECTS = 500_000
 def pytest_configure() -> None:
     """Look for garbage between tests only, as collecting them makes none.
 
-    The processes of the tests, which are begun after this, do linear algebra as commands do.
+    The processes of the tests, which are begun after this, do linear algebra as commands do, and
+    keep what they compile, as there are a hundred.
     """
     gc.disable()
     os.environ.update(ONE_THREAD)
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
 def pytest_collection_finish() -> None:
@@ -128,7 +130,7 @@ def no_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 # The last ones of a process are kept
-MOST_ANALYSES = 10
+MOST_ANALYSES = 16
 _drawn: dict[str, bytes] = {}
 
 
@@ -170,10 +172,10 @@ def _remembered(
         position=position and replace(position, path=Path(position.path).name),
     )
     known = (repr(named), *(sha256(file.read_bytes()).digest() for file in files))
-    if known not in _analyses:
-        _analyses[known] = _run(request, progress)
-        if len(_analyses) > MOST_ANALYSES:
-            del _analyses[next(iter(_analyses))]
+    # the last one used stands last
+    _analyses[known] = _analyses.pop(known) if known in _analyses else _run(request, progress)
+    if len(_analyses) > MOST_ANALYSES:
+        del _analyses[next(iter(_analyses))]
     return _analyses[known]
 
 

@@ -68,7 +68,7 @@ HELD, OFTEN_HELD = partial(errors.held, share=0.15), partial(errors.held, share=
 SMOOTH = partial(errors.low_pass, tau_s=0.5)
 
 
-@pytest.mark.parametrize("seed", range(1, 5))
+@pytest.mark.parametrize("seed", [1, 2])
 def test_white_noise_is_no_other(seed: int) -> None:
     analysis = judged(errors.white, seed=seed)
     assert told(analysis) == {}
@@ -110,7 +110,7 @@ def test_the_noisy_part_is_where_it_was() -> None:
     assert end == pytest.approx(time[0] + 2.0 * third, abs=third / 3.0)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_a_slow_error_is_no_low_pass_and_a_low_pass_no_slow_error(seed: int) -> None:
     slow, smooth = judged(SLOW, seed=seed), judged(SMOOTH, seed=seed)
     assert "source_smoothed" not in {one.id for one in find(slow)}
@@ -153,8 +153,7 @@ def test_what_no_innovation_shows_asks_for_no_smaller_noise(
         assert set(told(analysis)) == {"source_coloured"}
 
 
-@pytest.mark.parametrize("tau_s", [5.0, 20.0])
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(("tau_s", "seed"), [(5.0, 1), (20.0, 2)])
 def test_a_truth_shows_slow_errors_that_pass_for_those_of_the_imu(tau_s: float, seed: int) -> None:
     """As long as errors of the IMU are, so that no innovation shows them."""
     analysis = judged(partial(errors.coloured, tau_s=tau_s), 5.0, seed, truth_for=0.10)
