@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -324,13 +323,13 @@ def test_every_log_is_described_or_refused_in_one_line(shared_logs, monkeypatch,
     kinds = ("real/*.ulg", "simulated/*.ulg", "mavlink/*")
     paths = sorted(path for kind in kinds for path in shared_logs.glob(kind))
     assert len(paths) > 30
-    flights = []
+    taken = []
 
-    def read_once(*log: Any, **limits: Any) -> Flight:
-        flights.append(read_log(*log, **limits))
-        return flights[-1]
+    def take(flight: Flight) -> Inventory:
+        taken.append(take_inventory(flight))
+        return taken[-1]
 
-    monkeypatch.setattr("px4fuse.analysis.read_log", read_once)
+    monkeypatch.setattr("px4fuse.inspect.inventory.take_inventory", take)
     for path in paths:
         code, out, err = run_main(monkeypatch, capsys, "info", path)
         assert code in ((0,) if path.suffix == ".ulg" else (0, 2)), path.name
@@ -338,14 +337,13 @@ def test_every_log_is_described_or_refused_in_one_line(shared_logs, monkeypatch,
         if code == 2:
             continue
         assert widest(out) <= WIDTH, path.name
-        flight = flights.pop()
-        assert not flights
-        inventory = take_inventory(flight)
+        (inventory,) = taken
+        taken.clear()
         strict(json.dumps(to_plain(inventory)))
         assert len(inventory.abilities) == 8, path.name
         assert all(a.reason for a in inventory.abilities), path.name
         try:
-            choose_source(flight)
+            choose_source(inventory.flight)
         except Px4FuseError:
             assert not ability(inventory, "compare").possible, path.name
             remedy = "VISION_POSITION" if path.suffix == ".ulg" else "system's own file"
