@@ -225,6 +225,7 @@ def test_a_second_run_does_only_what_is_new(flights, tmp_path, monkeypatch):
     assert other.loc[0, "kf_nis_mean"] < table.loc[0, "kf_nis_mean"]
 
 
+@pytest.mark.usefixtures("in_this_process")  # the second time
 def test_ctrl_c_at_a_terminal_keeps_what_is_done_and_says_so_on_one_line(
     flights, undisturbed, tmp_path
 ):
@@ -409,6 +410,32 @@ def test_logs_are_found_in_folders_globs_and_urls(tmp_path, monkeypatch):
     assert small["reason"] == "1 MB, more than the limit of 0 MB"
 
 
+@pytest.mark.reallogs
+def test_shared_logs_of_every_kind_in_one_run(shared_logs, tmp_path):
+    """But for those of the sample's release, two long ones, and GNSS, which test_gnss.py has."""
+    files = [
+        str(file)
+        for file in sorted(shared_logs.glob("*/*"))
+        if file.suffix != ".json" and not re.match(r"v1\.16|ArduPilot_UAV|.*_gps_", file.name)
+    ]
+    table = px4fuse.batch(files, tmp_path, reports=True, workers=2)
+    assert set(table["log"]) == set(files)
+    validator = jsonschema.Draft202012Validator(schema())
+    for log, rows in table.groupby("log"):
+        first = rows.iloc[0]
+        if first["axis"]:
+            assert rows["kf_nis_mean"].notna().any() or first["reason"], log
+            text = (tmp_path / first["results"]).read_text(encoding="utf-8")
+            validator.validate(json.loads(text))
+            assert to_json(read_results(text.encode())) == text
+            assert (tmp_path / first["report"]).read_bytes().startswith(b"%PDF-")
+        else:
+            assert len(rows) == 1
+            assert first["reason"], log
+            assert first["status"] in ("not judged", "failed")
+    assert (table.drop_duplicates("log")["status"] == "done").sum() >= 12
+
+
 # ------------------------------------------------------------------ a cluster of its own
 
 
@@ -423,6 +450,45 @@ def started_scheduler(log: Path, **more: str) -> Any:
 def started_workers(address: str, log: Path, *options: str, **more: str) -> Any:
     arguments = ("--nthreads", "1", *LOCAL, *options)
     return started("worker", address, *arguments, says="Starting Worker plugin", log=log, **more)
+
+
+def test_a_scheduler_that_goes_is_said_on_one_line(tmp_path):
+    """Its process is ended while a log is being compared."""
+    logs, out = tiny_logs(tmp_path / "logs", 6, truth=False), tmp_path / "out"
+    with started_scheduler(tmp_path / "scheduler") as line:
+        address = line.split()[-1]
+        with started_workers(address, tmp_path / "worker"):
+            process = subprocess.Popen(
+                [*PX4FUSE, logs, "-o", out, "--scheduler", address], text=True,
+                stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, env=environment(),
+            )  # fmt: skip
+            while not list(out.glob("results/*.json")):
+                assert process.poll() is None
+                time.sleep(0.05)
+            port = int(address.rpartition(":")[2])
+            (owner,) = {
+                one.pid
+                for one in psutil.net_connections("tcp")
+                if one.status == psutil.CONN_LISTEN and one.laddr.port == port
+            }
+            psutil.Process(owner).kill()
+            _, said = process.communicate(timeout=120)
+    assert process.returncode == 2
+    assert said.startswith("px4fuse: the scheduler is gone")
+    assert said.endswith("What is done is kept: the same command goes on from there.\n")
+    assert said.count("\n") == 1
+
+
+def test_what_a_cluster_lacks_is_one_line(monkeypatch, flights):
+    monkeypatch.setattr(engine, "CONNECT_S", 0.5)
+    for address in ("tcp://127.0.0.1:1", "nonsense://x", ""):
+        with pytest.raises(SettingsError, match="no Dask scheduler answers"), connected(address):
+            pass
+    with connected() as client:
+        assert client is None  # none of those is the session's own
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(SettingsError, match=r'pip install "px4fuse\[batch\]"'):
+        px4fuse.batch(flights, scheduler="tcp://127.0.0.1:1")
 
 
 @pytest.fixture(scope="module")
@@ -467,68 +533,3 @@ def test_a_bad_job_is_lost_alone_on_a_cluster_too(cluster):
     assert dict(found).keys() == {*jobs, ("square", 5)}
     for one, what in zip(jobs, expected, strict=True):
         assert str(what) in str(dict(found)[one])
-
-
-def test_a_scheduler_that_goes_is_said_on_one_line(tmp_path):
-    """Its process is ended while a log is being compared."""
-    logs, out = tiny_logs(tmp_path / "logs", 6, truth=False), tmp_path / "out"
-    with started_scheduler(tmp_path / "scheduler") as line:
-        address = line.split()[-1]
-        with started_workers(address, tmp_path / "worker"):
-            process = subprocess.Popen(
-                [*PX4FUSE, logs, "-o", out, "--scheduler", address], text=True,
-                stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, env=environment(),
-            )  # fmt: skip
-            while not list(out.glob("results/*.json")):
-                assert process.poll() is None
-                time.sleep(0.05)
-            port = int(address.rpartition(":")[2])
-            (owner,) = {
-                one.pid
-                for one in psutil.net_connections("tcp")
-                if one.status == psutil.CONN_LISTEN and one.laddr.port == port
-            }
-            psutil.Process(owner).kill()
-            _, said = process.communicate(timeout=120)
-    assert process.returncode == 2
-    assert said.startswith("px4fuse: the scheduler is gone")
-    assert said.endswith("What is done is kept: the same command goes on from there.\n")
-    assert said.count("\n") == 1
-
-
-def test_what_a_cluster_lacks_is_one_line(monkeypatch, flights):
-    monkeypatch.setattr(engine, "CONNECT_S", 0.5)
-    for address in ("tcp://127.0.0.1:1", "nonsense://x", ""):
-        with pytest.raises(SettingsError, match="no Dask scheduler answers"), connected(address):
-            pass
-    with connected() as client:
-        assert client is None  # none of those is the session's own
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(SettingsError, match=r'pip install "px4fuse\[batch\]"'):
-        px4fuse.batch(flights, scheduler="tcp://127.0.0.1:1")
-
-
-@pytest.mark.reallogs
-def test_shared_logs_of_every_kind_in_one_run(shared_logs, tmp_path):
-    """But for those of the sample's release, two long ones, and GNSS, which test_gnss.py has."""
-    files = [
-        str(file)
-        for file in sorted(shared_logs.glob("*/*"))
-        if file.suffix != ".json" and not re.match(r"v1\.16|ArduPilot_UAV|.*_gps_", file.name)
-    ]
-    table = px4fuse.batch(files, tmp_path, reports=True, workers=2)
-    assert set(table["log"]) == set(files)
-    validator = jsonschema.Draft202012Validator(schema())
-    for log, rows in table.groupby("log"):
-        first = rows.iloc[0]
-        if first["axis"]:
-            assert rows["kf_nis_mean"].notna().any() or first["reason"], log
-            text = (tmp_path / first["results"]).read_text(encoding="utf-8")
-            validator.validate(json.loads(text))
-            assert to_json(read_results(text.encode())) == text
-            assert (tmp_path / first["report"]).read_bytes().startswith(b"%PDF-")
-        else:
-            assert len(rows) == 1
-            assert first["reason"], log
-            assert first["status"] in ("not judged", "failed")
-    assert (table.drop_duplicates("log")["status"] == "done").sum() >= 12
