@@ -61,15 +61,16 @@ settings.load_profile("steady")
 MANY_OBJECTS = 500_000
 
 
-def pytest_configure() -> None:
+def pytest_configure(config: pytest.Config) -> None:
     """Look for garbage between tests only, as collecting them makes none.
 
     The processes of the tests, which are begun after this, do linear algebra as commands do, and
-    keep what they compile, as there are a hundred.
+    keep what they compile, as there are a hundred; not those of a study, which changes the code.
     """
     gc.disable()
     os.environ.update(ONE_THREAD)
-    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    if config.getoption("numprocesses", None):
+        os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
 def pytest_collection_finish() -> None:
