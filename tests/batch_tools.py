@@ -28,10 +28,10 @@ def tiny_log(seed: int, **options: object) -> bytes:
     return to_ulog(simulate(Scenario(seed=seed, passes=1, length_m=6.0, ekf2=False, **options)))
 
 
-def tiny_logs(folder: Path, count: int) -> Path:
+def tiny_logs(folder: Path, count: int, **options: object) -> Path:
     folder.mkdir()
     for seed in range(1, count + 1):
-        (folder / f"f{seed}.ulg").write_bytes(tiny_log(seed))
+        (folder / f"f{seed}.ulg").write_bytes(tiny_log(seed, **options))
     return folder
 
 

@@ -7,6 +7,7 @@ import json
 import pickle
 import zipfile
 from collections.abc import Mapping
+from contextvars import copy_context
 from pathlib import Path
 
 from conftest import REPOSITORY
@@ -62,10 +63,10 @@ def at_once(monkeypatch) -> list[str]:
 
 
 def in_turn(function, jobs, **_):
-    """One job after the other, in this process."""
+    """One job after the other, in this process, whose limits stay as they are."""
     for index, job in enumerate(jobs):
         function_, job_ = pickle.loads(pickle.dumps((function, job)))
-        yield index, pickle.loads(pickle.dumps(function_(job_)))
+        yield index, pickle.loads(pickle.dumps(copy_context().run(function_, job_)))
 
 
 def in_this_process(monkeypatch) -> None:

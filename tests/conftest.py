@@ -61,13 +61,16 @@ settings.load_profile("steady")
 MANY_OBJECTS = 500_000
 
 
-def pytest_configure() -> None:
+def pytest_configure(config: pytest.Config) -> None:
     """Look for garbage between tests only, as collecting them makes none.
 
-    The processes of the tests, which are begun after this, do linear algebra as commands do.
+    The processes of the tests, which are begun after this, do linear algebra as commands do, and
+    keep what they compile, as there are a hundred; not those of a study, which changes the code.
     """
     gc.disable()
     os.environ.update(ONE_THREAD)
+    if config.getoption("numprocesses", None):
+        os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
 def pytest_collection_finish() -> None:
@@ -128,7 +131,7 @@ def no_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 # The last ones of a process are kept
-MOST_ANALYSES = 10
+MOST_ANALYSES = 16
 _drawn: dict[str, bytes] = {}
 
 
@@ -170,10 +173,10 @@ def _remembered(
         position=position and replace(position, path=Path(position.path).name),
     )
     known = (repr(named), *(sha256(file.read_bytes()).digest() for file in files))
-    if known not in _analyses:
-        _analyses[known] = _run(request, progress)
-        if len(_analyses) > MOST_ANALYSES:
-            del _analyses[next(iter(_analyses))]
+    # the last one used stands last
+    _analyses[known] = _analyses.pop(known) if known in _analyses else _run(request, progress)
+    if len(_analyses) > MOST_ANALYSES:
+        del _analyses[next(iter(_analyses))]
     return _analyses[known]
 
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator, Sequence
 
 from matplotlib.axes import Axes
+from pypdf import PdfReader
 
-from px4fuse.report.page import Block, Page
+from px4fuse.report import fonts
+from px4fuse.report.page import Block, Page, data
+from px4fuse.report.pdf import compiled
 
 
 def every(blocks: Sequence[Block]) -> Iterator[Block]:
@@ -44,3 +48,13 @@ def axes_of(*pages: Page) -> list[Axes]:
         if "figure" in block
         for axes in block["figure"].axes
     ]
+
+
+def set_by_typst(*pages: Page) -> list[str]:
+    """Text of each sheet of a PDF of these pages."""
+    blocks = data([block for page in pages for block in page.blocks])
+    report = {
+        "title": "t", "author": "a", "head": "", "student": "", "foot": "", "results": None,
+        "fonts": [fonts.FONT], "blocks": blocks,
+    }  # fmt: skip
+    return [sheet.extract_text() for sheet in PdfReader(io.BytesIO(compiled(report))).pages]

@@ -23,6 +23,7 @@ import pandas as pd
 import psutil
 import pytest
 from batch_tools import environment, started, tiny_log, tiny_logs
+from class_tools import in_turn
 from click.testing import CliRunner
 from made_up_fleet import DAMAGED, made_up
 from msgspec import structs
@@ -52,6 +53,12 @@ PX4FUSE = [sys.executable, "-m", "px4fuse", "batch"]
 def one_worker(monkeypatch) -> None:
     """Unless a test asks for more: each takes two seconds to start, on cores that others use."""
     monkeypatch.setattr(os, "cpu_count", lambda: 1)
+
+
+@pytest.fixture
+def in_this_process(monkeypatch) -> None:
+    """For tests of what surrounds the processes."""
+    monkeypatch.setattr(run, "run_bounded", in_turn)
 
 
 @pytest.fixture
@@ -87,6 +94,7 @@ def command(*arguments: str | Path) -> Any:
 # ------------------------------------------------------------------ the table
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_every_log_is_in_the_table_with_its_numbers_or_its_line(tmp_path):
     logs = tiny_logs(tmp_path / "logs", 1)
     (logs / "inner").mkdir()
@@ -163,6 +171,7 @@ def test_absent_numbers_are_empty_and_texts_are_no_formulas(tmp_path):
     assert "flight-?.ulg" in csv_bytes(table).decode()
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_logs_without_a_position_are_not_judged_but_known(tmp_path):
     log = gnss_log("v1.16").write(tmp_path / "a.ulg")
     row = px4fuse.batch(log, tmp_path / "out").loc[0]
@@ -175,6 +184,7 @@ def test_logs_without_a_position_are_not_judged_but_known(tmp_path):
 
 
 @pytest.mark.reallogs
+@pytest.mark.usefixtures("in_this_process")
 def test_a_flight_on_gnss_has_its_rows(shared_logs):
     (log,) = shared_logs.glob("simulated/*no_uwb.ulg")
     table = px4fuse.batch(log)
@@ -185,7 +195,7 @@ def test_a_flight_on_gnss_has_its_rows(shared_logs):
 # ------------------------------------------------------------------ resuming
 
 
-@pytest.mark.usefixtures("remembered")
+@pytest.mark.usefixtures("remembered", "in_this_process")
 def test_a_second_run_does_only_what_is_new(flights, tmp_path, monkeypatch):
     logs, output = tmp_path / "logs", tmp_path / "out"
     shutil.copytree(flights, logs)
@@ -193,10 +203,10 @@ def test_a_second_run_does_only_what_is_new(flights, tmp_path, monkeypatch):
     (logs / "late.ulg").write_bytes(b"")
     px4fuse.batch(logs, output)
     times = {file: file.stat().st_mtime_ns for file in (output / "results").iterdir()}
-    assert len(times) == 2
+    assert len(times) == len([*(output / "rows").iterdir()]) == 2  # what failed is tried again
     (tmp_path / "f3.ulg").rename(logs / "f3.ulg")
     (logs / "f2.ulg").rename(logs / "renamed.ulg")
-    (logs / "late.ulg").write_bytes(tiny_log(9))  # what failed is tried again
+    (logs / "late.ulg").write_bytes(tiny_log(9))
     said: list[tuple[str, int, int]] = []
     table = px4fuse.batch(logs, output, progress=lambda *step: said.append(step))
     assert said[-1] == ("comparing, 0 failed", 4, 4)
@@ -215,6 +225,7 @@ def test_a_second_run_does_only_what_is_new(flights, tmp_path, monkeypatch):
     assert other.loc[0, "kf_nis_mean"] < table.loc[0, "kf_nis_mean"]
 
 
+@pytest.mark.usefixtures("in_this_process")  # the second time
 def test_ctrl_c_at_a_terminal_keeps_what_is_done_and_says_so_on_one_line(
     flights, undisturbed, tmp_path
 ):
@@ -287,7 +298,7 @@ def test_a_log_that_changes_while_it_is_read_says_so(flights, tmp_path, monkeypa
     assert row["reason"] == "it changed while it was read"
 
 
-@pytest.mark.usefixtures("remembered")
+@pytest.mark.usefixtures("remembered", "in_this_process")
 @pytest.mark.parametrize("ends", [KeyboardInterrupt, OutputError])
 def test_what_ends_a_run_keeps_what_is_done(flights, undisturbed, tmp_path, monkeypatch, ends):
     write_all, written = run.write_all, []
@@ -314,7 +325,7 @@ def test_what_ends_a_run_keeps_what_is_done(flights, undisturbed, tmp_path, monk
 
 def test_two_runs_in_one_folder(tmp_path):
     """Both end well, and what they leave is one whole table."""
-    logs, out = tiny_logs(tmp_path / "logs", 3), tmp_path / "out"
+    logs, out = tiny_logs(tmp_path / "logs", 3, truth=False), tmp_path / "out"
     both = [
         subprocess.Popen(
             [*PX4FUSE, logs, "-o", out, "--workers", "1"], text=True, stderr=subprocess.PIPE,
@@ -329,6 +340,7 @@ def test_two_runs_in_one_folder(tmp_path):
     }
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_junk_in_hundreds_costs_a_line_each(tmp_path):
     folder = tmp_path / "logs"
     folder.mkdir()
@@ -398,6 +410,32 @@ def test_logs_are_found_in_folders_globs_and_urls(tmp_path, monkeypatch):
     assert small["reason"] == "1 MB, more than the limit of 0 MB"
 
 
+@pytest.mark.reallogs
+def test_shared_logs_of_every_kind_in_one_run(shared_logs, tmp_path):
+    """But for those of the sample's release, two long ones, and GNSS, which test_gnss.py has."""
+    files = [
+        str(file)
+        for file in sorted(shared_logs.glob("*/*"))
+        if file.suffix != ".json" and not re.match(r"v1\.16|ArduPilot_UAV|.*_gps_", file.name)
+    ]
+    table = px4fuse.batch(files, tmp_path, reports=True, workers=2)
+    assert set(table["log"]) == set(files)
+    validator = jsonschema.Draft202012Validator(schema())
+    for log, rows in table.groupby("log"):
+        first = rows.iloc[0]
+        if first["axis"]:
+            assert rows["kf_nis_mean"].notna().any() or first["reason"], log
+            text = (tmp_path / first["results"]).read_text(encoding="utf-8")
+            validator.validate(json.loads(text))
+            assert to_json(read_results(text.encode())) == text
+            assert (tmp_path / first["report"]).read_bytes().startswith(b"%PDF-")
+        else:
+            assert len(rows) == 1
+            assert first["reason"], log
+            assert first["status"] in ("not judged", "failed")
+    assert (table.drop_duplicates("log")["status"] == "done").sum() >= 12
+
+
 # ------------------------------------------------------------------ a cluster of its own
 
 
@@ -414,53 +452,9 @@ def started_workers(address: str, log: Path, *options: str, **more: str) -> Any:
     return started("worker", address, *arguments, says="Starting Worker plugin", log=log, **more)
 
 
-@pytest.fixture(scope="module")
-def cluster(tmp_path_factory) -> Any:
-    """Address of a scheduler with two workers."""
-    logs = tmp_path_factory.mktemp("cluster")
-    path = os.pathsep.join((str(batch_tools.REPOSITORY / "tests"), str(batch_tools.REPOSITORY)))
-    with started_scheduler(logs / "scheduler", PYTHONPATH=path) as line:
-        address = line.split()[-1]
-        with started_workers(address, logs / "both", "--nworkers", "2", PYTHONPATH=path):
-            yield address
-
-
-def test_a_scheduler_and_two_workers_that_run_already(cluster, flights, undisturbed, tmp_path):
-    arguments = [flights, "-o", tmp_path / "out", "--scheduler", cluster]
-    result = command(*arguments, "--fail-on", "failed")
-    assert result.exit_code == 0, result.output
-    assert_same(pd.read_parquet(tmp_path / "out" / "fleet.parquet"), undisturbed)
-    other = tmp_path / "px4fuse-9.9.dist-info"
-    other.mkdir()
-    (other / "METADATA").write_text("Metadata-Version: 2.1\nName: px4fuse\nVersion: 9.9\n")
-    path = f"{tmp_path}{os.pathsep}{batch_tools.REPOSITORY}"
-    with started_workers(cluster, tmp_path / "third", PYTHONPATH=path):
-        assert "has px4fuse 9.9, and this is" in str(command(*arguments).exception)
-
-
-def test_a_bad_job_is_lost_alone_on_a_cluster_too(cluster):
-    """And a worker that is killed costs nothing; the session's own client is taken."""
-    from distributed import Client
-
-    jobs = [("square", 3), ("raise", "no number"), ("exit", 3), ("hang", 0), ("square", 4)]
-    work = partial(run_bounded, bad_jobs.act, timeout_s=5.0, memory_bytes=2 * 10**9)
-    expected = [9, "ValueError: no number", "exit code 3", "longer than 5 s", 16]
-    with Client(cluster) as client, connected() as same:
-        assert same is client
-        found = []
-        for one, result in outcomes(client, work, [*jobs, ("square", 5)]):
-            if not found:
-                killed = next(iter(client.run(os.getpid).values()))
-                os.kill(killed, signal.SIGKILL)
-            found.append((one, result.reason if isinstance(result, Failed) else result))
-    assert dict(found).keys() == {*jobs, ("square", 5)}
-    for one, what in zip(jobs, expected, strict=True):
-        assert str(what) in str(dict(found)[one])
-
-
 def test_a_scheduler_that_goes_is_said_on_one_line(tmp_path):
     """Its process is ended while a log is being compared."""
-    logs, out = tiny_logs(tmp_path / "logs", 6), tmp_path / "out"
+    logs, out = tiny_logs(tmp_path / "logs", 6, truth=False), tmp_path / "out"
     with started_scheduler(tmp_path / "scheduler") as line:
         address = line.split()[-1]
         with started_workers(address, tmp_path / "worker"):
@@ -497,27 +491,46 @@ def test_what_a_cluster_lacks_is_one_line(monkeypatch, flights):
         px4fuse.batch(flights, scheduler="tcp://127.0.0.1:1")
 
 
-@pytest.mark.reallogs
-def test_shared_logs_of_every_kind_in_one_run(shared_logs, tmp_path):
-    """But for those of the sample's release, two long ones, and GNSS, which test_gnss.py has."""
-    files = [
-        str(file)
-        for file in sorted(shared_logs.glob("*/*"))
-        if file.suffix != ".json" and not re.match(r"v1\.16|ArduPilot_UAV|.*_gps_", file.name)
-    ]
-    table = px4fuse.batch(files, tmp_path, reports=True, workers=2)
-    assert set(table["log"]) == set(files)
-    validator = jsonschema.Draft202012Validator(schema())
-    for log, rows in table.groupby("log"):
-        first = rows.iloc[0]
-        if first["axis"]:
-            assert rows["kf_nis_mean"].notna().any() or first["reason"], log
-            text = (tmp_path / first["results"]).read_text(encoding="utf-8")
-            validator.validate(json.loads(text))
-            assert to_json(read_results(text.encode())) == text
-            assert (tmp_path / first["report"]).read_bytes().startswith(b"%PDF-")
-        else:
-            assert len(rows) == 1
-            assert first["reason"], log
-            assert first["status"] in ("not judged", "failed")
-    assert (table.drop_duplicates("log")["status"] == "done").sum() >= 12
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory) -> Any:
+    """Address of a scheduler with two workers."""
+    logs = tmp_path_factory.mktemp("cluster")
+    path = os.pathsep.join((str(batch_tools.REPOSITORY / "tests"), str(batch_tools.REPOSITORY)))
+    with started_scheduler(logs / "scheduler", PYTHONPATH=path) as line:
+        address = line.split()[-1]
+        with started_workers(address, logs / "both", "--nworkers", "2", PYTHONPATH=path):
+            yield address
+
+
+def test_a_scheduler_and_two_workers_that_run_already(cluster, flights, undisturbed, tmp_path):
+    arguments = [flights, "-o", tmp_path / "out", "--scheduler", cluster]
+    result = command(*arguments, "--fail-on", "failed")
+    assert result.exit_code == 0, result.output
+    assert_same(pd.read_parquet(tmp_path / "out" / "fleet.parquet"), undisturbed)
+    other = tmp_path / "px4fuse-9.9.dist-info"
+    other.mkdir()
+    (other / "METADATA").write_text("Metadata-Version: 2.1\nName: px4fuse\nVersion: 9.9\n")
+    path = f"{tmp_path}{os.pathsep}{batch_tools.REPOSITORY}"
+    with started_workers(cluster, tmp_path / "third", PYTHONPATH=path):
+        assert "has px4fuse 9.9, and this is" in str(command(*arguments).exception)
+
+
+def test_a_bad_job_is_lost_alone_on_a_cluster_too(cluster):
+    """And a worker that is killed costs nothing; the session's own client is taken."""
+    from distributed import Client
+
+    # each at once or never: an error of its own takes a process seconds to say
+    jobs = [("square", 3), ("unreadable", 0), ("exit", 3), ("hang", 0), ("square", 4)]
+    work = partial(run_bounded, bad_jobs.act, timeout_s=5.0, memory_bytes=2 * 10**9)
+    expected = [9, "could not be read (ValueError)", "exit code 3", "longer than 5 s", 16]
+    with Client(cluster) as client, connected() as same:
+        assert same is client
+        found = []
+        for one, result in outcomes(client, work, [*jobs, ("square", 5)]):
+            if not found:
+                killed = next(iter(client.run(os.getpid).values()))
+                os.kill(killed, signal.SIGKILL)
+            found.append((one, result.reason if isinstance(result, Failed) else result))
+    assert dict(found).keys() == {*jobs, ("square", 5)}
+    for one, what in zip(jobs, expected, strict=True):
+        assert str(what) in str(dict(found)[one])

@@ -10,6 +10,7 @@ from pathlib import Path
 import jsonschema
 import pypdf
 import pytest
+from batch_tools import tiny_log
 from cli_tools import contents, run, run_main
 from click.testing import Result
 from conftest import REPOSITORY as ROOT
@@ -168,9 +169,9 @@ def test_an_extra_costs_nothing_where_it_is_not_used(
     assert done.stdout.splitlines()[-1] == f"pyarrow {loaded} False"
 
 
-def test_no_file_is_opened_in_the_encoding_of_the_machine(sample_log: Path, tmp_path: Path) -> None:
+def test_no_file_is_opened_in_the_encoding_of_the_machine(tmp_path: Path) -> None:
     """With a console of Windows' western code page, and a decimal comma where there is one."""
-    shutil.copy(sample_log, tmp_path / "l.ulg")
+    (tmp_path / "l.ulg").write_bytes(tiny_log(1))
     typed = [
         "compare l.ulg -o r.pdf", "extract l.ulg -o t", "explore l.ulg",
         "simulate --passes 1 -o s.ulg", "answers l.ulg -o a.toml", "grade --write-rubric r.toml",

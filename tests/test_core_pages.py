@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-
 import numpy as np
 import pytest
 from exchange import replace
@@ -11,8 +9,7 @@ from flights import Estimator, Uwb, aisle_flight, unexplained, with_noises
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from msgspec import structs
-from page_tools import axes_of, texts, words
-from pypdf import PdfReader
+from page_tools import axes_of, set_by_typst, texts, words
 
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
@@ -22,7 +19,6 @@ from px4fuse.recording import Dropout
 from px4fuse.report import cover, flight, marks, panels
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page
-from px4fuse.report.pdf import render
 from px4fuse.report.style import report_style
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
@@ -113,9 +109,9 @@ def test_the_map_stays_and_every_finding_stands_once(count: int) -> None:
         1
     ] * count
     assert said.count("1.0 s to 2.0 s") == count
-    pages = [p.extract_text() for p in PdfReader(io.BytesIO(render(of, "{}"))).pages]
-    assert "From above" in pages[0]
-    assert (f"Finding number {count - 1}." in pages[0]) == (count == 3)
+    sheets = set_by_typst(page)
+    assert "From above" in sheets[0]
+    assert (f"Finding number {count - 1}." in sheets[0]) == (count == 3)
 
 
 def test_the_map_lies_along_the_aisle_and_a_wide_track_has_north_up() -> None:

@@ -10,11 +10,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from batch_tools import tiny_logs
+from class_tools import in_turn
 from click.testing import CliRunner
 from scipy.stats import t as student
 
 from px4fuse.cli import cli
 from px4fuse.errors import SettingsError
+from px4fuse.fleet import run
 from px4fuse.fleet.junit import junit
 from px4fuse.fleet.regressions import MIN_FLIGHTS, marked, read_baseline
 from px4fuse.fleet.rows import csv_bytes, table_of
@@ -129,8 +131,7 @@ def test_some_differences_say_nothing():
 def test_flights_of_the_same_vehicle_are_rarely_called_worse():
     """Of runs of twenty flights that are as the baseline's, one in twenty may have one."""
     hits = []
-    for run in range(40):
-        first = 1000 + 100 * run
+    for first in range(1000, 5000, 100):
         before = fleet(*(flight(number) for number in range(first, first + 15)))
         after = fleet(*(flight(number) for number in range(first + 50, first + 70)))
         hits.append(bool(changes_of(after, before)))
@@ -202,6 +203,7 @@ def test_a_log_is_a_test_case_which_fails_where_it_is_worse_or_failed():
 
 def test_the_command_marks_writes_and_fails(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(run, "run_bounded", in_turn)
     tiny_logs(tmp_path / "logs", 1)
     common = ["batch", "logs", "--axis", "north"]
     options = ["--baseline", "before/fleet.parquet", "--junit", "j.xml", "--fail-on", "worse"]

@@ -10,12 +10,13 @@ from pathlib import Path
 import matplotlib as mpl
 import pytest
 from batch_tools import tiny_logs
-from class_tools import in_this_process
+from class_tools import in_this_process, in_turn
 from click.testing import CliRunner
 from conftest import REPOSITORY as ROOT
 from matplotlib import pyplot
 
 from px4fuse.cli import COMMANDS, cli
+from px4fuse.fleet import run
 
 pytestmark = pytest.mark.usefixtures("analysed_once")
 
@@ -58,6 +59,7 @@ def test_commands_run_in_order(page: str, monkeypatch, tmp_path: Path) -> None:
     """What README has too is typed there."""
     if page == "docs/instructors.md":
         pytest.skip("a test of its own makes what its commands need")
+    monkeypatch.setattr(run, "run_bounded", in_turn)
     typed_there = commands("README.md") if page != "README.md" else []
     for number, line in enumerate(line for line in commands(page) if line not in typed_there):
         if line == "px4fuse practice":

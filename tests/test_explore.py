@@ -412,6 +412,7 @@ def explore(*words: str | Path) -> Result:
     return CliRunner().invoke(cli, ["explore", *map(str, words)])
 
 
+@pytest.mark.usefixtures("analysed_once")
 def test_without_a_log_it_is_the_sample_flight(
     sample_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -429,7 +430,7 @@ def test_without_a_log_it_is_the_sample_flight(
     assert (tmp_path / "reports" / "aisle_uwb_start-20_end-40.html").is_file()
 
 
-@pytest.mark.usefixtures("no_drawing")
+@pytest.mark.usefixtures("no_drawing", "analysed_once")
 def test_open_opens_what_is_looked_at(
     sample_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

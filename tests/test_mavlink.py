@@ -45,7 +45,7 @@ from patience import patience
 from scipy.spatial.transform import Rotation
 
 from px4fuse.comparison.comparison import compare
-from px4fuse.errors import LogError, MissingDataError, Px4FuseError, SettingsError
+from px4fuse.errors import LogError, MissingDataError, Px4FuseError
 from px4fuse.findings import find
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
@@ -582,11 +582,6 @@ def test_an_empty_recording_of_heartbeats_lacks_everything_by_name(read):
         assert isinstance(getattr(flight, part), Unavailable)
     whats = {part.what for part in flight.missing}
     assert {"IMU", "attitude", "EKF2", "ground truth", "position source ODOMETRY"} <= whats
-
-
-def test_system_is_for_mavlink_only(sample_log):
-    with pytest.raises(SettingsError, match="MAVLink"):
-        read_log(sample_log, system=1)
 
 
 # ---- two recordings of one flight ---------------------------------------------------------------

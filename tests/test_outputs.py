@@ -119,6 +119,7 @@ def test_auto_adds_nothing_where_zero_is_as_good(sample_log) -> None:
 
 
 @pytest.mark.reallogs
+@pytest.mark.usefixtures("no_drawing")
 def test_auto_brings_late_stamps_to_the_truth(shared_logs, tmp_path, monkeypatch, capsys) -> None:
     log = shared_logs / "simulated" / "v1.16.1_aisle_clock_late.ulg"
     rmse = {}

@@ -96,14 +96,6 @@ def test_what_is_no_regular_file_is_refused(desk, monkeypatch, capsys, command, 
     assert f"{what}: not a regular file" in err
 
 
-@pytest.mark.parametrize("name", READERS)
-def test_a_folder_is_refused(desk, monkeypatch, capsys, name) -> None:
-    if name in OF_FOLDERS:
-        return
-    err = refusal(monkeypatch, capsys, desk, READERS[name].format("folder"))
-    assert "folder: is a folder" in err
-
-
 @pytest.mark.parametrize("command", READERS.values(), ids=READERS)
 def test_a_file_of_ten_gigabytes_is_refused_at_once(desk, monkeypatch, capsys, command) -> None:
     err = refusal(monkeypatch, capsys, desk, command.format("sparse"))
@@ -190,8 +182,8 @@ def test_a_line_feed_in_a_name_makes_no_second_line(
 
 
 @pytest.mark.parametrize("name", READERS)
-@pytest.mark.parametrize("path", [".", "..", "/"])
-def test_a_path_without_a_name_is_shown(desk, monkeypatch, capsys, name, path) -> None:
+@pytest.mark.parametrize("path", ["folder", ".", "..", "/"])
+def test_a_folder_is_refused_by_its_name_or_path(desk, monkeypatch, capsys, name, path) -> None:
     if name in OF_FOLDERS:
         return
     err = refusal(monkeypatch, capsys, desk, READERS[name].format(path))

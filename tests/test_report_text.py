@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,7 +14,7 @@ from flights import random_walk
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib import font_manager
-from pypdf import PdfReader
+from page_tools import set_by_typst
 
 from px4fuse.filter.clock import ClockOffset, PartOffset
 from px4fuse.filter.likelihood import preintegrate, states
@@ -25,7 +24,7 @@ from px4fuse.flight import Unavailable
 from px4fuse.report import clock, fonts, notes
 from px4fuse.report.document import Document
 from px4fuse.report.notes import write
-from px4fuse.report.page import Block, Page, data, printable
+from px4fuse.report.page import Block, Page, printable
 from px4fuse.report.pdf import compiled
 from px4fuse.report.sensitivity import PAIRS, SETTINGS, _settled
 from px4fuse.results.model import Student
@@ -140,16 +139,6 @@ def test_any_markdown_is_read(text: str) -> None:
 
 def document(student: Student) -> Document:
     return Document(SimpleNamespace(), SimpleNamespace(student=student))  # type: ignore[arg-type]
-
-
-def set_by_typst(*pages: Page) -> list[str]:
-    """Text of each sheet of a PDF of these pages."""
-    blocks = data([block for page in pages for block in page.blocks])
-    report = {
-        "title": "t", "author": "a", "head": "", "student": "", "foot": "", "results": None,
-        "fonts": [fonts.FONT], "blocks": blocks,
-    }  # fmt: skip
-    return [sheet.extract_text() for sheet in PdfReader(io.BytesIO(compiled(report))).pages]
 
 
 def test_long_notes_run_over_pages_and_lose_nothing() -> None:

@@ -33,13 +33,14 @@ NEW = {"source_coloured", "source_repeats", "source_axes_unequal", "source_noise
 
 @cache
 def judged(
-    model: errors.Model, rate_hz: float = 10.0, seed: int = 1, truth_for: float | None = None
-) -> Analysis:
+    model: errors.Model, rate_hz: float = 10.0, seed: int = 1, truth_for: float | None = None,
+    passes: int = 3,
+) -> Analysis:  # fmt: skip
     """A simulated flight whose positions have errors of the study's models, without EKF2.
 
     With its truth where there is a SIGMA_Z (m) to try for that.
     """
-    flight = simulate_flight(Scenario(seed=seed, passes=5, ekf2=False))
+    flight = simulate_flight(Scenario(seed=seed, passes=passes, ekf2=False))
     assert isinstance(flight.truth, Truth)
     truth = flight.truth.samples[POSITION_COLUMNS].dropna()
     known = CubicSpline(truth.index.to_numpy(), truth.to_numpy())
@@ -66,9 +67,12 @@ SLOW = partial(errors.coloured, tau_s=0.5, share=1.0)
 MIXED = partial(errors.coloured, tau_s=0.3, share=0.5)
 HELD, OFTEN_HELD = partial(errors.held, share=0.15), partial(errors.held, share=0.6)
 SMOOTH = partial(errors.low_pass, tau_s=0.5)
+LOUDER, SCALED = partial(errors.two_levels, factor=6.0), partial(errors.scaled, scale=0.2)
+# What three passes are too short for
+PASSES = {UNEQUAL: 5, LOUDER: 5, SCALED: 5}
 
 
-@pytest.mark.parametrize("seed", range(1, 5))
+@pytest.mark.parametrize("seed", [1, 2])
 def test_white_noise_is_no_other(seed: int) -> None:
     analysis = judged(errors.white, seed=seed)
     assert told(analysis) == {}
@@ -87,14 +91,13 @@ def test_white_noise_is_no_other(seed: int) -> None:
         (UNEQUAL, "source_axes_unequal", "error",
          {"north_sigma_z_m": (0.05, 0.01), "east_sigma_z_m": (0.2, 0.02)}),
         (LOUD, "source_noise_changes", "error", {"ratio": (2.7, 0.4)}),
-        (partial(errors.two_levels, factor=6.0), "source_noise_changes", "error",
-         {"ratio": (6.0, 1.3)}),
+        (LOUDER, "source_noise_changes", "error", {"ratio": (6.0, 1.3)}),
     ],
 )  # fmt: skip
 def test_each_is_named_with_its_size_and_nothing_else(
     model: errors.Model, name: str, severity: str, evidence: Mapping[str, tuple[float, float]]
 ) -> None:
-    found = told(judged(model))
+    found = told(judged(model, passes=PASSES.get(model, 3)))
     assert set(found) == {name}
     assert found[name].severity == severity
     for key, (value, within) in evidence.items():
@@ -110,7 +113,7 @@ def test_the_noisy_part_is_where_it_was() -> None:
     assert end == pytest.approx(time[0] + 2.0 * third, abs=third / 3.0)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_a_slow_error_is_no_low_pass_and_a_low_pass_no_slow_error(seed: int) -> None:
     slow, smooth = judged(SLOW, seed=seed), judged(SMOOTH, seed=seed)
     assert "source_smoothed" not in {one.id for one in find(slow)}
@@ -153,8 +156,7 @@ def test_what_no_innovation_shows_asks_for_no_smaller_noise(
         assert set(told(analysis)) == {"source_coloured"}
 
 
-@pytest.mark.parametrize("tau_s", [5.0, 20.0])
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(("tau_s", "seed"), [(5.0, 1), (20.0, 2)])
 def test_a_truth_shows_slow_errors_that_pass_for_those_of_the_imu(tau_s: float, seed: int) -> None:
     """As long as errors of the IMU are, so that no innovation shows them."""
     analysis = judged(partial(errors.coloured, tau_s=tau_s), 5.0, seed, truth_for=0.10)
@@ -173,7 +175,7 @@ def test_a_truth_shows_slow_errors_that_pass_for_those_of_the_imu(tau_s: float, 
 @pytest.mark.parametrize(
     ("model", "name"),
     [
-        (partial(errors.scaled, scale=0.2), "source_scale_wrong"),
+        (SCALED, "source_scale_wrong"),
         (partial(errors.jumped, size=1.0), "source_jumps"),
         (partial(errors.clock, late=0.3), "source_clock_offset"),
         (LOUD, "source_noise_changes"),
@@ -182,7 +184,8 @@ def test_a_truth_shows_slow_errors_that_pass_for_those_of_the_imu(tau_s: float, 
     ],
 )
 def test_what_a_truth_shows_of_other_errors_is_no_slow_one(model: errors.Model, name: str) -> None:
-    assert set(told(judged(model, truth_for=0.10))) == {name}
+    analysis = judged(model, truth_for=0.10, passes=PASSES.get(model, 3))
+    assert set(told(analysis)) == {name}
 
 
 def test_a_clock_that_changes_too_little_to_be_told_is_no_slow_error() -> None:
@@ -263,7 +266,7 @@ def test_a_jump_among_outliers_is_one_with_its_size_and_time(seed: int) -> None:
         error[at:, 0] += 1.0
         return error, 0.0
 
-    found = told(judged(model, seed=seed))
+    found = told(judged(model, seed=seed, passes=5))
     assert {"source_jumps", "source_outliers"} == set(found)
     evidence = found["source_jumps"].evidence
     assert evidence["count"] == 1
