@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,14 +23,16 @@ from px4fuse.comparison.estimates import (
     size,
     turned_frame,
 )
-from px4fuse.comparison.interventions import Intervention, interventions
+from px4fuse.comparison.interventions import Intervention, interventions, to_try
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import no_source, prepare
 from px4fuse.comparison.remedy import asked_of_ekf2
 from px4fuse.comparison.why import to_walk, why_ekf2_differs
 from px4fuse.display import brief
 from px4fuse.ekf2.aids import AidResult, judge_aids
+from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, open_model
+from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import Ekf2Replay
 from px4fuse.ekf2.walk import Why
 from px4fuse.ekf2.whatif import WhatIf, sweep_values, what_if
@@ -478,10 +480,15 @@ def explain(comparison: Comparison, progress: Progress = silent) -> Analysis:
     """
     names = REPORTED if {"north", "east"} <= {line.name for line in comparison.lines} else None
     tuning, clock = noises_and_clock(comparison, progress, names)
-    progress("replaying EKF2")
-    model = open_model(comparison.flight, partial(to_walk, comparison))
-    why = why_ekf2_differs(comparison, model, clock)
     heading = turned_frame(comparison, tuning, clock, progress)
+    progress("replaying EKF2")
+
+    def asked(inputs: Inputs) -> list[Variant]:
+        tried = to_try(comparison, tuning, clock, heading, inputs)
+        return [*to_walk(comparison, inputs), *tried]
+
+    model = open_model(comparison.flight, asked)
+    why = why_ekf2_differs(comparison, model, clock)
     progress("looking for a loop")
     from px4fuse.loop.analysis import loop_in  # noqa: PLC0415 (tune and sync have none)
 

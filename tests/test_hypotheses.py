@@ -16,7 +16,7 @@ from flights import aisle_flight, unavailable, unexplained
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import noises_and_clock, turned_frame
-from px4fuse.filter.causes import explained, fit
+from px4fuse.filter.causes import Hypotheses, explained, fit, hypotheses_of
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings
@@ -92,6 +92,31 @@ def test_responses_are_what_the_filter_itself_makes_of_signals() -> None:
     nu, s = innovations(both, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, skip)
     expected = innovations(legs, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, skip)
     np.testing.assert_allclose([nu[:, 0], s], expected, atol=1e-9)
+
+
+def test_an_axis_of_which_a_gap_tells_less_has_a_filter_of_its_own() -> None:
+    analysis = flown()
+    axes = tuple(analysis.axes[name].axis for name in ("north", "east"))
+    model = hypotheses_of(analysis.flight, axes, RIGHT, 0.10, 0.0)
+    assert isinstance(model, Hypotheses)
+    north, east = model.legs
+    gap = np.zeros_like(east.noise_fixed)
+    gap[200] = 0.5, 0.5, 1.0
+    unlike = replace(model, legs=(north, replace(east, noise_fixed=gap)))
+    skip = np.zeros(len(model.time_s), dtype=bool)
+    for each in (model, unlike):
+        fits = each.fit(0.27, skip)
+        for at, legs in enumerate(each.legs):
+            own = replace(
+                legs,
+                measurement_m=legs.measurement_m[:, 0],
+                delta_position_m=legs.delta_position_m[:, 0],
+                delta_velocity_m_s=legs.delta_velocity_m_s[:, 0],
+            )
+            nu, s = innovations(own, 0.27, 0.10)
+            rows = fits.axis == at
+            whitened = fits.rest[rows] + fits.columns[rows] @ fits.coefficients
+            np.testing.assert_allclose(whitened, nu / np.sqrt(s), atol=1e-9)
 
 
 def test_a_fit_is_least_squares_with_the_prior_as_one_more_measurement() -> None:

@@ -273,13 +273,17 @@ def test_what_the_data_ask_for(sample: Analysis) -> None:
 def test_a_noise_that_the_sender_reports_is_overruled(sample: Analysis) -> None:
     model = model_of(sample)
     assert noise_used_m(model) == pytest.approx(0.1)
-    assert noise_change(model, 0.0012345) == {"EKF2_EVP_NOISE": 0.01}
+    assert noise_change(model.inputs, noise_used_m(model), 0.0012345) == {"EKF2_EVP_NOISE": 0.01}
     settings = {**model.inputs.settings, "EKF2_EVP_NOISE": 0.02, "EKF2_EV_NOISE_MD": 0.0}
     reported = replace(model, inputs=replace(model.inputs, settings=settings))
-    assert noise_change(reported, 0.05) == {"EKF2_EVP_NOISE": 0.05, "EKF2_EV_NOISE_MD": 1.0}
-    assert noise_change(reported, 0.2) == {"EKF2_EVP_NOISE": 0.2}
-    assert delay_change(model, -40.0) == {}
-    assert delay_change(model, 400.0) == {}
+    used = reported.inputs, noise_used_m(reported)
+    assert noise_change(*used, 0.05) == {
+        "EKF2_EVP_NOISE": 0.05,
+        "EKF2_EV_NOISE_MD": 1.0,
+    }
+    assert noise_change(*used, 0.2) == {"EKF2_EVP_NOISE": 0.2}
+    assert delay_change(model.inputs, -40.0) == {}
+    assert delay_change(model.inputs, 400.0) == {}
 
 
 def only(name: str, analysis: Analysis) -> Finding:

@@ -11,8 +11,8 @@ setting would only hide it.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -33,7 +33,9 @@ from px4fuse.comparison.model import (
 )
 from px4fuse.comparison.projection import project_state, project_truth
 from px4fuse.comparison.remedy import delay_asked, noise_change, noise_used_m
+from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, moved, replay_settings
+from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import HORIZONTAL as LEVEL
 from px4fuse.ekf2.replay import UPDATE_COLUMNS, Ekf2Replay, settled
 from px4fuse.ekf2_parameters import EV_POS, GNSS_VEL, PARAMETERS
@@ -199,26 +201,46 @@ def interventions(
     model : Model or Unavailable
         Of EKF2.
     """
-    known, source = (comparison, tuning, clock, heading), comparison.source
+    known = comparison, tuning, clock, heading
     filters: list[_Changed] = [_Ours(*known, explained)]
-    if not isinstance(model, Unavailable):
-        fused = source.name == model.inputs.received.source and source.alignment is None
-        filters += [_Ekf2(*known, model)] if fused and model.agreement.good else []
+    if not isinstance(model, Unavailable) and model.agreement.good:
+        inputs, used_m = model.inputs, noise_used_m(model)
+        filters += [_Replayed(*known, inputs, used_m, model)] if _fused(comparison, inputs) else []
     rows: list[Intervention] = []
     for changed in filters:
-        asked = [
-            (result, of)
-            for result in comparison.axes.values()
-            if changed.owner == "kf" or result.axis.name != "down"
-            for of in _discrepancies(result.filters[changed.owner])
-        ]
-        changed.ahead([each for one in asked for each in changed.candidates(*one)])
-        for result, of in asked:
+        for result, of in changed.asked():
             tried = _tried(changed, result, of)
             rows += tried
             if cause := cause_of(tried, changed.owner, result.axis.name, of):
                 rows += _apart(cause, result, changed)
     return tuple(rows)
+
+
+def to_try(
+    comparison: Comparison,
+    tuning: Tuning,
+    clock: ClockOffset | Unavailable,
+    heading: HeadingError | Unavailable,
+    inputs: Inputs,
+) -> list[Variant]:
+    """The variants of EKF2 that :func:`interventions` will ask for, as far as can be told before.
+
+    One that is not among them is replayed when it is asked for.
+    """
+    if not _fused(comparison, inputs):
+        return []
+    mode, flown = inputs.aid.noise_mode, inputs.settings
+    stated = inputs.received.variance_m2[:, :2] * (not mode or flown[mode] != 1.0)
+    used_m = float(np.sqrt(np.median(np.maximum(stated, flown[inputs.aid.noise] ** 2))))
+    tried = _Ekf2(comparison, tuning, clock, heading, inputs, used_m)
+    changes = [change for one in tried.asked() for change in tried.candidates(*one)]
+    return [Variant({**flown, **change}) for change in changes if change.keys() <= flown.keys()]
+
+
+def _fused(comparison: Comparison, inputs: Inputs) -> bool:
+    """Whether EKF2 fused what was analysed."""
+    source = comparison.source
+    return source.name == inputs.received.source and source.alignment is None
 
 
 def _apart(cause: Intervention, result: AxisComparison, changed: _Changed) -> list[Intervention]:
@@ -315,9 +337,18 @@ class _Changed:
 
     owner: ClassVar[FilterName]
 
-    @abstractmethod
+    def asked(self) -> list[tuple[AxisComparison, Of]]:
+        """Its discrepancies, each with its axis; EKF2 is replayed along horizontal ones."""
+        return [
+            (result, of)
+            for result in self.comparison.axes.values()
+            if self.owner == "kf" or result.axis.name != "down"
+            for of in _discrepancies(result.filters[self.owner])
+        ]
+
     def number(self, result: AxisComparison, of: Of, change: Change) -> tuple[float, int] | None:
         """Mean NIS or NEES along an axis with a change, or how far apart; and of how many."""
+        raise NotImplementedError
 
     @abstractmethod
     def of_noise(self, result: AxisComparison, tuned: AxisTuning, over: bool) -> list[Change]:
@@ -326,9 +357,6 @@ class _Changed:
     @abstractmethod
     def of_filter(self, tuned: AxisTuning | None) -> list[Change]:
         """What else may be wrong; ``tuned`` where the variance is not larger than what is shown."""
-
-    def ahead(self, changes: Sequence[Change]) -> None:
-        """Make at once what is cheaper so."""
 
     def candidates(self, result: AxisComparison, of: Of) -> list[Change]:
         """What to try along an axis."""
@@ -436,27 +464,21 @@ class _Ours(_Changed):
 
 @dataclass(frozen=True)
 class _Ekf2(_Changed):
-    """EKF2 with changes, where the model agrees with the log and fused what was analysed."""
+    """What to change of EKF2, where it fused what was analysed; ``used_m`` is its √R as flown."""
 
-    model: Model
+    inputs: Inputs
+    used_m: float
 
     owner = "ekf2"
 
-    def ahead(self, changes: Sequence[Change]) -> None:
-        """Replay together what changes parameters alone."""
-        of_parameters = [each for each in changes if each.keys() <= PARAMETERS.keys()]
-        distinct = {frozenset(each.items()): each for each in of_parameters}
-        replays = replay_settings(self.model, list(distinct.values()))
-        self.model.kept.update(zip(distinct, replays, strict=True))
-
     def of_stamps(self) -> list[Change]:
         """A delay is EKF2's own to set; there is none for stamps that are early."""
-        delay = delay_asked(self.comparison, self.model, self.clock)
+        delay = delay_asked(self.comparison, self.inputs, self.clock)
         return [delay] if delay else super().of_stamps()
 
     def of_filter(self, tuned: AxisTuning | None) -> list[Change]:
         """The gate, parameters that are not PX4's own, and the process noise."""
-        aid, flown = self.model.inputs.aid, self.model.inputs.settings
+        aid, flown = self.inputs.aid, self.inputs.settings
         usual = {name: PARAMETERS[name].default for name in (aid.gate, *NOT_OF_AID)}
         found: list[Change] = [
             {name: value}
@@ -474,8 +496,8 @@ class _Ekf2(_Changed):
         EKF2 adds (EKF2_ACC_NOISE · step)² to the variance of the velocity in each step, ours
         SIGMA_A² DT² in each DT.
         """
-        steps = self.comparison.settings.dt_s / self.model.inputs.step_s
-        flown, most = self.model.inputs.settings[ACC_NOISE], PARAMETERS[ACC_NOISE].maximum
+        steps = self.comparison.settings.dt_s / self.inputs.step_s
+        flown, most = self.inputs.settings[ACC_NOISE], PARAMETERS[ACC_NOISE].maximum
         if (tuned.filter_sigma_a.low or 0.0) * steps**0.5 <= SHAKEN * flown:
             return {}
         asked = min((tuned.filter_sigma_a.value or 0.0) * steps**0.5, most)
@@ -483,8 +505,8 @@ class _Ekf2(_Changed):
 
     def of_noise(self, result: AxisComparison, tuned: AxisTuning, over: bool) -> list[Change]:
         """The source's noise."""
-        used_m, noise, statement = noise_used_m(self.model), tuned.sigma_z, result.filters["ekf2"]
-        if (noise.low or 0.0) <= used_m <= (noise.high or np.inf):
+        noise, statement = tuned.sigma_z, result.filters["ekf2"]
+        if (noise.low or 0.0) <= self.used_m <= (noise.high or np.inf):
             return []
         asked_m = noise.value
         if asked_m is None:
@@ -492,7 +514,15 @@ class _Ekf2(_Changed):
                 return []
             # EKF2's own innovations bound it too, and less tightly
             asked_m = float(np.hypot(statement.innovation_std_m, statement.innovation_mean_m))
-        return [noise_change(self.model, asked_m)]
+        return [noise_change(self.inputs, self.used_m, asked_m)]
+
+
+@dataclass(frozen=True)
+class _Replayed(_Ekf2):
+    """EKF2 with changes, where the model agrees with the log."""
+
+    model: Model
+    replays: dict[tuple[tuple[str, float], ...], Ekf2Replay] = field(default_factory=dict)
 
     def number(self, result: AxisComparison, of: Of, change: Change) -> tuple[float, int] | None:
         """By a replay, along a horizontal axis; unchanged how far apart by the log."""
@@ -524,15 +554,15 @@ class _Ekf2(_Changed):
         """EKF2 with a change, each replayed once."""
         if not change:
             return self.model.flown
-        key = frozenset(change.items())
-        if key not in self.model.kept:
+        key = tuple(sorted(change.items()))
+        if key not in self.replays:
             settings = {name: value for name, value in change.items() if name in PARAMETERS}
             model = moved(self.model, change.get(TURN, 0.0), change.get(CLOCK, 0.0))
             left_out_s, tuned = None, tuned_for(self.tuning, HORIZONTAL)
             if OUTLIERS in change and tuned is not None:
-                stamp = 1e-3 * self.model.inputs.settings[self.model.inputs.aid.delay]
+                stamp = 1e-3 * self.inputs.settings[self.inputs.aid.delay]
                 of_source = self.comparison.source.origin.by_gnss
                 left_out_s = tuned.outlier_time_s - self.comparison.settings.clock_offset_s
                 left_out_s = left_out_s + (stamp if of_source else 0.0) + change.get(CLOCK, 0.0)
-            (self.model.kept[key],) = replay_settings(model, [settings], left_out_s)
-        return self.model.kept[key]
+            (self.replays[key],) = replay_settings(model, [settings], left_out_s)
+        return self.replays[key]

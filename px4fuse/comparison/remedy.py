@@ -14,6 +14,7 @@ import numpy as np
 from px4fuse.comparison.comparison import compare_prepared
 from px4fuse.comparison.model import AgainstTruth, Comparison
 from px4fuse.comparison.preparation import prepare
+from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.whatif import Summary, what_if
 from px4fuse.ekf2_parameters import EV_POS, PARAMETERS, Aid
@@ -77,21 +78,21 @@ def asked_of_ekf2(
     trusted = noise_m is not None and noise_m <= noise_used_m(model)
     slow = source.origin.may_drift or source.origin.is_gnss
     if noise_m is not None and not (trusted and slow):
-        changes |= noise_change(model, noise_m)
-    return changes | delay_asked(comparison, model, clock)
+        changes |= noise_change(model.inputs, noise_used_m(model), noise_m)
+    return changes | delay_asked(comparison, model.inputs, clock)
 
 
 def delay_asked(
-    comparison: Comparison, model: Model, clock: ClockOffset | Unavailable
+    comparison: Comparison, inputs: Inputs, clock: ClockOffset | Unavailable
 ) -> dict[str, float]:
     """EKF2's delay as the data ask for it; empty where they do not tell, or it is as flown."""
     if isinstance(clock, Unavailable) or not clock.determinable:
         return {}
-    age_s, flown = comparison.source.age_s, model.inputs.settings[model.inputs.aid.delay]
+    age_s, flown = comparison.source.age_s, inputs.settings[inputs.aid.delay]
     high, low = (1e3 * (age_s - end) for end in clock.interval_s)
     if low - UPDATE_MS <= flown <= high + UPDATE_MS:
         return {}
-    return delay_change(model, 1e3 * (age_s - clock.offset_s))
+    return delay_change(inputs, 1e3 * (age_s - clock.offset_s))
 
 
 def aid_of(comparison: Comparison, axis: str = "") -> Aid:
@@ -117,33 +118,33 @@ def tuned_noise_m(tuning: Mapping[str, AxisTuning | Unavailable]) -> float | Non
     return next((tuned.sigma_z.value for tuned in known if isinstance(tuned, AxisTuning)), None)
 
 
-def noise_change(model: Model, noise_m: float) -> dict[str, float]:
+def noise_change(inputs: Inputs, used_m: float, noise_m: float) -> dict[str, float]:
     """What to set so that EKF2 takes a position's standard deviation (m) to be this.
 
-    Two digits, within PX4's range.
+    Two digits, within PX4's range; ``used_m`` is what it took.
     """
-    settings, aid = model.inputs.settings, model.inputs.aid
+    settings, aid = inputs.settings, inputs.aid
     least = PARAMETERS[aid.noise].minimum
     changes = {aid.noise: max(float(f"{noise_m:.2g}"), least)}
-    reported = noise_used_m(model) > REPORTED_TIMES * settings[aid.noise]
+    reported = used_m > REPORTED_TIMES * settings[aid.noise]
     may_differ = aid.noise_mode and settings[aid.noise_mode] == 0.0
-    if may_differ and reported and noise_m < noise_used_m(model):
+    if may_differ and reported and noise_m < used_m:
         changes[aid.noise_mode] = 1.0
     return changes
 
 
-def delay_change(model: Model, delay_ms: float) -> dict[str, float]:
+def delay_change(inputs: Inputs, delay_ms: float) -> dict[str, float]:
     """What to set so that EKF2 takes positions to be this older than their stamps.
 
     Nothing where PX4's range ends before, or no parameter tells; 0 for stamps that are early.
     """
-    delay = model.inputs.aid.delay
+    delay = inputs.aid.delay
     known = PARAMETERS[delay]
-    if delay_ms > known.maximum or model.inputs.received.own_times:
+    if delay_ms > known.maximum or inputs.received.own_times:
         return {}
     changes = {delay: max(float(round(delay_ms)), known.minimum)}
-    needed, flown = changes[delay] + ARRIVAL_MS, model.inputs.settings
-    if not model.inputs.rules.horizon_by_delay and needed > flown["EKF2_DELAY_MAX"]:
+    needed, flown = changes[delay] + ARRIVAL_MS, inputs.settings
+    if not inputs.rules.horizon_by_delay and needed > flown["EKF2_DELAY_MAX"]:
         changes["EKF2_DELAY_MAX"] = DELAY_STEP_MS * math.ceil(needed / DELAY_STEP_MS)
     return {name: value for name, value in changes.items() if value != flown[name]}
 

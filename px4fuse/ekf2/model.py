@@ -83,10 +83,8 @@ class Model:
         The same, rejecting and resetting where EKF2 did, as far as the log tells.
     agreement : Agreement
         Of ``flown`` with what the log holds.
-    runs : tuple of Run
-        Through each stretch: of both, and of the variants that were asked for besides.
-    kept : dict from (name, value) pairs of a change to Ekf2Replay
-        Replays that are asked for more than once.
+    runs : list of Run
+        Through each stretch, of these inputs: both, and the variants that were asked for besides.
     """
 
     flight: Flight
@@ -95,8 +93,7 @@ class Model:
     flown: Ekf2Replay
     obedient: Ekf2Replay
     agreement: Agreement
-    runs: tuple[Run, ...]
-    kept: dict[frozenset[tuple[str, float]], Ekf2Replay] = field(default_factory=dict, init=False)
+    runs: list[Run] = field(default_factory=list, init=False)
 
     __repr__ = brief
 
@@ -117,7 +114,9 @@ def open_model(flight: Flight, besides: Besides = lambda _: ()) -> Model | Unava
         if not agreement.doubtful:
             agreement = structs.replace(agreement, doubtful=doubtful, **told)
             flown = structs.replace(model.flown, agreement=agreement)
-            return replace(model, flown=flown, agreement=agreement)
+            opened = replace(model, flown=flown, agreement=agreement)
+            opened.runs.extend(model.runs)
+            return opened
         doubtful |= agreement.doubtful
         fields = {FLOW.name: "carried_difference_m"}
         for name in agreement.doubtful:
@@ -140,9 +139,10 @@ def _open(flight: Flight, besides: Besides, doubtful: Mapping[str, str]) -> Mode
         for stretch, each in zip(inputs.stretches, intervals, strict=True)
     )
     inputs = replace(inputs, stretches=stretches)
-    both = [flown, replace(flown, as_logged=True)]
-    more = [each for each in besides(inputs) if each not in both]
-    runs = run_variants(inputs, both + more, {timing: intervals})
+    variants = [flown, replace(flown, as_logged=True)]
+    for each in besides(inputs):
+        variants += [] if each in variants else [each]
+    runs = run_variants(inputs, variants, {timing: intervals})
     replay, obedient = (_assemble(inputs, runs, at, {}) for at in range(2))
     agreement = agreement_with_log(flight, replay)
     if isinstance(agreement, Unavailable):
@@ -153,7 +153,9 @@ def _open(flight: Flight, besides: Besides, doubtful: Mapping[str, str]) -> Mode
         if isinstance(obeyed, Agreement):
             agreement = with_obedient(agreement, obeyed)
     replay = structs.replace(replay, agreement=agreement)
-    return Model(flight, inputs, intervals, replay, obedient, agreement, tuple(runs))
+    model = Model(flight, inputs, intervals, replay, obedient, agreement)
+    model.runs.extend(runs)
+    return model
 
 
 def replay_settings(
@@ -203,9 +205,7 @@ def replay_settings(
             raise SettingsError(f"{name}: of this log the model fuses {', '.join(known)}{why}.")
     if not changes:
         return ()
-    obeys, asked = left_out_s is not None, [frozenset(change.items()) for change in changes]
-    if not (obeys or without) and model.kept.keys() >= {*asked}:
-        return tuple(model.kept[change] for change in asked)
+    obeys = left_out_s is not None
     if left_out_s is not None:
         row = same_sample(inputs.received.stamp_s, left_out_s)
         rejected = np.full(len(inputs.received.stamp_s), np.nan)
@@ -218,7 +218,10 @@ def replay_settings(
         for change in changes
     ]
     runs = _run_model(model, variants)
-    replays = [_assemble(inputs, runs, at, change) for at, change in enumerate(changes)]
+    replays = [
+        _assemble(inputs, runs, runs[0].variants.index(variant), change)
+        for variant, change in zip(variants, changes, strict=True)
+    ]
     if left_out_s is not None:
         replays = [_without(inputs, each, left_out_s) for each in replays]
     return tuple(structs.replace(each, agreement=model.agreement) for each in replays)
@@ -291,14 +294,15 @@ def delayed_variants(model: Model, variants: Sequence[Variant]) -> Iterator[pd.D
 
     What a filter publishes is as long again, and takes as long to make.
     """
-    runs: Sequence[Run] = model.runs
-    if any(variant not in runs[0].variants for variant in variants):
-        runs = _run_model(model, variants)
+    runs = _run_model(model, variants)
     for at in map(runs[0].variants.index, variants):
         yield pd.concat([_track(part, delayed_states(part, at)[0]) for part in runs])
 
 
 def _run_model(model: Model, variants: Sequence[Variant]) -> list[Run]:
+    """Runs that hold these variants: those of the model, where they are among them."""
+    if model.runs and all(variant in model.runs[0].variants for variant in variants):
+        return model.runs
     timing = Variant(model.inputs.settings).timing(model.inputs)
     return run_variants(model.inputs, variants, {timing: model.intervals})
 

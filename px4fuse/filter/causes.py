@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -256,13 +256,14 @@ def _step_squares(model: Hypotheses, sigma_a: float, skip: BoolArray, times: Arr
     """χ² of a step at each time: what it takes away of the squares, summed over the axes."""
     base = model.fit(sigma_a, skip)
     chi_square = np.zeros(len(times))
-    for axis in range(len(model.legs)):
-        rows = base.axis == axis
-        columns, rest = base.columns[rows], base.rest[rows]
-        for few in np.array_split(np.arange(len(times)), -(-len(times) // STEPS_AT_ONCE)):
-            added = steps(model.time_s, times[few])
-            alone = _with_signals(model.legs[axis], 0.0 * added, 0.0 * added, added)
-            response = model.whitened(alone, sigma_a, skip)[0][~skip]
+    for few in np.array_split(np.arange(len(times)), -(-len(times) // STEPS_AT_ONCE)):
+        added = steps(model.time_s, times[few])
+        for axis, legs in enumerate(model.legs):
+            if axis in (alike[0] for alike in model.alike):
+                alone = _with_signals(legs, 0.0 * added, 0.0 * added, added)
+                response = model.whitened(alone, sigma_a, skip)[0][~skip]
+            rows = base.axis == axis
+            columns, rest = base.columns[rows], base.rest[rows]
             mixed = columns.T @ response
             size = np.sum(response**2, axis=0) - np.sum(mixed * (base.covariance @ mixed), axis=0)
             chi_square[few] += (rest @ response / base.spreads[axis]) ** 2 / np.maximum(size, 1e-9)
@@ -418,8 +419,15 @@ class Hypotheses:
         width, count = len(self.prior), model.steps.shape[1]
         return model, width + count * (1 + np.arange(len(self.legs))) - 1
 
+    @cached_property
+    def alike(self) -> list[list[int]]:
+        """Axes with the same filter: all, but where gaps in the IMU tell less of one."""
+        same = all(np.array_equal(each.noise_fixed, self.legs[0].noise_fixed) for each in self.legs)
+        every = list(range(len(self.legs)))
+        return [every] if same else [[axis] for axis in every]
+
     def whitened(self, legs: Preintegrated, sigma_a: float, skip: BoolArray) -> tuple[Array, float]:
-        """Innovations over √S of the signals of one axis, (m, k), and Σ ln S of those used."""
+        """Innovations over √S of signals along any axis, (m, k), and Σ ln S of those used."""
         nu, s = innovations(legs, sigma_a, self.sigma_z_m, skip)
         return nu / np.sqrt(s)[:, None], float(np.sum(np.log(s[~skip])))
 
@@ -454,24 +462,25 @@ class Hypotheses:
         width = len(self.prior)
         data = np.empty((axes, len(skip)))
         columns = np.zeros((axes, len(skip), width + axes * steps))
-        log_s = 0.0
-        for at, legs in enumerate(self.legs):
-            # acceleration in the source's own length: of what was measured, and of a turn of it
-            factor = np.ones(1 + CONSTANTS)
-            factor[[0, 1 + TURN]] = scale
-            still = np.zeros_like(self.hats[0])
-            signals = (
-                [factor * legs.delta_position_m, self.hats[0], 0.0 * self.steps],
-                [factor * legs.delta_velocity_m_s, self.hats[1], 0.0 * self.steps],
-                [legs.measurement_m, still, self.steps],
-            )
-            own = _with_signals(legs, *map(np.hstack, signals))
+        # acceleration in the source's own length: of what was measured, and of a turn of it
+        factor = np.ones(1 + CONSTANTS)
+        factor[[0, 1 + TURN]] = scale
+        still, log_s = np.zeros_like(self.hats[0]), 0.0
+        for alike in self.alike:
+            dp, dv, measured = list[Array](), list[Array](), list[Array]()
+            for legs in (self.legs[at] for at in alike):
+                dp += [factor * legs.delta_position_m, self.hats[0], 0.0 * self.steps]
+                dv += [factor * legs.delta_velocity_m_s, self.hats[1], 0.0 * self.steps]
+                measured += [legs.measurement_m, still, self.steps]
+            own = _with_signals(self.legs[alike[0]], *map(np.hstack, (dp, dv, measured)))
             normalised, own_log_s = self.whitened(own, scale * sigma_a, skip)
-            log_s += own_log_s
-            data[at] = normalised[:, 0]
-            first, step = CONSTANTS + hats * at, width + steps * at
-            which = np.r_[:CONSTANTS, first : first + hats, step : step + steps]
-            columns[at][:, which] = normalised[:, 1:]
+            log_s += len(alike) * own_log_s
+            parts = np.split(normalised, len(alike), axis=1)
+            for at, signals in zip(alike, parts, strict=True):
+                data[at] = signals[:, 0]
+                first, step = CONSTANTS + hats * at, width + steps * at
+                which = np.r_[:CONSTANTS, first : first + hats, step : step + steps]
+                columns[at][:, which] = signals[:, 1:]
         return data, columns, log_s
 
 

@@ -43,8 +43,8 @@ STRETCH_S = 30.0
 SEARCH_S = 0.6
 # The whole search is gone through in so many steps
 COARSE_POINTS = 25
-# Numbers of signals that are made at once
-BLOCK = 2**16
+# Numbers of signals that are made at once, and of offsets at least
+BLOCK, LEAST_OFFSETS = 2**16, 3
 # Of all stretches together, and of one
 MIN_MEASUREMENTS, MIN_STRETCH_MEASUREMENTS = 30, 15
 # Of a stretch of which only some are taken
@@ -183,7 +183,7 @@ class PreparedMotion:
     def blocks(self, offset_s: Array, *, scaled: bool = True) -> Iterator[Positions]:
         """The same at some offsets, a few at a time, with the scale as a constant or without."""
         signals = len(self.time_s) * len(self.directions) * (1 + len(CONSTANT_SIGMA))
-        at_once = max(1, BLOCK // signals)
+        at_once = max(LEAST_OFFSETS, BLOCK // signals)
         for few in np.split(offset_s, range(at_once, len(offset_s), at_once)):
             positions = self.positions(few)
             yield centred(positions, scaled=True) if scaled else positions

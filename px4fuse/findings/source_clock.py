@@ -84,7 +84,7 @@ def _for_ekf2(analysis: Analysis, clock: ClockOffset) -> str:
         )
     if isinstance(model, Unavailable) or source.name != model.inputs.received.source:
         return ""
-    changes = remedy.delay_change(model, 1e3 * (source.age_s - clock.offset_s))
+    changes = remedy.delay_change(model.inputs, 1e3 * (source.age_s - clock.offset_s))
     found = what_if(model, [changes]) if changes else None
     if not isinstance(found, WhatIf) or not remedy.delay_helps(found.replayed, *found.whatif):
         return ""
@@ -136,6 +136,6 @@ def delay_remedy(analysis: Analysis, delay_ms: float, flown_ms: float) -> str:
         return f"{AT_THE_SENDER} EKF2 has no parameter for stamps that are early."
     changes = {"EKF2_EV_DELAY": max(float(round(delay_ms)), 0.0)}
     if not isinstance(model, Unavailable):
-        changes = remedy.delay_change(model, delay_ms) or changes
+        changes = remedy.delay_change(model.inputs, delay_ms) or changes
     words, _ = remedy.remedy_words(model, changes, remedy.delay_helps, otherwise=AT_THE_SENDER)
     return words
