@@ -33,6 +33,7 @@ LEAD = (
 )
 STRIP = 21.0  # points, height of the innovations of one aid
 WIDEST = 4.0  # in √S; what is beyond stands at the edge
+DOTS = 400  # of each axis, at most
 # Horizontal aids other than external vision: with them a flight has the page in its appendix
 OUTDOORS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
@@ -142,12 +143,14 @@ def _strip(
         value = samples[f"innovation_{axis}"] / np.sqrt(samples[f"variance_{axis}"])
         size = value.clip(-WIDEST, WIDEST).to_numpy()
         for which, look in ((fused, EKF2_DOTS), (~fused, EKF2_REJECTED)):
-            axes.plot(*thin(samples.index.to_numpy()[which], size[which]), **look | {"ms": 1.4})
+            dots = thin(samples.index.to_numpy()[which], size[which], DOTS)
+            axes.plot(*dots, **look | {"ms": 1.4})
     for level in (-2.0, 2.0):
         axes.axhline(level, color="black", lw=0.4, ls=(0, (1, 1.5)))
     if log.meant is not None:
         grid = np.linspace(*span, 2000)
         off = at_times(log.meant, pd.Index(grid)) <= 0.0
-        axes.fill_between(grid, -WIDEST, WIDEST, where=off.tolist(), zorder=0.1, **GROUND)
+        if off.any():
+            axes.fill_between(grid, -WIDEST, WIDEST, where=off.tolist(), zorder=0.1, **GROUND)
     axes.set(xlim=span, ylim=(-1.1 * WIDEST, 1.1 * WIDEST), yticks=(-2.0, 2.0))
     time_axis(axes, last)
