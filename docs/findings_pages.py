@@ -39,7 +39,7 @@ from px4fuse.filter.heading import HeadingPart, turned  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402
 from px4fuse.findings import Finding, find, find_aids, find_loop, source_frame  # noqa: E402
 from px4fuse.findings.causes import CONSEQUENCES, NAMES, RECORDING, SETTINGS  # noqa: E402
-from px4fuse.flight import POSITION_COLUMNS  # noqa: E402
+from px4fuse.flight import Columns  # noqa: E402
 from px4fuse.simulation.flights import simulate_flight  # noqa: E402
 from px4fuse.simulation.mistakes import parse  # noqa: E402
 from px4fuse.simulation.scenario import Scenario  # noqa: E402
@@ -97,7 +97,7 @@ def examples() -> dict[str, Example]:
         keep(found, f"`{words}`{compared}", analysis)
     for model in (slow, partial(held, share=0.2), partial(white, sigma=UNEQUAL_M), louder):
         flight = simulate_flight(Scenario(passes=4, seed=2, ekf2=False))
-        truth = flight.truth.samples[POSITION_COLUMNS].dropna()
+        truth = flight.truth.samples[Columns.POSITION].dropna()
         known = CubicSpline(truth.index.to_numpy(), truth.to_numpy())
         analysis = explain(compare(laid_over(flight, known, model, 10.0, 2), Settings()))
         found = [one for one in find(analysis) if one.id.startswith("source_")]

@@ -5,8 +5,6 @@ what EKF2 can have done; the panels that show something; what can be done about 
 the form's grammar, never whether it is right.
 """
 
-from __future__ import annotations
-
 import hashlib
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping

@@ -3,8 +3,6 @@
 For practice, not an exam: the answers are in the page, packed so that nobody reads them by chance.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import zlib

@@ -14,14 +14,7 @@ from px4fuse.arrays import Array
 from px4fuse.comparison.preparation import choose_segment, choose_source
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, make_axes
-from px4fuse.flight import (
-    ANGULAR_RATE_COLUMNS,
-    POSITION_COLUMNS,
-    POSITION_VARIANCE_COLUMNS,
-    QUATERNION_COLUMNS,
-    SPECIFIC_FORCE_COLUMNS,
-    Flight,
-)
+from px4fuse.flight import Columns, Flight
 
 # --- axes as the two-state filter assumes them ---
 
@@ -139,7 +132,7 @@ def made_flight(
         samples=table(
             stamps,
             np.hstack([measured, np.full(measured.shape, np.nan)]),
-            POSITION_COLUMNS + POSITION_VARIANCE_COLUMNS,
+            Columns.POSITION + Columns.POSITION_VARIANCE,
         ),
     )
     imu = imu_table(time, force, rate)
@@ -147,15 +140,15 @@ def made_flight(
     flight = replace(
         base,
         imu=imu,
-        attitude=table(logged, quaternion, QUATERNION_COLUMNS),
+        attitude=table(logged, quaternion, Columns.QUATERNION),
         positions=(track,),
     )
     return flight, outlier
 
 
 def imu_table(time: Array, force: Array, rate: Array) -> pd.DataFrame:
-    return table(time, np.hstack([force, rate]), SPECIFIC_FORCE_COLUMNS + ANGULAR_RATE_COLUMNS)
+    return table(time, np.hstack([force, rate]), Columns.SPECIFIC_FORCE + Columns.ANGULAR_RATE)
 
 
 def attitude_table(time: Array, turn: Rotation) -> pd.DataFrame:
-    return table(time, turn.as_quat(scalar_first=True), QUATERNION_COLUMNS)
+    return table(time, turn.as_quat(scalar_first=True), Columns.QUATERNION)

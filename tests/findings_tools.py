@@ -22,13 +22,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings import Finding
-from px4fuse.flight import (
-    POSITION_COLUMNS,
-    POSITION_VARIANCE_COLUMNS,
-    Ekf2,
-    FusionRecord,
-    Unavailable,
-)
+from px4fuse.flight import Columns, Ekf2, FusionRecord, Unavailable
 from px4fuse.origin import RECEIVED
 
 T = TypeVar("T")
@@ -88,9 +82,9 @@ def source(**parts: Any) -> Any:
 
 
 def positions(time_s: Any, north_m: Any = 0.0, variance_m2: float = np.nan) -> pd.DataFrame:
-    frame = pd.DataFrame(0.0, index=np.asarray(time_s, float), columns=POSITION_COLUMNS)
+    frame = pd.DataFrame(0.0, index=np.asarray(time_s, float), columns=Columns.POSITION)
     frame["north_m"] = north_m
-    return frame.assign(**dict.fromkeys(POSITION_VARIANCE_COLUMNS, variance_m2))
+    return frame.assign(**dict.fromkeys(Columns.POSITION_VARIANCE, variance_m2))
 
 
 def analysis(

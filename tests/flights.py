@@ -23,14 +23,8 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.filter.signals import Axis, Segment, project_acceleration
 from px4fuse.filter.tuning import HORIZONTAL, tune
 from px4fuse.flight import (
-    ANGULAR_RATE_COLUMNS,
     AXIS_NAMES,
-    POSITION_COLUMNS,
-    POSITION_VARIANCE_COLUMNS,
-    QUATERNION_COLUMNS,
-    SPECIFIC_FORCE_COLUMNS,
-    VELOCITY_COLUMNS,
-    VELOCITY_VARIANCE_COLUMNS,
+    Columns,
     Ekf2,
     Flight,
     PositionTrack,
@@ -152,7 +146,7 @@ def aisle_flight(
         imu=unavailable("IMU")
         if imu is None
         else table(
-            time, np.hstack([force, 0.0 * force]), SPECIFIC_FORCE_COLUMNS + ANGULAR_RATE_COLUMNS
+            time, np.hstack([force, 0.0 * force]), Columns.SPECIFIC_FORCE + Columns.ANGULAR_RATE
         ).assign(clipped=(time >= clipped_s[0]) & (time <= clipped_s[1])),
         attitude=unavailable("attitude")
         if attitude_hz is None
@@ -161,7 +155,7 @@ def aisle_flight(
             np.tile(
                 BODY_TO_NED.as_quat(scalar_first=True), (len(times(duration_s, attitude_hz)), 1)
             ),
-            QUATERNION_COLUMNS,
+            Columns.QUATERNION,
         ),
         positions=(track,),
         ekf2=unavailable("EKF2")
@@ -172,7 +166,7 @@ def aisle_flight(
             table(
                 position_time,
                 np.hstack(path(position_time)[:2]),
-                POSITION_COLUMNS + VELOCITY_COLUMNS,
+                Columns.POSITION + Columns.VELOCITY,
             ),
         )
         if truth
@@ -224,7 +218,7 @@ def _track(rng: np.random.Generator, time: Array, uwb: Uwb, path) -> PositionTra
         samples=table(
             time,
             np.hstack([position, np.full(position.shape, np.nan)]),
-            POSITION_COLUMNS + POSITION_VARIANCE_COLUMNS,
+            Columns.POSITION + Columns.POSITION_VARIANCE,
         ),
         frame=uwb.frame,
         clock="autopilot boot clock",
@@ -246,11 +240,11 @@ def _ekf2(
     variances = np.repeat([made.sigma_p_m**2, made.sigma_v_m_s**2], 3)
     rejected = rng.random(len(updates)) < made.rejected_share
     return Ekf2(
-        state=table(time, np.hstack([position, velocity]), POSITION_COLUMNS + VELOCITY_COLUMNS),
+        state=table(time, np.hstack([position, velocity]), Columns.POSITION + Columns.VELOCITY),
         variance=table(
             second,
             np.tile(variances, (len(second), 1)),
-            POSITION_VARIANCE_COLUMNS + VELOCITY_VARIANCE_COLUMNS,
+            Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE,
         )
         if made.variance_logged
         else unavailable("EKF2 variances"),

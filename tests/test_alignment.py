@@ -21,14 +21,7 @@ from px4fuse.alignment.placement import place
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU
 from px4fuse.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
-from px4fuse.flight import (
-    POSITION_COLUMNS,
-    POSITION_VARIANCE_COLUMNS,
-    Alignment,
-    Flight,
-    PositionTrack,
-    Reset,
-)
+from px4fuse.flight import Alignment, Columns, Flight, PositionTrack, Reset
 from px4fuse.origin import GIVEN_FILE
 from px4fuse.readers import read_log
 from px4fuse.readers.position_csv import SAMPLE_COLUMNS, PositionRecording, read_position_csv
@@ -123,7 +116,7 @@ def recorded(
 ) -> PositionRecording:
     """Record the flight's UWB on another clock and in another frame."""
     samples = flight.positions[0].samples.loc[span_s[0] : span_s[1]]
-    n, e, d = (samples[POSITION_COLUMNS].to_numpy() - origin_m).T
+    n, e, d = (samples[Columns.POSITION].to_numpy() - origin_m).T
     c, s = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
     xyz = np.stack(FROM_NED[frame](c * n + s * e, c * e - s * n, d), axis=1)
     return position_file(samples.index.to_numpy() + flight.log.boot_time_s - offset_s, xyz, **made)
@@ -148,7 +141,7 @@ def turn(one_deg: float, other_deg: float) -> float:
 
 
 def assert_same_track(track: PositionTrack, expected: PositionTrack, tolerance_m: float) -> None:
-    difference = track.samples[POSITION_COLUMNS].to_numpy() - expected.samples[POSITION_COLUMNS]
+    difference = track.samples[Columns.POSITION].to_numpy() - expected.samples[Columns.POSITION]
     assert np.abs(difference.to_numpy()).max() < tolerance_m
 
 
@@ -201,7 +194,7 @@ def test_sample_file_is_placed_without_any_option(
     assert alignment.residual_rms_m == pytest.approx(0.115, abs=0.01)
     assert alignment.misplaced == alignment.warnings == ()
     assert len(track.samples) == len(external.samples)
-    assert track.samples[POSITION_VARIANCE_COLUMNS].isna().to_numpy().all()
+    assert track.samples[Columns.POSITION_VARIANCE].isna().to_numpy().all()
 
 
 # -- synthetic flights -----------------------------------------------------------------------------
@@ -277,7 +270,7 @@ def test_variances_turn_with_the_track(flight: Flight) -> None:
     file = recorded(flight, frame="enu", yaw_deg=90.0, sigma_m=[0.1, 0.2, 0.3])
     options: dict[str, Any] = {"frame": "enu", "clock_offset_s": OFFSET_S}
     variances = [
-        placed(flight, file, yaw_deg=yaw, **options)[1].samples[POSITION_VARIANCE_COLUMNS].iloc[7]
+        placed(flight, file, yaw_deg=yaw, **options)[1].samples[Columns.POSITION_VARIANCE].iloc[7]
         for yaw in (0.0, 90.0, 30.0)
     ]
     np.testing.assert_allclose(variances[0], [0.04, 0.01, 0.09])
@@ -531,7 +524,7 @@ def test_simulated_flights(shared_logs: Path, name: str) -> None:
         assert abs(alignment.yaw_deg) < 0.5
         np.testing.assert_allclose(alignment.origin_m[:2], 0.0, atol=0.05)
         truth = np.array([sample["truth"] for sample in record["uwb"]])
-        error_m = track.samples[POSITION_COLUMNS[:2]].to_numpy() - truth[:, :2]
+        error_m = track.samples[Columns.POSITION[:2]].to_numpy() - truth[:, :2]
         assert np.median(np.abs(error_m)) < 0.08
     alignment, _ = placed(replace(flight, ekf2=unavailable("EKF2")), file, frame="ned")
     assert off_s(alignment, true_s) < 2.0 * (alignment.clock_offset_sigma_s or 0.0)

@@ -53,7 +53,7 @@ from px4fuse.filter.motion import (
     signals_of,
 )
 from px4fuse.filter.signals import Segment
-from px4fuse.flight import POSITION_COLUMNS, Flight, Unavailable
+from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.origin import (
     ALIGNED,
     GIVEN_FILE,
@@ -248,7 +248,7 @@ def exact_imu() -> tuple[Flight, ClockOffset, list[tuple[Array, Array]]]:
     rng = np.random.default_rng(12)
     wind = rng.normal(0.0, SIGMA_A * np.sqrt(DT * UWB_HZ), (len(samples), 3))
     way = np.cumsum(np.cumsum(wind, axis=0), axis=0) / UWB_HZ**2
-    samples[POSITION_COLUMNS] += way
+    samples[Columns.POSITION] += way
     logged = np.arange(0.0, 50.005, 0.02)
     flight = replace(
         flight,
@@ -261,7 +261,7 @@ def exact_imu() -> tuple[Flight, ClockOffset, list[tuple[Array, Array]]]:
     used = samples[(samples.index >= 0.6) & (samples.index <= 49.4)]
     first = used.index < (used.index[0] + used.index[-1]) / 2.0
     stretches = [
-        (part.index.to_numpy(), part[POSITION_COLUMNS].to_numpy())
+        (part.index.to_numpy(), part[Columns.POSITION].to_numpy())
         for part in (used[first], used[~first])
     ]
     assert found.count == len(used)
@@ -348,7 +348,7 @@ def test_what_is_simulated_for_the_scatter_is_the_noise_of_the_imu(
 
     monkeypatch.setattr(clock, "paired_products", products)
     flight, _ = made_flight()
-    samples = flight.positions[0].samples[POSITION_COLUMNS]
+    samples = flight.positions[0].samples[Columns.POSITION]
     time = samples.index.to_numpy()
     moved = motion(flight, time, samples.to_numpy(), directions=np.eye(3), dt_s=DT)
     factor = clock._scatter(moved, 0.0, Noises(0.5, 0.1, 0.2), 40.0)

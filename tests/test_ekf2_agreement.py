@@ -26,7 +26,7 @@ from px4fuse.ekf2.replay import (
     settled,
     with_obedient,
 )
-from px4fuse.flight import STATE_COLUMNS, Ekf2, Unavailable
+from px4fuse.flight import Columns, Ekf2, Unavailable
 
 AID = ("estimator_aid_src_ev_pos",)
 
@@ -123,8 +123,8 @@ def test_what_an_axis_is_compared_by() -> None:
     frame = {"innovation_east_m": nu_log, "innovation_variance_east_m2": s_log}
     model = pd.DataFrame({"innovation_east_m": nu_log + 0.5, "innovation_variance_east_m2": s})
     index = pd.Index([16.0, 17.0, 99.0])
-    still = pd.DataFrame(0.0, index=index, columns=STATE_COLUMNS)
-    off = still.assign(**{STATE_COLUMNS[1]: [3.0, 4.0, 50.0], STATE_COLUMNS[4]: 0.25})
+    still = pd.DataFrame(0.0, index=index, columns=Columns.STATE)
+    off = still.assign(**{Columns.STATE[1]: [3.0, 4.0, 50.0], Columns.STATE[4]: 0.25})
     replay = SimpleNamespace(published=off, judged_s=((15.0, 20.0),))
     found = _axis("east", pd.DataFrame(frame), model, made(Ekf2, state=still), replay)  # type: ignore[arg-type]
     assert found.innovation_correlation == pytest.approx(1.0)
@@ -147,7 +147,7 @@ def compared(count: int, *, varying: bool = True) -> Agreement | Unavailable:
         {"innovation_m": nu, "innovation_variance_m2": 0.01, "rejected": 0.0}, index=time
     )
     frame.loc[frame.index[-2:], "rejected"] = 1.0
-    state = pd.DataFrame(0.0, index=time, columns=STATE_COLUMNS)
+    state = pd.DataFrame(0.0, index=time, columns=Columns.STATE)
     innovations = {"north": frame, "east": frame}
     ekf2 = made(Ekf2, aids={}, innovations=innovations, innovation_topics=AID, state=state)
     updates = pd.DataFrame({"rejected": 0.0, "fused_at_s": time}, index=time)

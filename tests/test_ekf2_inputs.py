@@ -28,24 +28,7 @@ from px4fuse.ekf2.stretches import (
 from px4fuse.ekf2.whatif import sweep_values
 from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS, check, fuses_by_mask, settings_in_force
 from px4fuse.errors import SettingsError
-from px4fuse.flight import (
-    ACCELEROMETER_BIAS_COLUMNS,
-    ANGULAR_RATE_COLUMNS,
-    DELAYED_VARIANCE_COLUMNS,
-    GYRO_BIAS_COLUMNS,
-    POSITION_COLUMNS,
-    POSITION_VARIANCE_COLUMNS,
-    QUATERNION_COLUMNS,
-    SPECIFIC_FORCE_COLUMNS,
-    STATE_COLUMNS,
-    VELOCITY_COLUMNS,
-    Ekf2,
-    Flight,
-    FusionRecord,
-    PositionTrack,
-    Reset,
-    Unavailable,
-)
+from px4fuse.flight import Columns, Ekf2, Flight, FusionRecord, PositionTrack, Reset, Unavailable
 from px4fuse.origin import ALIGNED, GIVEN_FILE, GNSS, KEPT, MOTION_CAPTURE, RECEIVED, Origin
 from px4fuse.trajectory.rotation import matrix
 
@@ -156,7 +139,7 @@ def test_what_a_log_must_hold(flown: Callable[..., Any]) -> None:
 
 def track(name: str, origin: Origin, interval_s: float = 0.1, **parts: Any) -> PositionTrack:
     time = 10.0 + interval_s * np.arange(30)
-    samples = pd.DataFrame(1.0, index=time, columns=POSITION_COLUMNS + POSITION_VARIANCE_COLUMNS)
+    samples = pd.DataFrame(1.0, index=time, columns=Columns.POSITION + Columns.POSITION_VARIANCE)
     usual = {"frame": "NED", "orientation": None, "topics": (name,)}
     return made(PositionTrack, name=name, origin=origin, samples=samples, **{**usual, **parts})
 
@@ -188,11 +171,11 @@ def test_a_frame_of_its_own_is_turned_with_its_variance() -> None:
 
     def facing(heading: float) -> pd.DataFrame:
         q = Rotation.from_euler("z", heading, degrees=True).as_quat(scalar_first=True)
-        return pd.DataFrame([q] * 30, index=time, columns=QUATERNION_COLUMNS)
+        return pd.DataFrame([q] * 30, index=time, columns=Columns.QUATERNION)
 
     own = track("vehicle_visual_odometry", RECEIVED, frame="FRD", orientation=facing(0.0))
-    own.samples[POSITION_COLUMNS] = [2.0, 0.5, -1.0]
-    own.samples[POSITION_VARIANCE_COLUMNS] = [0.04, np.nan, 0.09]
+    own.samples[Columns.POSITION] = [2.0, 0.5, -1.0]
+    own.samples[Columns.POSITION_VARIANCE] = [0.04, np.nan, 0.09]
     for parameters, yaw, turned in (
         ({}, 0.0, True), ({}, 1.0, False), ({"EKF2_AID_MASK": 64.0}, 1.0, True),
         ({"EKF2_AID_MASK": 8.0}, 0.0, False),
@@ -285,20 +268,20 @@ def facing(at: Any, error: Any = 0.0) -> np.ndarray:
 def turning(states: np.ndarray) -> tuple[pd.DataFrame, pd.DataFrame, Ekf2, FusionRecord]:
     """0.5 rad/s about the vertical; the gyro reads 0.01 rad/s too much, EKF2 knows."""
     time = 10.0 + 0.005 * np.arange(401)
-    imu = pd.DataFrame(0.0, index=time, columns=ANGULAR_RATE_COLUMNS + SPECIFIC_FORCE_COLUMNS)
-    imu[ANGULAR_RATE_COLUMNS[2]] = 0.51
-    imu[SPECIFIC_FORCE_COLUMNS] = [1.0, 0.2, -9.8]
-    attitude = pd.DataFrame(facing(time[::4]), index=time[::4], columns=QUATERNION_COLUMNS)
+    imu = pd.DataFrame(0.0, index=time, columns=Columns.ANGULAR_RATE + Columns.SPECIFIC_FORCE)
+    imu[Columns.ANGULAR_RATE[2]] = 0.51
+    imu[Columns.SPECIFIC_FORCE] = [1.0, 0.2, -9.8]
+    attitude = pd.DataFrame(facing(time[::4]), index=time[::4], columns=Columns.QUATERNION)
     delayed = pd.DataFrame(
-        facing(states, 0.1 * (states - 10.0)), index=states, columns=QUATERNION_COLUMNS
+        facing(states, 0.1 * (states - 10.0)), index=states, columns=Columns.QUATERNION
     )
-    delayed = delayed.assign(**dict.fromkeys(VELOCITY_COLUMNS, 2.0), **{
-        **dict.fromkeys(POSITION_COLUMNS, np.nan), **dict.fromkeys(GYRO_BIAS_COLUMNS, 0.0),
-        **dict.fromkeys(ACCELEROMETER_BIAS_COLUMNS, 0.2), GYRO_BIAS_COLUMNS[2]: 0.01,
-        **{name: 1.0 + n for n, name in enumerate(DELAYED_VARIANCE_COLUMNS)},
+    delayed = delayed.assign(**dict.fromkeys(Columns.VELOCITY, 2.0), **{
+        **dict.fromkeys(Columns.POSITION, np.nan), **dict.fromkeys(Columns.GYRO_BIAS, 0.0),
+        **dict.fromkeys(Columns.ACCELEROMETER_BIAS, 0.2), Columns.GYRO_BIAS[2]: 0.01,
+        **{name: 1.0 + n for n, name in enumerate(Columns.DELAYED_VARIANCE)},
     })  # fmt: skip
     delayed["attitude_down_rad2"] = states
-    state = pd.DataFrame(7.0, index=time, columns=STATE_COLUMNS).assign(down_m=time)
+    state = pd.DataFrame(7.0, index=time, columns=Columns.STATE).assign(down_m=time)
     record = made(FusionRecord, delayed=delayed, parameters={})
     return imu, attitude, made(Ekf2, state=state), record
 
@@ -318,7 +301,7 @@ def test_a_stretch_of_a_vehicle_that_turns() -> None:
     np.testing.assert_allclose(found.state[3:9], [2.0, 2.0, 2.0, 7.0, 7.0, 10.5])
     np.testing.assert_allclose(found.state[9:], 0.0)
     expected = np.arange(1.0, 16.0)
-    expected[DELAYED_VARIANCE_COLUMNS.index("attitude_down_rad2")] = 10.5
+    expected[Columns.DELAYED_VARIANCE.index("attitude_down_rad2")] = 10.5
     np.testing.assert_allclose(found.variance, expected)
     np.testing.assert_allclose(found.attitude_variance_rad2[:, 2], steps)
     np.testing.assert_allclose(found.down_m, steps)
@@ -326,7 +309,7 @@ def test_a_stretch_of_a_vehicle_that_turns() -> None:
         found.attitude_error_rad[:, 2], 0.05 + 0.1 * (steps - 10.5), atol=1e-6
     )
     assert found.fusing
-    flown[3].delayed[POSITION_COLUMNS] = 3.0
+    flown[3].delayed[Columns.POSITION] = 3.0
     np.testing.assert_allclose(_stretch(*flown, 5, 11.5).state[6:9], [3.0, 3.0, 10.5])
 
 

@@ -8,17 +8,7 @@ from scipy.spatial.transform import Rotation
 from ulog_tools import GENERATIONS, covariances, make_log, stamps, topic
 
 from px4fuse.alignment.joining import later
-from px4fuse.flight import (
-    ACCELEROMETER_BIAS_COLUMNS,
-    BODY_FIELD_COLUMNS,
-    DELAYED_STATE_COLUMNS,
-    DELAYED_VARIANCE_COLUMNS,
-    EARTH_FIELD_COLUMNS,
-    GYRO_BIAS_COLUMNS,
-    QUATERNION_COLUMNS,
-    Ekf2,
-    Unavailable,
-)
+from px4fuse.flight import Columns, Ekf2, Unavailable
 from px4fuse.readers import read_log
 
 QUATERNION = Rotation.from_euler("ZYX", [40.0, 10.0, -5.0], degrees=True).as_quat(scalar_first=True)
@@ -53,16 +43,16 @@ def made_log(generation, position=True):
 def test_states_and_variances_have_one_layout(record_of, generation):
     ekf2 = record_of(made_log(generation, position=generation != "v1.16"))
     record = ekf2.record
-    assert list(record.delayed) == DELAYED_STATE_COLUMNS + DELAYED_VARIANCE_COLUMNS
+    assert list(record.delayed) == Columns.DELAYED_STATE + Columns.DELAYED_VARIANCE
     row = record.delayed.iloc[3]
-    assert row[QUATERNION_COLUMNS].to_numpy() == pytest.approx(QUATERNION)
+    assert row[Columns.QUATERNION].to_numpy() == pytest.approx(QUATERNION)
     assert row["north_m_s"] == pytest.approx(0.5)
     assert row["down_m"] == pytest.approx(-1.5)
     old = generation in ("v1.12", "v1.14")
     assert record.per_step_biases == old
     per = ekf2.step_s if old else 1.0
-    assert row[GYRO_BIAS_COLUMNS].to_numpy() == pytest.approx(np.array([1, 2, 3]) * 1e-4 / per)
-    assert row[ACCELEROMETER_BIAS_COLUMNS].to_numpy() == pytest.approx(
+    assert row[Columns.GYRO_BIAS].to_numpy() == pytest.approx(np.array([1, 2, 3]) * 1e-4 / per)
+    assert row[Columns.ACCELEROMETER_BIAS].to_numpy() == pytest.approx(
         np.array([1, 2, 3]) * 1e-3 / per
     )
     if generation == "v1.16":
@@ -71,20 +61,20 @@ def test_states_and_variances_have_one_layout(record_of, generation):
     else:
         assert row["north_m"] == pytest.approx(3.0)
     logged = covariances(16)[4 if old else 3 :]
-    assert row[DELAYED_VARIANCE_COLUMNS[3:9]].to_numpy() == pytest.approx(logged[:6])
-    assert row[DELAYED_VARIANCE_COLUMNS[9:15]].to_numpy() == pytest.approx(logged[6:12] / per**2)
+    assert row[Columns.DELAYED_VARIANCE[3:9]].to_numpy() == pytest.approx(logged[:6])
+    assert row[Columns.DELAYED_VARIANCE[9:15]].to_numpy() == pytest.approx(logged[6:12] / per**2)
     # the fields of a magnetometer
-    fields = [*EARTH_FIELD_COLUMNS, *BODY_FIELD_COLUMNS]
+    fields = [*Columns.EARTH_FIELD, *Columns.BODY_FIELD]
     assert row[fields].to_numpy() == pytest.approx(STATES[16:])
     of_fields = covariances(22 if old else 21)[-6:]
-    assert row[DELAYED_VARIANCE_COLUMNS[15:]].to_numpy() == pytest.approx(of_fields)
+    assert row[Columns.DELAYED_VARIANCE[15:]].to_numpy() == pytest.approx(of_fields)
 
 
 def test_attitude_variance_of_a_quaternion_is_that_of_many_draws(record_of):
     log = made_log("v1.14")
     variance = np.array([1e-5, 4e-5, 2e-5, 3e-5])
     log["estimator_states"]["covariances"][:, :4] = variance
-    found = record_of(log).record.delayed.iloc[0][DELAYED_VARIANCE_COLUMNS[:3]].to_numpy()
+    found = record_of(log).record.delayed.iloc[0][Columns.DELAYED_VARIANCE[:3]].to_numpy()
     rng = np.random.default_rng(7)
     drawn = QUATERNION + rng.normal(0.0, np.sqrt(variance), (200_000, 4))
     truth = Rotation.from_quat(QUATERNION, scalar_first=True)

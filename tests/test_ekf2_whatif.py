@@ -45,7 +45,7 @@ from px4fuse.ekf2_parameters import GNSS_POS
 from px4fuse.filter.kalman import Replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
-from px4fuse.flight import STATE_COLUMNS, Flight, Truth, Unavailable
+from px4fuse.flight import Columns, Flight, Truth, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate, to_ulog
 from px4fuse.simulation.mistakes import parse
@@ -173,7 +173,7 @@ def test_the_longest_run_of_rejections_is_said_with_how_far_it_led() -> None:
         {"rejected": [0, 1, 0, 0, 1, 1, 1, 0, 1, 1], "fused_at_s": taken + 0.5}, index=taken
     )
     time = np.arange(20.0, 31.0, 0.5)
-    still = pd.DataFrame(0.0, index=time, columns=STATE_COLUMNS)
+    still = pd.DataFrame(0.0, index=time, columns=Columns.STATE)
     away = still.copy()
     away.iloc[:, 0] = np.where(time == 26.5, 3.0, 0.0)
     away.iloc[:, 1] = np.where(time == 26.5, -4.0, np.where(time < 24.0, 99.0, 0.0))
@@ -191,7 +191,7 @@ def test_the_longest_run_of_rejections_is_said_with_how_far_it_led() -> None:
 
 def test_errors_to_the_truth_are_of_its_own_span() -> None:
     times, direction = np.array([9.0, 10.0, 15.0, 20.0, 21.0]), np.array([0.6, 0.8, 0.0])
-    frame = pd.DataFrame(0.0, index=[10.0, 20.0], columns=STATE_COLUMNS)
+    frame = pd.DataFrame(0.0, index=[10.0, 20.0], columns=Columns.STATE)
     truth = made(Truth, samples=frame.assign(north_m=[0.0, 2.0], east_m=2.0))
     there = along(truth.samples, ["north_m", "east_m"], direction, times)
     assert there == pytest.approx([1.6, 1.6, 2.2, 2.8, 2.8])

@@ -62,7 +62,7 @@ from px4fuse.findings import (
     source_stamps,
 )
 from px4fuse.findings.model import moments, share_on, spans_at
-from px4fuse.flight import SPECIFIC_FORCE_COLUMNS, FusionRecord, Reset, Unavailable
+from px4fuse.flight import Columns, FusionRecord, Reset, Unavailable
 from px4fuse.origin import ALIGNED, GNSS, KEPT, MOTION_CAPTURE, REBUILT, RECEIVED
 from px4fuse.recording import Dropout
 
@@ -462,7 +462,7 @@ def bias_of_ekf2(*bias: float) -> dict[str, Any]:
     """EKF2's bias in the segment, and another one outside it."""
     rows = [[9.0] * 3, bias, bias, bias, [9.0] * 3]
     index = [9.0, 10.0, 50.0, 110.0, 111.0]
-    return {"accelerometer_bias": pd.DataFrame(rows, index=index, columns=SPECIFIC_FORCE_COLUMNS)}
+    return {"accelerometer_bias": pd.DataFrame(rows, index=index, columns=Columns.SPECIFIC_FORCE)}
 
 
 def clock_map(method: str = "TIMESYNC", distinct: int | None = None, jitter_s: float = 0.02) -> Any:

@@ -22,16 +22,7 @@ from px4fuse.ekf2.model import MODEL_NOTE
 from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import NAMES, Finding, by_root, find
-from px4fuse.flight import (
-    AXIS_NAMES,
-    QUATERNION_COLUMNS,
-    SPECIFIC_FORCE_COLUMNS,
-    Alignment,
-    Ekf2,
-    Flight,
-    Reset,
-    Unavailable,
-)
+from px4fuse.flight import AXIS_NAMES, Alignment, Columns, Ekf2, Flight, Reset, Unavailable
 from px4fuse.origin import ALIGNED, KEPT
 from px4fuse.readers import read_log
 from px4fuse.recording import ClockMap, Dropout
@@ -105,7 +96,7 @@ def as_recording(flight: Flight) -> Flight:
 
 def biased(flight: Flight) -> Flight:
     """EKF2 that found a bias along the body's axes."""
-    none = flight.ekf2.state.iloc[:, :3].set_axis(SPECIFIC_FORCE_COLUMNS, axis=1) * 0.0
+    none = flight.ekf2.state.iloc[:, :3].set_axis(Columns.SPECIFIC_FORCE, axis=1) * 0.0
     return with_ekf2(accelerometer_bias=none + np.array([0.2, -0.1, 0.2]))(flight)
 
 
@@ -114,7 +105,7 @@ def as_odometry(flight: Flight) -> Flight:
     (track,) = flight.positions
     turn = np.linspace(0.0, 0.5, len(track.samples))
     quaternions = np.column_stack([np.cos(turn), 0.0 * turn, 0.0 * turn, np.sin(turn)])
-    orientation = pd.DataFrame(quaternions, index=track.samples.index, columns=QUATERNION_COLUMNS)
+    orientation = pd.DataFrame(quaternions, index=track.samples.index, columns=Columns.QUATERNION)
     return with_source(orientation=orientation, origin=replace(track.origin, kind="vio"))(flight)
 
 

@@ -15,7 +15,7 @@ from px4fuse.ekf2.flow import FlowSamples, fuse_flow, gather_flow, with_flow
 from px4fuse.ekf2.inputs import read_gnss
 from px4fuse.ekf2.model import Model, open_model, replay_settings
 from px4fuse.ekf2.whatif import what_if
-from px4fuse.flight import VELOCITY_COLUMNS, Ekf2, Flight, FusionRecord, Reset, Truth
+from px4fuse.flight import Columns, Ekf2, Flight, FusionRecord, Reset, Truth
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_innovations import with_gnss
 from px4fuse.simulation.flights import simulate_flight
@@ -44,7 +44,7 @@ def true_velocity(times: np.ndarray) -> np.ndarray:
     truth = model().flight.truth
     assert isinstance(truth, Truth)
     return np.column_stack([np.interp(times, truth.samples.index, truth.samples[column])
-                            for column in VELOCITY_COLUMNS])  # fmt: skip
+                            for column in Columns.VELOCITY])  # fmt: skip
 
 
 def flow_of(noise_m_s: float = 0.0, every: int = 10) -> pd.DataFrame:

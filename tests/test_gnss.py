@@ -29,14 +29,7 @@ from px4fuse.ekf2.replay import rms, settled
 from px4fuse.ekf2.whatif import Summary, WhatIf, what_if
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.findings import find, noises
-from px4fuse.flight import (
-    POSITION_COLUMNS,
-    Ekf2,
-    Flight,
-    FusionRecord,
-    PositionTrack,
-    Unavailable,
-)
+from px4fuse.flight import Columns, Ekf2, Flight, FusionRecord, PositionTrack, Unavailable
 from px4fuse.origin import GNSS
 from px4fuse.readers import px4_fixes, read_log
 from px4fuse.readers.px4_fixes import rebuilt_fixes
@@ -110,7 +103,7 @@ def test_fixes_are_where_and_when_ekf2_takes_them_to_be(generation: str, tmp_pat
     times = track.samples.index.to_numpy()
     np.testing.assert_allclose(times, seconds_of(stamps(SECONDS, 5.0, 0.2)), atol=1e-6)
     exact_m = 0.012 if generation in ("v1.9", "v1.12") else 1e-4  # 1e-7 degrees
-    measured = track.samples[POSITION_COLUMNS].to_numpy()
+    measured = track.samples[Columns.POSITION].to_numpy()
     np.testing.assert_allclose(measured, position(times), atol=exact_m)
     assert track.clock == "autopilot boot clock, less 110 ms (EKF2_GPS_DELAY)"
     # EKF2 takes eph for each axis
@@ -174,8 +167,8 @@ def test_positions_are_those_of_the_vehicle_where_the_antenna_is_elsewhere(tmp_p
     turned = Slerp(known, Rotation.from_quat(
         moved.attitude.to_numpy(copy=True), scalar_first=True
     ))(np.clip(at, known[0], known[-1]))  # fmt: skip
-    expected = antenna.samples[POSITION_COLUMNS].to_numpy() - turned.apply([0.3, 0.0, -0.2])
-    np.testing.assert_allclose(vehicle.samples[POSITION_COLUMNS], expected, atol=1e-4)
+    expected = antenna.samples[Columns.POSITION].to_numpy() - turned.apply([0.3, 0.0, -0.2])
+    np.testing.assert_allclose(vehicle.samples[Columns.POSITION], expected, atol=1e-4)
     assert compare(flight_of(outdoors(), tmp_path)).source.notes == ()
 
 
@@ -315,7 +308,7 @@ def test_the_truth_lies_about_ekf2_s_origin_where_that_is_a_fix(
     log.add(topic("vehicle_local_position_groundtruth", times, about_home | velocity), everywhere)
     truth = flight_of(log, tmp_path).truth
     expected = here if fused else here - shift
-    np.testing.assert_allclose(truth.samples[POSITION_COLUMNS], expected, atol=1e-3)
+    np.testing.assert_allclose(truth.samples[Columns.POSITION], expected, atol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -603,7 +596,7 @@ def test_fixes_that_the_logger_left_out_are_filled_in(tmp_path: Path) -> None:
     assert "3 positions of GNSS that the logger left out are from" in " ".join(found.notes)
     whole = whole.drop(index=whole.index[60])
     np.testing.assert_allclose(found.samples.index, whole.index, atol=1e-6)
-    np.testing.assert_allclose(found.samples[POSITION_COLUMNS], whole[POSITION_COLUMNS], atol=0.05)
+    np.testing.assert_allclose(found.samples[Columns.POSITION], whole[Columns.POSITION], atol=0.05)
     np.testing.assert_allclose(found.velocity.loc[found.samples.index[50], "east_m_s"], 2.0)
     assert "3 of their heights are interpolated" in " ".join(found.notes)
     # EKF2 has their heights too, beside its bias of them where they are not its reference
@@ -737,9 +730,9 @@ def test_fixes_between_the_logged_ones_are_rebuilt(
     assert "to within 0.0" in note
     true = every.iloc[np.abs(taken[:, None] - made.index.to_numpy()).argmin(axis=0)]
     assert np.abs(true.index - made.index).max() < 0.01
-    error = (made[POSITION_COLUMNS[:2]] - true[POSITION_COLUMNS[:2]].to_numpy()).to_numpy()
+    error = (made[Columns.POSITION[:2]] - true[Columns.POSITION[:2]].to_numpy()).to_numpy()
     assert np.sqrt(np.mean(error**2)) < 0.1
-    assert np.isfinite(made[POSITION_COLUMNS]).all(axis=None)
+    assert np.isfinite(made[Columns.POSITION]).all(axis=None)
     # and not where they would be wrong
     wrong = replace(log, samples=rows.assign(innovation_north=rows["innovation_north"] + 0.5))
     bad = replace(ekf2, aids=dict(ekf2.aids) | {"gnss_pos": wrong})

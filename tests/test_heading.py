@@ -14,7 +14,7 @@ from px4fuse.comparison.preparation import choose_segment, choose_source
 from px4fuse.filter import heading
 from px4fuse.filter.heading import DRIFT_P, HeadingError, HeadingPart, heading_error
 from px4fuse.filter.settings import Settings
-from px4fuse.flight import QUATERNION_COLUMNS, ROTATION_VARIANCE_COLUMNS, Flight, Unavailable
+from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
@@ -37,10 +37,10 @@ def estimated(flight: Flight, sigma_z_m: float = SIGMA_UWB_M) -> HeadingError | 
 
 def turned(quaternions: pd.DataFrame, turn_deg: np.ndarray) -> pd.DataFrame:
     """The same orientations with a heading that is wrong."""
-    values = quaternions[QUATERNION_COLUMNS].to_numpy(copy=True)
+    values = quaternions[Columns.QUATERNION].to_numpy(copy=True)
     wrong = Rotation.from_euler("Z", turn_deg[:, None], degrees=True)
     made = (wrong * Rotation.from_quat(values, scalar_first=True)).as_quat(scalar_first=True)
-    return pd.DataFrame(made, index=quaternions.index, columns=QUATERNION_COLUMNS)
+    return pd.DataFrame(made, index=quaternions.index, columns=Columns.QUATERNION)
 
 
 def wandering(flight: Flight) -> tuple[Flight, np.ndarray]:
@@ -65,7 +65,7 @@ def test_a_heading_that_wanders_is_followed(by):
     plain = flown(passes=6 if by == "positions" else 4)
     flight, turn = wandering(plain)
     if by == "orientation":
-        oriented = plain.attitude.iloc[::4].assign(**dict.fromkeys(ROTATION_VARIANCE_COLUMNS, 1e-4))
+        oriented = plain.attitude.iloc[::4].assign(**dict.fromkeys(Columns.ROTATION_VARIANCE, 1e-4))
         tracks = tuple(replace(track, orientation=oriented) for track in flight.positions)
         flight = replace(flight, positions=tracks)
     found = estimated(flight)

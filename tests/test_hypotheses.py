@@ -30,7 +30,7 @@ from px4fuse.findings import (
     source_positions,
     source_stamps,
 )
-from px4fuse.flight import POSITION_VARIANCE_COLUMNS, Flight, Unavailable
+from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
@@ -256,7 +256,7 @@ def test_the_age_of_what_is_published_shows_when_the_clocks_were_synchronised(
 
 def without_variances(flight: Flight) -> Flight:
     (track,) = flight.positions
-    samples = track.samples.assign(**dict.fromkeys(POSITION_VARIANCE_COLUMNS, np.nan))
+    samples = track.samples.assign(**dict.fromkeys(Columns.POSITION_VARIANCE, np.nan))
     return replace(flight, positions=(replace(track, samples=samples),))
 
 

@@ -33,7 +33,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import find
 from px4fuse.findings.story import story
-from px4fuse.flight import SPECIFIC_FORCE_COLUMNS, Unavailable
+from px4fuse.flight import Columns, Unavailable
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
@@ -105,7 +105,7 @@ def test_a_bias_that_is_taken_out_is_an_imu_without_it() -> None:
     analysis = flown("accel-bias=0.5")
     found, imu = cause(analysis, "kf"), analysis.flight.imu
     assert isinstance(imu, pd.DataFrame)
-    without = imu[SPECIFIC_FORCE_COLUMNS] - [found.change[FORWARD], found.change[TO_RIGHT], 0.0]
+    without = imu[Columns.SPECIFIC_FORCE] - [found.change[FORWARD], found.change[TO_RIGHT], 0.0]
     flight = replace(analysis.flight, imu=imu.assign(**without))
     again = compare(flight, analysis.settings).axes["aisle"].filters["kf"]
     assert isinstance(again, FilterSummary)

@@ -12,7 +12,7 @@ from ulog_tools import load
 
 from px4fuse.alignment.joining import join, later
 from px4fuse.errors import MissingDataError
-from px4fuse.flight import AXIS_NAMES, POSITION_COLUMNS, Flight, FlightMode, Reset, Unavailable
+from px4fuse.flight import AXIS_NAMES, Columns, Flight, FlightMode, Reset, Unavailable
 from px4fuse.readers import read_log
 
 POSITION_TOPICS = ("vehicle_visual_odometry", "estimator_aid_src_ev_pos")
@@ -64,13 +64,13 @@ def test_a_ulog_without_positions_gets_them_back_and_keeps_what_it_has(
     mine = joined.positions[0].samples
     truth = track(sample_flight, "vehicle_visual_odometry").samples
     ours, theirs = (
-        samples[POSITION_COLUMNS].set_axis(pd.Index(boot(flight, samples), name="t"))
+        samples[Columns.POSITION].set_axis(pd.Index(boot(flight, samples), name="t"))
         for flight, samples in ((joined, mine), (sample_flight, truth))
     )
     nearest = pd.merge_asof(
         theirs, ours, left_index=True, right_index=True, direction="nearest", tolerance=1e-3
     )
-    left, right = (nearest[[c + end for c in POSITION_COLUMNS]] for end in ("_x", "_y"))
+    left, right = (nearest[[c + end for c in Columns.POSITION]] for end in ("_x", "_y"))
     np.testing.assert_allclose(left, right, atol=1e-6)
     assert joined.log.boot_time_s == stripped.log.boot_time_s
     for part in ("imu", "attitude", "truth", "airborne"):

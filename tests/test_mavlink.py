@@ -47,22 +47,7 @@ from scipy.spatial.transform import Rotation
 from px4fuse.comparison.comparison import compare
 from px4fuse.errors import LogError, MissingDataError, Px4FuseError
 from px4fuse.findings import find
-from px4fuse.flight import (
-    ANGULAR_RATE_COLUMNS,
-    POSITION_COLUMNS,
-    POSITION_VARIANCE_COLUMNS,
-    QUATERNION_COLUMNS,
-    ROTATION_VARIANCE_COLUMNS,
-    SPECIFIC_FORCE_COLUMNS,
-    STATE_COLUMNS,
-    VELOCITY_COLUMNS,
-    VELOCITY_VARIANCE_COLUMNS,
-    Ekf2,
-    Flight,
-    PositionTrack,
-    Truth,
-    Unavailable,
-)
+from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable
 from px4fuse.inspect.inventory import take_inventory
 from px4fuse.origin import MOTION_CAPTURE, RECEIVED
 from px4fuse.readers import read_log
@@ -72,7 +57,7 @@ from px4fuse.readers.mavlink_recording import _in_ned
 from px4fuse.readers.px4_positions import unproject
 
 FUZZ_CASES = int(os.environ.get("PX4FUSE_FUZZ_CASES", "60"))
-VARIANCE_COLUMNS = POSITION_VARIANCE_COLUMNS + VELOCITY_VARIANCE_COLUMNS
+VARIANCE_COLUMNS = Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE
 PAIRS = ("v1.13.3_aisle_hwlogvision", "v1.16.1_aisle_clock_late", "v1.16.1_aisle_clock_nosync")
 
 
@@ -123,14 +108,14 @@ def test_the_made_flight_comes_back(read):
     assert flight.log.boot_time_s == BOOT_S
     assert flight.log.duration_s == pytest.approx(39.99, abs=1e-6)
     force = np.array([aisle.path(t)[2] - [0, 0, GRAVITY_M_S2] for t in boot(flight, flight.imu)])
-    np.testing.assert_allclose(flight.imu[SPECIFIC_FORCE_COLUMNS], force, atol=1e-5)
+    np.testing.assert_allclose(flight.imu[Columns.SPECIFIC_FORCE], force, atol=1e-5)
     assert len(flight.imu) == 2000
     np.testing.assert_array_equal(
-        flight.attitude[QUATERNION_COLUMNS], np.tile([1.0, 0, 0, 0], (800, 1))
+        flight.attitude[Columns.QUATERNION], np.tile([1.0, 0, 0, 0], (800, 1))
     )
     state = flight.ekf2.state
     expected = np.array([np.hstack(aisle.path(t)[:2]) for t in boot(flight, state)])
-    np.testing.assert_allclose(state[STATE_COLUMNS], expected, atol=1e-5)
+    np.testing.assert_allclose(state[Columns.STATE], expected, atol=1e-5)
     np.testing.assert_allclose(boot(flight, state), aisle.times(20.0), atol=1e-6)
     variances = np.tile([*POSE_VARIANCE, *VELOCITY_VARIANCE], (800, 1))
     np.testing.assert_allclose(flight.ekf2.variance[VARIANCE_COLUMNS], variances, rtol=1e-6)
@@ -142,7 +127,7 @@ def test_the_made_flight_comes_back(read):
         "VISION_POSITION_ESTIMATE", RECEIVED, "NED",
     )  # fmt: skip
     np.testing.assert_allclose(
-        track.samples[POSITION_VARIANCE_COLUMNS], np.tile(POSE_VARIANCE, (200, 1)), rtol=1e-6
+        track.samples[Columns.POSITION_VARIANCE], np.tile(POSE_VARIANCE, (200, 1)), rtol=1e-6
     )
 
 
@@ -190,9 +175,9 @@ def test_scaled_imu_is_in_milli_g_and_milliradians(read, name):
     imu = read(recorder).imu
     assert len(imu) == 2000
     np.testing.assert_allclose(
-        imu[SPECIFIC_FORCE_COLUMNS].iloc[0], [9.80665, -4.903325, -9.80665], rtol=1e-12
+        imu[Columns.SPECIFIC_FORCE].iloc[0], [9.80665, -4.903325, -9.80665], rtol=1e-12
     )
-    np.testing.assert_allclose(imu[ANGULAR_RATE_COLUMNS].iloc[0], [1.0, -0.02, 0.003], rtol=1e-12)
+    np.testing.assert_allclose(imu[Columns.ANGULAR_RATE].iloc[0], [1.0, -0.02, 0.003], rtol=1e-12)
 
 
 def test_raw_imu_is_refused_with_the_reason(read):
@@ -224,7 +209,7 @@ def test_euler_angles_become_the_quaternion_that_turns_frd_into_ned(read):
     ))  # fmt: skip
     flight = read(recorder)
     assert flight.streams["attitude"].topics == ("ATTITUDE",)
-    got = Rotation.from_quat(flight.attitude[QUATERNION_COLUMNS].to_numpy()[0], scalar_first=True)
+    got = Rotation.from_quat(flight.attitude[Columns.QUATERNION].to_numpy()[0], scalar_first=True)
     # first about the nose, then about the wing, then about the vertical
     about = [Rotation.from_rotvec(turn) for turn in ([roll, 0, 0], [0, pitch, 0], [0, 0, yaw])]
     expected = about[2].as_matrix() @ about[1].as_matrix() @ about[0].as_matrix()
@@ -258,8 +243,8 @@ def test_external_odometry_is_turned_into_ned(read, frame_id, name, position, va
         return
     [track] = flight.positions
     assert (track.name, track.frame) == ("ODOMETRY_VIO", name)
-    np.testing.assert_array_equal(track.samples[POSITION_COLUMNS].iloc[5], position)
-    np.testing.assert_allclose(track.samples[POSITION_VARIANCE_COLUMNS].iloc[5], variance)
+    np.testing.assert_array_equal(track.samples[Columns.POSITION].iloc[5], position)
+    np.testing.assert_allclose(track.samples[Columns.POSITION_VARIANCE].iloc[5], variance)
 
 
 @pytest.mark.parametrize("child", [8, 12])
@@ -272,9 +257,9 @@ def test_velocity_in_the_body_is_turned_with_its_variances(read, child):
     ))  # fmt: skip
     ekf2 = read(recorder).ekf2
     matrix = attitude.as_matrix()
-    np.testing.assert_allclose(ekf2.state[VELOCITY_COLUMNS].iloc[3], matrix @ velocity, atol=1e-6)
+    np.testing.assert_allclose(ekf2.state[Columns.VELOCITY].iloc[3], matrix @ velocity, atol=1e-6)
     np.testing.assert_allclose(
-        ekf2.variance[VELOCITY_VARIANCE_COLUMNS].iloc[3],
+        ekf2.variance[Columns.VELOCITY_VARIANCE].iloc[3],
         np.diag(matrix @ np.diag(VELOCITY_VARIANCE) @ matrix.T), rtol=1e-5,
     )  # fmt: skip
 
@@ -288,7 +273,7 @@ def test_velocity_in_a_fixed_frame_is_turned(read, child, expected):
         us(t), [1, 2, 3], [1.0, -0.5, 0.25], estimator=8, child=child,
     ))  # fmt: skip
     state = read(recorder).ekf2.state
-    np.testing.assert_array_equal(state[VELOCITY_COLUMNS].iloc[0], expected)
+    np.testing.assert_array_equal(state[Columns.VELOCITY].iloc[0], expected)
 
 
 @pytest.mark.parametrize(
@@ -304,7 +289,7 @@ def test_odometry_to_the_autopilot_is_a_position_by_its_estimator(read, estimato
     assert (track.name, track.origin, track.topics) == (name, origin, ("ODOMETRY",))
     assert len(track.samples) == 200
     assert len(flight.ekf2.state) == 800
-    given = track.samples[POSITION_VARIANCE_COLUMNS]
+    given = track.samples[Columns.POSITION_VARIANCE]
     if estimator == 1:
         assert given.isna().all(axis=None)
     else:
@@ -328,8 +313,8 @@ def test_motion_capture_is_truth_where_another_source_feeds_ekf2(read):
     flight = read(recorder)
     assert flight.truth.name == "ATT_POS_MOCAP"
     expected = np.array([aisle.path(t)[0] for t in aisle.times(50.0)])
-    np.testing.assert_allclose(flight.truth.samples[POSITION_COLUMNS], expected, atol=1e-5)
-    assert flight.truth.samples[VELOCITY_COLUMNS].isna().all(axis=None)
+    np.testing.assert_allclose(flight.truth.samples[Columns.POSITION], expected, atol=1e-5)
+    assert flight.truth.samples[Columns.VELOCITY].isna().all(axis=None)
     assert [t.name for t in flight.positions] == ["VISION_POSITION_ESTIMATE", "ATT_POS_MOCAP"]
 
 
@@ -372,9 +357,9 @@ def test_estimator_status_stands_in_for_variances(read, state):
     variance = flight.ekf2.variance
     assert flight.streams["ekf2_state"].topics == (state,)
     np.testing.assert_allclose(
-        variance[POSITION_VARIANCE_COLUMNS].iloc[0], [0.125, 0.125, 0.09], rtol=1e-6
+        variance[Columns.POSITION_VARIANCE].iloc[0], [0.125, 0.125, 0.09], rtol=1e-6
     )
-    assert variance[VELOCITY_VARIANCE_COLUMNS].isna().all(axis=None)
+    assert variance[Columns.VELOCITY_VARIANCE].isna().all(axis=None)
     assert flight.streams["ekf2_variance"].topics == ("ESTIMATOR_STATUS",)
     assert any("ESTIMATOR_STATUS" in note for note in flight.ekf2.notes)
 
@@ -414,13 +399,13 @@ def test_simulation_truth_is_projected_about_its_first_sample(read, name):
     start = aisle.path(BOOT_S)[0]
     expected = np.array([aisle.path(t)[0] - start for t in aisle.times(25.0)])
     got = flight.truth.samples
-    np.testing.assert_allclose(got[POSITION_COLUMNS[:2]], expected[:, :2], atol=0.012)
+    np.testing.assert_allclose(got[Columns.POSITION[:2]], expected[:, :2], atol=0.012)
     velocity = np.array([aisle.path(t)[1] for t in aisle.times(25.0)])
     if name == "SIMSTATE":
-        assert got[["down_m", *VELOCITY_COLUMNS]].isna().all(axis=None)
+        assert got[["down_m", *Columns.VELOCITY]].isna().all(axis=None)
     else:
         np.testing.assert_allclose(got["down_m"], expected[:, 2], atol=1e-3)
-        np.testing.assert_allclose(got[VELOCITY_COLUMNS], velocity, atol=5.1e-3)
+        np.testing.assert_allclose(got[Columns.VELOCITY], velocity, atol=5.1e-3)
 
 
 # ---- the log itself -----------------------------------------------------------------------------
@@ -529,8 +514,8 @@ def test_gnss_is_a_position_about_the_autopilots_origin(read, origin):
     assert (track.name, track.origin.by_gnss, track.origin.automatic) == ("GPS_RAW_INT", True, True)
     assert track.age_s == pytest.approx(0.11)
     true = np.array([Aisle().path(BOOT_S + t)[0] for t in track.samples.index])
-    assert track.samples[POSITION_COLUMNS].to_numpy() == pytest.approx(true, abs=0.02)
-    variance = track.samples[POSITION_VARIANCE_COLUMNS].iloc[0]
+    assert track.samples[Columns.POSITION].to_numpy() == pytest.approx(true, abs=0.02)
+    variance = track.samples[Columns.POSITION_VARIANCE].iloc[0]
     assert variance.to_numpy() == pytest.approx([0.09, 0.09, 0.25])
     result = compare(flight, sigma_z_given=False)
     assert result.source.name == "GPS_RAW_INT"
@@ -573,7 +558,7 @@ def test_a_receivers_own_clock_is_not_the_boot_clock(read):
     recorder = add(Aisle(uwb=None, state=state).record(), 5.0, lambda t: fix(t, at_s=unix(t)))
     (track,) = read(add(recorder, 2.0, global_state)).positions
     true = np.array([Aisle().path(BOOT_S + t)[0] for t in track.samples.index])
-    assert track.samples[POSITION_COLUMNS].to_numpy() == pytest.approx(true, abs=0.03)
+    assert track.samples[Columns.POSITION].to_numpy() == pytest.approx(true, abs=0.03)
 
 
 def test_an_empty_recording_of_heartbeats_lacks_everything_by_name(read):
@@ -597,7 +582,7 @@ def stamp_differences(tlog: Flight, ulog: Flight) -> tuple[np.ndarray, np.ndarra
     theirs = track_of(ulog, "vehicle_visual_odometry").samples
 
     def keys(samples: pd.DataFrame) -> list[tuple[float, ...]]:
-        single = samples[POSITION_COLUMNS].to_numpy().astype(np.float32)
+        single = samples[Columns.POSITION].to_numpy().astype(np.float32)
         return [tuple(row) for row in single.tolist()]
 
     at = {key: row for row, key in enumerate(keys(theirs))}
@@ -619,11 +604,11 @@ def differences(
 
 def same_flight(tlog: Flight, ulog: Flight) -> None:
     """EKF2's state, the attitude and the truth, which do not depend on the companion's clock."""
-    states = differences(tlog, ulog, tlog.ekf2.state, ulog.ekf2.state, POSITION_COLUMNS)
+    states = differences(tlog, ulog, tlog.ekf2.state, ulog.ekf2.state, Columns.POSITION)
     assert len(states) > 1000
     assert np.abs(np.median(states, axis=0)).max() < 1e-3
     assert np.percentile(np.abs(states), 99) < 0.02
-    speeds = differences(tlog, ulog, tlog.ekf2.state, ulog.ekf2.state, VELOCITY_COLUMNS)
+    speeds = differences(tlog, ulog, tlog.ekf2.state, ulog.ekf2.state, Columns.VELOCITY)
     assert np.abs(np.median(speeds, axis=0)).max() < 2e-3
     assert np.percentile(np.abs(speeds), 99) < 0.06
     nearest = pd.merge_asof(
@@ -633,12 +618,12 @@ def same_flight(tlog: Flight, ulog: Flight) -> None:
     ).dropna()  # fmt: skip
     assert len(nearest) > 1000
     one, other = (
-        Rotation.from_quat(nearest[[c + s for c in QUATERNION_COLUMNS]].to_numpy(copy=True),
+        Rotation.from_quat(nearest[[c + s for c in Columns.QUATERNION]].to_numpy(copy=True),
                            scalar_first=True)
         for s in ("_x", "_y")
     )  # fmt: skip
     assert np.degrees(np.median((one.inv() * other).magnitude())) < 0.5
-    truth = differences(tlog, ulog, tlog.truth.samples, ulog.truth.samples, POSITION_COLUMNS)
+    truth = differences(tlog, ulog, tlog.truth.samples, ulog.truth.samples, Columns.POSITION)
     assert len(truth) > 1000
     # projected about the first sample of either recording, some millimetres apart
     assert np.abs(np.median(truth, axis=0)).max() < 0.015
@@ -765,8 +750,8 @@ class Chunks:
             assert (np.diff(times) > 0.0).all()
             assert not np.isinf(table.to_numpy()).any()
         for track in flight.positions:
-            assert np.isfinite(track.samples[POSITION_COLUMNS].to_numpy()).all()
-            assert not (track.samples[POSITION_VARIANCE_COLUMNS].to_numpy() <= 0.0).any()
+            assert np.isfinite(track.samples[Columns.POSITION].to_numpy()).all()
+            assert not (track.samples[Columns.POSITION_VARIANCE].to_numpy() <= 0.0).any()
         for clock in flight.clocks:
             assert np.isfinite([clock.offset_s, clock.drift_ppm, clock.jitter_s]).all()
         assert np.isfinite([flight.log.boot_time_s, flight.log.duration_s]).all()
@@ -856,13 +841,13 @@ def test_an_orientation_is_believed_only_where_the_frame_is_ned_or_frd(
 ) -> None:
     """What a sender of ENU or FLU calls its body is not known."""
     columns = [
-        *STATE_COLUMNS, *POSITION_VARIANCE_COLUMNS, *VELOCITY_VARIANCE_COLUMNS, *QUATERNION_COLUMNS,
-        *ROTATION_VARIANCE_COLUMNS,
+        *Columns.STATE, *Columns.POSITION_VARIANCE, *Columns.VELOCITY_VARIANCE, *Columns.QUATERNION,
+        *Columns.ROTATION_VARIANCE,
     ]  # fmt: skip
     samples = pd.DataFrame(0.5, index=[1.0, 2.0], columns=columns)
     samples["frame_id"] = samples["child_frame_id"] = frame_id
     made = _in_ned(samples)
-    assert np.isfinite(made[POSITION_VARIANCE_COLUMNS]).all(axis=None)
-    orientation = made[QUATERNION_COLUMNS + ROTATION_VARIANCE_COLUMNS].to_numpy()
+    assert np.isfinite(made[Columns.POSITION_VARIANCE]).all(axis=None)
+    orientation = made[Columns.QUATERNION + Columns.ROTATION_VARIANCE].to_numpy()
     assert np.isfinite(orientation).all() == kept
     assert np.isfinite(orientation).any() == kept

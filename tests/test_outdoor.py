@@ -27,7 +27,7 @@ from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find, source_clock
 from px4fuse.findings.story import story
-from px4fuse.flight import POSITION_COLUMNS, QUATERNION_COLUMNS, VELOCITY_COLUMNS, Unavailable
+from px4fuse.flight import Columns, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_positions import project, unproject
 from px4fuse.simulation import sensors
@@ -74,8 +74,8 @@ def test_fixes_are_the_truth_with_the_stated_noise_at_the_age_that_ekf2_takes(
     assert track.rate_hz == pytest.approx(5.0, rel=0.01)
     assert track.velocity is not None
     for measured, columns, sigma in (
-        (track.samples, POSITION_COLUMNS, 0.4),
-        (track.velocity, VELOCITY_COLUMNS, 0.3),
+        (track.samples, Columns.POSITION, 0.4),
+        (track.velocity, Columns.VELOCITY, 0.3),
     ):
         for column, times in zip(columns, (1.0, 1.0, 1.5), strict=True):
             true = np.interp(measured.index, truth.samples.index, truth.samples[column])
@@ -99,7 +99,7 @@ def test_field_and_height_are_the_truth_with_their_noise(tmp_path: Path) -> None
     measured = record.field_gauss
     true = interpolate(
         measured.index.to_numpy(), flight.truth.attitude.index.to_numpy(),
-        flight.truth.attitude[QUATERNION_COLUMNS].to_numpy(),
+        flight.truth.attitude[Columns.QUATERNION].to_numpy(),
     )  # fmt: skip
     expected = np.einsum("nji,j->ni", matrix(true), sensors.EARTH_FIELD_GAUSS)
     off = measured.drop(columns="fused_3d").to_numpy() - expected

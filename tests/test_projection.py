@@ -15,12 +15,7 @@ from px4fuse.comparison.projection import (
     project_innovations,
 )
 from px4fuse.filter.signals import Axis, Segment, make_axes
-from px4fuse.flight import (
-    POSITION_VARIANCE_COLUMNS,
-    Alignment,
-    Flight,
-    Unavailable,
-)
+from px4fuse.flight import Alignment, Columns, Flight, Unavailable
 from px4fuse.origin import MOTION_CAPTURE
 
 WHOLE = Segment(0.0, 40.0, "")
@@ -163,10 +158,10 @@ def test_the_observation_noise_is_ekf2s_own_rule(
     made = flight(parameters=parameters)
     (track,) = made.positions
     if reported_m is not None:
-        variances = dict(zip(POSITION_VARIANCE_COLUMNS, np.square(reported_m), strict=True))
+        variances = dict(zip(Columns.POSITION_VARIANCE, np.square(reported_m), strict=True))
         # one sample that says otherwise does not change the median
         samples = track.samples.assign(**variances)
-        samples.iloc[10, samples.columns.get_indexer(POSITION_VARIANCE_COLUMNS)] = 100.0
+        samples.iloc[10, samples.columns.get_indexer(Columns.POSITION_VARIANCE)] = 100.0
         track = replace(track, samples=samples)
     aisle = axes_of(made)["aisle"]
     assert observation_variance(made, track, aisle, WHOLE) == pytest.approx(expected_m2)

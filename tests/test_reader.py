@@ -31,14 +31,7 @@ from ulog_tools import (
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.errors import MissingDataError
-from px4fuse.flight import (
-    POSITION_COLUMNS,
-    POSITION_VARIANCE_COLUMNS,
-    VELOCITY_COLUMNS,
-    VELOCITY_VARIANCE_COLUMNS,
-    Reset,
-    Unavailable,
-)
+from px4fuse.flight import Columns, Reset, Unavailable
 from px4fuse.origin import ALIGNED, GNSS, KEPT, MOTION_CAPTURE, REBUILT, RECEIVED
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S
@@ -89,10 +82,10 @@ def test_external_vision_is_read(read, generation):
     expected = seconds_of(ev_stamps(10.0))
     np.testing.assert_allclose(times(track.samples), expected, atol=1e-9)
     np.testing.assert_allclose(
-        track.samples[POSITION_COLUMNS], position(expected) + ev_error(expected), **FLOAT32
+        track.samples[Columns.POSITION], position(expected) + ev_error(expected), **FLOAT32
     )
     np.testing.assert_allclose(
-        track.samples[POSITION_VARIANCE_COLUMNS],
+        track.samples[Columns.POSITION_VARIANCE],
         np.tile(EV_VARIANCE, (len(expected), 1)),
         **FLOAT32,
     )
@@ -158,8 +151,8 @@ def test_state_and_imu_are_read(read, generation):
     flight = read(make_log(generation))
     state = flight.ekf2.state
     np.testing.assert_allclose(times(state), seconds_of(stamps(10.0, 10.0)), atol=1e-9)
-    np.testing.assert_allclose(state[POSITION_COLUMNS], position(times(state)), **FLOAT32)
-    np.testing.assert_allclose(state[VELOCITY_COLUMNS], np.tile(VELOCITY, (100, 1)), **FLOAT32)
+    np.testing.assert_allclose(state[Columns.POSITION], position(times(state)), **FLOAT32)
+    np.testing.assert_allclose(state[Columns.VELOCITY], np.tile(VELOCITY, (100, 1)), **FLOAT32)
     assert len(flight.imu) == 1000
     np.testing.assert_allclose(flight.imu["down_m_s2"], -GRAVITY, rtol=1e-6)
     assert (flight.attitude == [1.0, 0.0, 0.0, 0.0]).all(axis=None)
@@ -180,8 +173,8 @@ def test_variances_are_picked_by_the_lengths_of_the_arrays(
     variance = read(make_log(generation)).ekf2.variance
     expected = covariances(24)
     for columns, first in (
-        (VELOCITY_VARIANCE_COLUMNS, first_velocity),
-        (POSITION_VARIANCE_COLUMNS, first_position),
+        (Columns.VELOCITY_VARIANCE, first_velocity),
+        (Columns.POSITION_VARIANCE, first_position),
     ):
         np.testing.assert_allclose(
             variance[columns], np.tile(expected[first : first + 3], (len(variance), 1)), rtol=1e-6
@@ -217,7 +210,7 @@ def test_frames_of_external_vision(read, generation, code, frame):
 def test_a_variance_that_was_not_given_is_nan(read, value):
     log = make_log("v1.16")
     log["vehicle_visual_odometry"]["position_variance"][:] = value
-    assert read(log).positions[0].samples[POSITION_VARIANCE_COLUMNS].isna().all(axis=None)
+    assert read(log).positions[0].samples[Columns.POSITION_VARIANCE].isna().all(axis=None)
 
 
 # ---- time -----------------------------------------------------------------------------------
@@ -503,10 +496,10 @@ def test_ekf2s_own_delay_is_added_back_to_its_observations(read, delay_ms):
     expected = seconds_of(ev_stamps(10.0))
     np.testing.assert_allclose(times(track.samples), expected, atol=1e-9)
     np.testing.assert_allclose(
-        track.samples[POSITION_COLUMNS], position(expected) + ev_error(expected), **FLOAT32
+        track.samples[Columns.POSITION], position(expected) + ev_error(expected), **FLOAT32
     )
     np.testing.assert_allclose(
-        track.samples[POSITION_VARIANCE_COLUMNS],
+        track.samples[Columns.POSITION_VARIANCE],
         np.tile(EV_VARIANCE, (len(expected), 1)),
         **FLOAT32,
     )
@@ -542,7 +535,7 @@ def test_state_plus_innovation_is_the_measurement(read, generation):
     track, _ = choose_source(read(log))
     assert (track.name, track.origin) == ("ekf2_state_plus_innovation", REBUILT)
     expected = position(times(track.samples)) + ev_error(times(track.samples))
-    np.testing.assert_allclose(track.samples[POSITION_COLUMNS], expected, atol=1e-5)
+    np.testing.assert_allclose(track.samples[Columns.POSITION], expected, atol=1e-5)
     assert len(track.samples) >= len(ev_stamps(10.0)) - 1
 
 
@@ -556,8 +549,8 @@ def test_simulation_truth_is_read(read):
     fields |= {name: np.full(len(at), 0.25) for name in ("vx", "vy", "vz")}
     flight = read(make_log("v1.16").add(topic("vehicle_local_position_groundtruth", at, fields)))
     assert flight.truth.name == "vehicle_local_position_groundtruth"
-    np.testing.assert_allclose(flight.truth.samples[POSITION_COLUMNS], here, **FLOAT32)
-    assert (flight.truth.samples[VELOCITY_COLUMNS] == 0.25).all(axis=None)
+    np.testing.assert_allclose(flight.truth.samples[Columns.POSITION], here, **FLOAT32)
+    assert (flight.truth.samples[Columns.VELOCITY] == 0.25).all(axis=None)
 
 
 def test_motion_capture_is_truth_only_where_something_else_feeds_ekf2(read):
@@ -643,7 +636,7 @@ def test_simulated_uwb_is_read_as_it_was_sent(shared_logs, name):
     axes = slice(0, 2) if track.origin == KEPT else slice(0, 3)  # EKF2 kept no height in these
     sent_z = np.array([sample["z"] for sample in sent["uwb"]])[:, axes]
     sent_s = np.array([sample["t_px4_us"] for sample in sent["uwb"]]) * 1e-6
-    read_z = track.samples[POSITION_COLUMNS[axes]].to_numpy()
+    read_z = track.samples[Columns.POSITION[axes]].to_numpy()
     read_s = times(track.samples) + flight.log.boot_time_s
 
     distance = np.abs(read_z[:, None, :] - sent_z[None, :, :]).max(axis=2)

@@ -27,20 +27,7 @@ from px4fuse.filter.signals import (
     project_acceleration,
     step_means,
 )
-from px4fuse.flight import (
-    ANGULAR_RATE_COLUMNS,
-    AXIS_NAMES,
-    POSITION_COLUMNS,
-    POSITION_VARIANCE_COLUMNS,
-    QUATERNION_COLUMNS,
-    SPECIFIC_FORCE_COLUMNS,
-    VELOCITY_COLUMNS,
-    Ekf2,
-    Flight,
-    PositionTrack,
-    Reset,
-    Unavailable,
-)
+from px4fuse.flight import AXIS_NAMES, Columns, Ekf2, Flight, PositionTrack, Reset, Unavailable
 from px4fuse.origin import RECEIVED
 from px4fuse.recording import LogInfo
 
@@ -57,16 +44,16 @@ def frame(time, values, columns):
 
 def still_imu(time, force=(0.0, 0.0, -GRAVITY)):
     values = np.hstack([np.broadcast_to(force, (len(time), 3)), np.zeros((len(time), 3))])
-    return frame(time, values, SPECIFIC_FORCE_COLUMNS + ANGULAR_RATE_COLUMNS)
+    return frame(time, values, Columns.SPECIFIC_FORCE + Columns.ANGULAR_RATE)
 
 
 def attitude_of(time, rotations):
-    return frame(time, rotations.as_quat(scalar_first=True), QUATERNION_COLUMNS)
+    return frame(time, rotations.as_quat(scalar_first=True), Columns.QUATERNION)
 
 
 def track_of(time, positions, name="vehicle_visual_odometry", origin=RECEIVED):
     values = np.hstack([positions, np.full((len(time), 3), np.nan)])
-    samples = frame(time, values, POSITION_COLUMNS + POSITION_VARIANCE_COLUMNS)
+    samples = frame(time, values, Columns.POSITION + Columns.POSITION_VARIANCE)
     return PositionTrack(name, origin, "", samples, "NED", "", (name,))
 
 
@@ -211,7 +198,7 @@ def test_axes_project_the_positions():
     axes = {axis.name: axis for axis in make_axes(flight_of(track=track), track, ALL)}
     assert list(axes) == ["north", "east", "down", "aisle"]
     for at, name in enumerate(AXIS_NAMES):
-        np.testing.assert_array_equal(axes[name].measurement_m, track.samples[POSITION_COLUMNS[at]])
+        np.testing.assert_array_equal(axes[name].measurement_m, track.samples[Columns.POSITION[at]])
     assert (axes["north"].heading_deg, axes["east"].heading_deg) == (0.0, 90.0)
     assert axes["down"].heading_deg is None
     offset = np.dot([3.0, -4.0], [np.cos(np.radians(30)), np.sin(np.radians(30))])
@@ -311,7 +298,7 @@ def truth_at(time):
 def ekf2_of(offset, resets, velocity=0.0):
     """EKF2 that publishes the truth plus an offset, shape (n, 3), of its own making."""
     state = np.hstack([truth_at(STATE_TIME) + offset, np.full((len(STATE_TIME), 3), velocity)])
-    table = frame(STATE_TIME, state, POSITION_COLUMNS + VELOCITY_COLUMNS)
+    table = frame(STATE_TIME, state, Columns.POSITION + Columns.VELOCITY)
     unavailable = dict.fromkeys(AXIS_NAMES, ABSENT)
     return Ekf2(table, ABSENT, unavailable, (), ABSENT, tuple(resets), ((-np.inf, 0),), 5.0)
 
@@ -335,7 +322,7 @@ def test_resets_that_change_the_frame_are_undone_exactly(at, good):
     offset = later @ deltas - deltas[:good].sum(axis=0)
     resets = [Reset(t, "position", tuple(d)) for t, d in zip(at, deltas, strict=True)]
     state, statement = continuous_state(ekf2_of(offset, resets), noisy_track(), WHOLE)
-    np.testing.assert_allclose(state[POSITION_COLUMNS], truth_at(STATE_TIME), atol=1e-12)
+    np.testing.assert_allclose(state[Columns.POSITION], truth_at(STATE_TIME), atol=1e-12)
     assert f"{len(at)} of horizontal position" in statement
     assert "undone" in statement
     assert "kept" not in statement

@@ -21,7 +21,7 @@ from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, make_axes, project_acceleration, step_means
 from px4fuse.findings import find
-from px4fuse.flight import ANGULAR_RATE_COLUMNS, Truth
+from px4fuse.flight import Columns, Truth
 from px4fuse.simulation import sensors
 from px4fuse.simulation.flights import answer, simulate, simulate_flight, to_flight, to_ulog
 from px4fuse.simulation.mistakes import MISTAKES, Mistakes, as_typed, made, parse
@@ -156,7 +156,7 @@ def test_biases_are_constant_and_drawn_as_stated():
     told = answer(simulation)["truth"]
     bias = imu.to_numpy()[:, :3].astype(float) - truth.specific_force_m_s2
     assert bias.mean(axis=0) == pytest.approx(told["accelerometer_bias_m_s2"], abs=0.025)
-    bias = imu[ANGULAR_RATE_COLUMNS].to_numpy(float) - truth.angular_rate_rad_s
+    bias = imu[Columns.ANGULAR_RATE].to_numpy(float) - truth.angular_rate_rad_s
     assert bias.mean(axis=0) == pytest.approx(told["gyro_bias_rad_s"], abs=3e-4)
     drawn = [sensors.biases(Scenario(seed=seed), NO_MISTAKES) for seed in range(400)]
     assert np.std([b[0] for b in drawn]) == pytest.approx(0.03, rel=0.1)

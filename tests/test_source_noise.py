@@ -21,7 +21,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding, find
 from px4fuse.findings.causes import SETTINGS
 from px4fuse.findings.source_noise import detect, levels
-from px4fuse.flight import POSITION_COLUMNS, Truth, Unavailable
+from px4fuse.flight import Columns, Truth, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.scenario import Scenario
@@ -42,7 +42,7 @@ def judged(
     """
     flight = simulate_flight(Scenario(seed=seed, passes=passes, ekf2=False))
     assert isinstance(flight.truth, Truth)
-    truth = flight.truth.samples[POSITION_COLUMNS].dropna()
+    truth = flight.truth.samples[Columns.POSITION].dropna()
     known = CubicSpline(truth.index.to_numpy(), truth.to_numpy())
     flight, chosen = errors.laid_over(flight, known, model, rate_hz, seed), RIGHT
     if truth_for is None:

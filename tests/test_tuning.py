@@ -25,7 +25,7 @@ from px4fuse.filter.tuning import (
     tune,
     tune_axes,
 )
-from px4fuse.flight import POSITION_COLUMNS, Flight, Unavailable
+from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.report.sensitivity import noise_words
 
 SIGMA_A, SIGMA_Z, SEEDS = TRUE.sigma_a_m_s2, TRUE.sigma_z_m, 40
@@ -219,7 +219,7 @@ def test_a_source_that_wanders_has_a_walk_of_its_own() -> None:
     track = flight.positions[0]
     steps = np.random.default_rng(4).normal(0.0, 0.1 * np.sqrt(0.2), (len(track.samples), 3))
     samples = track.samples.copy()
-    samples[POSITION_COLUMNS] += np.cumsum(steps, axis=0)
+    samples[Columns.POSITION] += np.cumsum(steps, axis=0)
     wandering = replace(flight, positions=(replace(track, samples=samples),))
     told, untold = horizontal(wandering, drifts=True), horizontal(wandering)
     assert told.noises.walk_m == pytest.approx(0.1, rel=0.25)

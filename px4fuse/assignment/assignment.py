@@ -1,7 +1,5 @@
 """A flight of one's own for every student of a class, with an answer key for the instructor."""
 
-from __future__ import annotations
-
 import hashlib
 import secrets
 from collections.abc import Callable, Sequence

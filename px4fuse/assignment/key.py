@@ -1,7 +1,5 @@
 """The answer key of an assignment: which flight each student was given, and what is wrong in it."""
 
-from __future__ import annotations
-
 import unicodedata
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The class list that a learning platform exports: who is in the class, and who somebody is."""
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections import Counter

@@ -5,8 +5,6 @@ Windows-1252) and separator. What is filled in and given back says what the plat
 the cells that are filled.
 """
 
-from __future__ import annotations
-
 import codecs
 import csv
 import io

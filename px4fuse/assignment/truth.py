@@ -1,7 +1,5 @@
 """What the right answers to a simulated flight are: the key to its form."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """``px4fuse answers``: the form about a flight, to fill in."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Our filter against EKF2 and ground truth: every number of the report."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, Unpack

@@ -7,8 +7,6 @@ wanders. Which sources those are says ``Origin.may_drift``; :func:`with_drift` s
 their clock estimate.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 

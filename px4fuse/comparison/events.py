@@ -1,7 +1,5 @@
 """What happened when, for the time axes of every page: one list for all of them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -55,11 +55,7 @@ from px4fuse.filter.signals import (
     within,
 )
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.flight import (
-    POSITION_COLUMNS,
-    SPECIFIC_FORCE_COLUMNS,
-    Unavailable,
-)
+from px4fuse.flight import Columns, Unavailable
 from px4fuse.record import Positive, Record
 
 Of = Literal["nis", "nees", "apart"]
@@ -421,8 +417,8 @@ class _Ours(_Changed):
         flight, imu = self.comparison.flight, self.comparison.flight.imu
         if isinstance(imu, Unavailable):
             return imu
-        bias = pd.Series([change[FORWARD], change[RIGHT], 0.0], SPECIFIC_FORCE_COLUMNS)
-        flight = replace(flight, imu=imu.assign(**(imu[SPECIFIC_FORCE_COLUMNS] - bias)))
+        bias = pd.Series([change[FORWARD], change[RIGHT], 0.0], Columns.SPECIFIC_FORCE)
+        flight = replace(flight, imu=imu.assign(**(imu[Columns.SPECIFIC_FORCE] - bias)))
         made = ned_acceleration(flight)
         if isinstance(made, Unavailable):
             return made
@@ -436,7 +432,7 @@ class _Ours(_Changed):
         truth, compass = result.truth, TURN in change and source.origin.is_gnss
         if TURN in change:
             turned = _turned(axis.direction, change[TURN])
-            measured_m = along(within(source.samples, segment), POSITION_COLUMNS, turned)
+            measured_m = along(within(source.samples, segment), Columns.POSITION, turned)
             axis = replace(axis, measurement_m=measured_m[np.isfinite(measured_m)])
             if compass:  # GNSS knows north, and so does the truth: the attitude does not
                 there = replace(axis, direction=turned)
@@ -542,7 +538,7 @@ class _Replayed(_Ekf2):
             state = state if change or isinstance(logged, Unavailable) else logged
             inside = settled(state.index, self.model.flown.judged_s)
             return _rms_apart(result.replay, state[inside])
-        at_s, track = updates["fused_at_s"], along(made.delayed, POSITION_COLUMNS, axis.direction)
+        at_s, track = updates["fused_at_s"], along(made.delayed, Columns.POSITION, axis.direction)
         stated = {
             "position_m": np.interp(at_s, made.delayed.index, track),
             "position_variance_m2": along(updates, POSITION_VARIANCES, weights**2),

@@ -1,7 +1,5 @@
 """What a comparison is: its records, by axis and by filter, and the tracks beside them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal

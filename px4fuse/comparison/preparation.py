@@ -1,7 +1,5 @@
 """What a comparison begins with: the source, the segment and the axes, before any filter runs."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import TypedDict, Unpack
 
@@ -14,15 +12,7 @@ from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
 from px4fuse.errors import MissingDataError, SettingsError, did_you_mean
 from px4fuse.filter.settings import SIGMA_Z_RANGE_M, Settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, make_axes, within
-from px4fuse.flight import (
-    POSITION_COLUMNS,
-    QUATERNION_COLUMNS,
-    Ekf2,
-    Flight,
-    PositionTrack,
-    Truth,
-    Unavailable,
-)
+from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable
 from px4fuse.origin import GIVEN_FILE, PositionKind
 from px4fuse.plain import capital
 from px4fuse.readers.mavlink_messages import POSITION_INPUTS
@@ -193,10 +183,10 @@ def _of_vehicle(track: PositionTrack, flight: Flight) -> PositionTrack:
     attitude = flight.attitude
     if not any(track.place_m) or isinstance(attitude, Unavailable) or track.frame != "NED":
         return track
-    known = attitude.index.to_numpy(), attitude[QUATERNION_COLUMNS].to_numpy()
+    known = attitude.index.to_numpy(), attitude[Columns.QUATERNION].to_numpy()
     turned = matrix(interpolate(track.samples.index.to_numpy(), *known)) @ np.asarray(track.place_m)
     samples = track.samples.copy()
-    samples[POSITION_COLUMNS] -= turned
+    samples[Columns.POSITION] -= turned
     forward, right, down = track.place_m
     note = (
         f"positions are those of the vehicle's origin: the sensor is {forward:g} m forward, "

@@ -1,7 +1,5 @@
 """EKF2 and ground truth along one axis: resets treated, variances and innovations projected."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from functools import partial
@@ -14,11 +12,7 @@ from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS
 from px4fuse.filter.signals import AISLE, Axis, Segment, along, within
 from px4fuse.flight import (
     AXIS_NAMES,
-    POSITION_COLUMNS,
-    POSITION_VARIANCE_COLUMNS,
-    STATE_COLUMNS,
-    VELOCITY_COLUMNS,
-    VELOCITY_VARIANCE_COLUMNS,
+    Columns,
     Ekf2,
     Flight,
     PositionTrack,
@@ -59,11 +53,11 @@ def continuous_state(
     kept: list[str] = []
     undone: list[str] = []
     for label, quantity, columns in (
-        ("horizontal position", "position", POSITION_COLUMNS[:2]),
-        ("height", "position", POSITION_COLUMNS[2:]),
-        ("velocity", "velocity", VELOCITY_COLUMNS),
+        ("horizontal position", "position", Columns.POSITION[:2]),
+        ("height", "position", Columns.POSITION[2:]),
+        ("velocity", "velocity", Columns.VELOCITY),
     ):
-        axes = [STATE_COLUMNS.index(column) % 3 for column in columns]
+        axes = [Columns.STATE.index(column) % 3 for column in columns]
         resets = [
             r for r in inside if r.quantity == quantity and any(r.delta[axis] for axis in axes)
         ]
@@ -106,7 +100,7 @@ def _distance(samples: pd.DataFrame, state: pd.DataFrame) -> float:
 
 def project_state(state: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
     """Position (m) and velocity (m/s) along the axis, within the segment."""
-    columns = {"position_m": POSITION_COLUMNS, "velocity_m_s": VELOCITY_COLUMNS}
+    columns = {"position_m": Columns.POSITION, "velocity_m_s": Columns.VELOCITY}
     return _project(within(state, segment), columns, axis.direction)
 
 
@@ -120,8 +114,8 @@ def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame |
     if isinstance(ekf2.variance, Unavailable):
         return ekf2.variance
     columns = {
-        "position_variance_m2": POSITION_VARIANCE_COLUMNS,
-        "velocity_variance_m2_s2": VELOCITY_VARIANCE_COLUMNS,
+        "position_variance_m2": Columns.POSITION_VARIANCE,
+        "velocity_variance_m2_s2": Columns.VELOCITY_VARIANCE,
     }
     projected = _project(within(ekf2.variance, segment), columns, axis.direction**2)
     if projected.empty:
@@ -152,8 +146,8 @@ def project_horizon(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | 
         return None
     delayed = within(ekf2.record.delayed, segment)
     found = pd.DataFrame(
-        {"position_m": along(delayed, POSITION_COLUMNS, axis.direction),
-         "position_variance_m2": along(delayed, POSITION_VARIANCE_COLUMNS, axis.direction**2)},
+        {"position_m": along(delayed, Columns.POSITION, axis.direction),
+         "position_variance_m2": along(delayed, Columns.POSITION_VARIANCE, axis.direction**2)},
         index=delayed.index,
     ).dropna()  # fmt: skip
     return found if len(found) else None
@@ -237,7 +231,7 @@ def observation_variance(
     theirs = track.alignment is not None or aid == BAROMETER
     if theirs or parameters.get(aid.noise_mode) == 1.0:
         return r
-    reported = within(track.samples, segment)[POSITION_VARIANCE_COLUMNS].median()
+    reported = within(track.samples, segment)[Columns.POSITION_VARIANCE].median()
     reported_along = float(np.nansum(reported.to_numpy() * axis.direction**2))
     return max(r, reported_along)
 

@@ -4,8 +4,6 @@ A change is proposed with its effect, and only where the replay confirms it. Whe
 replayed, the words say so.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 

@@ -4,8 +4,6 @@ The steps are those of :mod:`px4fuse.ekf2.walk`, from our filter as it was set t
 The sentences are made of them last: what each filter does, with numbers, and when it mattered.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

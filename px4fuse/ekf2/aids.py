@@ -4,8 +4,6 @@ Definitions as in :mod:`px4fuse.filter.consistency`; what PX4 logs and where it 
 ``EKF/aid_sources`` and ``EKF/ekf_helper.cpp``, v1.13 to main.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Literal

@@ -8,8 +8,6 @@ Sources: PX4-Autopilot ``EKF/aid_sources/optical_flow`` (``optical_flow_control.
 and their low pass; ``optical_flow_fusion.cpp``: R and gate).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

@@ -8,8 +8,6 @@ Sources: PX4-Autopilot ``EKF/bias_estimator`` (``bias_estimator.cpp``), ``EKF/ai
 ``EKF/baro_height_control.cpp`` and ``EKF/gnss_height_control.cpp``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 

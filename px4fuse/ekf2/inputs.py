@@ -4,8 +4,6 @@ Sources: PX4-Autopilot ``EKF/aid_sources/external_vision/ev_pos_control.cpp`` an
 ``EKF/ev_pos_control.cpp`` (frames), ``logged_topics.cpp`` (logging rates).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -32,19 +30,7 @@ from px4fuse.ekf2_parameters import (
     fuses_by_mask,
     settings_in_force,
 )
-from px4fuse.flight import (
-    POSITION_COLUMNS,
-    POSITION_VARIANCE_COLUMNS,
-    QUATERNION_COLUMNS,
-    VELOCITY_COLUMNS,
-    VELOCITY_VARIANCE_COLUMNS,
-    Ekf2,
-    Flight,
-    FusionRecord,
-    PositionTrack,
-    Unavailable,
-    at_times,
-)
+from px4fuse.flight import Columns, Ekf2, Flight, FusionRecord, PositionTrack, Unavailable, at_times
 from px4fuse.origin import GIVEN_FILE
 from px4fuse.readers.px4_innovations import fuses, with_gnss
 from px4fuse.readers.px4_positions import THINNED_HZ
@@ -344,15 +330,15 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> Received | Un
     stamp = samples.index.to_numpy() + flown_s
     # EKF2 believes no fix to be worse than without aiding (gps_control.cpp)
     worst_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
-    stated = samples[POSITION_VARIANCE_COLUMNS].fillna(0.0).clip(upper=worst_m**2)
-    velocity = velocities[VELOCITY_COLUMNS].to_numpy()
+    stated = samples[Columns.POSITION_VARIANCE].fillna(0.0).clip(upper=worst_m**2)
+    velocity = velocities[Columns.VELOCITY].to_numpy()
     fused = fuses_by_mask(parameters) or switch & GNSS_VELOCITY_BIT
-    spread = velocities[VELOCITY_VARIANCE_COLUMNS].fillna(0.0).to_numpy()
+    spread = velocities[Columns.VELOCITY_VARIANCE].fillna(0.0).to_numpy()
     known = bool(fused and np.isfinite(velocity).all())
     return Received(
         stamp,
         stamp,
-        samples[POSITION_COLUMNS].to_numpy(),
+        samples[Columns.POSITION].to_numpy(),
         stated.to_numpy(),
         *_decisions(ekf2, record, stamp, GNSS_POS),
         track.name,
@@ -378,10 +364,10 @@ def read_vision(
     track = _source(flight)
     if isinstance(track, Unavailable):
         return track
-    samples = track.samples.dropna(subset=POSITION_COLUMNS[:2])
+    samples = track.samples.dropna(subset=Columns.POSITION[:2])
     stamp = samples.index.to_numpy()
-    position = samples[POSITION_COLUMNS].to_numpy(copy=True)
-    variance = samples[POSITION_VARIANCE_COLUMNS].fillna(0.0).to_numpy(copy=True)
+    position = samples[Columns.POSITION].to_numpy(copy=True)
+    variance = samples[Columns.POSITION_VARIANCE].fillna(0.0).to_numpy(copy=True)
     rotated = not isinstance(ekf2.fusing, pd.DataFrame) or not ekf2.fusing["yaw"].any()
     if fuses_by_mask(record.parameters):
         rotated = bool(int(record.parameters[AID_MASK]) & ROTATE_VISION_BIT)
@@ -394,7 +380,7 @@ def read_vision(
                 "Send the position in NED, or with an orientation.",
             )
         published, sent = (
-            interpolate(stamp, frame.index.to_numpy(), frame[QUATERNION_COLUMNS].to_numpy())
+            interpolate(stamp, frame.index.to_numpy(), frame[Columns.QUATERNION].to_numpy())
             for frame in (attitude, track.orientation)
         )
         turn = matrix(multiply(published, conjugate(sent)))

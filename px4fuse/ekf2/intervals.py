@@ -13,8 +13,6 @@ errors of gyro bias b_g and accelerometer bias b_a. Equations as in PX4-Autopilo
     p ← p + (v_before + v_after) Δt / 2
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -7,8 +7,6 @@ Sources: PX4-Autopilot ``EKF/aid_sources/magnetometer`` (``mag_fusion.cpp``: fus
 ``mag_control.cpp``: R and its floor), ``EKF/covariance.cpp`` (process noise of the fields).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

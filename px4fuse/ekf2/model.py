@@ -7,8 +7,6 @@ It is not EKF2: what else EKF2 fuses (height, else the heading) is taken from it
 far it can be believed is measured on each log, see :mod:`px4fuse.ekf2.replay`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -55,7 +53,7 @@ from px4fuse.ekf2_parameters import (
     check,
 )
 from px4fuse.errors import SettingsError
-from px4fuse.flight import STATE_COLUMNS, Ekf2, Flight, Unavailable
+from px4fuse.flight import Columns, Ekf2, Flight, Unavailable
 from px4fuse.readers.px4_innovations import with_gnss
 
 # Where a log's EKF2 is this model (simulated flights), the log says so in these words
@@ -324,7 +322,7 @@ def run_variants(
 def _track(part: Run, state: Array) -> pd.DataFrame:
     """Position and velocity of a state at each step's end."""
     index = pd.Index(part.stretch.time_s, name="time_s")
-    return pd.DataFrame(np.hstack([state[:, POSITION], state[:, VELOCITY]]), index, STATE_COLUMNS)
+    return pd.DataFrame(np.hstack([state[:, POSITION], state[:, VELOCITY]]), index, Columns.STATE)
 
 
 def _assemble(

@@ -9,8 +9,6 @@ filters over the whole stretch.
 Source: PX4-Autopilot ``EKF/output_predictor/output_predictor.cpp`` (``EKF/ekf.cpp`` before v1.14).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.linalg import lapack
 

@@ -4,8 +4,6 @@ Sources: PX4-Autopilot ``EKF/covariance.cpp`` (limits of the biases), ``EKF/posi
 and ``EKF/vel_pos_fusion.cpp`` (gate, fusion), ``ev_pos_control.cpp`` (noise, resets).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace

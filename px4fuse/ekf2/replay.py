@@ -1,7 +1,5 @@
 """What a replay of EKF2 gives, and whether it agrees with the log, so that it may be believed."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
@@ -17,17 +15,7 @@ from px4fuse.ekf2.stretches import SETTLING_S
 from px4fuse.ekf2_parameters import AIDS, FLOW, GNSS_POS, MAG, Aid
 from px4fuse.filter import signals
 from px4fuse.filter.heading import heading_rad
-from px4fuse.flight import (
-    AXIS_NAMES,
-    POSITION_COLUMNS,
-    VELOCITY_COLUMNS,
-    AidLog,
-    AxisName,
-    Ekf2,
-    Flight,
-    Truth,
-    Unavailable,
-)
+from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Columns, Ekf2, Flight, Truth, Unavailable
 from px4fuse.readers.px4_innovations import along as innovations_along
 from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
 
@@ -303,8 +291,8 @@ def _carried_off_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     if not within.any():
         return None
     north, east = (
-        along(replay.published, POSITION_COLUMNS, one, times[within].to_numpy())
-        - along(ekf2.state, POSITION_COLUMNS, one, times[within].to_numpy())
+        along(replay.published, Columns.POSITION, one, times[within].to_numpy())
+        - along(ekf2.state, Columns.POSITION, one, times[within].to_numpy())
         for one in np.eye(3)[:2]
     )
     return float(np.hypot(north, east).max())
@@ -418,7 +406,7 @@ def _axis(
     position, velocity = (
         along(replay.published, columns, direction, times)
         - along(ekf2.state, columns, direction, times)
-        for columns in (POSITION_COLUMNS, VELOCITY_COLUMNS)
+        for columns in (Columns.POSITION, Columns.VELOCITY)
     )
     return AxisAgreement(
         innovation_correlation=float(np.corrcoef(nu, nu_log)[0, 1]),
@@ -443,12 +431,12 @@ def rms_to_truth(flight: Flight, position: Array, direction: Array, times: Array
     """Error of a position (m, RMS) along a direction in the truth's span; None without truth."""
     if not isinstance(flight.truth, Truth):
         return None
-    needed = POSITION_COLUMNS[2:] if direction[2] else POSITION_COLUMNS[:2]
+    needed = Columns.POSITION[2:] if direction[2] else Columns.POSITION[:2]
     truth = flight.truth.samples.dropna(subset=needed)
     if truth.empty:
         return None
     inside = (times >= truth.index[0]) & (times <= truth.index[-1])
-    error = (position - along(truth, POSITION_COLUMNS, direction, times))[inside]
+    error = (position - along(truth, Columns.POSITION, direction, times))[inside]
     return rms(error) if len(error) else None
 
 

@@ -3,8 +3,6 @@
 Sources: PX4-Autopilot ``EKF/imu_down_sampler/imu_down_sampler.cpp``.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -14,23 +12,7 @@ from scipy.linalg import block_diag
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
-from px4fuse.flight import (
-    ACCELEROMETER_BIAS_COLUMNS,
-    ANGULAR_RATE_COLUMNS,
-    BAD_ACCELERATION,
-    BODY_FIELD_COLUMNS,
-    DELAYED_VARIANCE_COLUMNS,
-    EARTH_FIELD_COLUMNS,
-    GYRO_BIAS_COLUMNS,
-    POSITION_COLUMNS,
-    QUATERNION_COLUMNS,
-    SPECIFIC_FORCE_COLUMNS,
-    VELOCITY_COLUMNS,
-    Ekf2,
-    Flight,
-    FusionRecord,
-    Unavailable,
-)
+from px4fuse.flight import BAD_ACCELERATION, Columns, Ekf2, Flight, FusionRecord, Unavailable
 from px4fuse.readers.px4_ekf2 import same_stamps, samples_per_step
 from px4fuse.trajectory.rotation import (
     conjugate,
@@ -335,9 +317,9 @@ def _stretch(
     interval = np.diff(time)
     known = same_stamps(time, record.delayed.index)
     ends = step_ends(interval, known, predict_s(record))
-    bias = np.asarray(start[ACCELEROMETER_BIAS_COLUMNS])
-    rate = imu[ANGULAR_RATE_COLUMNS].to_numpy()[1:] - np.asarray(start[GYRO_BIAS_COLUMNS])
-    force = imu[SPECIFIC_FORCE_COLUMNS].to_numpy()[1:] - bias
+    bias = np.asarray(start[Columns.ACCELEROMETER_BIAS])
+    rate = imu[Columns.ANGULAR_RATE].to_numpy()[1:] - np.asarray(start[Columns.GYRO_BIAS])
+    force = imu[Columns.SPECIFIC_FORCE].to_numpy()[1:] - bias
     turn, gain = down_sampled(rate * interval[:, None], force * interval[:, None], ends)
     times = time[np.concatenate([[0], ends])]
     step = np.diff(times)
@@ -346,7 +328,7 @@ def _stretch(
     def beyond(frame: pd.DataFrame, early_s: float, known: Array) -> tuple[Array, Array]:
         """Times of a frame's attitudes, and what they have beyond the known ones at the steps."""
         inside = (frame.index >= times[0] - early_s) & (frame.index <= times[-1])
-        at_s, own = frame.index[inside].to_numpy(), frame.loc[inside, QUATERNION_COLUMNS].to_numpy()
+        at_s, own = frame.index[inside].to_numpy(), frame.loc[inside, Columns.QUATERNION].to_numpy()
         return at_s, multiply(own, conjugate(interpolate(at_s, times, known)))
 
     # what the published attitude has beyond the gyro's, in the earth frame
@@ -354,8 +336,8 @@ def _stretch(
     nominal = multiply(extra, gyro)
     states, turned = beyond(record.delayed, 1e-4, nominal)
     error = to_vector(turned)
-    published = [np.interp(times[0], ekf2.state.index, ekf2.state[c]) for c in POSITION_COLUMNS]
-    position = start[POSITION_COLUMNS].to_numpy()
+    published = [np.interp(times[0], ekf2.state.index, ekf2.state[c]) for c in Columns.POSITION]
+    position = start[Columns.POSITION].to_numpy()
     position = np.where(np.isfinite(position), position, published)
     position[2] = published[2]  # altitude and height have different origins since v1.16
     return Stretch(
@@ -365,11 +347,11 @@ def _stretch(
         correction_rad=to_vector(multiply(extra[1:], conjugate(extra[:-1]))),
         force_m_s2=gain / step[:, None],
         accelerometer_bias_m_s2=bias,
-        state=np.concatenate([error[0], start[VELOCITY_COLUMNS], position, np.zeros(6)]),
-        variance=np.asarray(start[DELAYED_VARIANCE_COLUMNS[:15]]),
+        state=np.concatenate([error[0], start[Columns.VELOCITY], position, np.zeros(6)]),
+        variance=np.asarray(start[Columns.DELAYED_VARIANCE[:15]]),
         down_m=_at(ekf2.state["down_m"], times),
         attitude_variance_rad2=np.column_stack(
-            [_at(record.delayed[name], times) for name in DELAYED_VARIANCE_COLUMNS[:3]]
+            [_at(record.delayed[name], times) for name in Columns.DELAYED_VARIANCE[:3]]
         ),
         down_variance_m2=_at(record.delayed["down_m2"], times),
         attitude_error_rad=np.column_stack([np.interp(times, states, part) for part in error.T]),
@@ -396,8 +378,8 @@ def _with_field(stretch: Stretch, record: FusionRecord, at: int, step_s: float) 
     age_s = record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     weight = max(FIELD_HZ * float(np.median(np.diff(stamps))), 1.0)
     gauss = frame.drop(columns="fused_3d").to_numpy()
-    fields = np.asarray(start[[*EARTH_FIELD_COLUMNS, *BODY_FIELD_COLUMNS]])
-    variance = np.asarray(start[DELAYED_VARIANCE_COLUMNS[-6:]])
+    fields = np.asarray(start[[*Columns.EARTH_FIELD, *Columns.BODY_FIELD]])
+    variance = np.asarray(start[Columns.DELAYED_VARIANCE[-6:]])
     return with_field(stretch, stamps - age_s, gauss, weight, fields, variance)
 
 

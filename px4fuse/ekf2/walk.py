@@ -12,8 +12,6 @@ things worse. Therefore the biases come first. The last replays reject what EKF2
 rejects much, one sample on the edge of the gate would else lead the model another way.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import chain
@@ -30,7 +28,7 @@ from px4fuse.ekf2.replay import Ekf2Replay, Spans, along, rms_to_truth, settled
 from px4fuse.ekf2_parameters import FLOW, GNSS_POS, MAG
 from px4fuse.filter.kalman import Replay, state_at
 from px4fuse.filter.settings import Settings
-from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Ekf2, Truth, Unavailable
+from px4fuse.flight import Columns, Ekf2, Truth, Unavailable
 from px4fuse.record import Count, NotNegative, Record
 
 WHAT = "why EKF2 differs"
@@ -51,7 +49,7 @@ OUTPUT = "output predictor"
 # FIELD, SPEED and FLOWING come before GATE, where EKF2 fuses these
 STEPS = (SAMPLES, STAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
-COLUMNS = (POSITION_COLUMNS, VELOCITY_COLUMNS)
+COLUMNS = (Columns.POSITION, Columns.VELOCITY)
 
 
 class Step(Record, frozen=True, kw_only=True):
@@ -334,7 +332,7 @@ def _coast(
     part = flown.delayed.loc[begin:end]
     apart = [
         part[column] - np.interp(part.index, ungated.index, ungated[column])
-        for column in POSITION_COLUMNS[:2]
+        for column in Columns.POSITION[:2]
     ]
     return Coast(
         start_s=float(begin),

@@ -3,8 +3,6 @@
 All three are judged over the same times, in the same way.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -32,7 +30,7 @@ from px4fuse.ekf2_parameters import AIDS, GNSS_POS, MAG, check
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.heading import heading_rad
-from px4fuse.flight import POSITION_COLUMNS, Ekf2, Flight, Unavailable
+from px4fuse.flight import Columns, Ekf2, Flight, Unavailable
 from px4fuse.record import Count, NotNegative, Record, Share
 
 WHAT = "EKF2 what-if"
@@ -413,7 +411,7 @@ def _summary(
             known = logged if variance is None else variance
             stated = np.interp(at, known.index, known[f"{axis}_m2"])
             sigma = float(np.sqrt(np.median(stated)))
-        position = along(published, POSITION_COLUMNS, direction, times)
+        position = along(published, Columns.POSITION, direction, times)
         error = rms_to_truth(flight, position, direction, times)
         axes[axis] = AxisSummary(
             nis_mean=float(np.mean(nu**2 / s)),
@@ -426,7 +424,7 @@ def _summary(
     share = float(used["rejected"].mean())
     if heights:
         down = np.eye(3)[2]
-        error = rms_to_truth(flight, along(published, POSITION_COLUMNS, down, times), down, times)
+        error = rms_to_truth(flight, along(published, Columns.POSITION, down, times), down, times)
         more["height_rmse_to_truth_m"] = NO_TRUTH if error is None else error
         more["heights"] = {
             name: _of_height(kept, judged)
@@ -473,7 +471,7 @@ def _longest(fused_s: Array, judged: Spans) -> float:
 def _carried(model: Model, replay: Ekf2Replay, without: Mapping[str, float], judged: Spans) -> str:
     """How far from the replay as flown EKF2 comes without some aids."""
     flown, found = (
-        one.published.loc[settled(one.published.index, judged), POSITION_COLUMNS]
+        one.published.loc[settled(one.published.index, judged), Columns.POSITION]
         for one in (model.flown, replay)
     )
     *level, down = np.abs((found - flown).to_numpy()).T

@@ -40,7 +40,7 @@ from px4fuse.filter.likelihood import (
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, ned_acceleration, too_few
 from px4fuse.filter.steps import Timeline, timeline
-from px4fuse.flight import AXIS_NAMES, QUATERNION_COLUMNS, Flight, Unavailable
+from px4fuse.flight import AXIS_NAMES, Columns, Flight, Unavailable
 
 CAUSES = "causes beyond noise"
 MIN_MEASUREMENTS = 50
@@ -555,7 +555,7 @@ def _added(acceleration_m_s2: Array, time_s: ArrayLike, line: Timeline) -> tuple
 def _common_columns(attitude: pd.DataFrame, acceleration: pd.DataFrame) -> list[pd.DataFrame]:
     """NED acceleration that takes out a bias forward and right, and that a turn adds."""
     body_to_ned = Rotation.from_quat(
-        attitude[QUATERNION_COLUMNS].to_numpy(copy=True), scalar_first=True
+        attitude[Columns.QUATERNION].to_numpy(copy=True), scalar_first=True
     )
     names: list[Any] = list(AXIS_NAMES)
     biases = [

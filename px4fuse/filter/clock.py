@@ -11,8 +11,6 @@ but it scatters more than the likelihood's curvature says. By how much is simula
 interval is as much wider (a sandwich estimate: White 1982).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 
@@ -36,7 +34,7 @@ from px4fuse.filter.motion import (
 )
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, within
-from px4fuse.flight import POSITION_COLUMNS, Flight, PositionTrack, Unavailable
+from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
 from px4fuse.record import Count, NotNegative, Record, Share, Span
 
 FINE_POINTS, CURVE_POINTS = 11, 121
@@ -175,7 +173,7 @@ def estimate_clock_offset(
     -------
     ClockOffset, or Unavailable where there is no IMU, no attitude or too few measurements.
     """
-    samples = within(track.samples, segment)[POSITION_COLUMNS].dropna(subset=POSITION_COLUMNS[:2])
+    samples = within(track.samples, segment)[Columns.POSITION].dropna(subset=Columns.POSITION[:2])
     if outlier_time_s is not None:
         samples = samples[~np.isin(samples.index.to_numpy(), outlier_time_s)]
     moved = motion(

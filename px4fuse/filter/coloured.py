@@ -21,8 +21,6 @@ likelihood, what a turned, moved or scaled frame and late stamps would add to th
 (restricted likelihood, Patterson and Thompson 1971).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product

@@ -4,8 +4,6 @@ Definitions: Bar-Shalom, Li and Kirubarajan (2001), Estimation with Applications
 Navigation, section 5.4; Ljung and Box (1978), Biometrika 65(2).
 """
 
-from __future__ import annotations
-
 from typing import Any, Literal
 
 import numpy as np

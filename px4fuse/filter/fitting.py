@@ -6,8 +6,6 @@ distribution many times as wide (Tukey 1960): how many, how wide and which is fo
 and maximisation, one decision for all axes of a sample, with what *all* data say of its error.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache

@@ -9,8 +9,6 @@ the turn is a state that may walk: state [p, v, b, η], b what the acceleration 
 Whether it walks is told by the likelihood ratio.
 """
 
-from __future__ import annotations
-
 from itertools import product
 from typing import Literal, NamedTuple
 
@@ -26,7 +24,7 @@ from px4fuse.filter.model import INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, noise_o
 from px4fuse.filter.motion import MAX_IMU_INTERVAL_S
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import IMU_GAP_S, Segment, ned_acceleration, within
-from px4fuse.flight import POSITION_COLUMNS, QUATERNION_COLUMNS, Flight, PositionTrack, Unavailable
+from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
 from px4fuse.record import NotNegative, Record, Share
 
 PART_S = 2.0
@@ -156,7 +154,7 @@ def heading_error(
     acceleration = ned_acceleration(flight)
     if isinstance(acceleration, Unavailable):
         return acceleration
-    samples = within(track.samples, segment)[POSITION_COLUMNS[:2]].dropna()
+    samples = within(track.samples, segment)[Columns.POSITION[:2]].dropna()
     samples = samples.set_axis(samples.index.to_numpy() + offset_s)
     low, high = acceleration.index[[0, -1]]
     samples = samples[(samples.index >= low) & (samples.index <= high)]
@@ -192,7 +190,7 @@ def _parts(time: Array, turn: Array, sigma: Array) -> tuple[HeadingPart, ...]:
 
 def heading_rad(quaternions: pd.DataFrame) -> Array:
     """Heading of attitudes, clockwise seen from above, without steps of a whole turn."""
-    values = quaternions[QUATERNION_COLUMNS].to_numpy(copy=True)
+    values = quaternions[Columns.QUATERNION].to_numpy(copy=True)
     angles: Array = Rotation.from_quat(values, scalar_first=True).as_euler("ZYX")[:, 0]
     return np.unwrap(angles)
 

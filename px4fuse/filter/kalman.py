@@ -10,8 +10,6 @@ F, B, Q and H stand in :mod:`px4fuse.filter.model`, the steps in :mod:`px4fuse.f
 is run many times in this folder (likelihoods, ``quick``) has its own recursion, the same to 1e-9.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

@@ -13,8 +13,6 @@ filter, where arrays of one element would take fifty times as long) and arrays (
 A covariance is its elements 00, 01, 11.
 """
 
-from __future__ import annotations
-
 from typing import TypeVar
 
 import numpy as np

@@ -25,13 +25,7 @@ from px4fuse.filter.fitting import Noises, of_ratios
 from px4fuse.filter.marginal import Positions, centred
 from px4fuse.filter.model import noise_of_many_steps
 from px4fuse.filter.signals import imu_gaps
-from px4fuse.flight import (
-    ANGULAR_RATE_COLUMNS,
-    QUATERNION_COLUMNS,
-    SPECIFIC_FORCE_COLUMNS,
-    Flight,
-    Unavailable,
-)
+from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.trajectory.rotation import from_vector, matrix, multiply, running_product
 
 # Standard deviations of the constants, wide for consumer sensors: tilt and heading (rad), gyro
@@ -305,7 +299,7 @@ def signals_of(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, flo
     time = imu.index.to_numpy()
     first, last = np.searchsorted(time, [span[0] - 2 * STEP_S, span[1] + 2 * STEP_S], side="left")
     inside, time = imu.iloc[first:last], time[first:last]
-    columns = [*SPECIFIC_FORCE_COLUMNS, *ANGULAR_RATE_COLUMNS]
+    columns = [*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]
     integral = cumulative_integral(inside[columns].to_numpy(), time)
     edges = np.arange(time[0], time[-1], STEP_S)
     read = np.column_stack([np.interp(edges, time, one) for one in integral.T])
@@ -338,7 +332,7 @@ def _integrate_gyros(edges: Array, angle: Array, attitude: pd.DataFrame) -> Arra
     """Attitude (body to NED, w first) from the logged one at the start and the gyros alone."""
     known = attitude.index.to_numpy()
     near = slice(*np.clip(np.searchsorted(known, edges[0]) + np.array([-2, 3]), 0, len(known)))
-    logged = attitude.iloc[near][QUATERNION_COLUMNS].to_numpy(copy=True)
+    logged = attitude.iloc[near][Columns.QUATERNION].to_numpy(copy=True)
     at_start = np.clip(edges[0], known[near][0], known[near][-1])
     slerp = Slerp(known[near], Rotation.from_quat(logged, scalar_first=True))
     start = slerp(at_start).as_quat(scalar_first=True)

@@ -1,7 +1,5 @@
 """The replay of :mod:`px4fuse.filter.kalman` in plain floats, for what is only tried out."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from px4fuse.filter.kalman import Replay, as_replay

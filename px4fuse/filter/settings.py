@@ -1,7 +1,5 @@
 """What the user may turn: the settings of the filter, with their ranges."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import get_args
 

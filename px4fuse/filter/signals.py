@@ -3,8 +3,6 @@
 NED acceleration = R(q) · specific force + [0, 0, g] (Groves 2013, eq. 5.52 without earth rate).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
@@ -18,15 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from px4fuse.arrays import Array, BoolArray, cumulative_integral
 from px4fuse.display import brief
 from px4fuse.errors import MissingDataError, SettingsError
-from px4fuse.flight import (
-    AXIS_NAMES,
-    POSITION_COLUMNS,
-    QUATERNION_COLUMNS,
-    SPECIFIC_FORCE_COLUMNS,
-    Flight,
-    PositionTrack,
-    Unavailable,
-)
+from px4fuse.flight import AXIS_NAMES, Columns, Flight, PositionTrack, Unavailable
 
 AISLE = "aisle"
 # A track that is so many times longer than wide was flown along an aisle
@@ -153,10 +143,10 @@ def _ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
             "Record both from boot (SDLOG_MODE 1).",
         )
     rotations = Rotation.from_quat(
-        flight.attitude[QUATERNION_COLUMNS].to_numpy(copy=True), scalar_first=True
+        flight.attitude[Columns.QUATERNION].to_numpy(copy=True), scalar_first=True
     )
     body_to_ned = Slerp(attitude_time, rotations)(imu.index.to_numpy())
-    acceleration = body_to_ned.apply(imu[SPECIFIC_FORCE_COLUMNS].to_numpy(copy=True))
+    acceleration = body_to_ned.apply(imu[Columns.SPECIFIC_FORCE].to_numpy(copy=True))
     acceleration[:, 2] += constants.g
     return pd.DataFrame(acceleration, index=imu.index, columns=list(AXIS_NAMES))
 
@@ -171,7 +161,7 @@ def aisle_heading(track: PositionTrack, segment: Segment) -> tuple[float, float]
     elongation : float
         Ratio of the standard deviations along and across it (1: no direction is distinct).
     """
-    horizontal = within(track.samples, segment)[POSITION_COLUMNS[:2]].dropna().to_numpy()
+    horizontal = within(track.samples, segment)[Columns.POSITION[:2]].dropna().to_numpy()
     centred = horizontal - horizontal.mean(axis=0)
     _, singular, directions = np.linalg.svd(centred, full_matrices=False)
     heading = float(np.degrees(np.arctan2(directions[0, 1], directions[0, 0]))) % 180.0
@@ -221,9 +211,9 @@ def make_axes(
         direction, heading, note, elongation = _direction(name, track, segment, heading_deg)
         samples = track.samples
         if name == "down" and track.barometer is not None:
-            samples = track.barometer.reindex(columns=POSITION_COLUMNS)
+            samples = track.barometer.reindex(columns=Columns.POSITION)
         samples = within(samples, segment)
-        projected = along(samples, POSITION_COLUMNS, direction)
+        projected = along(samples, Columns.POSITION, direction)
         finite = np.isfinite(projected)
         if np.count_nonzero(finite) < MIN_MEASUREMENTS:
             if names is None:

@@ -1,7 +1,5 @@
 """The filter's steps: the DT grid, every measurement's own time, and the input of each step."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ Three groups: of the report as such, of the filter (settings, consistency, the c
 rests on), and of a loop. A check is its class here, and an item of rubric.toml that explains it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, ClassVar, Literal

@@ -4,8 +4,6 @@ Nothing that a student wrote can act: see :mod:`px4fuse.webpage`. Pictures of pa
 and PDFs stand in folders beside the page and are loaded as they are unfolded.
 """
 
-from __future__ import annotations
-
 import math
 import statistics
 from collections import Counter, defaultdict

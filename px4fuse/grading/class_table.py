@@ -1,7 +1,5 @@
 """A class as a table for spreadsheets, in which nothing that a student wrote can act."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """From what was handed in to one row per student: which attempt counts, and what it is worth."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -16,8 +16,6 @@ for one to delete, and zero for a grade.
   title is given or one of :data:`GRADE`.
 """
 
-from __future__ import annotations
-
 import html
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """What goes back to the students: the rules' feedback and the instructor's words in one text."""
 
-from __future__ import annotations
-
 import textwrap
 
 from px4fuse.grading.class_table import number

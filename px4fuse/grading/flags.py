@@ -4,8 +4,6 @@ A flag is not a proof. Two students may fly one flight together, and advice that
 leads everyone to the same number.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import unicodedata

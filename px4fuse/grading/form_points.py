@@ -4,8 +4,6 @@ The weights and shares are those by which forms were judged by hand. A guess doe
 claim that is not true costs, and what needs no measurement counts only with the size.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field

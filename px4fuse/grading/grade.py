@@ -1,7 +1,5 @@
 """Submissions become a class: in parallel, within bounds, and quick where nothing has changed."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing

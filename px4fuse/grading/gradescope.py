@@ -7,8 +7,6 @@ to build the container, ``run_autograder`` for every submission; the zip file's 
 ``/autograder/results/results.json`` is what counts.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import platform

@@ -5,8 +5,6 @@ most points that there are to have, never more than the limit that the rule name
 zero points.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass

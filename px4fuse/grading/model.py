@@ -1,7 +1,5 @@
 """What is handed in, and what it is worth: a submission, what it earns, and a student's row."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime

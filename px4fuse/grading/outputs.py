@@ -1,7 +1,5 @@
 """What grading a class writes: table, page, redrawn reports, feedback, and platforms' tables."""
 
-from __future__ import annotations
-
 import itertools
 import random
 from collections.abc import Sequence

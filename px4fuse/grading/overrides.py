@@ -1,7 +1,5 @@
 """What the instructor says instead of the rules: a table that is read and never written over."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -18,8 +18,6 @@ Sources of the names:
   the instructor's language is English; in others only ``--due`` tells.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence

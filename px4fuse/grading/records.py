@@ -5,8 +5,6 @@ for the versions that made it and the files that were there: the report says whi
 request. Rubric, answer key, roster and overrides are not in it.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

@@ -4,8 +4,6 @@ A report comes from a student; its results have been read strictly. A number tha
 no points and a comment, never an exception.
 """
 
-from __future__ import annotations
-
 from px4fuse.answers import Answers
 from px4fuse.assignment.key import AnswerKey
 from px4fuse.grading.checks import contradictions

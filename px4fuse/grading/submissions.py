@@ -3,8 +3,6 @@
 Nothing is unpacked to disk. Names from a zip file are shown and never used as paths.
 """
 
-from __future__ import annotations
-
 import re
 import stat
 import struct

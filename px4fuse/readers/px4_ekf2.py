@@ -16,22 +16,14 @@ from numpy.typing import ArrayLike
 from px4fuse.arrays import Array, IntArray
 from px4fuse.ekf2_parameters import AIDS, EV_POS, settings_in_force
 from px4fuse.flight import (
-    ACCELEROMETER_BIAS_COLUMNS,
     BAD_ACCELERATION,
     BIAS_NOT_LOGGED,
-    DELAYED_STATE_COLUMNS,
-    DELAYED_VARIANCE_COLUMNS,
     EKF2_STEP_S,
     FLOW_SHARE,
     GROUND_EFFECT,
     HORIZON_NOT_LOGGED,
-    POSITION_COLUMNS,
-    POSITION_VARIANCE_COLUMNS,
-    QUATERNION_COLUMNS,
     RECORD_NOT_LOGGED,
-    SPECIFIC_FORCE_COLUMNS,
-    STATE_COLUMNS,
-    VELOCITY_VARIANCE_COLUMNS,
+    Columns,
     Ekf2,
     FusionRecord,
     Reset,
@@ -80,7 +72,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     local = topics.read(px4.LOCAL_POSITION)
     if local is None:
         return Unavailable("EKF2", "no topic vehicle_local_position", px4.DEFAULT_PROFILE)
-    state = local[STATE_COLUMNS].dropna()
+    state = local[Columns.STATE].dropna()
     if state.empty:
         return Unavailable(
             "EKF2", "vehicle_local_position holds no finite sample", "Wait until EKF2 has started."
@@ -167,7 +159,7 @@ def _read_delayed(topics: Topics, step_s: float) -> pd.DataFrame | Unavailable:
     return pd.DataFrame(
         np.hstack([state, variance]),
         index=raw.index,
-        columns=DELAYED_STATE_COLUMNS + DELAYED_VARIANCE_COLUMNS,
+        columns=Columns.DELAYED_STATE + Columns.DELAYED_VARIANCE,
     )
 
 
@@ -175,7 +167,7 @@ def _variance(delayed: pd.DataFrame | Unavailable) -> pd.DataFrame | Unavailable
     """Variances of position and velocity."""
     if isinstance(delayed, Unavailable):
         return delayed
-    found = delayed[POSITION_VARIANCE_COLUMNS + VELOCITY_VARIANCE_COLUMNS]
+    found = delayed[Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE]
     found = found[(found > 0.0).all(axis=1)]
     return found if len(found) else VARIANCES_NOT_LOGGED
 
@@ -237,7 +229,7 @@ def _accelerometer_bias(
         return own
     if isinstance(delayed, Unavailable) or delayed.empty:
         return BIAS_NOT_LOGGED
-    return delayed[ACCELEROMETER_BIAS_COLUMNS].set_axis(SPECIFIC_FORCE_COLUMNS, axis=1)
+    return delayed[Columns.ACCELEROMETER_BIAS].set_axis(Columns.SPECIFIC_FORCE, axis=1)
 
 
 def _horizon_s(topics: Topics, step_s: float) -> float | Unavailable:
@@ -306,11 +298,11 @@ def _read_record(
     topic, attitude = _state_vector(topics)
     if topic != px4.ESTIMATOR_STATES[0] or isinstance(delayed, Unavailable):
         return RECORD_NOT_LOGGED
-    norm = np.linalg.norm(delayed[QUATERNION_COLUMNS], axis=1)
+    norm = np.linalg.norm(delayed[Columns.QUATERNION], axis=1)
     inside = delayed[np.abs(norm - 1.0) < 0.01].copy()
     if inside.empty:
         return RECORD_NOT_LOGGED
-    horizontal, altitude_m = POSITION_COLUMNS[:2], 0.0
+    horizontal, altitude_m = Columns.POSITION[:2], 0.0
     if not inside[horizontal].to_numpy().any():  # from v1.16 kept as latitude and longitude
         inside[horizontal] = np.nan
         # and its height, where there is an origin, as altitude above the sea (ekf_helper.cpp)

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array
-from px4fuse.flight import POSITION_COLUMNS, POSITION_VARIANCE_COLUMNS, Ekf2, Unavailable
+from px4fuse.flight import Columns, Ekf2, Unavailable
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.px4_innovations import with_gnss
 from px4fuse.readers.ulog_topics import Topics
@@ -96,7 +96,7 @@ def rebuilt_fixes(
     made = pd.DataFrame({
         column: np.interp(taken_s + late_s, ekf2.state.index, ekf2.state[column], np.nan, np.nan)
         + innovations["innovation_m"].to_numpy()[inside][clear]
-        for column, innovations in zip(POSITION_COLUMNS, (north, east), strict=False)
+        for column, innovations in zip(Columns.POSITION, (north, east), strict=False)
     }, index=pd.Index(taken_s, name="time_s"))  # fmt: skip
     known = passed == 0.0
     error = (made - fixes[made.columns].to_numpy()[before])[known].dropna()
@@ -105,7 +105,7 @@ def rebuilt_fixes(
     made = made[~made.index.duplicated()]
     if exact_m > EXACT_M or made.empty:
         return nothing, ()
-    for column in (POSITION_COLUMNS[2], *POSITION_VARIANCE_COLUMNS):
+    for column in (Columns.POSITION[2], *Columns.POSITION_VARIANCE):
         if column in fixes:
             made[column] = np.interp(made.index, times, fixes[column])
     return made, (

@@ -9,17 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from px4fuse.ekf2_parameters import AID_MASK, EV_POS
-from px4fuse.flight import (
-    ANGULAR_RATE_COLUMNS,
-    BAD_ACCELERATION,
-    GROUND_EFFECT,
-    POSITION_COLUMNS,
-    POSITION_VARIANCE_COLUMNS,
-    QUATERNION_COLUMNS,
-    ROTATION_VARIANCE_COLUMNS,
-    SPECIFIC_FORCE_COLUMNS,
-    VELOCITY_COLUMNS,
-)
+from px4fuse.flight import BAD_ACCELERATION, GROUND_EFFECT, Columns
 from px4fuse.origin import ALIGNED, GNSS, KEPT, MOTION_CAPTURE, REBUILT, RECEIVED, Origin
 from px4fuse.readers.layouts import (
     GLOBAL,
@@ -37,8 +27,8 @@ from px4fuse.readers.layouts import (
 IMU = (
     Layout(
         "sensor_combined",
-        elements(SPECIFIC_FORCE_COLUMNS, "accelerometer_m_s2")
-        | elements(ANGULAR_RATE_COLUMNS, "gyro_rad"),
+        elements(Columns.SPECIFIC_FORCE, "accelerometer_m_s2")
+        | elements(Columns.ANGULAR_RATE, "gyro_rad"),
         {
             "accelerometer_offset_us": "accelerometer_timestamp_relative",
             "clipped": "accelerometer_clipping",  # v1.10
@@ -46,7 +36,7 @@ IMU = (
     ),
 )
 
-ATTITUDE = (Layout("vehicle_attitude", elements(QUATERNION_COLUMNS, "q")),)
+ATTITUDE = (Layout("vehicle_attitude", elements(Columns.QUATERNION, "q")),)
 
 _RESETS = ("xy_reset_counter", "z_reset_counter", "vxy_reset_counter", "vz_reset_counter")
 LOCAL_POSITION = (
@@ -81,7 +71,7 @@ ATTITUDE_VARIANCES: Mapping[tuple[int, int], int] = {
 QUATERNION_FILTER = 4
 
 # EKF2's accelerometer bias in m/s², whatever the generation of the state vector
-SENSOR_BIAS = (Layout("estimator_sensor_bias", elements(SPECIFIC_FORCE_COLUMNS, "accel_bias")),)
+SENSOR_BIAS = (Layout("estimator_sensor_bias", elements(Columns.SPECIFIC_FORCE, "accel_bias")),)
 
 SELECTOR = (Layout("estimator_selector_status", {"instance": "primary_instance"}),)  # v1.12
 
@@ -104,10 +94,10 @@ TRUTH_GLOBAL = (
     Layout(
         "vehicle_global_position_groundtruth",
         GLOBAL,
-        fields(VELOCITY_COLUMNS, "vel_n vel_e vel_d"),
+        fields(Columns.VELOCITY, "vel_n vel_e vel_d"),
     ),
 )
-TRUTH_ATTITUDE = (Layout("vehicle_attitude_groundtruth", elements(QUATERNION_COLUMNS, "q")),)
+TRUTH_ATTITUDE = (Layout("vehicle_attitude_groundtruth", elements(Columns.QUATERNION, "q")),)
 
 BAROMETER = (Layout("vehicle_air_data", {"altitude_m": "baro_alt_meter"}),)
 _BIAS = {"bias_m": "bias", "bias_m2": "bias_var"}
@@ -132,9 +122,9 @@ FLOW = (
 _GPS_OPTIONAL = {
     "eph_m": "eph", "epv_m": "epv", "fix_type": "fix_type", "utc_us": "time_utc_usec",
     "published_us": "timestamp", "speed_accuracy_m_s": "s_variance_m_s",
-    **fields(VELOCITY_COLUMNS, "vel_n_m_s vel_e_m_s vel_d_m_s"),
+    **fields(Columns.VELOCITY, "vel_n_m_s vel_e_m_s vel_d_m_s"),
 }  # fmt: skip
-_VEHICLE_GNSS = _GPS_OPTIONAL | fields(VELOCITY_COLUMNS, "vel_north vel_east vel_down")
+_VEHICLE_GNSS = _GPS_OPTIONAL | fields(Columns.VELOCITY, "vel_north vel_east vel_down")
 ANTENNA_COLUMNS = ["antenna_forward_m", "antenna_right_m", "antenna_down_m"]
 
 
@@ -165,7 +155,7 @@ FUSED_FIXES = (
         elements(["latitude_deg", "longitude_deg"], "observation")  # v1.16
         | {"fused": "fused", "rejected": "innovation_rejected"},
     ),
-    Layout("estimator_aid_src_gnss_vel", elements(VELOCITY_COLUMNS, "observation")),
+    Layout("estimator_aid_src_gnss_vel", elements(Columns.VELOCITY, "observation")),
 )
 FUSED_HEIGHT = Layout(
     "estimator_aid_src_gnss_hgt", {"altitude_m": "observation"}, scale={"altitude_m": -1.0}
@@ -194,11 +184,11 @@ FRAMES: Mapping[str, Mapping[int, str]] = {
 }
 
 
-_OLD_POSE = elements(POSITION_VARIANCE_COLUMNS, "pose_covariance", POSE_DIAGONAL)
+_OLD_POSE = elements(Columns.POSITION_VARIANCE, "pose_covariance", POSE_DIAGONAL)
 _OLD_ODOMETRY = (
     _OLD_POSE
-    | elements(QUATERNION_COLUMNS, "q")
-    | elements(ROTATION_VARIANCE_COLUMNS, "pose_covariance", ROTATION_DIAGONAL)
+    | elements(Columns.QUATERNION, "q")
+    | elements(Columns.ROTATION_VARIANCE, "pose_covariance", ROTATION_DIAGONAL)
     | {"local_frame": "local_frame"}
 )
 
@@ -207,11 +197,11 @@ def _odometry(topic: str) -> tuple[Layout, ...]:
     return (
         Layout(  # v1.14
             topic,
-            elements(POSITION_COLUMNS, "position"),
-            elements(POSITION_VARIANCE_COLUMNS, "position_variance")
+            elements(Columns.POSITION, "position"),
+            elements(Columns.POSITION_VARIANCE, "position_variance")
             | {"pose_frame": "pose_frame"}
-            | elements(QUATERNION_COLUMNS, "q")
-            | elements(ROTATION_VARIANCE_COLUMNS, "orientation_variance"),
+            | elements(Columns.QUATERNION, "q")
+            | elements(Columns.ROTATION_VARIANCE, "orientation_variance"),
         ),
         Layout(topic, XYZ, _OLD_ODOMETRY),  # v1.9 to v1.13
     )
@@ -266,9 +256,9 @@ HOW_TO_FUSE: Mapping[str, str] = {
 AID_OBSERVATION_HORIZONTAL = (
     Layout(
         KEPT_OBSERVATION,
-        elements(POSITION_COLUMNS[:2], "observation"),
+        elements(Columns.POSITION[:2], "observation"),
         # v1.14
-        elements(POSITION_VARIANCE_COLUMNS[:2], "observation_variance"),
+        elements(Columns.POSITION_VARIANCE[:2], "observation_variance"),
     ),
 )
 AID_OBSERVATION_VERTICAL = (

@@ -1,7 +1,5 @@
 """What EKF2 fused: a page with a table and a strip of innovations for each aid."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 
 import numpy as np

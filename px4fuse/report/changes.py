@@ -1,7 +1,5 @@
 """What changed from A to B: its words and numbers, on a page and on the terminal."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 from px4fuse.plain import number_words

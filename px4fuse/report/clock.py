@@ -1,7 +1,5 @@
 """Appendix: the clock. Its page when there is something to say, else a line of provenance."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 from px4fuse.comparison.model import Comparison

@@ -1,7 +1,5 @@
 """Cover: what happened, the verdict, the findings, and the flight from above."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """What a report is made of: what was analysed, and its results as they are attached."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

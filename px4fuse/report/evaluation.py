@@ -1,7 +1,5 @@
 """Errors of a trajectory as evo's users know them: path by error, APE and RPE, on one page."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import Any, NamedTuple

@@ -3,8 +3,6 @@
 Besides, a zoom into predict and update, and the other axes beside the main one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

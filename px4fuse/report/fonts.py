@@ -4,8 +4,6 @@ Typst shapes text, so that Arabic joins, Devanagari orders and Thai stacks as th
 needs is a font that has the characters.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 

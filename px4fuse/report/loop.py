@@ -1,7 +1,5 @@
 """Loop: the path before and after, the closure error, and scores of every correction."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What happened, drawn the same way on every time axis: gaps, modes, resets, rejections."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

@@ -4,8 +4,6 @@ PDF/A-3a and PDF/UA-1: for archives, and for screen readers. Typst sees the temp
 alone: its root is an empty folder, and it loads no font but those of :mod:`px4fuse.report.fonts`.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator, Mapping
 from importlib import metadata

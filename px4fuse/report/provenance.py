@@ -1,7 +1,5 @@
 """Provenance: where every number comes from, so that somebody else can make it again."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 

@@ -6,8 +6,6 @@ Words are made without knowing where the log lies, and a report names no folder.
 ``px4fuse compare LOG --sigma-z 0.2``, and the terminal puts in what was typed.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import zip_longest

@@ -1,7 +1,5 @@
 """Appendix: what the knobs do. The ratio SIGMA_A/SIGMA_Z makes the track, their size the claims."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

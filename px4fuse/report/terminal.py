@@ -1,7 +1,5 @@
 """The summary on the terminal: what happened, what was compared with what, verdicts, findings."""
 
-from __future__ import annotations
-
 from px4fuse.ekf2.walk import Why
 from px4fuse.findings import by_root
 from px4fuse.report.aids import write_alone, write_appendix

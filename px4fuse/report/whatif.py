@@ -1,7 +1,5 @@
 """What if EKF2 had had other parameters: side by side, and a row for each value of one."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 

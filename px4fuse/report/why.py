@@ -1,7 +1,5 @@
 """Why EKF2 differs: from our filter to the logged EKF2, one change at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Any
 

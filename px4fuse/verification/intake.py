@@ -9,8 +9,6 @@ drawn again. A file that another program saved again is therefore as good as the
 as its results are still attached.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import logging

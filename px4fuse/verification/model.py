@@ -1,7 +1,5 @@
 """What is read from a report, and what verification says of it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Literal
 

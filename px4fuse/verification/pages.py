@@ -24,8 +24,6 @@ a page clipped, turned, emptied or exchanged                 0.55 to 0.81
 ===========================================================  ================
 """
 
-from __future__ import annotations
-
 import importlib
 import io
 import math

@@ -5,8 +5,6 @@ every value; files are found by their SHA-256 among those that were given, never
 nothing in it names an output.
 """
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping

@@ -9,8 +9,6 @@ The pages that were handed in prove nothing and are not read: the report is redr
 log gives. Pages that look otherwise are named, for somebody to look at.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

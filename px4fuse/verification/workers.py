@@ -5,8 +5,6 @@ job: a worker that is killed breaks the whole pool (BrokenProcessPool). ``multip
 waits forever for the result of a worker that died. So: one pipe per process, and a clock.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import pickle

@@ -56,7 +56,7 @@ SWAPPED = {
 
 # Changes that no test can tell, by file and what they make of a line
 EQUIVALENT = {
-    ("px4fuse/ekf2/walk.py", "for column in POSITION_COLUMNS[:3]"):
+    ("px4fuse/ekf2/walk.py", "for column in Columns.POSITION[:3]"):
         "numpy.hypot takes a third array for its output",
     ("px4fuse/filter/causes.py", "1.5e-12 * np.eye("): "below rounding, keeps a matrix regular",
     ("px4fuse/trajectory/graph/covariance.py", "_SINGULAR = 1.5"): "below rounding",

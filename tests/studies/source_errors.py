@@ -46,7 +46,7 @@ from px4fuse.filter.motion import motion
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
 from px4fuse.findings.story import story
-from px4fuse.flight import POSITION_COLUMNS, POSITION_VARIANCE_COLUMNS, Flight, Unavailable
+from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.readers import read_log
 
 Values = NDArray[np.float64]
@@ -214,8 +214,8 @@ def laid_over(
     true = known(time)
     error, late = model(rng, time, true)
     sent = np.round((true + error) * 1e3) / 1e3  # millimetres
-    samples = pd.DataFrame(sent, pd.Index(time + late, name="time_s"), POSITION_COLUMNS)
-    samples[POSITION_VARIANCE_COLUMNS] = sigma_m**2
+    samples = pd.DataFrame(sent, pd.Index(time + late, name="time_s"), Columns.POSITION)
+    samples[Columns.POSITION_VARIANCE] = sigma_m**2
     samples = samples[~samples.index.duplicated()].sort_index()
     return replace(
         flight,
