@@ -323,7 +323,7 @@ def test_the_command_writes_one_page(tmp_path: Path, monkeypatch: pytest.MonkeyP
     (told,), (drawn,) = keys(page), draw(3, 1, 1)
     assert told["right"] == drawn.right
     assert opened == []  # nobody sits there
-    monkeypatch.setattr("px4fuse.assignment.practice.practice_text", lambda *_: "made")
+    monkeypatch.setattr("px4fuse.practice.practice_text", lambda *_: "made")
     practice("--seed", "3", "--flights", "1", "--open", "-o", "a.html")
     assert opened == [str(tmp_path / "a.html")]
 
