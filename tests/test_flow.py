@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from exchange import replace
-from ulog_tools import gnss_log, stamps, topic
+from ulog_tools import gnss_log, seconds_of, stamps, topic
 
 from px4fuse.ekf2.flow import FlowSamples, fuse_flow, gather_flow, with_flow
 from px4fuse.ekf2.inputs import read_gnss
@@ -75,7 +75,8 @@ def test_what_lies_between_two_rows_is_read_as_the_mean_of_all_samples(tmp_path:
     log["estimator_states"]["states"][:, :4] = [1.0, 0.0, 0.0, 0.0]
     at = stamps(20.0, 50.0)
     raw = np.random.default_rng(3).normal(0.0, 1.0, (len(at), 2))
-    rows = np.cumsum(np.tile([10, 10, 9, 11], 12))  # a logger that is late now and then
+    # a logger that is late now and then, and once misses four
+    rows = np.cumsum([*[10, 10, 9, 11] * 6, 50, *[10, 10, 9, 11] * 12])
     log.add(topic("estimator_optical_flow_vel", at[rows], {
         "vel_body": raw[rows], "vel_body_filtered": low_passed(raw)[rows],
         "flow_rate_compensated": raw[rows][:, ::-1] * [1.0, -1.0] / 6.0,
@@ -86,17 +87,24 @@ def test_what_lies_between_two_rows_is_read_as_the_mean_of_all_samples(tmp_path:
     log.add(topic("estimator_aid_src_optical_flow", at[::25], {
         "observation_variance": np.full((len(at[::25]), 2), 0.04),
     }))  # fmt: skip
+    flags = log["estimator_status_flags"]
+    off_us = at[rows[30]]  # EKF2 gives flow up then, by the flags of the next second
+    flags["cs_opt_flow"] = flags["timestamp"] < off_us
     ekf2 = read_log(log.write(tmp_path / "a.ulg")).ekf2
     assert isinstance(ekf2, Ekf2)
     assert isinstance(ekf2.record, FusionRecord)
     flow = ekf2.record.flow
-    assert flow["samples"].tolist() == np.diff(rows).tolist()
+    end_s = seconds_of(flags["timestamp"][flags["timestamp"] >= off_us])[0]
+    fused = np.flatnonzero(seconds_of(at[rows]) < end_s)[1:]
+    fused = fused[fused != 24]
+    assert len(fused) > 25
+    assert flow["samples"].tolist() == np.diff(rows)[fused - 1].tolist()
     assert flow["interval_s"].unique() == pytest.approx([INTERVAL_S])
     np.testing.assert_allclose(flow["noise_m2_s2"], 0.04 * 6.0**2, rtol=1e-4)
-    for end, (forward, right) in zip(
-        rows[1:], flow[["forward_m_s", "right_m_s"]].to_numpy(), strict=True
-    ):
-        count = int(end - rows[np.searchsorted(rows, end) - 1])
+    for end, count, forward, right in zip(
+        rows[fused], flow["samples"].astype(int), flow["forward_m_s"], flow["right_m_s"],
+        strict=True,
+    ):  # fmt: skip
         weight = (1.0 - SHARE) ** np.arange(count)
         mean = weight @ raw[end - np.arange(count)] / weight.sum()
         assert [forward, right] == pytest.approx(mean.tolist(), abs=1e-4)

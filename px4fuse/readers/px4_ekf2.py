@@ -14,7 +14,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from px4fuse.arrays import Array, IntArray
-from px4fuse.ekf2_parameters import AIDS, EV_POS, settings_in_force
+from px4fuse.ekf2_parameters import AIDS, EV_POS, FLOW, settings_in_force
 from px4fuse.flight import (
     BAD_ACCELERATION,
     BIAS_NOT_LOGGED,
@@ -43,6 +43,8 @@ MAG_3D_BIT = 5  # filter_control_status_u, common.h
 FIELD_COLUMNS = ("forward_gauss", "right_gauss", "down_gauss")
 # So near to a half, IMU samples per step may be rounded either way
 HALF = 0.05
+# Between two rows of optical flow
+MAX_FLOW_S = 0.5
 # Horizontal aiding besides vision position
 OTHER_AIDING = ("gnss_pos", "gnss_vel", "optical_flow", "ev_vel", "aux_global_position", "airspeed")
 VARIANCES_NOT_LOGGED = Unavailable(
@@ -321,7 +323,7 @@ def _read_record(
         ),
         vision_age_s=age[~age.index.duplicated()],
         field_gauss=_read_field(topics, step_s),
-        flow=_read_flow(topics),
+        flow=_read_flow(topics, meant),
         altitude_m=altitude_m,
         states={one: meant[one] for one in (GROUND_EFFECT, BAD_ACCELERATION) if one in meant},
         height_bias={
@@ -351,24 +353,32 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
     return used.assign(fused_3d=(flags >> MAG_3D_BIT & 1).astype(float))
 
 
-def _read_flow(topics: Topics) -> pd.DataFrame:
+def _read_flow(topics: Topics, meant: Mapping[str, pd.Series[float]]) -> pd.DataFrame:
     """What optical flow measured: of the samples between two rows the mean, by the low pass."""
     if any(topics.find((layout,)) is None for layout in px4.FLOW):
         return pd.DataFrame()
     speed, interval, noise = (topics.of_primary(layout).dropna() for layout in px4.FLOW)
     interval_s = float(interval["interval_us"].median()) * 1e-6
-    samples = np.rint(np.diff(speed.index) / interval_s)
+    if not interval_s > 0.0 or noise.empty:
+        return pd.DataFrame()
+    times = speed.index.to_numpy()
+    # of more samples the low pass has forgotten too many
+    row = np.flatnonzero((np.diff(times) > 0.5 * interval_s) & (np.diff(times) <= MAX_FLOW_S)) + 1
+    if FLOW.name in meant:
+        row = row[at_times(meant[FLOW.name], times[row]) > 0.0]
+    samples = np.rint((times[row] - times[row - 1]) / interval_s)
     kept = ((1.0 - FLOW_SHARE) ** samples)[:, None]
     low_passed = speed[["forward_m_s", "right_m_s"]].to_numpy()
-    newest = np.hypot(speed["newest_forward_m_s"], speed["newest_right_m_s"])
-    range_m = newest / np.hypot(speed["x_rad_s"], speed["y_rad_s"])
-    forward, right = ((low_passed[1:] - kept * low_passed[:-1]) / (1.0 - kept)).T
+    forward, right = ((low_passed[row] - kept * low_passed[row - 1]) / (1.0 - kept)).T
+    now = speed.iloc[row]
+    range2 = (now["newest_forward_m_s"] ** 2 + now["newest_right_m_s"] ** 2) / (
+        now["x_rad_s"] ** 2 + now["y_rad_s"] ** 2
+    )
     found = pd.DataFrame({
         "forward_m_s": forward, "right_m_s": right, "samples": samples, "interval_s": interval_s,
-        "noise_m2_s2": (range_m**2)[1:] * np.interp(speed.index[1:], noise.index, noise["noise"]),
-    }, index=speed.index[1:])  # fmt: skip
-    found["noise_m2_s2"] = found["noise_m2_s2"].where(np.isfinite(found["noise_m2_s2"]))
-    return found[found["samples"] > 0.0].dropna()
+        "noise_m2_s2": range2 * np.interp(times[row], noise.index, noise["noise"]),
+    }, index=now.index)  # fmt: skip
+    return found.replace(np.inf, np.nan).dropna()
 
 
 def _attitude_variance(quaternion: Array, variance: Array) -> Array:
