@@ -258,9 +258,12 @@ def check_targets(targets: Iterable[Path | None]) -> None:
     paths = [Path(path) for some in several for path in some]  # URLs are texts
     read = [path if path.exists() else Path(str(path).rpartition(":")[0]) for path in paths]
     for target in files:
+        there = False
         try:
-            there = target.exists()
-        except OSError as error:  # a name that is too long
+            there = bool(target.stat())
+        except FileNotFoundError:
+            pass
+        except OSError as error:  # a name that is too long, a file in the place of a folder
             raise OutputError(
                 f"{target}: cannot be written ({error.strerror}). Choose another place for it."
             ) from error
