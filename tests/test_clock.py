@@ -352,7 +352,8 @@ def test_what_is_simulated_for_the_scatter_is_the_noise_of_the_imu(
     time = samples.index.to_numpy()
     moved = motion(flight, time, samples.to_numpy(), directions=np.eye(3), dt_s=DT)
     factor = clock._scatter(moved, 0.0, Noises(0.5, 0.1, 0.2), 40.0)
-    assert factor == pytest.approx(1.0 + (32**2 - 1) / 12.0 / 40.0)
+    size = clock.REPLICATES_AT_ONCE
+    assert factor == pytest.approx(1.0 + (size**2 - 1) / 12.0 / 40.0)
     error, dp, dv = (
         np.concatenate(part, axis=1) for part in zip(*(one for one, _ in given), strict=True)
     )

@@ -54,7 +54,7 @@ SURE_SIGMAS = 3.0
 # Flights simulated for the scatter that the IMU's noise adds
 REPLICATES = 96
 # Of these so many are weighed together: whitened they are twice as long
-REPLICATES_AT_ONCE = 32
+REPLICATES_AT_ONCE = 8
 # Steps of ln σ by which the noises are tried at every offset
 NOISE_STEP = 0.1
 
