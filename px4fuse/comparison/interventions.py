@@ -198,7 +198,7 @@ def interventions(
         Of EKF2.
     """
     known = comparison, tuning, clock, heading
-    filters: list[_Changed] = [_Ours(*known, explained)]
+    filters: list[_Tried] = [_Ours(*known, explained)]
     if not isinstance(model, Unavailable) and model.agreement.good:
         inputs, used_m = model.inputs, noise_used_m(model)
         filters += [_Replayed(*known, inputs, used_m, model)] if _fused(comparison, inputs) else []
@@ -239,7 +239,7 @@ def _fused(comparison: Comparison, inputs: Inputs) -> bool:
     return source.name == inputs.received.source and source.alignment is None
 
 
-def _apart(cause: Intervention, result: AxisComparison, changed: _Changed) -> list[Intervention]:
+def _apart(cause: Intervention, result: AxisComparison, changed: _Tried) -> list[Intervention]:
     """How far a cause keeps both filters apart."""
     before, after = (changed.number(result, "apart", change) for change in ({}, cause.change))
     if before is None or after is None:
@@ -259,7 +259,7 @@ def _discrepancies(statement: FilterSummary | UnjudgedFilter) -> list[Of]:
     return [*found, "nis"] if statement.times_off >= SIGMA_OFF else found
 
 
-def _tried(changed: _Changed, result: AxisComparison, of: Of) -> list[Intervention]:
+def _tried(changed: _Tried, result: AxisComparison, of: Of) -> list[Intervention]:
     """All candidates alone; where the best leaves the number outside its band, with the others."""
     statement, candidates = result.filters[changed.owner], changed.candidates(result, of)
     truth = statement.truth
@@ -324,7 +324,7 @@ def _turned(direction: Array, turned_deg: float) -> Array:
 
 @dataclass(frozen=True)
 class _Changed:
-    """A filter that is run with changes, and what the data ask for."""
+    """A filter, and what the data ask to change of it."""
 
     comparison: Comparison
     tuning: Tuning
@@ -341,10 +341,6 @@ class _Changed:
             if self.owner == "kf" or result.axis.name != "down"
             for of in _discrepancies(result.filters[self.owner])
         ]
-
-    def number(self, result: AxisComparison, of: Of, change: Change) -> tuple[float, int] | None:
-        """Mean NIS or NEES along an axis with a change, or how far apart; and of how many."""
-        raise NotImplementedError
 
     @abstractmethod
     def of_noise(self, result: AxisComparison, tuned: AxisTuning, over: bool) -> list[Change]:
@@ -385,7 +381,16 @@ class _Changed:
 
 
 @dataclass(frozen=True)
-class _Ours(_Changed):
+class _Tried(_Changed):
+    """A filter that is run with changes."""
+
+    @abstractmethod
+    def number(self, result: AxisComparison, of: Of, change: Change) -> tuple[float, int] | None:
+        """Mean NIS or NEES along an axis with a change, or how far apart; and of how many."""
+
+
+@dataclass(frozen=True)
+class _Ours(_Tried):
     """Our filter with changes."""
 
     explained: Explained | Unavailable
@@ -514,7 +519,7 @@ class _Ekf2(_Changed):
 
 
 @dataclass(frozen=True)
-class _Replayed(_Ekf2):
+class _Replayed(_Ekf2, _Tried):
     """EKF2 with changes, where the model agrees with the log."""
 
     model: Model
