@@ -55,11 +55,12 @@ SIZE_PX = 2
 MAX_PAGE_TEXT = 1_000_000
 # For the pages of a PDF that was handed in; libraries take 0.6 GB of the address space
 TIMEOUT_S, MEMORY_BYTES = 10.0, 1_000_000_000
-# Less where a page is very long
+# Less where a page is very long, or its picture does not fit into MAX_PICTURE_BYTES
 WIDTH_PX = 700
 # Enough to keep our blue, EKF2's orange and the severities apart, with smooth letters
 COLOURS = 16
-# A page of text and lines at 700 pixels takes 15 to 55 kB, any at most half a byte per pixel
+# A page of text and lines at 700 pixels takes 15 to 55 kB; a photograph is made smaller
+MAX_PICTURE_BYTES = 60_000
 MAX_PIXELS = 2_000_000
 MAX_DRAWN_COLOURS = 20_000
 # PDF's own limit is 14,400 points, or 200 inches
@@ -212,7 +213,7 @@ def pictures(pdf: bytes, page: int | None = None) -> tuple[bytes, ...] | Unavail
     Returns
     -------
     tuple of bytes or Unavailable
-        PNGs of at most :data:`MAX_PIXELS`, in :data:`COLOURS`; none for a page that is not there.
+        PNGs of at most :data:`MAX_PICTURE_BYTES`; none for a page that is not there.
     """
     return _of_pages(pdf, _picture, slice(None) if page is None else slice(page, page + 1))
 
@@ -250,9 +251,15 @@ def rendered(sheet: Any, width_px: float) -> Image.Image:
 
 
 def _small_png(image: Image.Image) -> bytes:
-    # Choosing by coverage is truer to text and lines, and takes minutes on a photograph
-    drawn = image.getcolors(MAX_DRAWN_COLOURS) is not None
-    method = Image.Quantize.MAXCOVERAGE if drawn else Image.Quantize.FASTOCTREE
-    out = io.BytesIO()
-    image.quantize(COLOURS, method, dither=Image.Dither.NONE).save(out, "PNG")
-    return out.getvalue()
+    while True:
+        # Choosing by coverage is truer to text and lines, and takes minutes on a photograph
+        drawn = image.getcolors(MAX_DRAWN_COLOURS) is not None
+        method = Image.Quantize.MAXCOVERAGE if drawn else Image.Quantize.FASTOCTREE
+        reduced = image.quantize(COLOURS, method, dither=Image.Dither.NONE)
+        out = io.BytesIO()
+        reduced.save(out, "PNG")
+        if out.tell() <= MAX_PICTURE_BYTES:
+            return out.getvalue()
+        ratio = min(0.9, math.sqrt(MAX_PICTURE_BYTES / out.tell()))
+        width, height = (max(1, int(ratio * side)) for side in image.size)
+        image = image.resize((width, height), Image.Resampling.LANCZOS)
