@@ -15,8 +15,8 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array, IntArray
-from px4fuse.ekf2.magnetometer import CROSS, EYE, fuse_mean
-from px4fuse.ekf2.stretches import GRAVITY_M_S2, THETA, VELOCITY, Flow, Stretch
+from px4fuse.ekf2.magnetometer import CROSS, EYE, fuse_mean, mean_by_event
+from px4fuse.ekf2.stretches import THETA, VELOCITY, Flow, Stretch
 from px4fuse.flight import FLOW_SHARE
 
 
@@ -44,9 +44,8 @@ def with_flow(stretch: Stretch, flow: pd.DataFrame, gate: float) -> Stretch:
     gate : float
         In standard deviations.
     """
-    count, interval_s = flow["samples"].to_numpy(), flow["interval_s"].to_numpy()
-    begin_s, end_s = flow.index - (count - 1.0) * interval_s, flow.index
-    flow = flow[(begin_s > stretch.time_s[0]) & (end_s <= stretch.time_s[-1])]
+    begin_s = flow.index - (flow["samples"] - 1.0) * flow["interval_s"]
+    flow = flow[(begin_s > stretch.time_s[0]) & (flow.index <= stretch.time_s[-1])]
     count, interval_s = flow["samples"].to_numpy(), flow["interval_s"].to_numpy()
     back = np.arange(int(count.max(initial=1.0)))
     weight = np.where(back < count[:, None], (1.0 - FLOW_SHARE) ** back, 0.0)
@@ -54,7 +53,7 @@ def with_flow(stretch: Stretch, flow: pd.DataFrame, gate: float) -> Stretch:
     taken_s = flow.index.to_numpy()[:, None] - back * interval_s[:, None]
     step = np.searchsorted(stretch.time_s, taken_s - 1e-9)
     turn = stretch.rotation[step].swapaxes(2, 3)[:, :, :2]
-    gained = np.einsum("ki,kiab,kib->ka", weight, turn, _gained_m_s(stretch)[step])
+    gained = np.einsum("ki,kiab,kib->ka", weight, turn, stretch.gained_m_s[step])
     return replace(stretch, flow=Flow(
         step=step[:, 0], speed_m_s=flow[["forward_m_s", "right_m_s"]].to_numpy() - gained,
         turn=np.einsum("ki,kiab->kab", weight, turn), noise_m2_s2=flow["noise_m2_s2"].to_numpy(),
@@ -62,26 +61,17 @@ def with_flow(stretch: Stretch, flow: pd.DataFrame, gate: float) -> Stretch:
     ))  # fmt: skip
 
 
-def _gained_m_s(stretch: Stretch) -> Array:
-    """Velocity gained since the start by the IMU alone, at each step's end (NED)."""
-    force = np.einsum("nij,nj->ni", stretch.rotation[1:], stretch.force_m_s2) + GRAVITY_M_S2
-    gained = np.cumsum(force * stretch.step_s[:, None], axis=0)
-    return np.concatenate([np.zeros((1, 3)), gained])
-
-
 def gather_flow(stretch: Stretch, flow: Flow, end: IntArray) -> FlowSamples:
     """Means by the event at which they are fused; ``end`` is the step of each event."""
     event = np.searchsorted(end, flow.step)
     inside = event < len(end)
     event, turn = event[inside], flow.turn[inside]
-    since = np.einsum("kab,kb->ka", turn, _gained_m_s(stretch)[end[event]])
+    since = np.einsum("kab,kb->ka", turn, stretch.gained_m_s[end[event]])
     rows = np.concatenate([flow.speed_m_s[inside] + since, turn.reshape(-1, 6),
                            flow.noise_m2_s2[inside, None]], axis=1)  # fmt: skip
-    number, total = np.zeros(len(end)), np.zeros((len(end), 9))
+    mean, _ = mean_by_event(event, rows, len(end))
+    number = np.zeros(len(end))
     np.add.at(number, event, flow.samples[inside])
-    np.add.at(total, event, rows)
-    count = np.bincount(event, minlength=len(end))
-    mean = total / np.maximum(count, 1)[:, None]
     return FlowSamples(mean[:, :2], mean[:, 2:8].reshape(-1, 2, 3), number, mean[:, 8])
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.ekf2.stretches import GRAVITY_M_S2, Heights, Stretch, steps_of
+from px4fuse.ekf2.stretches import Heights, Stretch, steps_of
 from px4fuse.ekf2_parameters import AIDS, BAROMETER, GNSS_HGT, fuses_by_mask
 from px4fuse.flight import GROUND_EFFECT, Ekf2, Flight, FusionRecord, at_times
 
@@ -104,9 +104,8 @@ def barometer_samples(stretch: Stretch, ends: Sequence[IntArray]) -> list[Array]
     """
     heights, time_s = stretch.heights, stretch.time_s
     assert heights is not None
-    force = np.einsum("nj,nj->n", stretch.rotation[1:, 2], stretch.force_m_s2) + GRAVITY_M_S2[2]
     # by the IMU alone, from a standstill
-    speed = np.concatenate([[0.0], np.cumsum(force * stretch.step_s)])
+    speed = stretch.gained_m_s[:, 2]
     path = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * stretch.step_s)])
     found = []
     for end in ends:

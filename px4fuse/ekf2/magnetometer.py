@@ -37,12 +37,16 @@ def gather(field: Field, rotation: Array, end: IntArray) -> FieldSamples:
     event = np.searchsorted(end, field.step)
     inside = event < len(end)
     event, step = event[inside], field.step[inside]
-    count = np.bincount(event, minlength=len(end))
     each = np.concatenate([field.gauss[inside][:, None], rotation[step].transpose(0, 2, 1)], axis=1)
-    total = np.zeros((len(end), 4, 3))
-    np.add.at(total, event, each)
-    mean = total / np.maximum(count, 1)[:, None, None]
+    mean, count = mean_by_event(event, each, len(end))
     return FieldSamples(mean[:, 0], mean[:, 1:], np.asarray(count * field.weight))
+
+
+def mean_by_event(event: IntArray, rows: Array, events: int) -> tuple[Array, IntArray]:
+    """Mean of the rows of each of some events, 0 where there is none, and how many there are."""
+    count, total = np.bincount(event, minlength=events), np.zeros((events, *rows.shape[1:]))
+    np.add.at(total, event, rows)
+    return total / np.expand_dims(np.maximum(count, 1), tuple(range(1, rows.ndim))), count
 
 
 def fuse_field(

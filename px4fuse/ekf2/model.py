@@ -10,7 +10,6 @@ far it can be believed is measured on each log, see :mod:`px4fuse.ekf2.replay`.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -62,6 +61,9 @@ MODEL_NOTE = (
 )
 MAX_HORIZON_S = 1.0  # EKF2_DELAY_MAX
 
+# What an agreement says of an aid by another name
+DOUBTED = {FLOW.name: "carried_difference_m"}
+
 Besides = Callable[[Inputs], Sequence[Variant]]
 
 
@@ -105,25 +107,19 @@ def open_model(flight: Flight, besides: Besides = lambda _: ()) -> Model | Unava
     besides : callable
         Gives the variants that will be asked for, which cost little when they run along.
     """
-    doubtful: dict[str, str] = {}
-    told: dict[str, Any] = {}
-    while not isinstance(model := _open(flight, besides, doubtful), Unavailable):
-        agreement = model.agreement
-        if not agreement.doubtful:
-            agreement = structs.replace(agreement, doubtful=doubtful, **told)
-            flown = structs.replace(model.flown, agreement=agreement)
-            opened = replace(model, flown=flown, agreement=agreement)
-            opened.runs.extend(model.runs)
-            return opened
-        doubtful |= agreement.doubtful
-        fields = {FLOW.name: "carried_difference_m"}
-        for name in agreement.doubtful:
-            told[fields.get(name, name)] = getattr(agreement, fields.get(name, name))
+    doubted: dict[str, Agreement] = {}
+    while not isinstance(model := _open(flight, besides, doubted), Unavailable):
+        if not (more := model.agreement.doubtful.keys() - doubted.keys()):
+            break
+        doubted |= dict.fromkeys(more, model.agreement)
     return model
 
 
-def _open(flight: Flight, besides: Besides, doubtful: Mapping[str, str]) -> Model | Unavailable:
-    """The model without what is doubtful."""
+def _open(
+    flight: Flight, besides: Besides, doubted: Mapping[str, Agreement]
+) -> Model | Unavailable:
+    """The model without the aids that are doubted, each by an agreement that says why."""
+    doubtful = {name: found.doubtful[name] for name, found in doubted.items()}
     inputs = prepare(flight, doubtful)
     if isinstance(inputs, Unavailable):
         return structs.replace(inputs, what=WHAT)
@@ -150,6 +146,12 @@ def _open(flight: Flight, besides: Besides, doubtful: Mapping[str, str]) -> Mode
         obeyed = agreement_with_log(flight, obedient)
         if isinstance(obeyed, Agreement):
             agreement = with_obedient(agreement, obeyed)
+    told = {DOUBTED.get(name, name): name for name in doubted}
+    agreement = structs.replace(
+        agreement,
+        doubtful={**doubtful, **agreement.doubtful},
+        **{of: getattr(doubted[name], of) for of, name in told.items()},
+    )
     replay = structs.replace(replay, agreement=agreement)
     model = Model(flight, inputs, intervals, replay, obedient, agreement)
     model.runs.extend(runs)

@@ -7,7 +7,7 @@ and ``EKF/vel_pos_fusion.cpp`` (gate, fusion), ``ev_pos_control.cpp`` (noise, re
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -28,7 +28,9 @@ from px4fuse.ekf2.stretches import (
     VELOCITY,
     Stretch,
 )
-from px4fuse.ekf2_parameters import FLOW, GNSS_POS, GNSS_VEL, MAG
+from px4fuse.ekf2_parameters import FLOW, GNSS_POS, GNSS_VEL, MAG, Aid
+
+Samples = TypeVar("Samples", FieldSamples, FlowSamples)
 
 # How long the first pass runs that gives the correlations at the start
 CORRELATING_S = 8.0
@@ -190,16 +192,20 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     own_attitude = stretch.attitude_variance_rad2[end]
     own_variance = np.stack([own_attitude[:, :, HEADING], stretch.down_variance_m2[end]], axis=-1)
     seen = heights = speeds = None
+
+    def means(of: Aid, each: Sequence[Samples]) -> Samples:
+        """What all variants were sent of an aid, while it is there."""
+        together = (np.stack(part, axis=1)[:, pick] for part in zip(*each, strict=True))
+        told = type(each[0])(*together)
+        return told._replace(number=np.where(on[of.name], told.number, 0.0))
+
+    ends = [one.events.end for one in distinct]
     if (field := stretch.field) is not None:
-        each = [gather(field, stretch.rotation, one.events.end) for one in distinct]
-        seen = FieldSamples(*(np.stack(part, axis=1)[:, pick] for part in zip(*each, strict=True)))
-        seen = seen._replace(number=np.where(on[MAG.name], seen.number, 0.0))
+        seen = means(MAG, [gather(field, stretch.rotation, one) for one in ends])
     if (flow := stretch.flow) is not None:
-        rows = [gather_flow(stretch, flow, one.events.end) for one in distinct]
-        speeds = FlowSamples(*(np.stack(part, axis=1)[:, pick] for part in zip(*rows, strict=True)))
-        speeds = speeds._replace(number=np.where(on[FLOW.name], speeds.number, 0.0))
+        speeds = means(FLOW, [gather_flow(stretch, flow, one) for one in ends])
     if stretch.heights is not None:
-        samples = barometer_samples(stretch, [one.events.end for one in distinct])
+        samples = barometer_samples(stretch, ends)
         told = np.stack(samples, axis=-1)[..., pick]
         heights = HeightFilter(stretch, told, event["time_s"], active, on, knob, gated)
     gyro2 = np.where(attitude, knob["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]

@@ -4,6 +4,7 @@ Sources: PX4-Autopilot ``EKF/imu_down_sampler/imu_down_sampler.cpp``.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -209,6 +210,13 @@ class Stretch:
     flow: Flow | None = None
 
     __repr__ = brief
+
+    @cached_property
+    def gained_m_s(self) -> Array:
+        """Velocity gained since the start by the IMU alone, at each step's end, (n + 1, 3)."""
+        force = np.einsum("nij,nj->ni", self.rotation[1:], self.force_m_s2) + GRAVITY_M_S2
+        gained = np.cumsum(force * self.step_s[:, None], axis=0)
+        return np.concatenate([np.zeros((1, 3)), gained])
 
 
 def find_stretches(
