@@ -338,13 +338,15 @@ def test_what_is_simulated_for_the_scatter_is_the_noise_of_the_imu(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Of legs and measurements as large as the noises say, with the velocity that goes with it."""
-    given: list[tuple[list[Array], list[Array]]] = []
+    given: list[Array] = []
 
-    def products(_: object, sigma_a: float, variance: Array, *pair: list[Array]) -> Array:
-        given.append(pair)
+    def products(
+        _: object, sigma_a: float, variance: Array, signals: tuple[Array, ...], measured: Array
+    ) -> Array:
+        given.extend([*signals, measured])
         assert sigma_a == 0.5
         np.testing.assert_allclose(variance, 0.1**2)
-        return np.arange(pair[0][0].shape[1])[None, :]
+        return np.arange(measured.shape[1])[None, :]
 
     monkeypatch.setattr(clock, "paired_products", products)
     flight, _ = made_flight()
@@ -352,12 +354,9 @@ def test_what_is_simulated_for_the_scatter_is_the_noise_of_the_imu(
     time = samples.index.to_numpy()
     moved = motion(flight, time, samples.to_numpy(), directions=np.eye(3), dt_s=DT)
     factor = clock._scatter(moved, 0.0, Noises(0.5, 0.1, 0.2), 40.0)
-    size = clock.REPLICATES_AT_ONCE
+    size = clock.REPLICATES
     assert factor == pytest.approx(1.0 + (size**2 - 1) / 12.0 / 40.0)
-    error, dp, dv = (
-        np.concatenate(part, axis=1) for part in zip(*(one for one, _ in given), strict=True)
-    )
-    speed = np.concatenate([two[0] for _, two in given], axis=1)
+    error, dp, dv, speed = given
     joined, length = moved.at(0.0).joined, np.diff(moved.time_s)
     for noise, expected in (
         (error, 0.1**2),

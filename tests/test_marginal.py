@@ -95,9 +95,10 @@ def test_the_system_is_that_of_the_dense_normal_equations(seed: int) -> None:
     system = factorise(length, noise, joined, precision)
     state = system.solve(*signals).reshape(3, 2 * count)
     np.testing.assert_allclose(state.T, expected, rtol=1e-6, atol=1e-6)
-    legs, explained = system.whiten(*signals)
+    (first, second), explained = system.whiten(*signals)
     over_sigma = np.sqrt(precision[:, 0]) * measured
-    products = over_sigma @ over_sigma.T + legs @ legs.T - explained @ explained.T
+    products = over_sigma @ over_sigma.T + first @ first.T + second @ second.T
+    products -= explained @ explained.T
     np.testing.assert_allclose(products, left.T @ left, rtol=1e-6, atol=1e-6)
     log_determinant += np.linalg.slogdet(normal)[1]
     assert system.log_determinant == pytest.approx(log_determinant, abs=1e-6)
@@ -293,7 +294,15 @@ def test_paired_products_are_under_the_covariance_with_the_constants() -> None:
     still = np.zeros((3, 2, COUNT - 1))
     first, second = signal.transpose(1, 2, 0), signal[..., [1, 1]].transpose(1, 2, 0)
     given = arguments(part, noises, np.ones(COUNT))
-    ours = paired_products(*given, [first, still, still], [second, still, still])
+    ours = paired_products(*given, (first, still, still), second)
+    # a path to which the legs lead is not seen
+    legs = np.random.default_rng(9).normal(0.0, 1.0, (2, *still.shape))
+    path, speed = np.zeros((2, *first.shape))
+    for at in np.flatnonzero(part.joined):
+        path[..., at + 1] = path[..., at] + part.length_s[at] * speed[..., at] + legs[0, ..., at]
+        speed[..., at + 1] = speed[..., at] + legs[1, ..., at]
+    moved = paired_products(*given, (first + path, *legs), second)
+    np.testing.assert_allclose(moved, ours, rtol=1e-3, atol=1e-3)
     for stretch in range(2):
         _, covariance, made = joint_normal(part, noises, given[2], stretch)
         picked = np.concatenate([signal[rows, axis] for axis, (rows, *_) in enumerate(made)])

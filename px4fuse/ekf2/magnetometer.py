@@ -85,14 +85,15 @@ def fuse_mean(
     """
     HP = H @ P
     S = HP @ H.transpose(0, 2, 1)
-    single = np.einsum("nii->ni", S) + R[:, None]
-    seen_at_all = number > 0.0
-    taken = seen_at_all & (nu * nu <= gate[:, None] ** 2 * single).all(axis=1)
-    fused = np.broadcast_to(taken[:, None], nu.shape)
-    left = np.where(seen_at_all, R / np.maximum(number, 1.0), 1.0)
-    S += left[:, None, None] * np.eye(nu.shape[1])
+    own = S.reshape(len(S), -1)[:, :: nu.shape[1] + 1]  # its diagonal, as a view
+    told = np.empty((3, *nu.shape))
+    told[0], told[1] = nu, own + R[:, None]
+    seen = number > 0.0
+    taken = seen & (nu * nu <= gate[:, None] ** 2 * told[1]).all(axis=1)
+    told[2] = taken[:, None]
+    told[:, ~seen] = np.nan
+    own += np.where(seen, R / np.maximum(number, 1.0), 1.0)[:, None]
     K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * taken[:, None, None]
     x = x + (K @ nu[:, :, None])[:, :, 0]
     P = P - K @ HP
-    told_of = np.where(seen_at_all[:, None], (nu, single, fused), np.nan)
-    return x, 0.5 * (P + P.transpose(0, 2, 1)), told_of
+    return x, 0.5 * (P + P.transpose(0, 2, 1)), told

@@ -9,6 +9,7 @@ far it can be believed is measured on each log, see :mod:`px4fuse.ekf2.replay`.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -79,8 +80,6 @@ class Model:
         Of each stretch, for the delay as flown.
     flown : Ekf2Replay
         With the parameters of the log.
-    obedient : Ekf2Replay
-        The same, rejecting and resetting where EKF2 did, as far as the log tells.
     agreement : Agreement
         Of ``flown`` with what the log holds.
     runs : list of Run
@@ -91,11 +90,17 @@ class Model:
     inputs: Inputs
     intervals: tuple[Intervals, ...]
     flown: Ekf2Replay
-    obedient: Ekf2Replay
     agreement: Agreement
     runs: list[Run] = field(default_factory=list, init=False)
 
     __repr__ = brief
+
+    @cached_property
+    def obedient(self) -> Ekf2Replay:
+        """As flown, rejecting and resetting where EKF2 did, as far as the log tells."""
+        obeys = Variant(self.inputs.settings, as_logged=True)
+        runs = _run_model(self, [obeys])
+        return _assemble(self.inputs, runs, runs[0].variants.index(obeys), {})
 
 
 def open_model(flight: Flight, besides: Besides = lambda _: ()) -> Model | Unavailable:
@@ -137,13 +142,13 @@ def _open(
     for each in besides(inputs):
         variants += [] if each in variants else [each]
     runs = run_variants(inputs, variants, {timing: intervals})
-    replay, obedient = (_assemble(inputs, runs, at, {}) for at in range(2))
+    replay = _assemble(inputs, runs, 0, {})
     agreement = agreement_with_log(flight, replay)
     if isinstance(agreement, Unavailable):
         return agreement
     share = max(agreement.rejected_share_logged, agreement.rejected_share_replayed)
     if share > REJECTING_SHARE and np.isfinite(inputs.received.rejected).any():
-        obeyed = agreement_with_log(flight, obedient)
+        obeyed = agreement_with_log(flight, _assemble(inputs, runs, 1, {}))
         if isinstance(obeyed, Agreement):
             agreement = with_obedient(agreement, obeyed)
     told = {DOUBTED.get(name, name): name for name in doubted}
@@ -153,7 +158,7 @@ def _open(
         **{of: getattr(doubted[name], of) for of, name in told.items()},
     )
     replay = structs.replace(replay, agreement=agreement)
-    model = Model(flight, inputs, intervals, replay, obedient, agreement)
+    model = Model(flight, inputs, intervals, replay, agreement)
     model.runs.extend(runs)
     return model
 

@@ -178,7 +178,7 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     event = stacked("events")
     action = np.where(gated, event["action"], np.where(event["usable"], FUSE, IDLE))
     end, active = event["end"], action > IDLE
-    now_s, sampled = stretch.time_s[end], np.any(active, axis=1)
+    now_s, sampled = stretch.time_s[end], np.any(active, axis=1).tolist()
     on = {aid.name: now_s < np.array([v.without.get(aid.name, np.inf) for v in variants])
           for aid in (inputs.aid, GNSS_VEL, MAG, FLOW, *SENSORS)}  # fmt: skip
     with_velocity = (action == FUSE) & on[GNSS_VEL.name] & fuses_velocity
@@ -192,6 +192,7 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     own_attitude = stretch.attitude_variance_rad2[end]
     own_variance = np.stack([own_attitude[:, :, HEADING], stretch.down_variance_m2[end]], axis=-1)
     seen = heights = speeds = None
+    told_field, told_speeds = np.zeros((2, events), bool)
 
     def means(of: Aid, each: Sequence[Samples]) -> Samples:
         """What all variants were sent of an aid, while it is there."""
@@ -202,8 +203,10 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     ends = [one.events.end for one in distinct]
     if (field := stretch.field) is not None:
         seen = means(MAG, [gather(field, stretch.rotation, one) for one in ends])
+        told_field = np.asarray(seen.number.any(axis=1))
     if (flow := stretch.flow) is not None:
         speeds = means(FLOW, [gather_flow(stretch, flow, one) for one in ends])
+        told_speeds = np.asarray(speeds.number.any(axis=1))
     if stretch.heights is not None:
         samples = barometer_samples(stretch, ends)
         told = np.stack(samples, axis=-1)[..., pick]
@@ -250,15 +253,15 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
         if floor is not None:
             _limit_bias(P, floor, biases)
         innovation[:, 2:], R[:, 2:] = 0.0, NOT_TAKEN
-        if seen is not None and seen.number[e].any():
+        if seen is not None and told_field[e]:
             field_now = FieldSamples(*(part[e] for part in seen))
             x, P, of_field[e] = fuse_field(x, P, field_now, knob[MAG.noise], knob[MAG.gate])
-        if speeds is not None and flow is not None and speeds.number[e].any():
+        if speeds is not None and flow is not None and told_speeds[e]:
             x, P = fuse_flow(x, P, FlowSamples(*(part[e] for part in speeds)), flow.gate)
         if sampled[e]:
             nu = measured[e] - x[:, TOLD]
             S = _diagonal(P)[:, TOLD] + noise[e]
-            innovations[e], variances[e] = np.where(active[e, :, None], (nu, S), np.nan)
+            innovations[e], variances[e] = nu, S
             outside = nu * nu > gate2 * S
             moving = with_velocity[e] & ~(outside[:, SPEED].any(axis=1) & gated)
             outside = outside[:, LEVEL].any(axis=1)
@@ -289,12 +292,13 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
                     R[:, 1] = np.where(active[e], noise[e, :, 5], NOT_TAKEN)
             x, P = _together(x, P, innovation, R)
             x[:, HEADING] = heading
-        if reset[e].any():
+        if sampled[e] and reset[e].any():
             after = inputs.rules.reset_scale * noise[e, :, LEVEL]
             _set(x, P, reset[e], HORIZONTAL, measured[e, :, LEVEL], after)
             if has_speed and inputs.rules.with_velocity:
                 _set(x, P, reset[e], VELOCITY, measured[e, :, SPEED], noise[e, :, SPEED])
         states[e + 1], spreads[e + 1] = x, _diagonal(P)
+    innovations[~active], variances[~active] = np.nan, np.nan
     return Run(
         stretch, tuple(variants), tuple(each.events for each in intervals), innovations, variances,
         noise, rejected, fused, reset, states, spreads, P, of_field, heights,
@@ -350,7 +354,8 @@ def _in_turn(
         column = columns[:, j]
         told = column[:, rows]
         b[:, j] -= square[:, j] * told[:, j]
-        columns[:, j + 1 :] -= (b[:, j, None] * told[:, j + 1 :])[:, :, None] * column[:, None]
+        if j < nu.shape[1] - 1:
+            columns[:, j + 1 :] -= (b[:, j, None] * told[:, j + 1 :])[:, :, None] * column[:, None]
     x = x + ((weight * nu)[:, None] @ columns)[:, 0]
     root = np.sqrt(b)[:, :, None] * columns
     return x, P - np.swapaxes(root, 1, 2) @ root

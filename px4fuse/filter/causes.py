@@ -254,7 +254,8 @@ def _scan(
 
 def _step_squares(model: Hypotheses, sigma_a: float, skip: BoolArray, times: Array) -> Array:
     """χ² of a step at each time: what it takes away of the squares, summed over the axes."""
-    base = model.fit(sigma_a, skip)
+    data, columns, log_s = model.laid_out(sigma_a, skip)
+    base = model.regress(data, columns, log_s, skip)
     chi_square = np.zeros(len(times))
     for few in np.array_split(np.arange(len(times)), -(-len(times) // STEPS_AT_ONCE)):
         added = steps(model.time_s, times[few])
@@ -262,9 +263,7 @@ def _step_squares(model: Hypotheses, sigma_a: float, skip: BoolArray, times: Arr
             if axis in (alike[0] for alike in model.alike):
                 alone = _with_signals(legs, 0.0 * added, 0.0 * added, added)
                 response = model.whitened(alone, sigma_a, skip)[0][~skip]
-            rows = base.axis == axis
-            columns, rest = base.columns[rows], base.rest[rows]
-            mixed = columns.T @ response
+            rest, mixed = base.rest[base.axis == axis], columns[axis][~skip].T @ response
             size = np.sum(response**2, axis=0) - np.sum(mixed * (base.covariance @ mixed), axis=0)
             chi_square[few] += (rest @ response / base.spreads[axis]) ** 2 / np.maximum(size, 1e-9)
     return chi_square
@@ -317,10 +316,8 @@ class HypothesisFit:
 
     Attributes
     ----------
-    columns : ndarray, shape (n, k)
-        Of all axes, one after the other.
     axis : ndarray of int, shape (n,)
-        Which axis each row is of.
+        Which axis each row is of: all of one, then of the next.
     rest : ndarray, shape (n,)
         What the columns leave of the innovations.
     coefficients, covariance : ndarray, shape (k,) and (k, k)
@@ -332,7 +329,6 @@ class HypothesisFit:
         Root mean square that remains, 1 where the noises are right.
     """
 
-    columns: Array
     axis: IntArray
     rest: Array
     coefficients: Array
@@ -359,8 +355,8 @@ def fit(data: Array, columns: Array, axis: IntArray, prior: Array, log_s: float)
     Parameters
     ----------
     data : ndarray, shape (n,)
-    columns, axis
-        As :class:`HypothesisFit` has them.
+    columns : ndarray, shape (n, k)
+    axis : ndarray of int, shape (n,)
     prior : ndarray, shape (k,)
         Standard deviation of each coefficient before the data, infinite where nothing is known.
     log_s : float
@@ -375,7 +371,6 @@ def fit(data: Array, columns: Array, axis: IntArray, prior: Array, log_s: float)
     coefficients = covariance @ moment
     square = float(data @ data - coefficients @ moment)
     return HypothesisFit(
-        columns,
         axis,
         data - columns @ coefficients,
         coefficients,
@@ -441,7 +436,10 @@ class Hypotheses:
             Measurements that are neither fused nor fitted.
         scale : float
         """
-        data, columns, log_s = self._laid_out(sigma_a, skip, scale)
+        return self.regress(*self.laid_out(sigma_a, skip, scale), skip)
+
+    def regress(self, data: Array, columns: Array, log_s: float, skip: BoolArray) -> HypothesisFit:
+        """Fit what :meth:`laid_out` gave, without the measurements that are left out."""
         axes, kept = len(data), np.count_nonzero(~skip)
         prior = np.append(self.prior, np.full(axes * self.steps.shape[1], np.inf))
         rows = columns[:, ~skip].reshape(axes * kept, -1)
@@ -449,12 +447,12 @@ class Hypotheses:
 
     def squares(self, sigma_a: float, skip: BoolArray) -> Array:
         """What a fit leaves of every measurement, over its σ: squares summed over the axes."""
-        found = self.fit(sigma_a, skip)
-        data, columns, _ = self._laid_out(sigma_a, skip)
+        data, columns, log_s = self.laid_out(sigma_a, skip)
+        found = self.regress(data, columns, log_s, skip)
         rest = data - columns @ found.coefficients
         return np.asarray(np.sum(rest**2, axis=0)) / max(found.spread, 1.0) ** 2
 
-    def _laid_out(
+    def laid_out(
         self, sigma_a: float, skip: BoolArray, scale: float = 1.0
     ) -> tuple[Array, Array, float]:
         """Whitened innovations (a, m) of all axes and their columns (a, m, k), and Σ ln S."""
@@ -467,20 +465,21 @@ class Hypotheses:
         factor[[0, 1 + TURN]] = scale
         still, log_s = np.zeros_like(self.hats[0]), 0.0
         for alike in self.alike:
-            dp, dv, measured = list[Array](), list[Array](), list[Array]()
-            for legs in (self.legs[at] for at in alike):
-                dp += [factor * legs.delta_position_m, self.hats[0], 0.0 * self.steps]
-                dv += [factor * legs.delta_velocity_m_s, self.hats[1], 0.0 * self.steps]
-                measured += [legs.measurement_m, still, self.steps]
-            own = _with_signals(self.legs[alike[0]], *map(np.hstack, (dp, dv, measured)))
+            legs = [self.legs[at] for at in alike]
+            dp = [*(factor * each.delta_position_m for each in legs), self.hats[0]]
+            dv = [*(factor * each.delta_velocity_m_s for each in legs), self.hats[1]]
+            measured = [*(each.measurement_m for each in legs), still, self.steps]
+            dp, dv = ([*each, 0.0 * self.steps] for each in (dp, dv))
+            own = _with_signals(legs[0], *map(np.hstack, (dp, dv, measured)))
             normalised, own_log_s = self.whitened(own, scale * sigma_a, skip)
             log_s += len(alike) * own_log_s
-            parts = np.split(normalised, len(alike), axis=1)
-            for at, signals in zip(alike, parts, strict=True):
+            *each_own, common = np.split(normalised, len(factor) * np.arange(1, 1 + len(legs)), 1)
+            for at, signals in zip(alike, each_own, strict=True):
                 data[at] = signals[:, 0]
                 first, step = CONSTANTS + hats * at, width + steps * at
-                which = np.r_[:CONSTANTS, first : first + hats, step : step + steps]
-                columns[at][:, which] = signals[:, 1:]
+                columns[at][:, :CONSTANTS] = signals[:, 1:]
+                which = np.r_[first : first + hats, step : step + steps]
+                columns[at][:, which] = common
         return data, columns, log_s
 
 

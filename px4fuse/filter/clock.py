@@ -53,8 +53,6 @@ CHANGE_P = 0.005
 SURE_SIGMAS = 3.0
 # Flights simulated for the scatter that the IMU's noise adds
 REPLICATES = 96
-# Of these so many are weighed together: whitened they are twice as long
-REPLICATES_AT_ONCE = 8
 # Steps of ln σ by which the noises are tried at every offset
 NOISE_STEP = 0.1
 
@@ -188,14 +186,14 @@ def estimate_clock_offset(
     if isinstance(moved, Unavailable):
         return moved
     progress("clock offset")
-    offset, _ = moved.search(COARSE_MEASUREMENTS, noises)
+    few = moved.thinned(COARSE_MEASUREMENTS)
+    offset, _ = few.search(COARSE_MEASUREMENTS, noises)
     sigma, width = 0.0, 0.1
-    for _ in range(2):
-        noises = most_likely([moved.at(offset)], noises, moved.weight, outliers=False).noises
+    for some in (few, moved):
+        noises = most_likely([some.at(offset)], noises, some.weight, outliers=False).noises
         curve = _around(offset, width, FINE_POINTS)
-        offset, sigma = _vertex(
-            curve, fitted(moved.blocks(curve), noises, moved.weight).totals()[0]
-        )
+        totals = fitted(some.blocks(curve), noises, some.weight).totals()[0]
+        offset, sigma = _vertex(curve, totals)
         width = float(np.clip(3.5 * sigma, 0.01, SEARCH_S))
     factor = _scatter(moved, offset, noises, sigma**-2.0)
     while True:
@@ -297,7 +295,7 @@ def _scatter(moved: PreparedMotion, offset: float, noises: Noises, information: 
         return rng.standard_normal((size, axes, REPLICATES)).transpose(1, 2, 0)
 
     q00, q01, q11 = noises.sigma_a_m_s2**2 * here.noise_unit[:, joined]
-    dp, dv, still = np.zeros((3, axes, REPLICATES, count - 1))
+    dp, dv = np.zeros((2, axes, REPLICATES, count - 1))
     dp[..., joined] = np.sqrt(q00) * normal(legs)
     dv[..., joined] = np.sqrt(q11 - q01**2 / q00) * normal(legs)
     dv[..., joined] += q01 / q00 * dp[..., joined]
@@ -309,17 +307,8 @@ def _scatter(moved: PreparedMotion, offset: float, noises: Noises, information: 
     if noises.walk_m:  # the source's own walk is in the residuals, but nothing the IMU measured
         dp[..., joined] += noises.walk_m * np.sqrt(here.length_s[joined]) * normal(legs)
     here, variance = here.over(1.0, noises.walk_m, moved.weight / noises.sigma_z_m**2)
-    score = [
-        paired_products(
-            here,
-            noises.sigma_a_m_s2,
-            variance,
-            [part[:, own] for part in (error, dp, dv)],
-            [part[:, own] for part in (speed, still, still)],
-        ).sum(axis=0)
-        for own in np.split(np.arange(REPLICATES), REPLICATES // REPLICATES_AT_ONCE)
-    ]
-    return 1.0 + float(np.var(score)) / information
+    products = paired_products(here, noises.sigma_a_m_s2, variance, (error, dp, dv), speed)
+    return 1.0 + float(np.var(products.sum(axis=0))) / information
 
 
 def _vertex(grid: Array, profile: Array) -> tuple[float, float]:

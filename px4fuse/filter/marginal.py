@@ -31,6 +31,8 @@ HELD = 1e-3
 # Position noise of a leg that is always there, over a measurement's and over its own: Q has an
 # inverse, also that of a single step, which is of rank one, or without process noise
 LEAST_SHARE = 1e-5
+# Signals whose states are found at once: more take more memory, and no less time
+AT_ONCE = 8
 # A determinant below this share of its terms is their rounding
 SINGULAR = 1e-12
 
@@ -209,12 +211,13 @@ def fit(
         log_determinant += len(axes) * system.log_determinant
         freedom += len(axes) * own
         data = measured_m[axes]
-        parts = (np.sqrt(system.precision[:, 0]) * data, *system.whiten(data, dp[axes], dv[axes]))
+        legs, explained = system.whiten(data, dp[axes], dv[axes])
+        parts = (np.sqrt(system.precision[:, 0]) * data, *legs, explained)
         for at, (begin, end) in enumerate(positions.stretches):
-            rows = slice(2 * begin, 2 * end - 2)
+            rows = slice(begin, end - 1)
             states = slice(system.states * begin, system.states * end)
             for sign, part, here in zip(
-                (1.0, 1.0, -1.0), parts, (slice(begin, end), rows, states), strict=True
+                (1.0, 1.0, 1.0, -1.0), parts, (slice(begin, end), rows, rows, states), strict=True
             ):
                 signal = part[..., here]
                 gram[at] += sign * (signal @ np.swapaxes(signal, -1, -2)).sum(axis=0)
@@ -290,10 +293,10 @@ def paired_products(
     positions: Positions,
     sigma_a_m_s2: float,
     variance_m2: Array,
-    first: Sequence[Array],
-    second: Sequence[Array],
+    signals: Sequence[Array],
+    measured_m: Array,
 ) -> Array:
-    """Products of pairs of other signals by stretch, with the constants' signals taken out.
+    """Products of signals with others by stretch, with the constants' signals taken out.
 
     Parameters
     ----------
@@ -301,26 +304,50 @@ def paired_products(
         With one clock offset; their measurements only say which of them there are.
     sigma_a_m_s2 : float
     variance_m2 : ndarray, shape (m,)
-    first, second : sequence of three ndarray, shape (a, k, m) and twice (a, k, m - 1)
+    signals : three ndarray, shape (a, k, m) and twice (a, k, m - 1)
         Measurements, Δp and Δv of k signals.
+    measured_m : ndarray, shape (a, k, m)
+        Of the others, which have nothing on the legs.
 
     Returns
     -------
     ndarray, shape (s, k)
     """
     by_constants = positions.delta_position_m[:, 0, 1:], positions.delta_velocity_m_s[:, 0, 1:]
-    axes, count = first[0].shape[:2]
-    still = np.zeros((axes, len(positions.constant_sigma), len(variance_m2)))
-    measured, dp, dv = (
-        np.concatenate(parts, axis=1)[:, None]
-        for parts in zip(first, second, (still, *by_constants), strict=True)
-    )
-    signals = replace(positions, delta_position_m=dp, delta_velocity_m_s=dv)
-    gram = fit(signals, sigma_a_m_s2, variance_m2, measured).gram[:, 0]
-    own, by = gram[:, :count, count : 2 * count], gram[:, : 2 * count, 2 * count :]
-    information = gram[:, 2 * count :, 2 * count :] + np.diag(positions.constant_sigma**-2.0)
-    taken = np.linalg.solve(information, np.swapaxes(by[:, count:], 1, 2))
-    return np.asarray(np.einsum("sii->si", own - by[:, :count] @ taken))
+    count, constants = measured_m.shape[1], len(positions.constant_sigma)
+    own = np.zeros((len(positions.start), count))
+    by_first, by_second = np.zeros((2, len(positions.start), count, constants))
+    information = np.tile(np.diag(positions.constant_sigma**-2.0), (len(own), 1, 1))
+    for axes, system, _ in positions.systems(sigma_a_m_s2, variance_m2):
+        weight, (i00, i01, i11) = system.precision[:, 0], system.inverse
+        # the inverse covariance times a constant's signal: what no state explains of it, weighed
+        constant = [part[axes] for part in by_constants]
+        place, speed = np.moveaxis(system.solve(np.zeros(1), *constant)[..., :2], -1, 0)
+        dp = constant[0] - np.diff(place) + system.length_s * speed[..., :-1]
+        dv = constant[1] - np.diff(speed)
+        weighed = i00 * dp + i01 * dv, i01 * dp + i11 * dv
+        for begin in range(0, count, AT_ONCE):
+            few = slice(begin, begin + AT_ONCE)
+            error, *legs = (part[axes, few] for part in signals)
+            second = measured_m[axes, few]
+            left = weight * (error - system.solve(error, *legs)[..., 0]) * second
+            own[:, few] += np.add.reduceat(left.sum(axis=0), positions.start, axis=-1).T
+            for at, (first, last) in enumerate(positions.stretches):
+                rows, inside = slice(first, last), slice(first, last - 1)
+                by_first[at, few] -= _over_axes(error, weight * place, rows)
+                by_second[at, few] -= _over_axes(second, weight * place, rows)
+                for part, of in zip(legs, weighed, strict=True):
+                    by_first[at, few] += _over_axes(part, of, inside)
+        for at, (first, last) in enumerate(positions.stretches):
+            for part, of in zip(constant, weighed, strict=True):
+                information[at] += _over_axes(part, of, slice(first, last - 1))
+    taken = np.linalg.solve(information, np.swapaxes(by_second, 1, 2))
+    return np.asarray(own - np.einsum("skc,sck->sk", by_first, taken))
+
+
+def _over_axes(first: Array, second: Array, rows: slice) -> Array:
+    """Products of two sets of signals in a stretch, summed over the axes."""
+    return np.asarray((first[..., rows] @ np.swapaxes(second[..., rows], 1, 2)).sum(axis=0))
 
 
 @dataclass(frozen=True)
@@ -357,7 +384,7 @@ class BandedSystem:
         """Of each time: position, velocity, and a slow error of the source where there is one."""
         return len(self.bands) - 2
 
-    def whiten(self, measured_m: Array, dp: Array, dv: Array) -> tuple[Array, Array]:
+    def whiten(self, measured_m: Array, dp: Array, dv: Array) -> tuple[tuple[Array, Array], Array]:
         """Signals such that the products under the inverse covariance are a difference of two.
 
         Those of the rows, less those of what the states explain, and of the measurements over
@@ -371,39 +398,39 @@ class BandedSystem:
 
         Returns
         -------
-        rows : ndarray, shape (..., 2m - 2)
-            Legs over their covariance's root, two for each, zero where a stretch begins.
+        legs : two ndarray, shape (..., m - 1)
+            Over their covariance's root, zero where a stretch begins.
         explained : ndarray, shape (..., states · m)
         """
+        legs, right = self._sides(measured_m, dp, dv)
+        explained, _ = lapack.dtbtrs(self.lower, right.T, uplo="L", overwrite_b=1)
+        return legs, explained.T.reshape(*dp.shape[:-1], -1)
+
+    def solve(self, measured_m: Array, dp: Array, dv: Array) -> Array:
+        """Most likely states: position and velocity first, shape (..., m, states); as `whiten`."""
+        _, right = self._sides(measured_m, dp, dv)
+        state, _ = lapack.dpbtrs(self.lower, right.T, lower=1, overwrite_b=1)
+        return np.asarray(state.T.reshape(*dp.shape[:-1], -1, self.states))
+
+    def _sides(self, measured_m: Array, dp: Array, dv: Array) -> tuple[tuple[Array, Array], Array]:
+        """Legs as `whiten`, and the right side of the equations, shape (columns, states · m)."""
         i00, i01, _ = self.inverse
         # Q⁻¹ = UᵀU; where a stretch begins it is zero
         u00 = np.sqrt(i00)
         u01 = np.divide(i01, u00, out=np.zeros_like(i01), where=u00 > 0.0)
-        rows = np.empty((*dp.shape, 2))
-        np.add(u00 * dp, u01 * dv, out=rows[..., 0])
-        np.multiply(self.root, dv, out=rows[..., 1])
-        right = self._right(measured_m, dp, dv)
-        explained, _ = lapack.dtbtrs(self.lower, right.T, uplo="L", overwrite_b=1)
-        return rows.reshape(*dp.shape[:-1], -1), explained.T.reshape(*dp.shape[:-1], -1)
-
-    def solve(self, measured_m: Array, dp: Array, dv: Array) -> Array:
-        """Most likely states: position and velocity first, shape (..., m, states); as `whiten`."""
-        right = self._right(measured_m, dp, dv)
-        state, _ = lapack.dpbtrs(self.lower, right.T, lower=1, overwrite_b=1)
-        return np.asarray(state.T.reshape(*dp.shape[:-1], -1, self.states))
-
-    def _right(self, measured_m: Array, dp: Array, dv: Array) -> Array:
-        """The right side of the normal equations, shape (columns, states · m)."""
-        i00, i01, i11 = self.inverse
+        first, second = u00 * dp + u01 * dv, self.root * dv
+        g0, g1 = u00 * first, u01 * first + self.root * second
         right = np.zeros((*dp.shape[:-1], len(self.precision), self.states))
-        right[..., 0] = self.precision[:, 0] * measured_m
-        right[..., 2:] = right[..., :1]
-        g0, g1 = i00 * dp + i01 * dv, i01 * dp + i11 * dv
-        right[..., 1:, 0] += g0
-        right[..., 1:, 1] += g1
+        right[..., 1:, 0], right[..., 1:, 1] = g0, g1
         right[..., :-1, 0] -= g0
-        right[..., :-1, 1] -= g1 + g0 * self.length_s
-        return right.reshape(-1, self.states * len(self.precision))
+        g0 *= self.length_s
+        g0 += g1
+        right[..., :-1, 1] -= g0
+        if measured_m.any():
+            weighed = self.precision[:, 0] * measured_m
+            right[..., 0] += weighed
+            right[..., 2:] += weighed[..., None]
+        return (first, second), right.reshape(-1, self.states * len(self.precision))
 
     def position_variance(self) -> Array:
         """Variance of each state's position given all data (m²), shape (m,).

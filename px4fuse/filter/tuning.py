@@ -48,7 +48,7 @@ MAP_SIGMAS = 4.5
 MIN_MEASUREMENTS = 30
 MAX_OUTLIER_SHARE = 0.3
 # The clock offset is a nuisance here: a rough one is enough
-COARSE_MEASUREMENTS = 1000
+COARSE_MEASUREMENTS = 600
 SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 FIRST_WALK_M = 0.02
 # A value this near to the end of its search lies there
