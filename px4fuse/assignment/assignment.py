@@ -8,8 +8,8 @@ from pathlib import Path
 
 from px4fuse.answers import form_name, form_text
 from px4fuse.assignment.drawing import Drawn, Kinds, draw, most_mistakes
-from px4fuse.assignment.key import Answer, AnswerKey, folded, key_text, read_key
-from px4fuse.assignment.roster import Person
+from px4fuse.assignment.key import Answer, AnswerKey, key_text, read_key
+from px4fuse.assignment.roster import Person, folded
 from px4fuse.assignment.truth import truth_of
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.plain import plain

@@ -1,21 +1,34 @@
-"""From what was handed in to one row per student: which attempt counts, and what it is worth."""
+"""From what was handed in to one row per student: which attempt counts, and what it is worth.
+
+The instructor's word, ``overrides.csv``, counts instead of the rules.
+"""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from pathlib import Path
 from typing import Literal
 
-from px4fuse.assignment.roster import Person, Register
-from px4fuse.assignment.sheet import Sheet
-from px4fuse.grading.class_table import number
+from px4fuse.assignment.roster import Person, Register, folded
+from px4fuse.assignment.sheet import Sheet, decimal, number, read_sheet
+from px4fuse.errors import SettingsError
 from px4fuse.grading.flags import class_flags
 from px4fuse.grading.lateness import LateRule, in_zone_of, moodle_time
 from px4fuse.grading.model import Entry, Graded, Item, Override, Submission
-from px4fuse.grading.overrides import TOTAL, Overrides, matched
-from px4fuse.results.reading import one_line
+from px4fuse.results.reading import cleaned, one_line
 
 SHOWN = "%Y-%m-%d %H:%M"
+# What the instructor says instead of the rules: a table that is read and never written over
+NAME = "overrides.csv"
+TITLES = ("id", "item", "points", "comment")
+TEMPLATE = "\ufeff" + ",".join(TITLES) + "\r\n"
+TOTAL = "total"
+MOST = 1e6
+MAX_COMMENT = 10_000
+
+# Id as it was typed, to item as it was typed ("" for all of it), to what is said
+Overrides = Mapping[str, Mapping[str, Override]]
 
 
 @dataclass(frozen=True)
@@ -82,26 +95,20 @@ def class_entries(
         On overrides that fit nobody.
     """
     everyone = register if register.people else _named(graded, submissions)
-    attempts: dict[int, list[Attempt]] = defaultdict(list)
-    strangers = []
-    note = "Neither the report nor the platform names anyone."
-    if register.people:
-        note = "Not in the roster."
+    attempts: dict[int | None, list[Attempt]] = defaultdict(list)
     for one, submission in zip(graded, submissions, strict=True):
         place = everyone.place(submission.origin.person)
         if place is None:
             place = everyone.place(Person(one.student_id, one.student))
-        attempt = _attempt(one, submission, course, place, everyone)
-        if place is not None:
-            attempts[place].append(attempt)
-        else:
-            strangers.append(replace(attempt[2], flags=(note, *attempt[2].flags)))
+        attempts[place].append(_attempt(one, submission, course, place, everyone))
     made = [
         _chosen(attempts[at], course) if attempts[at]
         else Entry(person.name, person.student_id, None)
         for at, person in enumerate(everyone.people)
     ]  # fmt: skip
-    made += strangers
+    nobody = "Neither the report nor the platform names anyone."
+    note = "Not in the roster." if register.people else nobody
+    made += [replace(entry, flags=(note, *entry.flags)) for *_, entry in attempts[None]]
     told, notes = matched(overrides, made)
     most = max((one.of for one in graded), default=0.0)
     alike = class_flags([entry.counting for entry in made if entry.counting])
@@ -258,3 +265,85 @@ def _overruled(item: Item, said: Override | None) -> Item:
     if said.points != item.points:
         comment = f"{comment} (Your instructor gave {number(said.points)} points.)"
     return replace(item, points=said.points, comment=comment, waits=False)
+
+
+# ------------------------------------------------------------------ the instructor's word
+
+
+def read_overrides(path: Path) -> Overrides:
+    """Read ``overrides.csv``; nothing where it is not there.
+
+    Its columns are id (as in class.csv, or the file's name), item (a title of the rubric, "total",
+    or empty for a comment on all of it), points and comment.
+
+    Raises
+    ------
+    SettingsError
+        A column is missing, or a row says no number of points where it should.
+    """
+    if not path.exists():
+        return {}
+    sheet = read_sheet(path)
+    missing = [title for title in TITLES if sheet.column((title,)) is None]
+    if missing:
+        raise SettingsError(
+            f"{path}: no column {', '.join(missing)}", f"Its columns are {', '.join(TITLES)}."
+        )
+    found: dict[str, dict[str, Override]] = defaultdict(dict)
+    for at, row in enumerate(sheet.rows, start=2):
+        student, item, points, comment = (
+            sheet.cell(row, (title,)).removeprefix("'") for title in TITLES
+        )
+        value = decimal(points)
+        wrong = ""
+        if item in found[student]:
+            wrong = f"{one_line(student, 40)}, {one_line(item, 40) or 'all'} stands there twice"
+        elif points and (value is None or not 0.0 <= value <= MOST or not item):
+            given = one_line(points, 20)
+            wrong = f"points {given!r}: give a number from 0 up, and an item or total"
+        if wrong:
+            raise SettingsError(f"{path}: row {at}: {wrong}.")
+        found[student][item] = Override(value, cleaned(comment[:MAX_COMMENT]))
+    return found
+
+
+def matched(
+    overrides: Overrides, entries: Sequence[Entry]
+) -> tuple[list[dict[str, Override]], tuple[str, ...]]:
+    """What is said of whom, and a sentence for every row that fits nobody, or no item.
+
+    Returns
+    -------
+    said : list of dict
+        For each entry, by the title of an item, "total", or "" for all of it.
+    notes : tuple of str
+    """
+    said: list[dict[str, Override]] = [{} for _ in entries]
+    whole = max((one.of for entry in entries for one in entry.files), default=MOST)
+    files = (entry.counting.submission if entry.counting else "" for entry in entries)
+    people = Register(
+        Person(entry.student_id, login=file) for entry, file in zip(entries, files, strict=True)
+    )
+    notes = []
+    for student, rows in overrides.items():
+        # by the very id, the id but for leading zeros, or the file's name
+        place = people.place(Person(student, login=student))
+        if place is None:
+            notes.append(f"{NAME}: nobody has the id {one_line(student, 40) or '(empty)'}.")
+            continue
+        one = entries[place].counting
+        most = {item.title: item.of for item in one.items} if one else {}
+        most |= {TOTAL: one.of if one else whole, "": MOST}
+        titles = {folded(title): title for title in most}
+        for item, override in rows.items():
+            title, wrong = titles.get(folded(item)), ""
+            if title is None:
+                wrong = f"has no item {one_line(item, 60)!r}"
+            elif title in said[place]:
+                wrong = f"has {title or 'a comment on all'!r} from another row already"
+            elif (override.points or 0.0) > most[title]:
+                wrong = f"cannot have more than {most[title]:g} points of {one_line(title, 60)!r}"
+            else:
+                said[place][title] = override
+            notes += [f"{NAME}: {one_line(student, 40)} {wrong}."] if wrong else []
+    return said, tuple(notes)

@@ -21,11 +21,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 
-from px4fuse.assignment.key import folded
-from px4fuse.assignment.roster import Register, person_of_row
-from px4fuse.assignment.sheet import Sheet
+from px4fuse.assignment.roster import Register, folded, person_of_row
+from px4fuse.assignment.sheet import Sheet, decimal, number
 from px4fuse.errors import SettingsError
-from px4fuse.grading.class_table import decimal, number
 from px4fuse.grading.model import Entry
 from px4fuse.plain import few_words
 from px4fuse.results.reading import one_line

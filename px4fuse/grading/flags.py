@@ -14,7 +14,7 @@ from itertools import combinations
 from operator import attrgetter
 from typing import Any
 
-from px4fuse.assignment.key import folded
+from px4fuse.assignment.roster import folded
 from px4fuse.filter.tuning import Tuned
 from px4fuse.grading.model import Graded
 from px4fuse.plain import few_words

@@ -10,15 +10,13 @@ from pathlib import Path
 from px4fuse.assignment.key import AnswerKey
 from px4fuse.assignment.roster import Person, Register, people_of_sheet
 from px4fuse.grading import submissions
-from px4fuse.grading.entries import Course, class_entries
+from px4fuse.grading.entries import NAME, Course, Overrides, class_entries, read_overrides
 from px4fuse.grading.exports import grade_column
 from px4fuse.grading.flags import own_flags
 from px4fuse.grading.model import Entry, Graded, Submission
 from px4fuse.grading.outputs import write_class
-from px4fuse.grading.overrides import NAME, read_overrides
 from px4fuse.grading.records import RECORDS, verified
-from px4fuse.grading.rubric import Rubric
-from px4fuse.grading.scoring import assess, refused
+from px4fuse.grading.rubric import Rubric, assess, refused
 from px4fuse.reading import files_by_sha256, max_log_bytes
 from px4fuse.results.reading import one_line
 from px4fuse.verification.model import Refused, Verdict
@@ -102,24 +100,13 @@ def grade(
     unread = sorted(one.name for one in output.glob("overrides*") if one.name != NAME)
     renamed = [f"{one_line(name, 80)}: not read; only {NAME} is." for name in unread]
     found, notes = submissions.collect(paths)
-    register = register_of(course, key)
-    records = output / RECORDS
-    graded, reused = grade_all(found, logs, rubric, records, key, register, processes, progress)
-    entries, unknown = class_entries(graded, found, register, course, overrides)
+    everyone = grade_all(
+        found, logs, rubric, output / RECORDS, key, course, overrides, processes, progress
+    )
+    entries, register, unknown, reused = everyone
     name = title or rubric.title or "Class"
     written, more = write_class(entries, register, course, name, output)
     return GradeOutcome(entries, (*notes, *renamed, *unknown, *more), reused, written)
-
-
-def register_of(course: Course, key: AnswerKey | None) -> Register:
-    """Who is in the class, with what all worksheets know of them."""
-    listed = [people_of_sheet(sheet) for sheet in course.worksheets]
-    handed_out = tuple(Person(one.student_id, one.name) for one in key.answers) if key else ()
-    people = course.roster or handed_out or next(iter(listed), ())
-    register = Register(people)
-    for others in listed:
-        register.add(others)
-    return register
 
 
 def grade_all(
@@ -128,11 +115,26 @@ def grade_all(
     rubric: Rubric,
     records: Path,
     key: AnswerKey | None,
-    register: Register,
+    course: Course,
+    overrides: Overrides,
     processes: int | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
-) -> tuple[tuple[Graded, ...], int]:
-    """Verify, or recall, and score every file, each within bounds; and how many were recalled."""
+) -> tuple[tuple[Entry, ...], Register, tuple[str, ...], int]:
+    """Verify, or recall, and score every file, each within bounds, and lay out the class.
+
+    Returns
+    -------
+    entries, register, notes
+        As :func:`~px4fuse.grading.entries.class_entries` takes and gives them; everyone in the
+        class is known by what all worksheets say.
+    reused : int
+        How many reports were recalled.
+    """
+    listed = [people_of_sheet(sheet) for sheet in course.worksheets]
+    handed_out = tuple(Person(one.student_id, one.name) for one in key.answers) if key else ()
+    register = Register(course.roster or handed_out or next(iter(listed), ()))
+    for others in listed:
+        register.add(others)
     jobs = []
     for submission in found:
         place = register.place(submission.origin.person)
@@ -162,7 +164,9 @@ def grade_all(
             made[index] = replace(one, submission=submission.name, student=student)
             reused += recalled
             progress(len(made), len(found))
-    return tuple(made[index] for index in range(len(found))), reused
+    graded = [made[index] for index in range(len(found))]
+    entries, notes = class_entries(graded, found, register, course, overrides)
+    return entries, register, notes, reused
 
 
 def grade_one(

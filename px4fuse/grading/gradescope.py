@@ -27,11 +27,11 @@ import msgspec
 from px4fuse.assignment.key import key_text, read_key
 from px4fuse.assignment.roster import Person
 from px4fuse.errors import SettingsError
-from px4fuse.grading.entries import Course, class_entries
-from px4fuse.grading.feedback import returned_text
-from px4fuse.grading.grade import grade_all, register_of
+from px4fuse.grading.entries import Course
+from px4fuse.grading.grade import grade_all
 from px4fuse.grading.lateness import LateRule
 from px4fuse.grading.model import Entry
+from px4fuse.grading.outputs import returned_text
 from px4fuse.grading.platforms import NOBODY, ExportOrigin
 from px4fuse.grading.rubric import read_rubric, rubric_text
 from px4fuse.grading.submissions import collect
@@ -185,7 +185,6 @@ def run_autograder(folder: Path, late: LateRule | None) -> None:
     key = read_key(key_path) if key_path.exists() else None
     origin, due = submission_metadata(folder)
     course = Course(due=due, late=late)
-    register = register_of(course, key)
     try:
         found, _ = collect([folder / "submission"])
     except SettingsError as error:  # an empty folder, or other files than PDFs
@@ -193,8 +192,8 @@ def run_autograder(folder: Path, late: LateRule | None) -> None:
     else:
         found = tuple(replace(one, origin=origin) for one in found)
         with tempfile.TemporaryDirectory(prefix="px4fuse-") as records:
-            graded, _ = grade_all(found, [source / "logs"], rubric, Path(records), key, register, 1)
-        entries, _ = class_entries(graded, found, register, course, {})
+            logs, kept = [source / "logs"], Path(records)
+            entries, register, *_ = grade_all(found, logs, rubric, kept, key, course, {}, 1)
         entry = max(
             (one for one in entries if one.counting),
             key=lambda one: -1.0 if one.total is None else one.total,

@@ -2,22 +2,22 @@
 
 import itertools
 import random
+import textwrap
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 
 from px4fuse.assignment.roster import Register, distinct, file_names
-from px4fuse.assignment.sheet import Sheet, read_sheet
+from px4fuse.assignment.sheet import Sheet, number, read_sheet
 from px4fuse.grading import exports
+from px4fuse.grading.checks import text_of
 from px4fuse.grading.class_page import html_text
-from px4fuse.grading.class_table import csv_text
-from px4fuse.grading.entries import Course
-from px4fuse.grading.feedback import returned_text
-from px4fuse.grading.model import Entry, Graded
-from px4fuse.grading.overrides import NAME, TEMPLATE
+from px4fuse.grading.entries import NAME, TEMPLATE, TOTAL, Course
+from px4fuse.grading.model import Entry, Graded, columns
 from px4fuse.grading.records import HANDED_IN, PAGE, RECORDS, REDRAWN, file_of
 from px4fuse.spreadsheet import neutral, neutral_id
+from px4fuse.verification.model import Verdict
 from px4fuse.writing import write_all
 
 # Reports drawn again from their logs: what to read instead of what was handed in
@@ -26,6 +26,29 @@ FEEDBACK = "feedback"
 GRADES = "grades"
 NAMES = "names.csv"
 NAMES_HEAD = ("pseudonym", "id", "name")
+# Columns of the class table, before and behind those of items and numbers
+FIRST = ("file", "student", "id", "status", "points", "pending points", "of", "deducted", "total")
+LAST = (
+    "handed in", "hours late", "pending", "comment", "flags", "other files", "reasons",
+    "log SHA-256",
+)  # fmt: skip
+BETWEEN = " | "
+# A list of reasons is cut where it would become longer than a sentence
+NAMED = 4
+NEXT = (
+    "Your instructor has these points as a proposal and decides; ask if you think that something "
+    "was overlooked."
+)
+AGAIN = (
+    "Make it again with px4fuse, of the log that you were given, and hand in the PDF as it was "
+    "written."
+)
+FOUND = {
+    "verified": "Your report was verified: its numbers are what px4fuse computes from your log",
+    "numbers differ": "Your report's numbers are not those that px4fuse computes from its log",
+    "other log": "The log of your report is not one of those that your instructor has",
+    "cannot verify": "Your report could not be verified",
+}
 
 
 def write_class(
@@ -142,3 +165,99 @@ def nameless(entry: Entry, pseudonym: str) -> Entry:
         pseudonym, "", one, (), entry.handed_in, entry.late_s, entry.deduction,
         total=entry.total, of=entry.of, flags=("Flagged.",) * bool(entry.flags),
     )  # fmt: skip
+
+
+# ------------------------------------------------------------------ the class table
+
+
+def csv_text(entries: Sequence[Entry]) -> str:
+    """Lay out a class as CSV, for Excel and LibreOffice.
+
+    Points of the items are those that count, the instructor's where there are some.
+
+    Returns
+    -------
+    str
+        Begins with the byte order mark by which Excel knows UTF-8; lines end with CRLF. Write it
+        without translating line ends.
+    """
+    items, numbers = columns(entries)
+    head = tuple(map(neutral, (*FIRST, *items, *numbers, *LAST)))
+    rows = []
+    for entry in entries:
+        one = entry.counting
+        points = {item.title: item.points for item in one.items} if one else {}
+        row: list[str | float | None] = [
+            one.submission if one else "", entry.student, None, one.status if one else "missing",
+            one.counted if one else None, one.points if one and one.counted is None else None,
+            entry.of, entry.deduction or None, entry.total,
+            *map(points.get, items),
+            *(one.numbers.get(title) if one else None for title in numbers),
+            entry.handed_in, None if entry.late_s is None else entry.late_s / 3600.0,
+            one.pending if one else "", entry.comment, BETWEEN.join(entry.flags),
+            BETWEEN.join(other.submission for other in entry.others),
+            BETWEEN.join(one.verdict.reasons) if one else "", one.log_sha256 if one else "",
+        ]  # fmt: skip
+        cells = [neutral(part) if isinstance(part, str) else number(part) for part in row]
+        cells[FIRST.index("id")] = neutral_id(entry.student_id)
+        rows.append(tuple(cells))
+    return "\ufeff" + Sheet(Path(), head, tuple(rows)).text
+
+
+# ------------------------------------------------------------------ feedback
+
+
+def returned_text(entry: Entry, class_name: str = "") -> str:
+    """Plain text for one student: points and why, what being late costs, and the instructor's word.
+
+    Flags and remarks are for the instructor and are not in it.
+    """
+    graded = entry.counting
+    lines = [class_name] if class_name else []
+    if graded is None:
+        lines += ["Nothing was handed in.", ""]
+    else:
+        # a total that the instructor has said leaves no proposal beside it
+        lines += _feedback(graded, final=TOTAL in entry.overrides and entry.total is not None)
+    if entry.deduction:
+        hours = (entry.late_s or 0.0) / 3600.0
+        off = number(entry.deduction)
+        lines.append(f"Handed in {hours:.1f} hours late: {off} points taken off.")
+    if entry.total is not None and (entry.deduction or TOTAL in entry.overrides):
+        lines.append(f"Total    {number(entry.total)} of {number(entry.of)}")
+    if entry.comment:
+        lines += ["", "From your instructor:", "", entry.comment]
+    return "\n".join(lines).rstrip("\n") + "\n"
+
+
+def _feedback(graded: Graded, final: bool) -> list[str]:
+    """The points, and why."""
+    who = ", ".join(filter(None, map(text_of, (graded.student, graded.student_id))))
+    lines = [f"Report   {text_of(graded.submission)}", *([f"Student  {who}"] if who else [])]
+    points = f"{number(graded.points)} of {number(graded.of)}"
+    if graded.counted is None:
+        points = f"pending: they do not count yet (as it is: {points})"
+    proposed = bool(graded.items) and not final
+    lines += [f"Points   {points}"] if proposed else []
+    lines += ["", *_wrapped(verdict_text(graded.verdict)), ""]
+    for item in graded.items:
+        lines.append(f"{number(item.points)} of {number(item.of)}  {text_of(item.title)}")
+        lines += [f"    {line}" for line in _wrapped(item.comment, 84)]
+    return [*lines, *(["", *_wrapped(NEXT)] if proposed else []), ""]
+
+
+def verdict_text(verdict: Verdict) -> str:
+    """What verification found, and what to do about it, for the student."""
+    said = FOUND[verdict.status]
+    if verdict.status == "verified":
+        return f"{said}."
+    reasons = (text_of(one).rstrip(".") for one in verdict.reasons[:NAMED])
+    if told := "; ".join(filter(None, reasons)):
+        said = f"{said}: {told}"
+    if verdict.missing:
+        return f"{said}. Hand in {text_of(verdict.missing)}, if your instructor does not have it."
+    return f"{said}. {AGAIN}"
+
+
+def _wrapped(text: str, width: int = 88) -> list[str]:
+    return textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False)
