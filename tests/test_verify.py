@@ -48,6 +48,7 @@ from pypdf.generic import (
 )
 
 from px4fuse.cli import cli
+from px4fuse.reading import files_by_sha256
 from px4fuse.results.contract import to_json, to_plain
 from px4fuse.verification import pages, rerun, verification
 from px4fuse.verification.intake import read_report
@@ -119,7 +120,7 @@ def test_a_report_on_a_loop_is_verified(loop: Base) -> None:
 
 def test_nothing_is_verified_without_the_log(aisle: Base, loop: Base) -> None:
     for one in (aisle, loop):
-        verdict = verify(report_of(one.pdf))
+        verdict = verify(report_of(one.pdf), {})
         assert verdict.status == "cannot verify"
         assert verdict.reasons == (NO_LOG,)
         assert verdict.redrawn == b""
@@ -554,10 +555,10 @@ def test_a_joined_recording_is_found_by_its_content(tmp_path: Path) -> None:
     report = report_of(target.read_bytes())
     (tmp_path / "a").write_bytes(LOG.read_bytes())
     (tmp_path / "b").write_bytes((source / "aisle_uwb_external.csv").read_bytes())
-    verdict = verify(report, [tmp_path / "a"])
+    verdict = verify(report, files_by_sha256([tmp_path / "a"]))
     assert verdict.status == "cannot verify"
     assert "--position" in verdict.reasons[0]
-    assert verify(report, [tmp_path / "a", tmp_path / "b"]).status == "verified"
+    assert verify(report, files_by_sha256([tmp_path / "a", tmp_path / "b"])).status == "verified"
 
 
 # -- the command -----------------------------------------------------------------------------------

@@ -12,24 +12,17 @@ log gives. Pages that look otherwise are named, for somebody to look at.
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from px4fuse.flight import Unavailable
-from px4fuse.reading import files_by_sha256
 from px4fuse.results.contract import Reported, to_plain
 from px4fuse.results.model import Provenance
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification import rerun
-from px4fuse.verification.model import (
-    Mismatch,
-    PageDifference,
-    PageStatus,
-    Refused,
-    Report,
-    Verdict,
-)
+from px4fuse.verification.model import Mismatch, PageStatus, Refused, Report, Status, Verdict
 from px4fuse.verification.pages import NumbersAlike, compare_pages
 from px4fuse.verification.rerun import ADD, Recomputed
 
@@ -56,7 +49,7 @@ SHOWN_TEXT = 120
 PRINTED_SCALES = (1.0, 100.0, 1000.0)
 # Of notes that are drawn again; a page holds about 60
 MAX_NOTES_LINES = 5_000
-_NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[+-]?\d+)?")
+_NUMBER = re.compile(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)")
 
 Recompute = Callable[[Reported, Mapping[str, Path]], Recomputed | Refused]
 
@@ -68,24 +61,21 @@ class Numbers:
     Attributes
     ----------
     differences : tuple of Mismatch
-        The first of those beyond the tolerances.
-    differing : int
-        How many there are.
-    pairs : tuple of (float, float)
-        Recorded and recomputed numbers that agree within the tolerances and are not the same.
+        What is beyond the tolerances.
+    alike : callable
+        Whether two printed numbers are a recorded number and its recomputed twin, each rounded.
     compared : int
         How many values.
     """
 
     differences: tuple[Mismatch, ...]
-    differing: int
-    pairs: tuple[tuple[float, float], ...]
+    alike: NumbersAlike
     compared: int
 
 
 def verify(
     report: Report,
-    logs: Sequence[Path] | Mapping[str, Path] = (),
+    logs: Mapping[str, Path],
     *,
     recompute: Recompute = rerun.recompute,
 ) -> Verdict:
@@ -93,9 +83,8 @@ def verify(
 
     Parameters
     ----------
-    logs : sequence of Path, or mapping of str to Path
-        Logs and other recordings, or folders of such; or files by their SHA-256, where many
-        reports share them.
+    logs : mapping of str to Path
+        Logs and other recordings by their SHA-256.
     recompute : callable
         Repeats the analysis.
 
@@ -105,11 +94,6 @@ def verify(
         "verified" where the log gives every number; without a log never. It proves that the
         numbers belong to the log, not who wrote them. ``redrawn`` is the report to read, and
         ``pages`` names those of the PDF that look otherwise.
-
-    Raises
-    ------
-    OSError
-        A log cannot be read.
     """
     theirs, ours = report.results.provenance.px4fuse, metadata.version("px4fuse")
     if theirs != ours:
@@ -119,17 +103,16 @@ def verify(
     name = one_line(rerun.log_name(report.results), 80) or "its log"
     if not logs:
         return _unknown(Refused(NO_LOG, ADD.format(name), name))
-    files = logs if isinstance(logs, Mapping) else files_by_sha256(logs)
     sha256 = rerun.log_sha256(report.results)
-    if sha256 not in files:
+    if sha256 not in logs:
         asked = one_line(sha256, 64) or "none"
-        reason = f"none of the {len(files)} files given is the log, whose SHA-256 is {asked}"
+        reason = f"none of the {len(logs)} files given is the log, whose SHA-256 is {asked}"
         remedy = f"If it is a log of yours, a{ADD.format(name)[1:]}"
         return Verdict("other log", (reason,), False, remedy=remedy, missing=name)
     if report.results.student.notes.count("\n") > MAX_NOTES_LINES:
         reason = f"its notes have more than {MAX_NOTES_LINES} lines, which is no report"
         return _unknown(Refused(reason, rerun.ASK))
-    again = recompute(report.results, files)
+    again = recompute(report.results, logs)
     return _unknown(again) if isinstance(again, Refused) else _with_log(report, again)
 
 
@@ -144,35 +127,27 @@ def _with_log(report: Report, again: Recomputed) -> Verdict:
         reason = "the log gives the same file again, byte for byte"
         return Verdict("verified", (reason, LIMIT), True, page_status="same", redrawn=redrawn)
     numbers = compare_results(to_plain(report.results), to_plain(again.results))
-    alike = _rounding(numbers.pairs)
-    pages = compare_pages(report.pdf, redrawn, lambda one, other: same_words(one, other, alike))
-    first = ", ".join(one.path for one in numbers.differences[:3]) + ", …" * (numbers.differing > 3)
+    wrong, alike = numbers.differences, partial(same_words, alike=numbers.alike)
+    first = ", ".join(one.path for one in wrong[:3]) + ", …" * (len(wrong) > 3)
     reasons = [
-        f"{numbers.differing} of {numbers.compared} values are not what the log gives: {first}"
-        if numbers.differing
+        f"{len(wrong)} of {numbers.compared} values are not what the log gives: {first}"
+        if wrong
         else f"the log gives all {numbers.compared} values again (within {RELATIVE:g}, estimates "
         f"within {ESTIMATE_RELATIVE:g})"
     ]
     page_status: PageStatus = "not compared"
-    differing: tuple[PageDifference, ...] = ()
+    pages = compare_pages(report.pdf, redrawn, alike)
     if isinstance(pages, Unavailable):
         reasons.append(f"the pages were not compared: {pages.reason}. {pages.remedy}")
+        pages = ()
     else:
-        differing, page_status = pages, "differ" if pages else "same"
-        reasons += [f"page {one.page} differs: {one.what}" for one in pages]
-    if differing:
+        page_status = "differ" if pages else "same"
+    reasons += [f"page {one.page} differs: {one.what}" for one in pages]
+    if pages:
         reasons += _other_machine(report.results.provenance, again.results.provenance)
-    if not numbers.differing:
-        reasons.append(LIMIT)
-    return Verdict(
-        "numbers differ" if numbers.differing else "verified",
-        tuple(reasons),
-        True,
-        numbers.differences,
-        page_status,
-        differing,
-        redrawn,
-    )
+    status: Status = "numbers differ" if wrong else "verified"
+    said = (*reasons, *([] if wrong else [LIMIT]))
+    return Verdict(status, said, True, wrong[:SHOWN], page_status, pages, redrawn)
 
 
 def _other_machine(theirs: Provenance, ours: Provenance) -> tuple[str, ...]:
@@ -190,30 +165,30 @@ def compare_results(recorded: Mapping[str, Any], recomputed: Mapping[str, Any]) 
     """Compare every value of two results, of which the first is a stranger's."""
     command = str(recomputed["provenance"]["command"])
     # everything rests on an offset or placement that was estimated
-    everywhere = "auto" in command.split() or "--position" in command.split()
-    wrong: dict[str, tuple[Any, Any]] = {}
-    pairs: list[tuple[float, float]] = []
-    others: list[tuple[str, Any, Any]] = []
-    compared = 0
+    everywhere = not {"auto", "--position"}.isdisjoint(command.split())
     handed_in, made = dict(flattened(recorded)), dict(flattened(recomputed))
-    for path in {**made, **handed_in}:
-        if path.startswith(MACHINE):
-            continue
-        theirs, ours = handed_in.get(path, _ABSENT), made.get(path, _ABSENT)
-        compared += 1
-        if not (is_number(theirs) and is_number(ours)):
-            others.append((path, theirs, ours))
-        elif not _near(path, theirs, ours, everywhere or path.startswith(ESTIMATES)):
-            wrong[path] = theirs, ours
-        elif theirs != ours:
-            pairs.append((float(theirs), float(ours)))
-    rounded = _rounding(pairs)
-    wrong |= {path: (a, b) for path, a, b in others if not _same(a, b, rounded)}
-    found = tuple(
-        Mismatch(one_line(path, SHOWN_TEXT), _shown(theirs), _shown(ours))
-        for path, (theirs, ours) in list(wrong.items())[:SHOWN]
+    pairs = {
+        path: (handed_in.get(path, _ABSENT), made.get(path, _ABSENT))
+        for path in {**made, **handed_in}
+        if not path.startswith(MACHINE)
+    }
+    numbers = {path: pair for path, pair in pairs.items() if all(map(is_number, pair))}
+    near = {
+        path: pair
+        for path, pair in numbers.items()
+        if _near(path, *pair, everywhere or path.startswith(ESTIMATES))
+    }
+    alike = _rounding([(float(one), float(other)) for one, other in near.values() if one != other])
+    wrong = {path: pair for path, pair in numbers.items() if path not in near}
+    wrong |= {
+        path: pair
+        for path, pair in pairs.items()
+        if path not in numbers and not _same(*pair, alike)
+    }
+    found = (
+        Mismatch(one_line(path, SHOWN_TEXT), *map(_shown, pair)) for path, pair in wrong.items()
     )
-    return Numbers(found, len(wrong), tuple(pairs), compared)
+    return Numbers(tuple(found), alike, len(pairs))
 
 
 # Stands where there is nothing
@@ -264,12 +239,10 @@ def same_words(one: str, other: str, alike: NumbersAlike) -> bool:
     """
     if one == other:
         return True
-    numbers, our_numbers = _NUMBER.findall(one), _NUMBER.findall(other)
-    return (
-        _NUMBER.split(one) == _NUMBER.split(other)
-        and len(numbers) == len(our_numbers)
-        and all(a == b or alike(a, b) for a, b in zip(numbers, our_numbers, strict=True))
-    )
+    # every second part is a number
+    parts, others = _NUMBER.split(one), _NUMBER.split(other)
+    numbers = zip(parts[1::2], others[1::2], strict=False)
+    return parts[::2] == others[::2] and all(a == b or alike(a, b) for a, b in numbers)
 
 
 def _rounding(pairs: Sequence[tuple[float, float]]) -> NumbersAlike:
