@@ -135,10 +135,10 @@ class Lab:
 
     def grade(self, rubric=None) -> GradeOutcome:
         due = due_time("2026-11-20 12:00:00 Europe/Berlin")
-        course = Course(self.roster, tuple(map(read_sheet, self.sheets)), "", due=due,
-                        late=late_rule("10%/day"), anonymous=True)  # fmt: skip
-        return grade(self.exports, [self.logs], rubric or read_rubric(None), self.output,
-                     key=self.key, course=course, title="Lab", processes=1)  # fmt: skip
+        course = Course(rubric or read_rubric(None), self.key, [self.logs], "Lab", self.roster,
+                        tuple(map(read_sheet, self.sheets)), due=due, late=late_rule("10%/day"),
+                        anonymous=True)  # fmt: skip
+        return grade(self.exports, course, self.output, processes=1)
 
     def filled(self, file: str, separator: str = ",") -> list[dict[str, str]]:
         text = (self.output / "grades" / file).read_text(encoding="utf-8-sig")

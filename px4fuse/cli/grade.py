@@ -111,8 +111,11 @@ def grade(
         raise SettingsError("say with -o where the class table goes.")
     _check_place(output, (*submissions, *logs))
     answers = None if key is None else read_key(key)
-    worth = read_rubric(rubric)
     course = Course(
+        read_rubric(rubric),
+        answers,
+        logs,
+        title or "",
         roster=None if roster is None else read_people(roster),
         worksheets=tuple(map(read_sheet, worksheet)),
         column=column or "",
@@ -125,15 +128,7 @@ def grade(
     try:
         with progress() as step:
             outcome = grade_all(
-                submissions,
-                logs,
-                worth,
-                output,
-                key=answers,
-                course=course,
-                title=title or "",
-                processes=jobs,
-                progress=partial(step, "grading"),
+                submissions, course, output, processes=jobs, progress=partial(step, "grading")
             )
     except KeyboardInterrupt as stopped:
         left = "but what is graded is kept. The same command goes on from there."

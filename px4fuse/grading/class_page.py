@@ -12,8 +12,7 @@ from typing import Any
 
 from px4fuse.answers import form_rows
 from px4fuse.assignment.sheet import number
-from px4fuse.grading.entries import TOTAL
-from px4fuse.grading.model import Entry, Graded, Item, Override, columns
+from px4fuse.grading.model import TOTAL, Entry, Graded, Item, Override, columns
 from px4fuse.plain import number_words
 from px4fuse.webpage import frame
 from px4fuse.webpage.charts import tenths

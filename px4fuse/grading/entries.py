@@ -7,15 +7,18 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
-from px4fuse.assignment.roster import Person, Register, folded
+from px4fuse.assignment.key import AnswerKey
+from px4fuse.assignment.roster import Person, Register, folded, people_of_sheet
 from px4fuse.assignment.sheet import Sheet, decimal, number, read_sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.flags import class_flags
 from px4fuse.grading.lateness import LateRule, in_zone_of, moodle_time
-from px4fuse.grading.model import Entry, Graded, Item, Override, Submission
+from px4fuse.grading.model import TOTAL, Entry, Graded, Item, Override, Submission
+from px4fuse.grading.rubric import Rubric
 from px4fuse.results.reading import cleaned, one_line
 
 SHOWN = "%Y-%m-%d %H:%M"
@@ -23,7 +26,6 @@ SHOWN = "%Y-%m-%d %H:%M"
 NAME = "overrides.csv"
 TITLES = ("id", "item", "points", "comment")
 TEMPLATE = "\ufeff" + ",".join(TITLES) + "\r\n"
-TOTAL = "total"
 MOST = 1e6
 MAX_COMMENT = 10_000
 
@@ -37,6 +39,13 @@ class Course:
 
     Attributes
     ----------
+    rubric : Rubric
+    key : AnswerKey or None
+        Which mistakes each student's flight has.
+    logs : sequence of Path
+        Flight logs and folders of them; a report names its log by SHA-256.
+    title : str
+        Of the class page; by default the rubric's.
     roster : tuple of Person or None
         Without one the students of the answer key, else those of the worksheets.
     worksheets : tuple of Sheet
@@ -53,6 +62,10 @@ class Course:
         Whether the class page shows pseudonyms.
     """
 
+    rubric: Rubric
+    key: AnswerKey | None = None
+    logs: Sequence[Path] = ()
+    title: str = ""
     roster: tuple[Person, ...] | None = None
     worksheets: tuple[Sheet, ...] = ()
     column: str = ""
@@ -61,6 +74,17 @@ class Course:
     late: LateRule | None = None
     include_pending: bool = False
     anonymous: bool = False
+
+    @cached_property
+    def register(self) -> Register:
+        """Who is in the class, with what all worksheets know of them."""
+        listed = [people_of_sheet(sheet) for sheet in self.worksheets]
+        given = self.key.answers if self.key else ()
+        handed_out = tuple(Person(one.student_id, one.name) for one in given)
+        found = Register(self.roster or handed_out or next(iter(listed), ()))
+        for others in listed:
+            found.add(others)
+        return found
 
 
 # When it came and when it was packed, by which attempts are ordered; the file; and the row that it
@@ -71,7 +95,6 @@ Attempt = tuple[tuple[float, float], Graded, Entry]
 def class_entries(
     graded: Sequence[Graded],
     submissions: Sequence[Submission],
-    register: Register,
     course: Course,
     overrides: Overrides,
 ) -> tuple[tuple[Entry, ...], tuple[str, ...]]:
@@ -85,8 +108,6 @@ def class_entries(
     ----------
     graded, submissions : sequences
         Of every file, in one order.
-    register : Register
-        Without people where nobody knows who is in the class.
 
     Returns
     -------
@@ -94,7 +115,7 @@ def class_entries(
     notes : tuple of str
         On overrides that fit nobody.
     """
-    everyone = register if register.people else _named(graded, submissions)
+    everyone = course.register if course.register.people else _named(graded, submissions)
     attempts: dict[int | None, list[Attempt]] = defaultdict(list)
     for one, submission in zip(graded, submissions, strict=True):
         place = everyone.place(submission.origin.person)
@@ -107,7 +128,7 @@ def class_entries(
         for at, person in enumerate(everyone.people)
     ]  # fmt: skip
     nobody = "Neither the report nor the platform names anyone."
-    note = "Not in the roster." if register.people else nobody
+    note = "Not in the roster." if course.register.people else nobody
     made += [replace(entry, flags=(note, *entry.flags)) for *_, entry in attempts[None]]
     told, notes = matched(overrides, made)
     most = max((one.of for one in graded), default=0.0)
@@ -193,14 +214,10 @@ def _worth(attempt: Attempt) -> float:
     return max(one.points - entry.deduction, 0.0)
 
 
-def _order(attempt: Attempt) -> tuple[object, ...]:
-    """By time, of one submission the better file later."""
-    return attempt[0], _worth(attempt), attempt[1].submission
-
-
 def _chosen(attempts: Sequence[Attempt], course: Course) -> Entry:
     """The attempt that counts, with the others and what that needs said."""
-    ordered = sorted(attempts, key=_order)
+    # by time, of one submission the better file later
+    ordered = sorted(attempts, key=lambda one: (one[0], _worth(one), one[1].submission))
     # what is pending, such as another's report under this id, or no report counts only where there
     # is nothing else
     reports = [one for one in ordered if one[1].version]
@@ -209,7 +226,7 @@ def _chosen(attempts: Sequence[Attempt], course: Course) -> Entry:
         "latest": able[-1],
         # several files of one submission: the best
         "first": [one for one in able if one[0] == able[0][0]][-1],
-        "best": max(able, key=lambda one: (_worth(one), _order(one))),
+        "best": max(reversed(able), key=_worth),
     }[course.attempt]
     stamps, graded, entry = found
     flags = list(entry.flags)

@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 
 from px4fuse.assignment.key import AnswerKey
-from px4fuse.assignment.roster import Person, Register, people_of_sheet
 from px4fuse.grading import submissions
 from px4fuse.grading.entries import NAME, Course, Overrides, class_entries, read_overrides
 from px4fuse.grading.exports import grade_column
@@ -55,13 +54,9 @@ class GradeOutcome:
 
 def grade(
     paths: Sequence[Path],
-    logs: Sequence[Path],
-    rubric: Rubric,
+    course: Course,
     output: Path,
     *,
-    key: AnswerKey | None = None,
-    course: Course | None = None,
-    title: str = "",
     processes: int | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> GradeOutcome:
@@ -71,16 +66,10 @@ def grade(
     ----------
     paths : sequence of Path
         PDFs, folders and zip files.
-    logs : sequence of Path
-        Flight logs and folders of them; a report names its log by SHA-256.
     output : Path
         Folder for the class table (``class.csv``, ``class.html``), the redrawn ``reports/``,
         ``feedback/``, ``grades/`` for learning platforms, and the records that
         make a second run quick. Its ``overrides.csv`` is read.
-    key : AnswerKey, optional
-        Which mistakes each student's flight has.
-    title : str
-        Of the class page; by default the rubric's.
     processes : int, optional
         By default as many as there are cores.
     progress : callable
@@ -93,61 +82,43 @@ def grade(
     OutputError
         The folder cannot be written.
     """
-    course = course or Course()
     overrides = read_overrides(output / NAME)
     for sheet in course.worksheets:
         grade_column(sheet, course.column)
     unread = sorted(one.name for one in output.glob("overrides*") if one.name != NAME)
     renamed = [f"{one_line(name, 80)}: not read; only {NAME} is." for name in unread]
     found, notes = submissions.collect(paths)
-    everyone = grade_all(
-        found, logs, rubric, output / RECORDS, key, course, overrides, processes, progress
+    entries, unknown, reused = grade_all(
+        found, course, output / RECORDS, overrides, processes, progress
     )
-    entries, register, unknown, reused = everyone
-    name = title or rubric.title or "Class"
-    written, more = write_class(entries, register, course, name, output)
+    written, more = write_class(entries, course, output)
     return GradeOutcome(entries, (*notes, *renamed, *unknown, *more), reused, written)
 
 
 def grade_all(
     found: Sequence[Submission],
-    logs: Sequence[Path],
-    rubric: Rubric,
-    records: Path,
-    key: AnswerKey | None,
     course: Course,
+    records: Path,
     overrides: Overrides,
     processes: int | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
-) -> tuple[tuple[Entry, ...], Register, tuple[str, ...], int]:
+) -> tuple[tuple[Entry, ...], tuple[str, ...], int]:
     """Verify, or recall, and score every file, each within bounds, and lay out the class.
 
     Returns
     -------
-    entries, register, notes
-        As :func:`~px4fuse.grading.entries.class_entries` takes and gives them; everyone in the
-        class is known by what all worksheets say.
+    entries, notes
+        As :func:`~px4fuse.grading.entries.class_entries` gives them.
     reused : int
         How many reports were recalled.
     """
-    listed = [people_of_sheet(sheet) for sheet in course.worksheets]
-    handed_out = tuple(Person(one.student_id, one.name) for one in key.answers) if key else ()
-    register = Register(course.roster or handed_out or next(iter(listed), ()))
-    for others in listed:
-        register.add(others)
     jobs = []
     for submission in found:
-        place = register.place(submission.origin.person)
-        owner = "" if place is None else register.people[place].student_id
+        place = course.register.place(submission.origin.person)
+        owner = "" if place is None else course.register.people[place].student_id
         jobs.append((submission, owner))
-    scored = partial(
-        grade_one,
-        logs=files_by_sha256(logs),
-        rubric=rubric,
-        key=key,
-        records=records,
-        largest_log_bytes=max_log_bytes.get(),
-    )
+    rules, logs = (course.rubric, course.key), files_by_sha256(course.logs)
+    scored = partial(grade_one, *rules, logs, records, max_log_bytes.get())
     made: dict[int, Graded] = {}
     reused = 0
     progress(0, len(found))
@@ -155,7 +126,7 @@ def grade_all(
         for index, result in work:
             if isinstance(result, Failed):
                 why = Refused(f"Grading it failed: {result.reason}", FAILED)
-                one, recalled = refused(rubric, key, why), False
+                one, recalled = refused(*rules, why), False
             else:
                 one, recalled = result
             submission = found[index]
@@ -165,17 +136,16 @@ def grade_all(
             reused += recalled
             progress(len(made), len(found))
     graded = [made[index] for index in range(len(found))]
-    entries, notes = class_entries(graded, found, register, course, overrides)
-    return entries, register, notes, reused
+    return (*class_entries(graded, found, course, overrides), reused)
 
 
 def grade_one(
-    job: tuple[Submission, str],
-    logs: Mapping[str, Path],
     rubric: Rubric,
     key: AnswerKey | None,
+    logs: Mapping[str, Path],
     records: Path,
     largest_log_bytes: int,
+    job: tuple[Submission, str],
 ) -> tuple[Graded, bool]:
     """Read, verify or recall, and score a file, whoever it is from; in a process of its own."""
     max_log_bytes.set(largest_log_bytes)

@@ -9,6 +9,9 @@ from px4fuse.answers import Answers
 from px4fuse.grading.platforms import NOBODY, ExportOrigin
 from px4fuse.verification.model import Verdict
 
+# What the sum over the items is called
+TOTAL = "total"
+
 
 @dataclass(frozen=True)
 class Submission:

@@ -8,13 +8,13 @@ from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 
-from px4fuse.assignment.roster import Register, distinct, file_names
+from px4fuse.assignment.roster import distinct, file_names
 from px4fuse.assignment.sheet import Sheet, number, read_sheet
 from px4fuse.grading import exports
 from px4fuse.grading.checks import text_of
 from px4fuse.grading.class_page import html_text
-from px4fuse.grading.entries import NAME, TEMPLATE, TOTAL, Course
-from px4fuse.grading.model import Entry, Graded, columns
+from px4fuse.grading.entries import NAME, TEMPLATE, Course
+from px4fuse.grading.model import TOTAL, Entry, Graded, columns
 from px4fuse.grading.records import HANDED_IN, PAGE, RECORDS, REDRAWN, file_of
 from px4fuse.spreadsheet import neutral, neutral_id
 from px4fuse.verification.model import Verdict
@@ -52,11 +52,7 @@ FOUND = {
 
 
 def write_class(
-    entries: Sequence[Entry],
-    register: Register,
-    course: Course,
-    title: str,
-    output: Path,
+    entries: Sequence[Entry], course: Course, output: Path
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """Write everything, and say what could not be entered.
 
@@ -64,8 +60,8 @@ def write_class(
 
     Parameters
     ----------
-    register : Register
-        Its people are those of the first entries.
+    entries : sequence of Entry
+        The first ones of those in the course's register, in its order.
 
     Returns
     -------
@@ -77,6 +73,7 @@ def write_class(
     OutputError
         The folder cannot be written.
     """
+    title = course.title or course.rubric.title or "Class"
     stems = file_names([_identity(entry, stem=True) for entry in entries])
     shown = [_with_files(entry, stem, output) for entry, stem in zip(entries, stems, strict=True)]
     drawn = any(entry.counting and entry.counting.redrawn_name for entry in shown)
@@ -94,7 +91,7 @@ def write_class(
     notes: list[str] = []
     names = distinct((sheet.path.name for sheet in course.worksheets), "{1}-{0}")
     for sheet, name in zip(course.worksheets, names, strict=True):
-        made, said = exports.filled(sheet, entries, register, course.column, texts)
+        made, said = exports.filled(sheet, entries, course.register, course.column, texts)
         contents[f"{GRADES}/{name}"] = made.content()
         notes += said
     write_all({output / name: content for name, content in contents.items()})

@@ -21,9 +21,8 @@ from px4fuse.assignment.key import AnswerKey
 from px4fuse.assignment.roster import distinct
 from px4fuse.errors import SettingsError
 from px4fuse.grading.checks import Evidence, RubricItem, Text, bracketed, contradictions, text_of
-from px4fuse.grading.entries import TOTAL
 from px4fuse.grading.flags import text_flags
-from px4fuse.grading.model import Graded, Item
+from px4fuse.grading.model import TOTAL, Graded, Item
 from px4fuse.reading import read_text
 from px4fuse.results.contract import Reported
 from px4fuse.results.reading import one_line
