@@ -93,10 +93,7 @@ Attempt = tuple[tuple[float, float], Graded, Entry]
 
 
 def class_entries(
-    graded: Sequence[Graded],
-    submissions: Sequence[Submission],
-    course: Course,
-    overrides: Overrides,
+    graded: Sequence[Graded], submissions: Sequence[Submission], course: Course, said: Overrides
 ) -> tuple[tuple[Entry, ...], tuple[str, ...]]:
     """Lay out a class: everyone in the register, then what belongs to nobody in it.
 
@@ -122,21 +119,18 @@ def class_entries(
         if place is None:
             place = everyone.place(Person(one.student_id, one.student))
         attempts[place].append(_attempt(one, submission, course, place, everyone))
+    most = max((one.of for one in graded), default=0.0)
     made = [
         _chosen(attempts[at], course) if attempts[at]
-        else Entry(person.name, person.student_id, None)
+        else Entry(person.name, person.student_id, None, of=most)
         for at, person in enumerate(everyone.people)
     ]  # fmt: skip
     nobody = "Neither the report nor the platform names anyone."
     note = "Not in the roster." if course.register.people else nobody
     made += [replace(entry, flags=(note, *entry.flags)) for *_, entry in attempts[None]]
-    told, notes = matched(overrides, made)
-    most = max((one.of for one in graded), default=0.0)
+    told, notes = matched(said, made)
     alike = class_flags([entry.counting for entry in made if entry.counting])
-    settled = (
-        _settled(one, words, alike, most, course.include_pending)
-        for one, words in zip(made, told, strict=True)
-    )
+    settled = (_settled(*each, alike, course) for each in zip(made, told, strict=True))
     return tuple(settled), notes
 
 
@@ -152,8 +146,7 @@ def _named(graded: Sequence[Graded], submissions: Sequence[Submission]) -> Regis
             # two students may not hand in under one id: the second is known by the platform alone
             student_id = person.student_id or ("" if claimed is not None else one.student_id)
             name = one_line(one.student if student_id else person.name, 200) or person.name
-            known_by = (student_id, person.login, *person.numbers.values())
-            student_id = next(filter(None, known_by))
+            student_id = next(filter(None, (student_id, person.login, *person.numbers.values())))
             register.people.append(replace(person, student_id=student_id, name=name))
         elif one.student_id and claimed is None:
             register.people.append(Person(one.student_id, one_line(one.student, 200)))
@@ -161,11 +154,7 @@ def _named(graded: Sequence[Graded], submissions: Sequence[Submission]) -> Regis
 
 
 def _attempt(
-    graded: Graded,
-    submission: Submission,
-    course: Course,
-    place: int | None,
-    register: Register,
+    graded: Graded, submission: Submission, course: Course, place: int | None, register: Register
 ) -> Attempt:
     """One file as if it were the only one of its student."""
     origin, due = submission.origin, course.due
@@ -202,6 +191,7 @@ def _attempt(
         "" if time is None else time.strftime(SHOWN),
         late_s,
         course.late.deduction(late_s, graded.of) if course.late and late_s else 0.0,
+        of=graded.of,
         flags=tuple(flags),
     )
     stamps = (time.timestamp() if time else 0.0, packed.timestamp() if packed else 0.0)
@@ -233,9 +223,8 @@ def _chosen(attempts: Sequence[Attempt], course: Course) -> Entry:
     others = tuple(one for _, one, _ in ordered if one is not graded)
     beside = [one for stamp, one, _ in able if stamp == stamps]
     if course.attempt != "best" and len({one.form for one in beside}) > 1:  # a guess in each
-        graded = replace(
-            graded, pending=f"Ask which of {len(beside)} reports is meant: their forms differ."
-        )
+        asked = f"Ask which of {len(beside)} reports is meant: their forms differ."
+        graded = replace(graded, pending=asked)
     elif len(beside) > 1 and any(stamps):
         flags.append(f"{len(beside)} reports came at the same time; the best of them counts.")
     for stamp, one, _ in ordered:
@@ -246,11 +235,7 @@ def _chosen(attempts: Sequence[Attempt], course: Course) -> Entry:
 
 
 def _settled(
-    entry: Entry,
-    said: Mapping[str, Override],
-    alike: Mapping[str, Sequence[str]],
-    most: float,
-    include_pending: bool,
+    entry: Entry, said: Mapping[str, Override], alike: Mapping[str, Sequence[str]], course: Course
 ) -> Entry:
     """With the instructor's word on items and on all of it, the total that follows, and flags."""
     one, total, flags = entry.counting, None, entry.flags
@@ -258,7 +243,7 @@ def _settled(
         items = (_overruled(item, said.get(item.title)) for item in one.items)
         one = replace(one, items=tuple(items))
         flags = (*flags, *one.flags, *alike.get(one.submission, ()))
-        if one.counted is not None or include_pending:
+        if one.counted is not None or course.include_pending:
             total = round(max(one.points - entry.deduction, 0.0), 2)
     final = said.get(TOTAL, Override())
     return replace(
@@ -267,7 +252,6 @@ def _settled(
         overrides=said,
         comment="\n".join(filter(None, (said.get("", Override()).comment, final.comment))),
         total=total if final.points is None else final.points,
-        of=one.of if one else most,
         flags=flags,
     )
 

@@ -74,11 +74,7 @@ def grade_column(sheet: Sheet, wanted: str) -> int:
 
 
 def filled(
-    sheet: Sheet,
-    entries: Sequence[Entry],
-    register: Register,
-    column: str,
-    feedback: Sequence[str],
+    sheet: Sheet, entries: Sequence[Entry], register: Register, column: str, feedback: Sequence[str]
 ) -> tuple[Sheet, tuple[str, ...]]:
     """Enter the grades of a class into a platform's table, and say what could not be entered.
 

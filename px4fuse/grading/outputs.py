@@ -249,8 +249,7 @@ def verdict_text(verdict: Verdict) -> str:
     if verdict.status == "verified":
         return f"{said}."
     reasons = (text_of(one).rstrip(".") for one in verdict.reasons[:NAMED])
-    if told := "; ".join(filter(None, reasons)):
-        said = f"{said}: {told}"
+    said = f"{said}: {'; '.join(filter(None, reasons))}"
     if verdict.missing:
         return f"{said}. Hand in {text_of(verdict.missing)}, if your instructor does not have it."
     return f"{said}. {AGAIN}"

@@ -150,10 +150,7 @@ def run_bounded(
 
 
 def bounded(
-    function: Callable[[Job], Result],
-    job: Job,
-    timeout_s: float,
-    memory_bytes: int = MEMORY_BYTES,
+    function: Callable[[Job], Result], job: Job, timeout_s: float, memory_bytes: int = MEMORY_BYTES
 ) -> Result | Failed:
     """One call in a process of its own, within bounds: see :func:`run_bounded`."""
     work = run_bounded(function, [job], timeout_s=timeout_s, memory_bytes=memory_bytes)
