@@ -171,29 +171,23 @@ def draw(
     if count is None:
         count = bisect(list(accumulate(COUNTS[kind][:-1])), one("count"))
     chosen: list[AssignableMistake] = []
+    typed: list[str] = []
+    hard: list[float] = []
     for choice in sorted(CHOICES[kind], key=lambda c: one(f"order {c.mistake}")):
         if len(chosen) < count and all(map(choice.goes_with, chosen)):
+            name = choice.mistake
+            share = 0.0 if choice.limit is None else one(f"size {name}")
+            sign = -1.0 if choice.either_sign and one(f"sign {name}") < 0.5 else 1.0
             chosen.append(choice)
-    hard = [
-        EASIEST if choice.limit is None
-        else EASIEST + (HARDEST - EASIEST) * one(f"size {choice.mistake}")
-        for choice in chosen
-    ]  # fmt: skip
-    typed = tuple(
-        choice.typed(
-            difficulty,
-            -1.0 if choice.either_sign and one(f"sign {choice.mistake}") < 0.5 else 1.0,
-            one(f"at {choice.mistake}"),
-        )
-        for choice, difficulty in zip(chosen, hard, strict=True)
-    )
+            hard.append(EASIEST + (HARDEST - EASIEST) * share)
+            typed.append(choice.typed(hard[-1], sign, one(f"at {name}")))
     numbers: dict[str, Any] = {
         name: round(low + (high - low) * one(name), decimals)
         for name, (low, high, decimals) in NOISES[kind].items()
     }
     told, seed = truth and kind == "aisle", int(one("seed") * 2**32)
     scenario = scenario_of(kind, truth=told, seed=seed, **numbers)
-    return Drawn(scenario, typed, round(max(hard, default=HARDEST), 2))
+    return Drawn(scenario, tuple(typed), round(max(hard, default=HARDEST), 2))
 
 
 def most_mistakes(kind: Kinds) -> int:

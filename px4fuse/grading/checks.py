@@ -402,15 +402,14 @@ class ClockItem(RubricItem, frozen=True, kw_only=True, tag="clock"):
 
     def score(self, evidence: Evidence) -> Scored:
         """All or nothing, ``undeterminable`` where the flight does not tell."""
-        comparison, handed_out = evidence.comparison, evidence.answer is not None
-        if comparison is None:
+        if evidence.comparison is None:
             return NO_COMPARISON
-        clock = comparison.clock
+        clock = evidence.comparison.clock
         if not isinstance(clock, Clock) or not clock.determinable:
             share = self.undeterminable if isinstance(clock, Clock) else 0.0
             why = bracketed(clock.reason or "")
             said = f"Your flight does not determine the clock offset{why}."
-            return 1.0 if handed_out else share, said
+            return 1.0 if evidence.answer is not None else share, said
         (low, high), applied = clock.interval_s, clock.applied_s
         said = f"You applied a clock offset of {applied:.3f} s"
         if low - self.margin_s <= applied <= high + self.margin_s:

@@ -147,20 +147,19 @@ def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str]) -> Row:
         *(frame.figure(points.get(name)) for name in items),
         *(frame.figure(held.get(name)) for name in numbers),
     )
-    nothing = (frame.listed("Missing", ["Nothing was handed in."]), _comment(entry))
-    details = _details(entry, one) if one else nothing
     # who has neither id nor file cannot be named in overrides.csv
     boxes = (_boxes(entry),) if entry.student_id or file else ()
     beside = _beside(entry, one) if one else ()
-    return Row(cells, tuple(_tags(entry)), (*details, *boxes), beside)
+    return Row(cells, tuple(_tags(entry)), (*_details(entry), *boxes), beside)
 
 
-def _comment(entry: Entry) -> Part:
-    return frame.prose("Your comment", entry.comment)
-
-
-def _details(entry: Entry, one: Graded) -> Iterator[Part]:
+def _details(entry: Entry) -> Iterator[Part]:
     """What a row unfolds to, as long as nobody is to be hidden."""
+    one, comment = entry.counting, frame.prose("Your comment", entry.comment)
+    if one is None:
+        yield frame.listed("Missing", ["Nothing was handed in."])
+        yield comment
+        return
     verdict = one.verdict
     differ = [(each.path, each.recorded, each.recomputed) for each in verdict.differences]
     items = [(item.title, number(item.points), number(item.of), item.comment) for item in one.items]
@@ -173,7 +172,7 @@ def _details(entry: Entry, one: Graded) -> Iterator[Part]:
     yield frame.tabled("The first numbers that differ", heads, differ)
     title = "Points (proposed)" if one.pending else "Points"
     yield frame.tabled(title, ("Item", "Points", "Of", "Comment") if items else (), items, (1, 2))
-    yield _comment(entry)
+    yield comment
     yield frame.listed("Mistakes of this flight", named)
     yield frame.pairs("The form", [*form_rows(one.form)] if one.form else [])
     yield frame.prose("The student's own words", one.notes)

@@ -21,6 +21,7 @@ from px4fuse.plain import few_words
 from px4fuse.results.contract import LoopResults, Reported, to_plain
 from px4fuse.results.reading import one_line
 from px4fuse.simulation import flights
+from px4fuse.verification.model import Verdict
 
 # Numbers of a form that two students do not have in common by chance, also where one of them has
 # changed each a little
@@ -54,6 +55,22 @@ TO_A_GRADER = re.compile(
 
 # Two reports that have something in common, and how much where that is not all of it
 Pairs = Iterator[tuple[Graded, Graded, str]]
+
+
+def page_flags(verdict: Verdict) -> Iterator[str]:
+    """Which pages are not as px4fuse draws them, or that nobody could see them."""
+    if verdict.pages:
+        first, *others = verdict.pages
+        more = f" Also: page {', '.join(str(one.page) for one in others)}." if others else ""
+        yield (
+            f"Page {first.page} of the PDF that was handed in is not what px4fuse draws from the "
+            f"log: {first.what}.{more} Read the redrawn report."
+        )
+    elif verdict.with_log and verdict.page_status == "not compared":
+        yield (
+            "The pages that were handed in could not be drawn: do not open them, read the redrawn "
+            "report."
+        )
 
 
 def own_flags(results: Reported, handed_out: bool = False) -> Iterator[str]:

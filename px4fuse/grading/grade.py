@@ -11,19 +11,15 @@ from px4fuse.assignment.key import AnswerKey
 from px4fuse.grading import submissions
 from px4fuse.grading.entries import NAME, Course, Overrides, class_entries, read_overrides
 from px4fuse.grading.exports import grade_column
-from px4fuse.grading.flags import own_flags
 from px4fuse.grading.model import Entry, Graded, Submission
 from px4fuse.grading.outputs import write_class
 from px4fuse.grading.records import RECORDS, verified
 from px4fuse.grading.rubric import Rubric, assess, refused
 from px4fuse.reading import files_by_sha256, max_log_bytes
 from px4fuse.results.reading import one_line
-from px4fuse.verification.model import Refused, Verdict
+from px4fuse.verification.model import Refused
 from px4fuse.verification.workers import Failed, run_bounded
 
-UNSEEN = (
-    "The pages that were handed in could not be drawn: do not open them, read the redrawn report."
-)
 FAILED = "Do not open it: ask for the report as px4fuse wrote it."
 
 
@@ -160,22 +156,4 @@ def grade_one(
         return replace(refused(rubric, key, found), sha256=sha256), recalled
     results, verdict, page = found
     made = assess(results, verdict, rubric, key, owner_id)
-    whole = replace(
-        made,
-        flags=(*_page_flags(verdict), *own_flags(results, key is not None), *made.flags),
-        sha256=sha256,
-        page=page,
-    )
-    return whole, recalled
-
-
-def _page_flags(verdict: Verdict) -> tuple[str, ...]:
-    if not verdict.pages:
-        unseen = verdict.with_log and verdict.page_status == "not compared"
-        return (UNSEEN,) if unseen else ()
-    first, *others = verdict.pages
-    more = f" Also: page {', '.join(str(one.page) for one in others)}." if others else ""
-    return (
-        f"Page {first.page} of the PDF that was handed in is not what px4fuse draws from the log: "
-        f"{first.what}.{more} Read the redrawn report.",
-    )
+    return replace(made, sha256=sha256, page=page), recalled

@@ -113,8 +113,8 @@ class Graded:
     @property
     def status(self) -> str:
         """That of the verdict, or "page differs" where only the numbers are verified."""
-        altered = self.verdict.status == "verified" and self.verdict.page_status == "differ"
-        return "page differs" if altered else self.verdict.status
+        differ = self.verdict.page_status == "differ"
+        return self.verdict.outcome if differ else self.verdict.status
 
     @property
     def points(self) -> float:

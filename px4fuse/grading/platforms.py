@@ -19,11 +19,9 @@ Sources of the names:
 """
 
 import re
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from pathlib import Path
 
 from px4fuse.assignment.roster import Person
 
@@ -116,36 +114,6 @@ def origin_of(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> ExportO
             imitated = len(_PARTS.findall(name)) > (platform in ("moodle", "blackboard"))
             return ExportOrigin(platform, person, time, bool(said.get("late")), imitated)
     return NOBODY
-
-
-def origins_of(
-    names: Sequence[tuple[Path | None, str]], people: Mapping[str, ExportOrigin]
-) -> list[ExportOrigin]:
-    """Who handed in each file, and by which platform.
-
-    An export is of one platform: that of most of its files. What a student called a file, in the
-    way of another platform, says nothing.
-
-    Parameters
-    ----------
-    names : sequence of (Path or None, str)
-        Zip file (None for a file of its own) and name of each.
-    people : mapping
-        Of Gradescope's metadata, by number of a submission.
-    """
-    exports = [zipped or name.partition("/")[0] for zipped, name in names]
-    counted: dict[object, Counter[str]] = defaultdict(Counter)
-    for export, (_, name) in zip(exports, names, strict=True):
-        counted[export].update(filter(None, [origin_of(name).platform]))
-    made = []
-    for export, (_, name) in zip(exports, names, strict=True):
-        origin = origin_of(name, [one for one, _ in counted[export].most_common(1)])
-        if origin.platform in ("gradescope", ""):
-            # PDF assignments are exported as 123456.pdf
-            stem = name.rpartition("/")[2].casefold().removesuffix(".pdf")
-            origin = people.get(origin.person.numbers.get("gradescope", stem), origin)
-        made.append(origin)
-    return made
 
 
 def gradescope_metadata(text: str) -> dict[str, ExportOrigin]:

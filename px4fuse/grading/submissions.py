@@ -8,7 +8,8 @@ import stat
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import datetime
@@ -18,7 +19,7 @@ from typing import IO
 from px4fuse.assignment.roster import distinct
 from px4fuse.errors import SettingsError
 from px4fuse.grading.model import Submission
-from px4fuse.grading.platforms import METADATA, ExportOrigin, gradescope_metadata, origins_of
+from px4fuse.grading.platforms import METADATA, ExportOrigin, gradescope_metadata, origin_of
 from px4fuse.reading import files_below
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification.intake import MAX_BYTES
@@ -111,14 +112,34 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
         found.values(), key=lambda one: (one.name.casefold(), one.name, one.file, one.entry)
     )
     names = distinct(_shown(one.name) for one in order)
-    exports = [
-        (one.file if one.entry else None, name) for one, name in zip(order, names, strict=True)
-    ]
-    made = (
-        replace(one, name=name, origin=origin)
-        for one, name, origin in zip(order, names, origins_of(exports, people), strict=True)
-    )
-    return tuple(made), tuple(notes)
+    named = [replace(one, name=name) for one, name in zip(order, names, strict=True)]
+    return tuple(with_origins(named, people)), tuple(notes)
+
+
+def with_origins(
+    those: Sequence[Submission], people: Mapping[str, ExportOrigin]
+) -> Iterator[Submission]:
+    """Submissions with who handed in each, and by which platform.
+
+    An export is of one platform: that of most of its files. What a student called a file, in the
+    way of another platform, says nothing.
+
+    Parameters
+    ----------
+    people : mapping
+        Of Gradescope's metadata, by number of a submission.
+    """
+    exports = [one.file if one.entry else one.name.partition("/")[0] for one in those]
+    counted: dict[object, Counter[str]] = defaultdict(Counter)
+    for export, one in zip(exports, those, strict=True):
+        counted[export].update(filter(None, [origin_of(one.name).platform]))
+    for export, one in zip(exports, those, strict=True):
+        origin = origin_of(one.name, [platform for platform, _ in counted[export].most_common(1)])
+        if origin.platform in ("gradescope", ""):
+            # PDF assignments are exported as 123456.pdf
+            stem = one.name.rpartition("/")[2].casefold().removesuffix(".pdf")
+            origin = people.get(origin.person.numbers.get("gradescope", stem), origin)
+        yield replace(one, origin=origin)
 
 
 def read(submission: Submission) -> bytes | Refused:

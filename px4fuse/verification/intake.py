@@ -107,10 +107,9 @@ def read_report(pdf: bytes, name: str) -> Report | Refused:
     except ResultsError as refusal:
         return Refused(f"{refusal.reason}.", refusal.remedy)
     if not isinstance(results, ComparisonResults | LoopResults):
-        alone = isinstance(results, AidsResults)
-        held = (
-            "the aids of EKF2 alone, nothing of our filter" if alone else "no results of a report"
-        )
+        held = "no results of a report"
+        if isinstance(results, AidsResults):
+            held = "the aids of EKF2 alone, nothing of our filter"
         return Refused(f"{one_line(name, 200)}: {RESULTS_NAME} in it holds {held}.")
     return Report(hashlib.sha256(pdf).hexdigest(), results, pdf)
 
@@ -170,9 +169,8 @@ def _inflated_bytes(pdf: bytes, start: int, limit: int) -> int:
         return 0  # RFC 1950, section 2.2: not zlib data
     inflate = zlib.decompressobj()
     taken = given = 0
-    feed = b""
     while not inflate.eof and max(taken, given) <= limit:
-        if not feed:
+        if not (feed := inflate.unconsumed_tail):
             feed = pdf[start + taken : start + taken + 16_384]
             taken += len(feed)
         if not feed:
@@ -181,7 +179,6 @@ def _inflated_bytes(pdf: bytes, start: int, limit: int) -> int:
             given += len(inflate.decompress(feed, 1_000_000))
         except zlib.error:  # pypdf, told not to repair, has no more use for it
             break
-        feed = inflate.unconsumed_tail
     taken -= len(inflate.unused_data)
     # the least is what a try costs, however little is there
     return min(max(taken, given, 1000), limit + 1)
@@ -202,7 +199,10 @@ def _dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObject, b
             if (value, clicked) in seen:
                 continue
             seen.add((value, clicked))
-            listed = _is_listed(reader, value.idnum, value.generation)
+            # in the cross-reference table, so that no search is needed for it
+            number, generation = value.idnum, value.generation
+            packed = generation == 0 and number in reader.xref_objStm
+            listed = packed or number in reader.xref.get(generation, {})
             missing += not listed
             if len(seen) > MAX_OBJECTS or missing > MAX_MISSING:
                 raise ResultsError(_COSTLY)
@@ -215,13 +215,6 @@ def _dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObject, b
             left.extend((value.raw_get(key), key == "/A") for key in value)
         elif isinstance(value, ArrayObject):
             left.extend((each, False) for each in list.__iter__(value))
-
-
-def _is_listed(reader: pypdf.PdfReader, number: int, generation: int) -> bool:
-    """Whether the cross-reference table has an object, so that no search is needed for it."""
-    return number in reader.xref.get(generation, {}) or (
-        generation == 0 and number in reader.xref_objStm
-    )
 
 
 def _foreign(value: DictionaryObject, clicked: bool) -> Iterator[str]:
