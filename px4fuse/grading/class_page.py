@@ -221,10 +221,10 @@ def _beside(entry: Entry, one: Graded) -> tuple[Part, ...]:
     every = frame.pictures("Every page, drawn again from the log", drawn)
     handed_in = []
     if source := local_link(one.handed_in):
-        said = f"Page {one.page}, as handed in: not verified"
+        said = f"Page {one.verdict.page}, as handed in: not verified"
         # the redrawn one stands beside it
-        handed_in = drawn[one.page - 1 : one.page]
-        handed_in += [(said, f"Page {one.page} {whose}, as handed in", source)]
+        handed_in = drawn[one.verdict.page - 1 : one.verdict.page]
+        handed_in += [(said, f"Page {one.verdict.page} {whose}, as handed in", source)]
     report = [("Drawn again from the log (PDF)", local_link(one.redrawn_name))]
     title = "The page that differs" if drawn else "As handed in"
     return frame.links("The report", report), frame.pictures(title, handed_in), every

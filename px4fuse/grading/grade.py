@@ -154,6 +154,4 @@ def grade_one(
     found, recalled = verified(records, content, logs, handed_out)
     if isinstance(found, Refused):
         return replace(refused(rubric, key, found), sha256=sha256), recalled
-    results, verdict, page = found
-    made = assess(results, verdict, rubric, key, owner_id)
-    return replace(made, sha256=sha256, page=page), recalled
+    return replace(assess(*found, rubric, key, owner_id), sha256=sha256), recalled

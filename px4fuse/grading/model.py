@@ -84,11 +84,8 @@ class Graded:
     mistakes : mapping
         What the answer key says is wrong in the student's flight, and whether the form names it.
     handed_in, sheets, redrawn_name : str, tuple of str, str
-        Where the picture of a page as it was handed in (the cover where nothing could be redrawn,
-        else the one that differs most), pictures of the redrawn pages, and the redrawn PDF stand,
-        relative to the class page.
-    page : int
-        Which page was pictured as it was handed in, counted from 1.
+        Where the picture of a page as it was handed in (the verdict's), pictures of the redrawn
+        pages, and the redrawn PDF stand, relative to the class page.
     """
 
     submission: str
@@ -106,7 +103,6 @@ class Graded:
     notes: str = field(default="", repr=False)
     mistakes: Mapping[str, bool] = field(default_factory=dict)
     handed_in: str = ""
-    page: int = 1
     redrawn_name: str = ""
     sheets: tuple[str, ...] = ()
 

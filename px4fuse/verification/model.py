@@ -117,6 +117,12 @@ class Verdict:
     missing: str = ""
 
     @property
+    def page(self) -> int:
+        """The page that differs most, counted from 1; the cover where none does."""
+        most = max(self.pages, key=lambda one: (one.picture, one.words), default=None)
+        return most.page if most else 1
+
+    @property
     def outcome(self) -> str:
         """In two words: the status, and where that is "verified" what the pages add to it."""
         if self.status != "verified" or self.page_status == "same":
