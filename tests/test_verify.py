@@ -50,15 +50,15 @@ from pypdf.generic import (
 from px4fuse.cli import cli
 from px4fuse.reading import files_by_sha256
 from px4fuse.results.contract import to_json, to_plain
-from px4fuse.verification import pages, rerun, verification
+from px4fuse.verification import pages, verification
 from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import Refused, Report
-from px4fuse.verification.rerun import Recomputed
 from px4fuse.verification.verification import (
     ESTIMATE_RELATIVE,
     LIMIT,
     NO_LOG,
     RELATIVE,
+    Recomputed,
     compare_results,
     verify,
 )
@@ -299,7 +299,7 @@ def test_changed_results(aisle: Base, name: str, monkeypatch: pytest.MonkeyPatch
 def test_what_is_printed_from_the_record(loop: Base, path: tuple[str, ...]) -> None:
     results = copy.deepcopy(loop.results)
     put({"name": "Eve", "notes": "I flew it."}.get(path[-1], "9.9.9"), *path)(results)
-    again = rerun.recompute(read_again(results), loop.files)
+    again = verification.recompute(read_again(results), loop.files)
     verdict = verify(report_of(loop.with_results(results)), loop.files, recompute=lambda *_: again)
     assert (verdict.status, verdict.outcome) == ("verified", "page differs"), verdict
     assert verdict.redrawn != loop.pdf

@@ -33,8 +33,7 @@ from px4fuse.results.reading import one_line
 from px4fuse.trajectory.evaluation import Score
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 from px4fuse.verification.model import Verdict
-from px4fuse.verification.rerun import log_sha256
-from px4fuse.verification.verification import flattened, is_number
+from px4fuse.verification.verification import flattened, is_number, log_sha256
 
 MAX_QUOTE = 160
 NOT_BOTH = " (it needs the axes north and east: leave --axis out)"

@@ -27,7 +27,7 @@ from px4fuse.reading import read_text
 from px4fuse.results.contract import Reported
 from px4fuse.results.reading import one_line
 from px4fuse.verification.model import Refused, Verdict
-from px4fuse.verification.rerun import log_sha256
+from px4fuse.verification.verification import log_sha256
 
 DEFAULT = "rubric.toml"
 MAX_RUBRIC_BYTES = 1_000_000

@@ -7,25 +7,45 @@ report with another name on it.
 
 The pages that were handed in prove nothing and are not read: the report is redrawn from what the
 log gives. Pages that look otherwise are named, for somebody to look at.
+
+The recorded request is a stranger's. It is decoded strictly, and the analysis knows the range of
+every value; files are found by their SHA-256 among those that were given, never by name; and
+nothing in it names an output.
 """
 
 import re
+import shutil
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from dataclasses import replace as replaced
 from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from msgspec.structs import replace
+
+from px4fuse.errors import Px4FuseError, ResultsError, SettingsError
 from px4fuse.flight import Unavailable
-from px4fuse.results.contract import Reported, to_plain
-from px4fuse.results.model import Provenance
+from px4fuse.report.document import Document, LoopDocument
+from px4fuse.results.contract import (
+    ComparisonResults,
+    LoopResults,
+    Reported,
+    to_json,
+    to_plain,
+)
+from px4fuse.results.model import LIBRARIES, Provenance
 from px4fuse.results.reading import cleaned, one_line
-from px4fuse.verification import rerun
 from px4fuse.verification.model import Mismatch, PageStatus, Refused, Report, Status, Verdict
 from px4fuse.verification.pages import NumbersAlike, compare_pages
-from px4fuse.verification.rerun import ADD, Recomputed
 
+ADD = "Add {} to --logs."
+ASK = "Ask how the report was made, and for the log and all files that it was made from."
+NOT_OURS = "the recorded request is not one that px4fuse can have made"
+# A flight of ten minutes has 60,000 steps of it, which take half a minute
+MIN_DT_S = 0.01
 LIMIT = "A verified report proves that its numbers belong to the log, not who wrote them."
 NO_LOG = "no log was given, so that no number could be computed again"
 # Sums over a flight differ between machines in the last few of 16 digits; what is left of a
@@ -51,7 +71,23 @@ PRINTED_SCALES = (1.0, 100.0, 1000.0)
 MAX_NOTES_LINES = 5_000
 _NUMBER = re.compile(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)")
 
-Recompute = Callable[[Reported, Mapping[str, Path]], Recomputed | Refused]
+_Place = Callable[[str, str | None, str], Path]
+
+
+@dataclass(frozen=True)
+class Recomputed:
+    """What the analysis gives now.
+
+    Attributes
+    ----------
+    results : ComparisonResults or LoopResults
+        As a report attaches them.
+    draw : callable
+        Draws the report: with the student, and with the versions, that were recorded.
+    """
+
+    results: Reported
+    draw: Callable[[], bytes]
 
 
 @dataclass(frozen=True)
@@ -73,11 +109,148 @@ class Numbers:
     compared: int
 
 
+class FileMissingError(ResultsError):
+    """A file that a report rests on is not among those given; ``missing`` is what it is called."""
+
+    def __init__(self, text: str, missing: str) -> None:
+        super().__init__(text, ADD.format(missing))
+        self.missing = missing
+
+
+def log_sha256(results: Reported) -> str:
+    """SHA-256 of the log that a report is about."""
+    return results.track.sha256 if isinstance(results, LoopResults) else results.log.sha256
+
+
+def log_name(results: Reported) -> str:
+    """Name of the log that a report is about, as the report gives it."""
+    loop = isinstance(results, LoopResults)
+    return split_part(results.track.name)[0] if loop else results.log.name  # type: ignore[union-attr]
+
+
+def recompute(results: Reported, logs: Mapping[str, Path]) -> Recomputed | Refused:
+    """Repeat the analysis from what a report recorded.
+
+    Parameters
+    ----------
+    results : ComparisonResults or LoopResults
+        What is attached to the report.
+    logs : mapping of str to Path
+        Files by their SHA-256.
+
+    Returns
+    -------
+    Recomputed or Refused
+        Refused where the command is not px4fuse's, a file is missing, or the analysis fails.
+    """
+    try:
+        if tuple(results.provenance.libraries) != LIBRARIES:
+            raise ResultsError("the results do not say which libraries they were made with", ASK)
+        with tempfile.TemporaryDirectory(prefix="px4fuse-") as folder:
+            place = partial(_place, logs, Path(folder))
+            if isinstance(results, LoopResults):
+                return _looped(results, place)
+            return _compared(results, place)
+    except SettingsError as error:  # no run with these settings can have made a report
+        return Refused(f"{NOT_OURS}: {error}", ASK)
+    except ResultsError as error:
+        return Refused(error.reason, error.remedy, getattr(error, "missing", ""))
+    except Px4FuseError as error:
+        return Refused(str(error), ASK)
+    except Exception as error:  # noqa: BLE001 - settings made to fail may fail anywhere
+        return Refused(f"the analysis cannot be repeated ({type(error).__name__})", ASK)
+
+
+def _place(
+    logs: Mapping[str, Path], within: Path, recorded: str, sha256: str | None, what: str
+) -> Path:
+    """A file with this content where the analysis finds it, under the recorded name.
+
+    Names are printed in the report. They are those of links in a folder of this run alone, and
+    only where they are plain names.
+    """
+    path = None if sha256 is None else logs.get(sha256)
+    if path is None:
+        asked = f"none of the files given has the SHA-256 of {what}"
+        raise FileMissingError(asked, one_line(recorded, 80) or "its file")
+    name = recorded
+    plain = name == Path(name).name != ".." and "\\" not in name and name.isprintable()
+    if not plain:
+        raise ResultsError(f"{NOT_OURS}: a file name in it is not a plain name", ASK)
+    # each in a folder of its own: two may have one name
+    folder = Path(tempfile.mkdtemp(dir=within))
+    target = folder / name
+    try:
+        target.symlink_to(path.resolve())
+    except OSError:  # on Windows for administrators only
+        shutil.copyfile(path, target)
+    return target
+
+
+def split_part(source: str) -> tuple[str, str]:
+    """File and part of ``LOG:vio``, without a look at any file."""
+    from px4fuse.loop.tracks import PARTS  # noqa: PLC0415
+
+    name, colon, tail = source.rpartition(":")
+    return (name, f":{tail}") if colon and tail in PARTS else (source, "")
+
+
+def _compared(handed_in: ComparisonResults, place: _Place) -> Recomputed:
+    from px4fuse.analysis import run  # noqa: PLC0415
+    from px4fuse.results.build import results  # noqa: PLC0415
+
+    recorded = handed_in.request
+    if recorded.dt_s < MIN_DT_S:
+        raise ResultsError(f"DT is below {MIN_DT_S:g} s, which takes too long to repeat", ASK)
+    joined = {file.role: file.sha256 for file in handed_in.log.joined}
+    request = replace(recorded, log=str(place(recorded.log, handed_in.log.sha256, "the log")))
+    if (mavlink := recorded.mavlink) is not None:
+        placed = place(mavlink, joined.get("mavlink"), "--mavlink")
+        request = replace(request, mavlink=str(placed))
+    if (position := recorded.position) is not None:
+        placed = place(position.path, joined.get("position"), "--position")
+        request = replace(request, position=replace(position, path=str(placed)))
+    analysis = run(request)
+    document = Document(analysis, results(recorded, analysis, handed_in.student))
+    return Recomputed(document.results, partial(_drawn, document, handed_in.provenance))
+
+
+def _looped(handed_in: LoopResults, place: _Place) -> Recomputed:
+    from px4fuse.analysis import run_loop  # noqa: PLC0415
+    from px4fuse.results.build import loop_results  # noqa: PLC0415
+
+    recorded = handed_in.request
+    path, part = split_part(recorded.source)
+    placed = place(path, handed_in.track.sha256, "the log")
+    request = replace(recorded, source=f"{placed}{part}")
+    if recorded.reference is not None:
+        path, part = split_part(recorded.reference)
+        sha256 = handed_in.references[-1].sha256 if handed_in.references else None
+        placed = place(path, sha256, "--reference")
+        request = replace(request, reference=f"{placed}{part}")
+    found = run_loop(request)
+    document = LoopDocument(found, loop_results(recorded, found, handed_in.student))
+    return Recomputed(document.results, partial(_drawn, document, handed_in.provenance))
+
+
+def _drawn(document: Document | LoopDocument, versions: Provenance) -> bytes:
+    """Draw the report with the versions that were recorded."""
+    from px4fuse.report.pdf import render  # noqa: PLC0415
+
+    made = replace(versions, command=document.results.provenance.command)
+    shown = replace(document.results, provenance=made)
+    drawn = replaced(document, results=shown)  # type: ignore[arg-type]
+    return render(drawn, to_json(document.results))
+
+
+# ------------------------------------------------------------------ the verdict
+
+
 def verify(
     report: Report,
     logs: Mapping[str, Path],
     *,
-    recompute: Recompute = rerun.recompute,
+    recompute: Callable[[Reported, Mapping[str, Path]], Recomputed | Refused] = recompute,
 ) -> Verdict:
     """Say whether a report's numbers are what its log gives, and draw it again.
 
@@ -100,10 +273,10 @@ def verify(
         named = one_line(theirs, 40)
         why = f"made with px4fuse {named}, this is {ours}"
         return _unknown(Refused(why, f"Run it with px4fuse {named}."))
-    name = one_line(rerun.log_name(report.results), 80) or "its log"
+    name = one_line(log_name(report.results), 80) or "its log"
     if not logs:
         return _unknown(Refused(NO_LOG, ADD.format(name), name))
-    sha256 = rerun.log_sha256(report.results)
+    sha256 = log_sha256(report.results)
     if sha256 not in logs:
         asked = one_line(sha256, 64) or "none"
         reason = f"none of the {len(logs)} files given is the log, whose SHA-256 is {asked}"
@@ -111,7 +284,7 @@ def verify(
         return Verdict("other log", (reason,), False, remedy=remedy, missing=name)
     if report.results.student.notes.count("\n") > MAX_NOTES_LINES:
         reason = f"its notes have more than {MAX_NOTES_LINES} lines, which is no report"
-        return _unknown(Refused(reason, rerun.ASK))
+        return _unknown(Refused(reason, ASK))
     again = recompute(report.results, logs)
     return _unknown(again) if isinstance(again, Refused) else _with_log(report, again)
 
