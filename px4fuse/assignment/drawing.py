@@ -164,7 +164,18 @@ def draw(
         Of mistakes; None draws it.
     truth : bool
         Whether an aisle's log holds the truth. A loop's does not: it would tell where it landed.
+
+    Raises
+    ------
+    SettingsError
+        So many mistakes cannot be in one flight.
     """
+    most = min(len(COUNTS[one]) for one in (COUNTS if kind == "mixed" else (kind,))) - 1
+    if count is not None and not 0 <= count <= most:
+        raise SettingsError(
+            f"--mistakes {count}: a flight of kind {kind} can have 0 to {most}, of which each is "
+            "still found beside the others."
+        )
     if kind == "mixed":
         kind = "loop" if uniform(secret, student_id, kind, "kind") < LOOPS else "aisle"
     one = partial(uniform, secret, student_id, kind)
@@ -188,11 +199,6 @@ def draw(
     told, seed = truth and kind == "aisle", int(one("seed") * 2**32)
     scenario = scenario_of(kind, truth=told, seed=seed, **numbers)
     return Drawn(scenario, tuple(typed), round(max(hard, default=HARDEST), 2))
-
-
-def most_mistakes(kind: Kinds) -> int:
-    """How many mistakes every flight can have."""
-    return min(len(COUNTS[one]) for one in (COUNTS if kind == "mixed" else (kind,))) - 1
 
 
 def secret_of(text: str, where: str) -> bytes:

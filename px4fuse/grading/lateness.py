@@ -7,6 +7,7 @@ zero points.
 
 import math
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
@@ -111,8 +112,6 @@ def moodle_time(text: str) -> datetime | None:
     >>> moodle_time("-")
     """
     for form in _MOODLE_FORMATS:
-        try:
+        with suppress(ValueError):
             return datetime.strptime(text.strip(), form)
-        except ValueError:
-            continue
     return None
