@@ -13,8 +13,7 @@ from px4fuse.answers import Answers, Claim
 from px4fuse.assignment.roster import Person
 from px4fuse.errors import SettingsError
 from px4fuse.grading.class_page import _boxes
-from px4fuse.grading.entries import Course, class_entries, read_overrides
-from px4fuse.grading.lateness import due_time, late_rule
+from px4fuse.grading.entries import Course, class_entries, due_time, late_rule, read_overrides
 from px4fuse.grading.model import Override, Submission
 from px4fuse.grading.outputs import returned_text
 from px4fuse.grading.platforms import origin_of

@@ -16,9 +16,8 @@ from golden_tools import agrees
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.roster import read_people
 from px4fuse.assignment.sheet import read_sheet
-from px4fuse.grading.entries import Course
+from px4fuse.grading.entries import Course, due_time, late_rule
 from px4fuse.grading.grade import GradeOutcome, grade
-from px4fuse.grading.lateness import due_time, late_rule
 from px4fuse.grading.model import Entry
 from px4fuse.grading.rubric import read_rubric, rubric_text
 

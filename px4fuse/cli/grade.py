@@ -87,10 +87,9 @@ def grade(
     from px4fuse.assignment.key import read_key
     from px4fuse.assignment.roster import read_people
     from px4fuse.assignment.sheet import read_sheet
-    from px4fuse.grading.entries import Course
+    from px4fuse.grading.entries import Course, due_time, late_rule
     from px4fuse.grading.grade import grade as grade_all
     from px4fuse.grading.gradescope import autograder_zip, run_autograder
-    from px4fuse.grading.lateness import due_time, late_rule
     from px4fuse.grading.rubric import read_rubric, rubric_text
 
     if write_rubric is not None:

@@ -10,9 +10,8 @@ from pathlib import Path
 from px4fuse.assignment.key import AnswerKey
 from px4fuse.grading import submissions
 from px4fuse.grading.entries import NAME, Course, Overrides, class_entries, read_overrides
-from px4fuse.grading.exports import grade_column
 from px4fuse.grading.model import Entry, Graded, Submission
-from px4fuse.grading.outputs import write_class
+from px4fuse.grading.outputs import grade_column, write_class
 from px4fuse.grading.records import RECORDS, verified
 from px4fuse.grading.rubric import Rubric, assess, refused
 from px4fuse.reading import files_by_sha256, max_log_bytes

@@ -27,9 +27,8 @@ import msgspec
 from px4fuse.assignment.key import key_text, read_key
 from px4fuse.assignment.roster import Person
 from px4fuse.errors import SettingsError
-from px4fuse.grading.entries import Course
+from px4fuse.grading.entries import Course, LateRule
 from px4fuse.grading.grade import grade_all
-from px4fuse.grading.lateness import LateRule
 from px4fuse.grading.model import Entry
 from px4fuse.grading.outputs import returned_text
 from px4fuse.grading.platforms import NOBODY, ExportOrigin

@@ -9,7 +9,6 @@ drawn again. A file that another program saved again is therefore as good as the
 as its results are still attached.
 """
 
-import hashlib
 import io
 import logging
 import re
@@ -111,7 +110,7 @@ def read_report(pdf: bytes, name: str) -> Report | Refused:
         if isinstance(results, AidsResults):
             held = "the aids of EKF2 alone, nothing of our filter"
         return Refused(f"{one_line(name, 200)}: {RESULTS_NAME} in it holds {held}.")
-    return Report(hashlib.sha256(pdf).hexdigest(), results, pdf)
+    return Report(results, pdf)
 
 
 def attached_results(pdf: bytes, name: str) -> Results:

@@ -16,15 +16,12 @@ class Report:
 
     Attributes
     ----------
-    sha256 : str
-        Of the PDF.
     results : ComparisonResults or LoopResults
         The attached results.
     pdf : bytes
         The file itself.
     """
 
-    sha256: str
     results: Reported
     pdf: bytes = field(repr=False)
 
