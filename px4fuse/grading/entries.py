@@ -38,6 +38,7 @@ MAX_COMMENT = 10_000
 
 # Id as it was typed, to item as it was typed ("" for all of it), to what is said
 Overrides = Mapping[str, Mapping[str, Override]]
+# What being late costs, as it is typed
 _RULE = re.compile(
     r"(?P<rate>\d+(?:\.\d+)?)\s*%\s*/\s*(?P<unit>day|hour)"
     r"(?:\s+up to\s+(?P<most>\d+(?:\.\d+)?)\s*%)?"

@@ -69,8 +69,7 @@ FOUND = {
     "other log": "The log of your report is not one of those that your instructor has",
     "cannot verify": "Your report could not be verified",
 }
-
-# ------ of platforms' tables: titles of the columns for the grade, its maximum and comments
+# Titles of columns of platforms' tables
 GRADE = ("grade", "bewertung", "points", "punkte", "mark", "note", "score")
 MAX_GRADE = ("maximumgrade", "hoechstebewertung", "höchstebewertung")
 # Read as HTML, and read as text
@@ -91,7 +90,7 @@ def write_class(
     Parameters
     ----------
     entries : sequence of Entry
-        The first ones of those in the course's register, in its order.
+        Those of the people in the course's register first, in its order.
 
     Returns
     -------
