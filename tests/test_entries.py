@@ -16,8 +16,8 @@ from px4fuse.grading.class_page import _boxes
 from px4fuse.grading.entries import Course, class_entries, due_time, late_rule, read_overrides
 from px4fuse.grading.model import Override, Submission
 from px4fuse.grading.outputs import returned_text
-from px4fuse.grading.platforms import origin_of
 from px4fuse.grading.rubric import read_rubric
+from px4fuse.grading.submissions import origin_of
 from px4fuse.verification.model import Verdict
 
 DUE = due_time("2026-11-20 12:00:00 +01:00")

@@ -18,8 +18,7 @@ from px4fuse.assignment.roster import Person
 from px4fuse.errors import SettingsError
 from px4fuse.grading import submissions
 from px4fuse.grading.model import Submission
-from px4fuse.grading.platforms import origin_of
-from px4fuse.grading.submissions import collect, read, with_origins
+from px4fuse.grading.submissions import collect, origin_of, read, with_origins
 from px4fuse.reading import files_by_sha256
 from px4fuse.verification.intake import MAX_BYTES, read_report
 from px4fuse.verification.model import Refused

@@ -29,9 +29,8 @@ from px4fuse.assignment.roster import Person
 from px4fuse.errors import SettingsError
 from px4fuse.grading.entries import Course, LateRule
 from px4fuse.grading.grade import grade_all
-from px4fuse.grading.model import Entry
+from px4fuse.grading.model import NOBODY, Entry, ExportOrigin
 from px4fuse.grading.outputs import returned_text
-from px4fuse.grading.platforms import NOBODY, ExportOrigin
 from px4fuse.grading.rubric import read_rubric, rubric_text
 from px4fuse.grading.submissions import collect
 from px4fuse.reading import files_by_sha256, read_log_bytes, read_text

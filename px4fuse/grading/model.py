@@ -6,11 +6,43 @@ from datetime import datetime
 from pathlib import Path
 
 from px4fuse.answers import Answers
-from px4fuse.grading.platforms import NOBODY, ExportOrigin
+from px4fuse.assignment.roster import Person
 from px4fuse.verification.model import Verdict
 
 # What the sum over the items is called
 TOTAL = "total"
+
+
+UNKNOWN = Person("")
+
+
+@dataclass(frozen=True)
+class ExportOrigin:
+    """What a platform says of a file that was handed in.
+
+    Attributes
+    ----------
+    platform : str
+        One of :data:`px4fuse.grading.submissions.PLATFORMS`; "" where the name is of no platform.
+    person : Person
+        The student, as far as the platform says; its number is the platform's own (Moodle's
+        participant, Canvas's and ILIAS's user, Gradescope's submission), never the university's.
+    time : datetime or None
+        Without a time zone where the platform leaves it out.
+    late : bool
+        Whether the platform marks it so.
+    imitated : bool
+        Whether a student's own part of the name looks like a platform's.
+    """
+
+    platform: str = ""
+    person: Person = UNKNOWN
+    time: datetime | None = None
+    late: bool = False
+    imitated: bool = False
+
+
+NOBODY = ExportOrigin()
 
 
 @dataclass(frozen=True)
