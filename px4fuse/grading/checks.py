@@ -106,11 +106,6 @@ class Evidence:
         """The results where they compare filters."""
         return None if isinstance(self.results, LoopResults) else self.results
 
-    @property
-    def kind(self) -> Literal["compare", "loop"]:
-        """Which command made the report."""
-        return "loop" if isinstance(self.results, LoopResults) else "compare"
-
     @cached_property
     def values(self) -> dict[str, Any]:
         """What the results hold, for paths that a rubric names."""

@@ -139,10 +139,10 @@ def assess(
     """
     evidence = Evidence(results, verdict, key, owner_id)
     fate, why = _fate(evidence, rubric)
-    student = results.student
+    student, kind = results.student, "compare" if evidence.comparison else "loop"
     made = []
     for item in rubric.items:
-        if not item.applies(evidence.kind, key):
+        if not item.applies(kind, key):
             continue
         share, comment = 0.0, f"No points, since {why}."
         if fate != "zero":
