@@ -19,8 +19,7 @@ from px4fuse.grading import records
 from px4fuse.grading.model import Entry, Graded, Item
 from px4fuse.verification import workers
 from px4fuse.verification.model import Verdict
-from px4fuse.verification.rerun import log_sha256
-from px4fuse.verification.verification import verify
+from px4fuse.verification.verification import log_sha256, verify
 
 REPORT = REPOSITORY / "reports" / "aisle_uwb.pdf"
 VERIFIED = Verdict("verified", ("the log gives every value again",), True, page_status="same")

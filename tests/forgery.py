@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import re
@@ -19,10 +18,9 @@ from px4fuse.errors import ResultsError
 from px4fuse.reading import files_by_sha256
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json
 from px4fuse.results.reading import read_results
-from px4fuse.verification import rerun
+from px4fuse.verification import verification
 from px4fuse.verification.model import Refused, Report, Verdict
-from px4fuse.verification.rerun import Recomputed
-from px4fuse.verification.verification import verify
+from px4fuse.verification.verification import Recomputed, verify
 
 Forge = Callable[[PdfWriter], Any]
 Edit = Callable[[bytes], bytes]
@@ -142,7 +140,7 @@ def report_of(pdf: bytes) -> Report:
     """A report, read without care: tests of reading are elsewhere."""
     results = read_results(PdfReader(io.BytesIO(pdf)).attachments["results.json"][0])
     assert isinstance(results, ComparisonResults | LoopResults)
-    return Report(hashlib.sha256(pdf).hexdigest(), results, pdf)
+    return Report(results, pdf)
 
 
 def plain(report: Report) -> dict[str, Any]:
@@ -171,11 +169,11 @@ class Base:
         """What a new run gives; from memory where everything that it rests on is recorded so."""
         ours, theirs = (
             # the recorded command is made anew from the request
-            (held.request, held.student, rerun.log_sha256(held),
+            (held.request, held.student, verification.log_sha256(held),
              msgspec.structs.replace(held.provenance, command=""))
             for held in (self.again.results, results)
         )  # fmt: skip
-        return self.again if ours == theirs else rerun.recompute(results, logs)
+        return self.again if ours == theirs else verification.recompute(results, logs)
 
     def verified(self, pdf: bytes) -> Verdict:
         """The verdict on a forged report, with the log."""
@@ -193,7 +191,7 @@ class Base:
 def base(pdf: bytes, log: Path) -> Base:
     files = files_by_sha256([log])
     report = report_of(pdf)
-    again = rerun.recompute(report.results, files)
+    again = verification.recompute(report.results, files)
     assert isinstance(again, Recomputed), again
     drawn = again.draw()
     kept = Recomputed(again.results, lambda: drawn)

@@ -24,8 +24,7 @@ from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.truth import truth_of
 from px4fuse.cli import cli
 from px4fuse.grading.model import Graded
-from px4fuse.grading.rubric import Rubric, read_rubric
-from px4fuse.grading.scoring import assess, refused
+from px4fuse.grading.rubric import Rubric, assess, read_rubric, refused
 from px4fuse.report import pdf as pdf_module
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse

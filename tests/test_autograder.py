@@ -16,10 +16,9 @@ from click.testing import CliRunner
 from px4fuse.cli import cli
 from px4fuse.errors import SettingsError
 from px4fuse.grading import gradescope
+from px4fuse.grading.entries import late_rule
 from px4fuse.grading.gradescope import results, submission_metadata
-from px4fuse.grading.lateness import late_rule
-from px4fuse.grading.model import Entry
-from px4fuse.grading.platforms import NOBODY
+from px4fuse.grading.model import NOBODY, Entry
 from px4fuse.grading.rubric import read_rubric
 
 LOG = REPORT.parents[1] / "sample_logs" / "aisle_uwb.ulg"

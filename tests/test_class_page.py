@@ -25,7 +25,7 @@ from px4fuse.answers import Answers, Claim
 from px4fuse.grading.class_page import html_text
 from px4fuse.grading.model import Entry, Graded, Item, Override
 from px4fuse.grading.outputs import nameless
-from px4fuse.verification.model import Mismatch, Verdict
+from px4fuse.verification.model import Mismatch, PageDifference, Verdict
 from px4fuse.webpage.safe import MAX_CHARACTERS
 
 MARKUP = '<img src=x onerror="window.alive=1"><b>bold</b>'
@@ -49,7 +49,8 @@ def png(width: int = 7, height: int = 10) -> bytes:
 
 
 def graded(name: str, points: float | None, **more: Any) -> Graded:
-    verdict = Verdict(more.pop("status", "verified"), more.pop("reasons", ("All agrees.",)), True)
+    verdict = Verdict(more.pop("status", "verified"), more.pop("reasons", ("All agrees.",)), True,
+                      pages=more.pop("pages", ()))  # fmt: skip
     items = (
         ()
         if points is None
@@ -313,8 +314,9 @@ def test_keys_step_through_the_reports(page: Browser) -> None:
 
 
 def test_a_page_that_differs_stands_beside_the_redrawn_one() -> None:
-    one = row("Zoë", 18.5, sheets=("pages/1.png", "pages/2.png"), handed_in="pages/in.png", page=2,
-              redrawn_name="reports/1.pdf")  # fmt: skip
+    pages = (PageDifference(1, "a word", 1, 0.0), PageDifference(2, "its picture", 0, 0.2))
+    one = row("Zoë", 18.5, sheets=("pages/1.png", "pages/2.png"), handed_in="pages/in.png",
+              redrawn_name="reports/1.pdf", pages=pages)  # fmt: skip
     made = content(html_text([one, row("Bo", 1.0, handed_in="pages/bo.png")], "Class", "px4fuse 1"))
     both, every = (part for part in made["rows"][0][3] if part[0] == "pictures")
     assert [said for said, *_ in both[2]] == ["Page 2 of 2", "Page 2, as handed in: not verified"]

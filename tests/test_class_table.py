@@ -12,8 +12,8 @@ from exchange import replace
 from hypothesis import given
 from hypothesis import strategies as st
 
-from px4fuse.grading.class_table import FIRST, LAST, csv_text
 from px4fuse.grading.model import Entry, Graded, Item
+from px4fuse.grading.outputs import FIRST, LAST, csv_text
 from px4fuse.spreadsheet import MAX_CHARACTERS, neutral, neutral_id
 from px4fuse.verification.model import Verdict
 

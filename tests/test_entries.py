@@ -10,19 +10,19 @@ from class_tools import graded
 from exchange import replace
 
 from px4fuse.answers import Answers, Claim
-from px4fuse.assignment.roster import Person, Register
+from px4fuse.assignment.roster import Person
 from px4fuse.errors import SettingsError
 from px4fuse.grading.class_page import _boxes
-from px4fuse.grading.entries import Course, class_entries
-from px4fuse.grading.feedback import returned_text
-from px4fuse.grading.lateness import due_time, late_rule
+from px4fuse.grading.entries import Course, class_entries, due_time, late_rule, read_overrides
 from px4fuse.grading.model import Override, Submission
-from px4fuse.grading.overrides import read_overrides
-from px4fuse.grading.platforms import origin_of
+from px4fuse.grading.outputs import returned_text
+from px4fuse.grading.rubric import read_rubric
+from px4fuse.grading.submissions import origin_of
 from px4fuse.verification.model import Verdict
 
 DUE = due_time("2026-11-20 12:00:00 +01:00")
-LATEST = Course()
+RUBRIC = read_rubric(None)
+LATEST = Course(RUBRIC)
 PEOPLE = (Person("1", "Ada Lovelace", login="ada"), Person("2", "Grace Hopper", login="grace"))
 
 
@@ -33,7 +33,7 @@ def laid_out(files, term=LATEST, overrides=None, people=PEOPLE, packed=None):
         Submission(Path("x.zip"), name, name, (packed or {}).get(name), origin_of(name))
         for name in files
     ]
-    return class_entries(reports, found, Register(people), term, overrides or {})
+    return class_entries(reports, found, replace(term, roster=people), overrides or {})
 
 
 def blackboard(login: str, stamp: str, name: str = "r.pdf") -> str:
@@ -49,7 +49,7 @@ THREE = {
 
 @pytest.mark.parametrize(("attempt", "points"), [("latest", 7.0), ("first", 4.0), ("best", 9.0)])
 def test_one_attempt_counts_and_the_others_are_beneath(attempt, points) -> None:
-    (ada, grace), _ = laid_out(THREE, Course(attempt=attempt))
+    (ada, grace), _ = laid_out(THREE, Course(RUBRIC, attempt=attempt))
     assert ada.counting.points == ada.total == points
     assert len(ada.others) == 2
     assert ada.counting not in ada.others
@@ -57,7 +57,7 @@ def test_one_attempt_counts_and_the_others_are_beneath(attempt, points) -> None:
 
 
 def test_late_is_what_comes_after_the_due_time_in_its_zone() -> None:
-    term = Course(due=DUE, late=late_rule("10%/day"))
+    term = Course(RUBRIC, due=DUE, late=late_rule("10%/day"))
     (ada, _), _ = laid_out(THREE, term)
     assert (ada.late_s, ada.deduction, ada.total) == (46 * 3600.0, 2.0, 5.0)
     assert ada.handed_in == "2026-11-22 10:00"
@@ -77,7 +77,7 @@ def test_late_is_what_comes_after_the_due_time_in_its_zone() -> None:
     ],
 )
 def test_what_is_taken_off(due, rule, late_s, off) -> None:
-    (ada, _), _ = laid_out(THREE, Course(due=due, late=late_rule(rule)))
+    (ada, _), _ = laid_out(THREE, Course(RUBRIC, due=due, late=late_rule(rule)))
     assert (ada.late_s, ada.deduction) == (late_s, off)
     assert ada.total == 0.0
 
@@ -86,7 +86,7 @@ def test_a_zip_files_time_orders_attempts_and_costs_nothing() -> None:
     first, second = "hoppergrace_7_8_b.pdf", "hoppergrace_7_9_a.pdf"
     packed = {first: datetime(2026, 11, 24), second: datetime(2026, 11, 25)}
     files = {second: graded("", 7.0), first: graded("", 9.0)}
-    term = Course(due=DUE, late=late_rule("10%/day"))
+    term = Course(RUBRIC, due=DUE, late=late_rule("10%/day"))
     (_, grace), _ = laid_out(files, term, packed=packed)
     assert (grace.total, grace.late_s, grace.handed_in) == (7.0, None, "")
     assert "nothing was taken off" in grace.flags[0]
@@ -119,7 +119,7 @@ def test_a_guess_in_each_of_several_files_does_not_pay() -> None:
     assert ada.total is None
     assert ada.counting.pending == "Ask which of 2 reports is meant: their forms differ."
     assert len(ada.others) == 1
-    assert laid_out(files, Course(attempt="best"))[0][0].total == 9.0
+    assert laid_out(files, Course(RUBRIC, attempt="best"))[0][0].total == 9.0
     # the same form twice is no guess
     (ada, _), _ = laid_out({name: of_form(4.0, "yaw") for name in files})
     assert ada.total == 4.0
@@ -151,7 +151,7 @@ def test_of_two_files_of_one_submission_the_better_one_counts() -> None:
     files = {blackboard("ada", "19-10-00-00", "a.pdf"): graded("", 8.0),
              blackboard("ada", "19-10-00-00", "b.pdf"): graded("", 2.0)}  # fmt: skip
     for attempt in ("first", "latest", "best"):
-        (ada, _), _ = laid_out(files, Course(attempt=attempt))
+        (ada, _), _ = laid_out(files, Course(RUBRIC, attempt=attempt))
         assert ada.total == 8.0, attempt
 
 

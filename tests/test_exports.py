@@ -12,7 +12,7 @@ from class_tools import entry
 from px4fuse.assignment.roster import Person, Register, people_of_sheet
 from px4fuse.assignment.sheet import read_sheet
 from px4fuse.errors import SettingsError
-from px4fuse.grading.exports import filled, grade_column
+from px4fuse.grading.outputs import filled, grade_column
 
 # As mod/assign/gradingtable.php of Moodle writes it
 MOODLE = (

@@ -21,6 +21,7 @@ from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.roster import file_names
 from px4fuse.cli import cli
 from px4fuse.cli.outputs import Interrupted
+from px4fuse.grading.entries import Course
 from px4fuse.grading.grade import GradeOutcome, grade
 from px4fuse.grading.model import Entry, Graded
 from px4fuse.grading.rubric import read_rubric
@@ -67,7 +68,9 @@ def handed_in(tmp_path: Path) -> Path:
 def test_everything_that_was_handed_in_stands_in_the_table(handed_in, tmp_path) -> None:
     output = tmp_path / "class"
     before = {path for path in tmp_path.rglob("*") if not path.is_relative_to(output)}
-    outcome = grade([handed_in, tmp_path / "more.zip"], [], read_rubric(None), output, processes=2)
+    outcome = grade(
+        [handed_in, tmp_path / "more.zip"], Course(read_rubric(None)), output, processes=2
+    )
     assert {path for path in tmp_path.rglob("*") if not path.is_relative_to(output)} == before
     assert len(outcome.graded) == 6
     table = rows(output)
@@ -96,7 +99,9 @@ def test_pages_that_cannot_be_drawn_hide_in_no_verified_row(tmp_path, monkeypatc
         forged(REPORT.read_bytes(), lambda writer: writer.remove_page(7))
     )
     monkeypatch.setattr(pages, "bounded", lambda *_: Failed("it took longer than 10 s."))
-    (only,) = grade([folder], [LOG.parent], read_rubric(None), tmp_path / "class").graded
+    (only,) = grade(
+        [folder], Course(read_rubric(None), logs=[LOG.parent]), tmp_path / "class"
+    ).graded
     assert only.status == "verified"
     assert any("could not be drawn: do not open them" in flag for flag in only.flags)
 
@@ -112,7 +117,7 @@ def test_a_report_with_its_log_is_verified_and_a_changed_one_is_not(tmp_path) ->
     (folder / "b.pdf").write_bytes(forged(pdf, with_results(json.dumps(results))))
     (folder / "c.pdf").write_bytes(forged(pdf, lambda writer: writer.remove_page(7)))
     output = tmp_path / "class"
-    outcome = grade([folder], [LOG.parent], read_rubric(None), output, processes=2)
+    outcome = grade([folder], Course(read_rubric(None), logs=[LOG.parent]), output, processes=2)
     first, second, third = outcome.graded
     assert first.verdict.status == "verified"
     assert first.verdict.with_log
@@ -136,7 +141,7 @@ def test_a_report_with_its_log_is_verified_and_a_changed_one_is_not(tmp_path) ->
     assert any("Page 8 of the PDF" in flag and "missing" in flag for flag in third.flags)
     assert not any("of the PDF" in flag for flag in first.flags)
     # a second run does nothing again, and says the same
-    again = grade([folder], [LOG.parent], read_rubric(None), output, processes=2)
+    again = grade([folder], Course(read_rubric(None), logs=[LOG.parent]), output, processes=2)
     assert again.reused == 3
     assert again.graded == outcome.graded
 
@@ -148,11 +153,9 @@ def test_only_what_changed_is_done_again(handed_in, tmp_path) -> None:
     def reused(title: str = "") -> int:
         return grade(
             [handed_in, tmp_path / "more.zip"],
-            [],
-            read_rubric(None),
+            Course(read_rubric(None), title=title),
             output,
             processes=2,
-            title=title,
         ).reused
 
     assert reused() == 2  # of one report there are three copies
@@ -167,7 +170,7 @@ def test_only_what_changed_is_done_again(handed_in, tmp_path) -> None:
         record.write_text('{"made_with": {"verdict": 3}}')
     assert reused() == 2
     (output / "overrides (1).csv").write_text("id,item,points,comment\n")
-    again = grade([handed_in, tmp_path / "more.zip"], [], read_rubric(None), output)
+    again = grade([handed_in, tmp_path / "more.zip"], Course(read_rubric(None)), output)
     assert "overrides (1).csv: not read; only overrides.csv is." in again.notes
 
 
@@ -177,7 +180,9 @@ def test_another_log_at_hand_verifies_again(tmp_path) -> None:
     shutil.copy(REPORT, tmp_path / "in" / "a.pdf")
     said = []
     for logs in ([], [LOG], [LOG], []):
-        outcome = grade([tmp_path / "in"], logs, read_rubric(None), tmp_path / "out", processes=1)
+        outcome = grade(
+            [tmp_path / "in"], Course(read_rubric(None), logs=logs), tmp_path / "out", processes=1
+        )
         said.append((outcome.graded[0].verdict.status, outcome.reused))
         # the redrawn pages, or the cover as it was handed in, and nothing of the run before
         drawn = [one.name for one in (tmp_path / "out" / "records").glob("*.p*")]
@@ -199,7 +204,7 @@ def test_a_log_that_was_handed_out_and_is_not_at_hand_costs_nobody_everything(tm
     rubric, logs = read_rubric(None), [tmp_path / "logs"]
     for given, status in ((sha256, "cannot verify"), ("0" * 64, "other log")):
         key = AnswerKey("aisle", (Answer("1", "Ada", "1.ulg", given),))
-        outcome = grade([tmp_path / "in"], logs, rubric, tmp_path / "out", key=key, processes=1)
+        outcome = grade([tmp_path / "in"], Course(rubric, key, logs), tmp_path / "out", processes=1)
         (one,) = outcome.graded
         assert one.verdict.status == status
         assert one.points > 0
@@ -278,9 +283,8 @@ def test_the_options_of_a_term_reach_it(tmp_path, monkeypatch) -> None:
     )
     result = CliRunner().invoke(cli, [*words.split(), "2026-11-20 23:59 +01:00"])
     assert result.exit_code == 0, result.exception
-    given = noted.call_args.kwargs
-    course = given["course"]
-    assert (given["title"], given["processes"]) == ("Lab", 3)
+    course, processes = noted.call_args.args[1], noted.call_args.kwargs["processes"]
+    assert (course.title, processes) == ("Lab", 3)
     assert [person.student_id for person in course.roster] == ["0042"]
     assert course.worksheets[0].head == ("id", "Grade")
     assert (course.column, course.anonymous, course.attempt) == ("Grade", True, "best")

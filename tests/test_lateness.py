@@ -8,7 +8,7 @@ from datetime import UTC, datetime, timedelta, timezone
 import pytest
 
 from px4fuse.errors import SettingsError
-from px4fuse.grading.lateness import due_time, in_zone_of, late_rule, moodle_time
+from px4fuse.grading.entries import due_time, in_zone_of, late_rule, moodle_time
 
 BERLIN = "2026-11-20T23:59:59+01:00"
 

@@ -17,7 +17,7 @@ from px4fuse.errors import LogError, Px4FuseError
 from px4fuse.reading import max_log_bytes, read_text, read_whole, shown
 from px4fuse.verification import workers
 from px4fuse.verification.model import Verdict
-from px4fuse.verification.rerun import log_sha256
+from px4fuse.verification.verification import log_sha256
 
 SAMPLES = REPOSITORY / "sample_logs"
 posix = pytest.mark.skipif(os.name == "nt", reason="devices, pipes and sockets are those of POSIX")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from px4fuse.assignment.roster import Person, Register, read_people
-from px4fuse.grading.platforms import ExportOrigin
+from px4fuse.grading.model import ExportOrigin
 
 MOODLE = (
     'Identifier,"Full name","ID number","Email address",Status,Grade,"Maximum Grade"\r\n'

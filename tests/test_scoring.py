@@ -15,11 +15,10 @@ from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.truth import FormTruth, VerdictTruth, Wrong
 from px4fuse.errors import ResultsError
 from px4fuse.findings import NAMES
-from px4fuse.grading.feedback import returned_text
 from px4fuse.grading.flags import class_flags, own_flags, text_flags
 from px4fuse.grading.model import Entry, Graded
-from px4fuse.grading.rubric import parse_rubric, read_rubric
-from px4fuse.grading.scoring import assess, refused
+from px4fuse.grading.outputs import returned_text
+from px4fuse.grading.rubric import assess, parse_rubric, read_rubric, refused
 from px4fuse.results.contract import to_plain
 from px4fuse.simulation.flights import HARDWARE
 from px4fuse.verification.intake import read_report
@@ -62,7 +61,7 @@ def filled(kinds, results=EXAMPLE, **values):
 
 
 def test_a_file_that_is_not_at_hand():
-    verdict = verify(read_report((ROOT / "reports" / "aisle_uwb.pdf").read_bytes(), "a.pdf"))
+    verdict = verify(read_report((ROOT / "reports" / "aisle_uwb.pdf").read_bytes(), "a.pdf"), {})
     assert checked("verified", verdict=verdict)[0] == 0.0
     assert "Hand in aisle_uwb.ulg" in fed_back(graded(verdict=verdict))
     other = replace(verdict, reasons=("made with another version",), missing="")

@@ -18,8 +18,7 @@ from px4fuse.assignment.roster import Person
 from px4fuse.errors import SettingsError
 from px4fuse.grading import submissions
 from px4fuse.grading.model import Submission
-from px4fuse.grading.platforms import origin_of, origins_of
-from px4fuse.grading.submissions import collect, read
+from px4fuse.grading.submissions import collect, origin_of, read, with_origins
 from px4fuse.reading import files_by_sha256
 from px4fuse.verification.intake import MAX_BYTES, read_report
 from px4fuse.verification.model import Refused
@@ -128,7 +127,8 @@ def test_a_name_that_a_student_chose_does_not_change_platform_or_time():
         "Lab_eve_attempt_2026-11-23-10-00-00_x_attempt_2026-11-19-10-00-00_r.pdf",
         "Lab_mal_attempt_2026-11-23-10-00-00_Doe Jane_4711_assignsubmission_file_r.pdf",
     ]
-    origins = origins_of([(Path("export.zip"), name) for name in (*usual, *forged)], {})
+    files = [Submission(Path("export.zip"), name, name) for name in (*usual, *forged)]
+    origins = [one.origin for one in with_origins(files, {})]
     assert {one.platform for one in origins} == {"blackboard"}
     assert [one.person.login for one in origins[3:]] == ["eve", "mal"]
     assert {one.time.day for one in origins[3:]} == {23}

@@ -16,9 +16,8 @@ from golden_tools import agrees
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.roster import read_people
 from px4fuse.assignment.sheet import read_sheet
-from px4fuse.grading.entries import Course
+from px4fuse.grading.entries import Course, due_time, late_rule
 from px4fuse.grading.grade import GradeOutcome, grade
-from px4fuse.grading.lateness import due_time, late_rule
 from px4fuse.grading.model import Entry
 from px4fuse.grading.rubric import read_rubric, rubric_text
 
@@ -135,10 +134,10 @@ class Lab:
 
     def grade(self, rubric=None) -> GradeOutcome:
         due = due_time("2026-11-20 12:00:00 Europe/Berlin")
-        course = Course(self.roster, tuple(map(read_sheet, self.sheets)), "", due=due,
-                        late=late_rule("10%/day"), anonymous=True)  # fmt: skip
-        return grade(self.exports, [self.logs], rubric or read_rubric(None), self.output,
-                     key=self.key, course=course, title="Lab", processes=1)  # fmt: skip
+        course = Course(rubric or read_rubric(None), self.key, [self.logs], "Lab", self.roster,
+                        tuple(map(read_sheet, self.sheets)), due=due, late=late_rule("10%/day"),
+                        anonymous=True)  # fmt: skip
+        return grade(self.exports, course, self.output, processes=1)
 
     def filled(self, file: str, separator: str = ",") -> list[dict[str, str]]:
         text = (self.output / "grades" / file).read_text(encoding="utf-8-sig")

@@ -48,16 +48,17 @@ from pypdf.generic import (
 )
 
 from px4fuse.cli import cli
+from px4fuse.reading import files_by_sha256
 from px4fuse.results.contract import to_json, to_plain
-from px4fuse.verification import pages, rerun, verification
+from px4fuse.verification import pages, verification
 from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import Refused, Report
-from px4fuse.verification.rerun import Recomputed
 from px4fuse.verification.verification import (
     ESTIMATE_RELATIVE,
     LIMIT,
     NO_LOG,
     RELATIVE,
+    Recomputed,
     compare_results,
     verify,
 )
@@ -119,7 +120,7 @@ def test_a_report_on_a_loop_is_verified(loop: Base) -> None:
 
 def test_nothing_is_verified_without_the_log(aisle: Base, loop: Base) -> None:
     for one in (aisle, loop):
-        verdict = verify(report_of(one.pdf))
+        verdict = verify(report_of(one.pdf), {})
         assert verdict.status == "cannot verify"
         assert verdict.reasons == (NO_LOG,)
         assert verdict.redrawn == b""
@@ -298,7 +299,7 @@ def test_changed_results(aisle: Base, name: str, monkeypatch: pytest.MonkeyPatch
 def test_what_is_printed_from_the_record(loop: Base, path: tuple[str, ...]) -> None:
     results = copy.deepcopy(loop.results)
     put({"name": "Eve", "notes": "I flew it."}.get(path[-1], "9.9.9"), *path)(results)
-    again = rerun.recompute(read_again(results), loop.files)
+    again = verification.recompute(read_again(results), loop.files)
     verdict = verify(report_of(loop.with_results(results)), loop.files, recompute=lambda *_: again)
     assert (verdict.status, verdict.outcome) == ("verified", "page differs"), verdict
     assert verdict.redrawn != loop.pdf
@@ -554,10 +555,10 @@ def test_a_joined_recording_is_found_by_its_content(tmp_path: Path) -> None:
     report = report_of(target.read_bytes())
     (tmp_path / "a").write_bytes(LOG.read_bytes())
     (tmp_path / "b").write_bytes((source / "aisle_uwb_external.csv").read_bytes())
-    verdict = verify(report, [tmp_path / "a"])
+    verdict = verify(report, files_by_sha256([tmp_path / "a"]))
     assert verdict.status == "cannot verify"
     assert "--position" in verdict.reasons[0]
-    assert verify(report, [tmp_path / "a", tmp_path / "b"]).status == "verified"
+    assert verify(report, files_by_sha256([tmp_path / "a", tmp_path / "b"])).status == "verified"
 
 
 # -- the command -----------------------------------------------------------------------------------

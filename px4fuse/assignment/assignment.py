@@ -7,9 +7,9 @@ from dataclasses import asdict
 from pathlib import Path
 
 from px4fuse.answers import form_name, form_text
-from px4fuse.assignment.drawing import Drawn, Kinds, draw, most_mistakes
-from px4fuse.assignment.key import Answer, AnswerKey, folded, key_text, read_key
-from px4fuse.assignment.roster import Person
+from px4fuse.assignment.drawing import Drawn, Kinds, draw
+from px4fuse.assignment.key import Answer, AnswerKey, key_text, read_key
+from px4fuse.assignment.roster import Person, folded
 from px4fuse.assignment.truth import truth_of
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.plain import plain
@@ -102,7 +102,6 @@ def assign(
     OutputError
         A file is there already with other content, or cannot be written.
     """
-    _check_count(kind, count)
     key = read_key(key_file) if key_file.exists() else AnswerKey(kind, ())
     answers = {folded(answer.student_id): answer for answer in key.answers}
     _check_extends(
@@ -147,7 +146,6 @@ def preview(
     OutputError
         The key that is there was made by an earlier px4fuse.
     """
-    _check_count(kind, count)
     if secret is None:
         before = read_key(key_file) if key_file.exists() else None
         if before is None or not before.secret:
@@ -157,14 +155,6 @@ def preview(
             )
         secret = before.secret.encode()
     return [draw(secret, student.student_id, kind, count) for student in students]
-
-
-def _check_count(kind: Kinds, count: int | None) -> None:
-    if count is not None and not 0 <= count <= most_mistakes(kind):
-        raise SettingsError(
-            f"--mistakes {count}: a flight of kind {kind} can have 0 to {most_mistakes(kind)}, of "
-            "which each is still found beside the others."
-        )
 
 
 def _there(target: Path, log: bytes) -> bool:

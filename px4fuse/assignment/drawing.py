@@ -15,7 +15,7 @@ from functools import partial
 from itertools import accumulate
 from typing import Any, Literal
 
-from px4fuse.assignment.key import folded
+from px4fuse.assignment.roster import folded
 from px4fuse.errors import SettingsError
 from px4fuse.simulation.scenario import Kind, Scenario, scenario_of
 
@@ -59,8 +59,6 @@ class AssignableMistake:
     ----------
     mistake : str
         Name in :data:`px4fuse.simulation.mistakes.MISTAKES`.
-    finding : str
-        What names it.
     group : str
         Of two of the same group, one would hide the other.
     limit : float or None
@@ -77,7 +75,6 @@ class AssignableMistake:
     """
 
     mistake: str
-    finding: str
     group: str
     limit: float | None = None
     unit: str = ""
@@ -113,30 +110,19 @@ class AssignableMistake:
 NEED_IMU = ("clock", "frame")
 CHOICES: dict[Kind, tuple[AssignableMistake, ...]] = {
     "aisle": (
-        AssignableMistake(
-            "clock-offset", "source_clock_offset", "clock", 150, "ms", either_sign=True
-        ),
-        AssignableMistake(
-            "clock-jump", "source_stamps_of_arrival", "clock", 50, "ms", hides=("frame", "gap")
-        ),
-        AssignableMistake("yaw", "source_frame_turned", "frame", 15, "deg", either_sign=True),
-        AssignableMistake("nlos", "source_outliers", "outliers", 1, "%", hides=("frame",)),
-        AssignableMistake("dropout", "source_gap", "gap", 2, "s", at_s=(30, 70)),
-        AssignableMistake(
-            "imu-rate", "logging_rate_low", "rate", 40, "Hz", less_is_plainer=True, hides=NEED_IMU
-        ),
-        AssignableMistake(
-            "ekf2-noise", "ekf2_variance_understated", "ekf2", 4, "cm", less_is_plainer=True,
-            hides=("outliers",),
-        ),
-        AssignableMistake(
-            "ekf2-gate", "ekf2_rejecting", "ekf2", 2, less_is_plainer=True, hides=("outliers",)
-        ),
-        AssignableMistake("ekf2-delay", "ekf2_ev_delay_wrong", "clock", 150, "ms", hides=("ekf2",)),
-        AssignableMistake("ekf2-off", "ekf2_not_fusing", "ekf2"),
+        AssignableMistake("clock-offset", "clock", 150, "ms", either_sign=True),
+        AssignableMistake("clock-jump", "clock", 50, "ms", hides=("frame", "gap")),
+        AssignableMistake("yaw", "frame", 15, "deg", either_sign=True),
+        AssignableMistake("nlos", "outliers", 1, "%", hides=("frame",)),
+        AssignableMistake("dropout", "gap", 2, "s", at_s=(30, 70)),
+        AssignableMistake("imu-rate", "rate", 40, "Hz", less_is_plainer=True, hides=NEED_IMU),
+        AssignableMistake("ekf2-noise", "ekf2", 4, "cm", less_is_plainer=True, hides=("outliers",)),
+        AssignableMistake("ekf2-gate", "ekf2", 2, less_is_plainer=True, hides=("outliers",)),
+        AssignableMistake("ekf2-delay", "clock", 150, "ms", hides=("ekf2",)),
+        AssignableMistake("ekf2-off", "ekf2"),
     ),
-    "loop": (AssignableMistake("open-end", "false_loop_closure", "end", 4, "m"),),
-}  # fmt: skip
+    "loop": (AssignableMistake("open-end", "end", 4, "m"),),
+}
 
 
 @dataclass(frozen=True)
@@ -146,7 +132,7 @@ class Drawn:
     Attributes
     ----------
     typed : tuple of str
-        The mistakes as typed, in the same order.
+        The mistakes, as they are typed.
     difficulty : float
         That of the hardest mistake; what has no size cannot be missed for being small. Only a
         student who has looked for the smallest can say that there is none: such a flight is among
@@ -154,7 +140,6 @@ class Drawn:
     """
 
     scenario: Scenario
-    chosen: tuple[AssignableMistake, ...]
     typed: tuple[str, ...]
     difficulty: float
 
@@ -179,45 +164,41 @@ def draw(
         Of mistakes; None draws it.
     truth : bool
         Whether an aisle's log holds the truth. A loop's does not: it would tell where it landed.
+
+    Raises
+    ------
+    SettingsError
+        So many mistakes cannot be in one flight.
     """
+    most = min(len(COUNTS[one]) for one in (COUNTS if kind == "mixed" else (kind,))) - 1
+    if count is not None and not 0 <= count <= most:
+        raise SettingsError(
+            f"--mistakes {count}: a flight of kind {kind} can have 0 to {most}, of which each is "
+            "still found beside the others."
+        )
     if kind == "mixed":
         kind = "loop" if uniform(secret, student_id, kind, "kind") < LOOPS else "aisle"
     one = partial(uniform, secret, student_id, kind)
     if count is None:
         count = bisect(list(accumulate(COUNTS[kind][:-1])), one("count"))
     chosen: list[AssignableMistake] = []
+    typed: list[str] = []
+    hard: list[float] = []
     for choice in sorted(CHOICES[kind], key=lambda c: one(f"order {c.mistake}")):
         if len(chosen) < count and all(map(choice.goes_with, chosen)):
+            name = choice.mistake
+            share = 0.0 if choice.limit is None else one(f"size {name}")
+            sign = -1.0 if choice.either_sign and one(f"sign {name}") < 0.5 else 1.0
             chosen.append(choice)
-    hard = [
-        EASIEST if choice.limit is None
-        else EASIEST + (HARDEST - EASIEST) * one(f"size {choice.mistake}")
-        for choice in chosen
-    ]  # fmt: skip
-    typed = tuple(
-        choice.typed(
-            difficulty,
-            -1.0 if choice.either_sign and one(f"sign {choice.mistake}") < 0.5 else 1.0,
-            one(f"at {choice.mistake}"),
-        )
-        for choice, difficulty in zip(chosen, hard, strict=True)
-    )
+            hard.append(EASIEST + (HARDEST - EASIEST) * share)
+            typed.append(choice.typed(hard[-1], sign, one(f"at {name}")))
     numbers: dict[str, Any] = {
         name: round(low + (high - low) * one(name), decimals)
         for name, (low, high, decimals) in NOISES[kind].items()
     }
-    scenario = scenario_of(
-        kind,
-        truth=truth and kind == "aisle",
-        seed=int(one("seed") * 2**32),
-        **numbers,
-    )
-    return Drawn(scenario, tuple(chosen), typed, round(max(hard, default=HARDEST), 2))
-
-
-def most_mistakes(kind: Kinds) -> int:
-    """How many mistakes every flight can have."""
-    return min(len(COUNTS[one]) for one in (COUNTS if kind == "mixed" else (kind,))) - 1
+    told, seed = truth and kind == "aisle", int(one("seed") * 2**32)
+    scenario = scenario_of(kind, truth=told, seed=seed, **numbers)
+    return Drawn(scenario, tuple(typed), round(max(hard, default=HARDEST), 2))
 
 
 def secret_of(text: str, where: str) -> bytes:

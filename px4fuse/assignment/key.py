@@ -1,21 +1,18 @@
 """The answer key of an assignment: which flight each student was given, and what is wrong in it."""
 
-import unicodedata
-from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 
+from px4fuse.assignment.roster import MAX_STUDENTS, Person, Register, folded
 from px4fuse.assignment.truth import FormTruth
 from px4fuse.errors import SettingsError
 from px4fuse.reading import read_text
 
-T = TypeVar("T")
 # A thousand students take two million
 MAX_KEY_BYTES = 20_000_000
-MAX_STUDENTS = 1000
 NOTE = (
     "For the instructor only: it says what is wrong in every student's flight. Do not hand it out "
     "and do not put it into the students' folder."
@@ -88,44 +85,13 @@ class AnswerKey(msgspec.Struct, frozen=True):
         return f"AnswerKey({self.kind!r}, {len(self.answers)} students)"
 
     def of_student(self, student_id: str) -> Answer | None:
-        """The answer for an id, however it is capitalised.
-
-        Leading zeros, which spreadsheets take away, may be missing where that is unambiguous.
-        """
-        looks: tuple[Callable[[Answer], bool], ...] = (
-            lambda one: folded(one.student_id) == folded(student_id) != "",
-            lambda one: same_id(one.student_id, student_id),
-        )
-        place = only_place(self.answers, looks)
+        """The answer for an id, as a :class:`Register` knows it."""
+        place = Register(Person(a.student_id) for a in self.answers).place(Person(student_id))
         return None if place is None else self.answers[place]
 
     def of_log(self, sha256: str) -> Answer | None:
         """The answer for a log."""
         return next((a for a in self.answers if sha256 and a.sha256 == sha256), None)
-
-
-def folded(text: str) -> str:
-    """Id or name for comparison: one spelling per character, case and outer spaces ignored."""
-    return unicodedata.normalize("NFKC", text).strip().casefold()
-
-
-def only_place(those: Sequence[T], looks: Iterable[Callable[[T], bool]]) -> int | None:
-    """Where the one stands that fits, by the first way of looking by which exactly one does."""
-    for look in looks:
-        places = [place for place, one in enumerate(those) if look(one)]
-        if len(places) == 1:
-            return places[0]
-    return None
-
-
-def same_id(one: str, other: str) -> bool:
-    """Whether two ids are the same; spreadsheets take away leading zeros.
-
-    >>> same_id("0042", "42"), same_id("S1", "s1 "), same_id("", "")
-    (True, True, False)
-    """
-    one, other = folded(one), folded(other)
-    return bool(one) and (one == other or one.lstrip("0") == other.lstrip("0") != "")
 
 
 def key_text(key: AnswerKey) -> str:

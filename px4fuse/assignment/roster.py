@@ -5,14 +5,15 @@ import unicodedata
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from pathlib import Path
 
-from px4fuse.assignment.key import MAX_STUDENTS, folded, only_place, same_id
 from px4fuse.assignment.sheet import Sheet, read_sheet
 from px4fuse.errors import SettingsError
 from px4fuse.results.reading import one_line
 
 MAX_NAME = 200
+MAX_STUDENTS = 1000
 # A file system takes 255 bytes, and a character up to 4
 MAX_STEM = 48
 RESERVED = {"con", "prn", "aux", "nul"} | {f"{n}{i}" for n in ("com", "lpt") for i in range(10)}
@@ -168,24 +169,44 @@ class Register:
                 self.people[place] = replace(known, numbers=numbers, **whole)
 
     def place(self, other: Person) -> int | None:
-        """Where somebody stands of whom another list knows: by number, id, email, login or name."""
-        looks: tuple[Callable[[Person], bool], ...] = (
-            *(
-                lambda one, at=platform, said=said: _same(one.numbers.get(at, ""), said)
-                for platform, said in other.numbers.items()
-            ),
-            lambda one: _same(one.student_id, other.student_id),
-            lambda one: same_id(one.student_id, other.student_id),
-            lambda one: _same(one.email, other.email),
+        """Where somebody stands of whom another list knows: by number, id, email, login or name.
+
+        By the first of these that exactly one of the class has. Leading zeros, which spreadsheets
+        take away from ids, may be missing.
+        """
+        numbers = other.numbers.items()
+        looks: tuple[tuple[Callable[[str, str], bool], Callable[[Person], str], str], ...] = (
+            *((_same, lambda one, at=at: one.numbers.get(at, ""), said) for at, said in numbers),
+            (_same, attrgetter("student_id"), other.student_id),
+            (same_id, attrgetter("student_id"), other.student_id),
+            (_same, attrgetter("email"), other.email),
             # Blackboard's user name and ILIAS's login are ids where the roster has no other
-            lambda one: _same(one.login or one.student_id, other.login),
-            lambda one: same_name(one.name, other.name),
+            (_same, lambda one: one.login or one.student_id, other.login),
+            (same_name, attrgetter("name"), other.name),
         )
-        return only_place(self.people, looks)
+        for same, known, said in looks:
+            places = [at for at, one in enumerate(self.people) if same(known(one), said)]
+            if len(places) == 1:
+                return places[0]
+        return None
+
+
+def folded(text: str) -> str:
+    """Id or name for comparison: one spelling per character, case and outer spaces ignored."""
+    return unicodedata.normalize("NFKC", text).strip().casefold()
 
 
 def _same(known: str, said: str) -> bool:
     return folded(known) == folded(said) != ""
+
+
+def same_id(one: str, other: str) -> bool:
+    """Whether two ids are the same; spreadsheets take away leading zeros.
+
+    >>> same_id("0042", "42"), same_id("S1", "s1 "), same_id("00", "0")
+    (True, True, False)
+    """
+    return folded(one).lstrip("0") == folded(other).lstrip("0") != ""
 
 
 def same_name(one: str, other: str) -> bool:

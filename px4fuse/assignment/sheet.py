@@ -8,6 +8,7 @@ the cells that are filled.
 import codecs
 import csv
 import io
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -108,3 +109,21 @@ def read_sheet(path: Path) -> Sheet:
         raise SettingsError(f"{path}: empty", "Give a CSV file with a header.")
     filled = (tuple(cells + [""] * (len(head) - len(cells))) for cells in rows)
     return Sheet(path, tuple(head), tuple(filled), encoding, separator)
+
+
+def number(value: float | None) -> str:
+    """A number as spreadsheets read it; nothing for what is absent or not finite.
+
+    >>> number(7.0), number(0.1 + 0.2), number(float("nan"))
+    ('7', '0.3', '')
+    """
+    return "" if value is None or not math.isfinite(value) else f"{value:.10g}"
+
+
+def decimal(text: str) -> float | None:
+    """A number as people type it in tables, also with a comma; None for anything else.
+
+    >>> decimal("12,5"), decimal("1_5"), decimal("nan")
+    (12.5, None, None)
+    """
+    return float(text.replace(",", ".")) if re.fullmatch(r"[+-]?\d+([.,]\d*)?", text) else None

@@ -31,25 +31,22 @@ CLOSURE_WITHIN_M = 0.3
 REJECTED = 0.005
 # A reset of position that is seen, after EKF2 has found its first position
 RESET_M, SETTLED_S = 0.2, 5.0
-# What EKF2 does with a source that has this; after the semicolon what may be said as well
-DID: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "clock-offset": (("followed the wrong positions",), ("fused at the wrong time",)),
-    "clock-drift": (("followed the wrong positions",), ("fused at the wrong time",)),
-    "clock-jump": ((), ("fused at the wrong time", "followed the wrong positions")),
-    "yaw": (("followed the wrong positions",), ()),
-    "scale": (("followed the wrong positions",), ()),
-    "jump": ((), ("followed the wrong positions",)),
-    "slow-error": (("followed the wrong positions",), ()),
-    "heading": ((), ("followed the positions",)),
-    "mag": ((), ("rejected the bad samples", "followed the positions")),
-    "smoothed": (("followed the wrong positions",), ("fused at the wrong time",)),
-    "ekf2-delay": (("fused at the wrong time",), ()),
-    "ekf2-off": (("never fused",), ()),
-    "dropout": ((), ("coasted, then reset",)),
-    "nlos": ((), ("followed the wrong positions",)),
-    "decimate": ((), ("never fused",)),
+# What EKF2 does in flights that have one of these, and what may be said as well
+DOES: Mapping[str, frozenset[str]] = {
+    "followed the wrong positions": frozenset(
+        ("clock-offset", "clock-drift", "yaw", "scale", "smoothed", "slow-error")
+    ),
+    "fused at the wrong time": frozenset(("ekf2-delay",)),
+    "never fused": frozenset(("ekf2-off",)),
 }
-NOTHING: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+MAY_DO: Mapping[str, frozenset[str]] = {
+    "fused at the wrong time": frozenset(("clock-offset", "clock-drift", "clock-jump", "smoothed")),
+    "followed the wrong positions": frozenset(("clock-jump", "nlos", "jump")),
+    "coasted, then reset": frozenset(("dropout",)),
+    "never fused": frozenset(("decimate",)),
+    "followed the positions": frozenset(("heading", "mag")),
+    "rejected the bad samples": frozenset(("mag",)),
+}
 
 
 class Wrong(Record, frozen=True):
@@ -139,23 +136,17 @@ def _wrong(
         _, found = noises_and_clock(comparison)
         if isinstance(found, ClockOffset) and found.determinable:
             low, high = min(low, -found.interval_s[1]), max(high, -found.interval_s[0])
-    start_s, end_s = truth["airborne_s"]
-    from_s: float | None = None
-    until_s: float | None = None
+    from_s = until_s = None
     match name:
         case "clock-jump":
             until_s = TIMESYNC_CONVERGED_S
         case "open-end":
-            from_s = end_s
+            _, from_s = truth["airborne_s"]
         case "nlos" if truth["outlier_time_s"]:
             from_s, *_, until_s = truth["outlier_time_s"] * 2
-        case "heading":
-            from_s = given["heading_at_s"]
-        case "dropout" | "imu-dropout" | "jump" | "mag":
-            share = 2.0 / 3.0 if name == "jump" else 0.5
+        case "dropout" | "imu-dropout" | "jump" | "heading" | "mag":
             from_s = given[sizes[1]]
-            from_s = start_s + share * (end_s - start_s) if from_s is None else from_s
-            until_s = None if name in ("jump", "mag") else from_s + abs(size)
+            until_s = from_s + abs(size) if name.endswith("dropout") else None
     return Wrong(name, size, low, high, from_s, until_s)
 
 
@@ -164,24 +155,21 @@ def _verdict(comparison: Comparison, which: FilterName) -> VerdictTruth:
     if not isinstance(judged, FilterSummary):
         return VerdictTruth("")
     word = judged.verdict.removeprefix("variance ")
-    if word == "consistent":
-        return VerdictTruth(word)
-    return VerdictTruth(word, judged.times_off)
+    return VerdictTruth(word, None if word == "consistent" else judged.times_off)
 
 
 def _ekf2_did(
     comparison: Comparison, mistakes: tuple[Wrong, ...], sigma_z_m: float
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What EKF2 did in this flight: by what is wrong with it, and by what the log shows."""
-    by_kind = {wrong.kind: wrong for wrong in mistakes}
-    must = [said for kind in by_kind for said in DID.get(kind, NOTHING)[0]]
-    also = [said for kind in by_kind for said in DID.get(kind, NOTHING)[1]]
-    noise = by_kind.get("ekf2-noise")
-    if noise is not None and (noise.size or 0.0) > sigma_z_m:
+    size_of = {wrong.kind: wrong.size or 0.0 for wrong in mistakes}
+    must = [said for said, kinds in DOES.items() if kinds & size_of.keys()]
+    also = [said for said, kinds in MAY_DO.items() if kinds & size_of.keys()]
+    if size_of.get("ekf2-noise", 0.0) > sigma_z_m:
         must.append("trusted the positions too little")
     innovations = comparison.main.ekf2_innovations
     if not isinstance(innovations, Unavailable):
-        bad = "nlos" in by_kind or "jump" in by_kind
+        bad = "nlos" in size_of or "jump" in size_of
         if (innovations["rejected"] > 0).mean() > REJECTED:
             must.append("rejected the bad samples" if bad else "rejected good samples")
     ekf2 = comparison.flight.ekf2

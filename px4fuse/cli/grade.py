@@ -87,10 +87,9 @@ def grade(
     from px4fuse.assignment.key import read_key
     from px4fuse.assignment.roster import read_people
     from px4fuse.assignment.sheet import read_sheet
-    from px4fuse.grading.entries import Course
+    from px4fuse.grading.entries import Course, due_time, late_rule
     from px4fuse.grading.grade import grade as grade_all
     from px4fuse.grading.gradescope import autograder_zip, run_autograder
-    from px4fuse.grading.lateness import due_time, late_rule
     from px4fuse.grading.rubric import read_rubric, rubric_text
 
     if write_rubric is not None:
@@ -111,8 +110,11 @@ def grade(
         raise SettingsError("say with -o where the class table goes.")
     _check_place(output, (*submissions, *logs))
     answers = None if key is None else read_key(key)
-    worth = read_rubric(rubric)
     course = Course(
+        read_rubric(rubric),
+        answers,
+        logs,
+        title or "",
         roster=None if roster is None else read_people(roster),
         worksheets=tuple(map(read_sheet, worksheet)),
         column=column or "",
@@ -125,15 +127,7 @@ def grade(
     try:
         with progress() as step:
             outcome = grade_all(
-                submissions,
-                logs,
-                worth,
-                output,
-                key=answers,
-                course=course,
-                title=title or "",
-                processes=jobs,
-                progress=partial(step, "grading"),
+                submissions, course, output, processes=jobs, progress=partial(step, "grading")
             )
     except KeyboardInterrupt as stopped:
         left = "but what is graded is kept. The same command goes on from there."

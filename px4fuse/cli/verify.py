@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import sys
 from dataclasses import asdict
 from functools import partial
@@ -80,7 +81,7 @@ def _plain(report: Report, verdict: Verdict) -> dict[str, object]:
         del values[name]
     return {
         "schema": SCHEMA,
-        "report_sha256": report.sha256,
+        "report_sha256": hashlib.sha256(report.pdf).hexdigest(),
         "outcome": verdict.outcome,
         **values,
         "limit": LIMIT,

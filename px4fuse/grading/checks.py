@@ -1,40 +1,209 @@
 """The checks that a rubric can ask for: each is a kind of item, whose fields are its parameters.
 
-Three groups: of the report as such, of the filter (settings, consistency, the clocks that it
-rests on), and of a loop. A check is its class here, and an item of rubric.toml that explains it.
+A check looks at the :class:`Evidence`. Three groups: of the report as such, of the filter
+(settings, consistency, the clocks that it rests on), and of a loop. A check is its class here, and
+an item of rubric.toml that explains it.
 """
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, ClassVar, Literal
+from __future__ import annotations
 
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated, Any, ClassVar, Literal
+
+import msgspec
 from msgspec import Meta
 from scipy.stats import chi2
 
+from px4fuse.answers import Answers, check
+from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.comparison.model import AgainstTruth
 from px4fuse.filter.clock import Clock
 from px4fuse.filter.consistency import SIGMA_OFF, HorizontalNis
 from px4fuse.filter.tuning import HORIZONTAL
-from px4fuse.grading.evidence import (
-    Bound,
-    Evidence,
-    Factor,
-    RubricItem,
-    Scored,
-    Text,
-    absence,
-    falling,
-    reason_of,
-    text_of,
-    values_at,
-)
+from px4fuse.grading.form_points import FormPoints, form_points
 from px4fuse.loop.model import Closure, Correction, LoopPart, Way
 from px4fuse.plain import capital, factor_words, length_words, p_words
-from px4fuse.record import Maybe, Share
-from px4fuse.results.contract import ASKED, ComparisonResults, LoopResults
+from px4fuse.record import Maybe, Share, Unavailable
+from px4fuse.results.contract import ASKED, ComparisonResults, LoopResults, Reported, to_plain
+from px4fuse.results.reading import one_line
 from px4fuse.trajectory.evaluation import Score
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
-from px4fuse.verification.verification import is_number
+from px4fuse.verification.model import Verdict
+from px4fuse.verification.verification import flattened, is_number, log_sha256
+
+MAX_QUOTE = 160
+NOT_BOTH = " (it needs the axes north and east: leave --axis out)"
+# What stands on one line
+_PLAIN = r"[^\x00-\x1f\x7f]"
+Text = Annotated[str, Meta(max_length=200, pattern=rf"^{_PLAIN}*$")]
+Title = Annotated[str, Meta(max_length=200, pattern=rf"^{_PLAIN}*[^\s\x00-\x1f\x7f]{_PLAIN}*$")]
+Bound = Annotated[float, Meta(ge=-1e12, le=1e12)]
+Factor = Annotated[float, Meta(ge=1.0, le=1000.0)]
+# Share of the points, and why
+Scored = tuple[float, str]
+
+
+class RubricItem(
+    msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="check"
+):
+    """One part of the grade; each check is a kind of item, whose fields are its parameters.
+
+    Attributes
+    ----------
+    points : float
+        The most that it gives.
+    report : {"any", "compare", "loop"}
+        The reports that it is for; in others it is left out.
+    needs_key, by_hand : bool
+        Whether it takes an answer key, and whether only the instructor can score it.
+    """
+
+    needs_key: ClassVar[bool] = False
+    by_hand: ClassVar[bool] = False
+
+    title: Title
+    points: Annotated[float, Meta(ge=0.0, le=1000.0)]
+    report: Literal["any", "compare", "loop"] = "any"
+
+    def score(self, evidence: Evidence) -> Scored:
+        """Share of the points from 0 to 1, and a sentence that says why."""
+        raise NotImplementedError
+
+    def applies(self, kind: str, key: AnswerKey | None) -> bool:
+        """Whether reports of this kind have it."""
+        return self.report in ("any", kind) and (key is not None or not self.needs_key)
+
+
+def falling(off: float, factor: float) -> float:
+    """Share for what is off by a factor: 1 where it is not, 0 from ``factor`` on, by logarithms.
+
+    >>> [round(falling(off, 4.0), 2) for off in (1.0, 2.0, 4.0, 9.0)]
+    [1.0, 0.5, 0.0, 0.0]
+    """
+    if off <= 1.0:
+        return 1.0
+    return max(1.0 - math.log(off) / math.log(factor), 0.0) if factor > 1.0 else 0.0
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a check may look at: a report's results, the verdict on them, and the answer key.
+
+    ``owner_id`` is who handed it in by what a platform says, whatever the report says.
+    """
+
+    results: Reported
+    verdict: Verdict
+    key: AnswerKey | None
+    owner_id: str = ""
+
+    @property
+    def comparison(self) -> ComparisonResults | None:
+        """The results where they compare filters."""
+        return None if isinstance(self.results, LoopResults) else self.results
+
+    @cached_property
+    def values(self) -> dict[str, Any]:
+        """What the results hold, for paths that a rubric names."""
+        return dict(flattened(to_plain(self.results)))
+
+    @cached_property
+    def answer(self) -> Answer | None:
+        """What is wrong with this log, where it is one of the answer key."""
+        return None if self.key is None else self.key.of_log(log_sha256(self.results))
+
+    @cached_property
+    def given(self) -> Answer | None:
+        """What the answer key gave to this student; the platform knows better who that is."""
+        if self.key is None:
+            return None
+        claimed = self.key.of_student(text_of(self.results.student.id))
+        return self.key.of_student(self.owner_id) or claimed
+
+    @cached_property
+    def own(self) -> bool:
+        """Whether the answer key gave this log to this student; without a key nobody knows."""
+        given = self.given
+        return self.key is None or (given is not None and given.sha256 == log_sha256(self.results))
+
+    @cached_property
+    def form(self) -> Answers | str:
+        """The form about this log, or why there is none."""
+        answers = self.results.student.answers
+        if not isinstance(answers, Answers):
+            return "your form is not in your report: make it with --answers answers.toml"
+        try:
+            check(answers)
+        except ValueError as error:
+            return f"your form cannot be read ({text_of(str(error))})"
+        if answers.log_sha256 != log_sha256(self.results):
+            return "your form was made for another log"
+        return answers
+
+    @cached_property
+    def form_points(self) -> FormPoints | str:
+        """What the form is worth, or why nothing."""
+        if self.answer is None or (self.given and not self.own):
+            given = f" ({text_of(self.given.file)})" if self.given else ""
+            return (
+                f"this report is not about the log that you were given{given}: make it of that "
+                "log, with your --id"
+            )
+        if isinstance(self.form, str):
+            return self.form
+        truth = self.answer.form
+        return "the answer key has no answers" if truth is None else form_points(self.form, truth)
+
+    def claims(self, *kinds: str) -> bool:
+        """Whether the form names one of these mistakes."""
+        form = self.form
+        return isinstance(form, Answers) and any(one.kind in kinds for one in form.mistakes)
+
+    def has(self, finding: str) -> bool:
+        """Whether the report lists a finding."""
+        return any(one.id == finding for one in self.results.findings)
+
+    def why_absent(self, path: str) -> str:
+        """Why there is nothing at a path, in brackets, as far as the results say it."""
+        steps = path.split(".")
+        for end in range(len(steps), 0, -1):
+            for _, reason in values_at(self.values, ".".join((*steps[:end], "reason"))):
+                return bracketed(reason)
+        return NOT_BOTH if HORIZONTAL in path else ""
+
+
+def values_at(values: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
+    """Paths and values where a path leads; ``*`` is every key, quotes may enclose names with dots.
+
+    >>> values_at({"a.b.c.0": 1, "a.b.c.d.0": 2}, 'a."b.c".*')
+    [('a.b.c.0', 1)]
+    """
+    pattern = re.compile(re.escape(path.replace('"', "")).replace(r"\*", "[^.]*"))
+    return [(name, value) for name, value in values.items() if pattern.fullmatch(name)]
+
+
+def text_of(value: str) -> str:
+    """One line of text, without control characters and not too long to be quoted."""
+    return one_line(value, MAX_QUOTE)
+
+
+def bracketed(reason: str) -> str:
+    """A reason behind what it is the reason of."""
+    said = text_of(reason).rstrip(".")
+    return f" ({said})" if said else ""
+
+
+def absence(part: object) -> str:
+    """Why a part is not there, in brackets; "" where it is, or nobody says."""
+    return bracketed(part.reason) if isinstance(part, Unavailable) else ""
+
+
+# ------------------------------------------------------------------ the report
+
 
 NO_COMPARISON: Scored = (0.0, "Your report compares no filters.")
 
@@ -45,8 +214,8 @@ class VerifiedItem(RubricItem, frozen=True, kw_only=True, tag="verified"):
     def score(self, evidence: Evidence) -> Scored:
         """All or nothing."""
         verdict = evidence.verdict
-        said = f"Verification says: {verdict.status}{reason_of(verdict)}."
-        return float(verdict.status == "verified"), said
+        why = bracketed("".join(verdict.reasons[:1]))
+        return float(verdict.status == "verified"), f"Verification says: {verdict.status}{why}."
 
 
 class NumberItem(RubricItem, frozen=True, kw_only=True, tag="number"):
@@ -227,16 +396,14 @@ class ClockItem(RubricItem, frozen=True, kw_only=True, tag="clock"):
 
     def score(self, evidence: Evidence) -> Scored:
         """All or nothing, ``undeterminable`` where the flight does not tell."""
-        comparison, handed_out = evidence.comparison, evidence.answer is not None
-        if comparison is None:
+        if evidence.comparison is None:
             return NO_COMPARISON
-        clock = comparison.clock
-        said = "Your flight does not determine the clock offset"
-        if not isinstance(clock, Clock):
-            return float(handed_out), f"{said}{absence(clock)}."
-        if not clock.determinable:
-            why = f" ({text_of(clock.reason).rstrip('.')})" if clock.reason else ""
-            return 1.0 if handed_out else self.undeterminable, f"{said}{why}."
+        clock = evidence.comparison.clock
+        if not isinstance(clock, Clock) or not clock.determinable:
+            share = self.undeterminable if isinstance(clock, Clock) else 0.0
+            why = bracketed(clock.reason or "")
+            said = f"Your flight does not determine the clock offset{why}."
+            return 1.0 if evidence.answer is not None else share, said
         (low, high), applied = clock.interval_s, clock.applied_s
         said = f"You applied a clock offset of {applied:.3f} s"
         if low - self.margin_s <= applied <= high + self.margin_s:
@@ -265,8 +432,11 @@ TOO_GOOD, USUAL_P = 0.001, 0.05
 OPEN_UNKNOWN, WITHOUT_REFERENCE = 0.8, 0.5
 
 
-def contradictions(evidence: Evidence) -> Iterator[str]:
-    """Options of a loop that its log or the answer key contradict: sentences."""
+def contradictions(evidence: Evidence, closed: bool = False) -> Iterator[str]:
+    """Options of a loop that its log or the answer key contradict: sentences.
+
+    ``closed``: also that it is taken for closed, where it truly landed elsewhere.
+    """
     results = evidence.results
     if not isinstance(results, LoopResults):
         return
@@ -294,6 +464,11 @@ def contradictions(evidence: Evidence) -> Iterator[str]:
             "The loop closes far better than the stated drift lets any loop close: "
             "--landed-at, --drift or --heading-drift may have been chosen for that."
         )
+    if closed and landed is not None and landed > TAPE_M and request.came_back and at is None:
+        yield (
+            "It did not land at the place of take-off: say where it did (--landed-at) or leave the "
+            "end open (--open)."
+        )
 
 
 def _stated_drift(results: LoopResults) -> float:
@@ -306,18 +481,6 @@ def _stated_drift(results: LoopResults) -> float:
 def _landed_m(evidence: Evidence) -> float | None:
     """How far from the place of take-off it landed; None where only the vehicle knows."""
     return None if evidence.answer is None else evidence.answer.truth.get("closure_error_m")
-
-
-def _assumed_closed(evidence: Evidence) -> Iterator[str]:
-    """What is wrong with a loop that is taken for closed and is not, by where it truly landed."""
-    results, landed = evidence.results, _landed_m(evidence)
-    if landed is None or landed <= TAPE_M or not isinstance(results, LoopResults):
-        return
-    if results.request.came_back and results.request.landed_at is None:
-        yield (
-            "It did not land at the place of take-off: say where it did (--landed-at) or leave the "
-            "end open (--open)."
-        )
 
 
 class LoopItem(RubricItem, frozen=True, kw_only=True, tag="loop"):
@@ -342,9 +505,9 @@ class LoopItem(RubricItem, frozen=True, kw_only=True, tag="loop"):
         if opened:
             said = "You left the end open (--open)"
         accepted = [one for one in loop.closures if one.accepted]
-        wrong = [*contradictions(evidence), *(_assumed_closed(evidence) if accepted else ())]
+        wrong = next(contradictions(evidence, bool(accepted)), "")
         if wrong and loop.closures:
-            return 0.25, f"{said}. {wrong[0]}"
+            return 0.25, f"{said}. {wrong}"
         if not accepted:
             share, why = _open_end(evidence, loop)
             false = "; the closure was rejected as false" if loop.closures else ""

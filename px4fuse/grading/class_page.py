@@ -11,9 +11,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from px4fuse.answers import form_rows
-from px4fuse.grading.class_table import number
-from px4fuse.grading.model import Entry, Graded, Item, Override, columns
-from px4fuse.grading.overrides import TOTAL
+from px4fuse.assignment.sheet import number
+from px4fuse.grading.model import TOTAL, Entry, Graded, Item, Override, columns
 from px4fuse.plain import number_words
 from px4fuse.webpage import frame
 from px4fuse.webpage.charts import tenths
@@ -148,20 +147,19 @@ def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str]) -> Row:
         *(frame.figure(points.get(name)) for name in items),
         *(frame.figure(held.get(name)) for name in numbers),
     )
-    nothing = (frame.listed("Missing", ["Nothing was handed in."]), _comment(entry))
-    details = _details(entry, one) if one else nothing
     # who has neither id nor file cannot be named in overrides.csv
     boxes = (_boxes(entry),) if entry.student_id or file else ()
     beside = _beside(entry, one) if one else ()
-    return Row(cells, tuple(_tags(entry)), (*details, *boxes), beside)
+    return Row(cells, tuple(_tags(entry)), (*_details(entry), *boxes), beside)
 
 
-def _comment(entry: Entry) -> Part:
-    return frame.prose("Your comment", entry.comment)
-
-
-def _details(entry: Entry, one: Graded) -> Iterator[Part]:
+def _details(entry: Entry) -> Iterator[Part]:
     """What a row unfolds to, as long as nobody is to be hidden."""
+    one, comment = entry.counting, frame.prose("Your comment", entry.comment)
+    if one is None:
+        yield frame.listed("Missing", ["Nothing was handed in."])
+        yield comment
+        return
     verdict = one.verdict
     differ = [(each.path, each.recorded, each.recomputed) for each in verdict.differences]
     items = [(item.title, number(item.points), number(item.of), item.comment) for item in one.items]
@@ -174,7 +172,7 @@ def _details(entry: Entry, one: Graded) -> Iterator[Part]:
     yield frame.tabled("The first numbers that differ", heads, differ)
     title = "Points (proposed)" if one.pending else "Points"
     yield frame.tabled(title, ("Item", "Points", "Of", "Comment") if items else (), items, (1, 2))
-    yield _comment(entry)
+    yield comment
     yield frame.listed("Mistakes of this flight", named)
     yield frame.pairs("The form", [*form_rows(one.form)] if one.form else [])
     yield frame.prose("The student's own words", one.notes)
@@ -223,10 +221,10 @@ def _beside(entry: Entry, one: Graded) -> tuple[Part, ...]:
     every = frame.pictures("Every page, drawn again from the log", drawn)
     handed_in = []
     if source := local_link(one.handed_in):
-        said = f"Page {one.page}, as handed in: not verified"
+        said = f"Page {one.verdict.page}, as handed in: not verified"
         # the redrawn one stands beside it
-        handed_in = drawn[one.page - 1 : one.page]
-        handed_in += [(said, f"Page {one.page} {whose}, as handed in", source)]
+        handed_in = drawn[one.verdict.page - 1 : one.verdict.page]
+        handed_in += [(said, f"Page {one.verdict.page} {whose}, as handed in", source)]
     report = [("Drawn again from the log (PDF)", local_link(one.redrawn_name))]
     title = "The page that differs" if drawn else "As handed in"
     return frame.links("The report", report), frame.pictures(title, handed_in), every

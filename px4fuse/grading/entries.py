@@ -1,21 +1,81 @@
-"""From what was handed in to one row per student: which attempt counts, and what it is worth."""
+"""From what was handed in to one row per student: which attempt counts, and what it is worth.
 
+The instructor's word, ``overrides.csv``, counts instead of the rules.
+
+Points are taken off for every started day (or hour) after the due time: so many per cent of the
+most points that there are to have, never more than the limit that the rule names, and never below
+zero points.
+"""
+
+import math
+import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import cached_property
+from pathlib import Path
 from typing import Literal
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
-from px4fuse.assignment.roster import Person, Register
-from px4fuse.assignment.sheet import Sheet
-from px4fuse.grading.class_table import number
+from px4fuse.assignment.key import AnswerKey
+from px4fuse.assignment.roster import Person, Register, folded, people_of_sheet
+from px4fuse.assignment.sheet import Sheet, decimal, number, read_sheet
+from px4fuse.errors import SettingsError
 from px4fuse.grading.flags import class_flags
-from px4fuse.grading.lateness import LateRule, in_zone_of, moodle_time
-from px4fuse.grading.model import Entry, Graded, Item, Override, Submission
-from px4fuse.grading.overrides import TOTAL, Overrides, matched
-from px4fuse.results.reading import one_line
+from px4fuse.grading.model import TOTAL, Entry, Graded, Item, Override, Submission
+from px4fuse.grading.rubric import Rubric
+from px4fuse.results.reading import cleaned, one_line
 
 SHOWN = "%Y-%m-%d %H:%M"
+# What the instructor says instead of the rules: a table that is read and never written over
+NAME = "overrides.csv"
+TITLES = ("id", "item", "points", "comment")
+TEMPLATE = "\ufeff" + ",".join(TITLES) + "\r\n"
+MOST = 1e6
+MAX_COMMENT = 10_000
+
+# Id as it was typed, to item as it was typed ("" for all of it), to what is said
+Overrides = Mapping[str, Mapping[str, Override]]
+# What being late costs, as it is typed
+_RULE = re.compile(
+    r"(?P<rate>\d+(?:\.\d+)?)\s*%\s*/\s*(?P<unit>day|hour)"
+    r"(?:\s+up to\s+(?P<most>\d+(?:\.\d+)?)\s*%)?"
+)
+# Moodle's strftimedaydatetime in English, with hours of twelve and of twenty-four
+_MOODLE_FORMATS = ("%A, %d %B %Y, %I:%M %p", "%A, %d %B %Y, %H:%M")
+
+
+@dataclass(frozen=True)
+class LateRule:
+    """What late hand-ins cost.
+
+    Attributes
+    ----------
+    share : float
+        Of the most points, for every started unit.
+    most : float
+        Share that is never exceeded.
+    text : str
+        As it was given.
+    """
+
+    share: float
+    unit_s: float
+    most: float
+    text: str
+
+    def deduction(self, late_s: float, of: float) -> float:
+        """Points that are taken off.
+
+        >>> late_rule("10%/day").deduction(86_401.0, 50.0)
+        10.0
+        >>> late_rule("10%/day up to 30%").deduction(1e9, 50.0)
+        15.0
+        """
+        units = math.ceil(max(late_s, 0.0) / self.unit_s)
+        return round(of * min(units * self.share, self.most), 2)
 
 
 @dataclass(frozen=True)
@@ -24,6 +84,13 @@ class Course:
 
     Attributes
     ----------
+    rubric : Rubric
+    key : AnswerKey or None
+        Which mistakes each student's flight has.
+    logs : sequence of Path
+        Flight logs and folders of them; a report names its log by SHA-256.
+    title : str
+        Of the class page; by default the rubric's.
     roster : tuple of Person or None
         Without one the students of the answer key, else those of the worksheets.
     worksheets : tuple of Sheet
@@ -40,6 +107,10 @@ class Course:
         Whether the class page shows pseudonyms.
     """
 
+    rubric: Rubric
+    key: AnswerKey | None = None
+    logs: Sequence[Path] = ()
+    title: str = ""
     roster: tuple[Person, ...] | None = None
     worksheets: tuple[Sheet, ...] = ()
     column: str = ""
@@ -49,6 +120,17 @@ class Course:
     include_pending: bool = False
     anonymous: bool = False
 
+    @cached_property
+    def register(self) -> Register:
+        """Who is in the class, with what all worksheets know of them."""
+        listed = [people_of_sheet(sheet) for sheet in self.worksheets]
+        given = self.key.answers if self.key else ()
+        handed_out = tuple(Person(one.student_id, one.name) for one in given)
+        found = Register(self.roster or handed_out or next(iter(listed), ()))
+        for others in listed:
+            found.add(others)
+        return found
+
 
 # When it came and when it was packed, by which attempts are ordered; the file; and the row that it
 # would make alone
@@ -56,11 +138,7 @@ Attempt = tuple[tuple[float, float], Graded, Entry]
 
 
 def class_entries(
-    graded: Sequence[Graded],
-    submissions: Sequence[Submission],
-    register: Register,
-    course: Course,
-    overrides: Overrides,
+    graded: Sequence[Graded], submissions: Sequence[Submission], course: Course, said: Overrides
 ) -> tuple[tuple[Entry, ...], tuple[str, ...]]:
     """Lay out a class: everyone in the register, then what belongs to nobody in it.
 
@@ -72,8 +150,6 @@ def class_entries(
     ----------
     graded, submissions : sequences
         Of every file, in one order.
-    register : Register
-        Without people where nobody knows who is in the class.
 
     Returns
     -------
@@ -81,34 +157,25 @@ def class_entries(
     notes : tuple of str
         On overrides that fit nobody.
     """
-    everyone = register if register.people else _named(graded, submissions)
-    attempts: dict[int, list[Attempt]] = defaultdict(list)
-    strangers = []
-    note = "Neither the report nor the platform names anyone."
-    if register.people:
-        note = "Not in the roster."
+    everyone = course.register if course.register.people else _named(graded, submissions)
+    attempts: dict[int | None, list[Attempt]] = defaultdict(list)
     for one, submission in zip(graded, submissions, strict=True):
         place = everyone.place(submission.origin.person)
         if place is None:
             place = everyone.place(Person(one.student_id, one.student))
-        attempt = _attempt(one, submission, course, place, everyone)
-        if place is not None:
-            attempts[place].append(attempt)
-        else:
-            strangers.append(replace(attempt[2], flags=(note, *attempt[2].flags)))
+        attempts[place].append(_attempt(one, submission, course, place, everyone))
+    most = max((one.of for one in graded), default=0.0)
     made = [
         _chosen(attempts[at], course) if attempts[at]
-        else Entry(person.name, person.student_id, None)
+        else Entry(person.name, person.student_id, None, of=most)
         for at, person in enumerate(everyone.people)
     ]  # fmt: skip
-    made += strangers
-    told, notes = matched(overrides, made)
-    most = max((one.of for one in graded), default=0.0)
+    nobody = "Neither the report nor the platform names anyone."
+    note = "Not in the roster." if course.register.people else nobody
+    made += [replace(entry, flags=(note, *entry.flags)) for *_, entry in attempts[None]]
+    told, notes = matched(said, made)
     alike = class_flags([entry.counting for entry in made if entry.counting])
-    settled = (
-        _settled(one, words, alike, most, course.include_pending)
-        for one, words in zip(made, told, strict=True)
-    )
+    settled = (_settled(*each, alike, course) for each in zip(made, told, strict=True))
     return tuple(settled), notes
 
 
@@ -124,8 +191,7 @@ def _named(graded: Sequence[Graded], submissions: Sequence[Submission]) -> Regis
             # two students may not hand in under one id: the second is known by the platform alone
             student_id = person.student_id or ("" if claimed is not None else one.student_id)
             name = one_line(one.student if student_id else person.name, 200) or person.name
-            known_by = (student_id, person.login, *person.numbers.values())
-            student_id = next(filter(None, known_by))
+            student_id = next(filter(None, (student_id, person.login, *person.numbers.values())))
             register.people.append(replace(person, student_id=student_id, name=name))
         elif one.student_id and claimed is None:
             register.people.append(Person(one.student_id, one_line(one.student, 200)))
@@ -133,11 +199,7 @@ def _named(graded: Sequence[Graded], submissions: Sequence[Submission]) -> Regis
 
 
 def _attempt(
-    graded: Graded,
-    submission: Submission,
-    course: Course,
-    place: int | None,
-    register: Register,
+    graded: Graded, submission: Submission, course: Course, place: int | None, register: Register
 ) -> Attempt:
     """One file as if it were the only one of its student."""
     origin, due = submission.origin, course.due
@@ -174,6 +236,7 @@ def _attempt(
         "" if time is None else time.strftime(SHOWN),
         late_s,
         course.late.deduction(late_s, graded.of) if course.late and late_s else 0.0,
+        of=graded.of,
         flags=tuple(flags),
     )
     stamps = (time.timestamp() if time else 0.0, packed.timestamp() if packed else 0.0)
@@ -186,14 +249,10 @@ def _worth(attempt: Attempt) -> float:
     return max(one.points - entry.deduction, 0.0)
 
 
-def _order(attempt: Attempt) -> tuple[object, ...]:
-    """By time, of one submission the better file later."""
-    return attempt[0], _worth(attempt), attempt[1].submission
-
-
 def _chosen(attempts: Sequence[Attempt], course: Course) -> Entry:
     """The attempt that counts, with the others and what that needs said."""
-    ordered = sorted(attempts, key=_order)
+    # by time, of one submission the better file later
+    ordered = sorted(attempts, key=lambda one: (one[0], _worth(one), one[1].submission))
     # what is pending, such as another's report under this id, or no report counts only where there
     # is nothing else
     reports = [one for one in ordered if one[1].version]
@@ -202,16 +261,15 @@ def _chosen(attempts: Sequence[Attempt], course: Course) -> Entry:
         "latest": able[-1],
         # several files of one submission: the best
         "first": [one for one in able if one[0] == able[0][0]][-1],
-        "best": max(able, key=lambda one: (_worth(one), _order(one))),
+        "best": max(reversed(able), key=_worth),
     }[course.attempt]
     stamps, graded, entry = found
     flags = list(entry.flags)
     others = tuple(one for _, one, _ in ordered if one is not graded)
     beside = [one for stamp, one, _ in able if stamp == stamps]
     if course.attempt != "best" and len({one.form for one in beside}) > 1:  # a guess in each
-        graded = replace(
-            graded, pending=f"Ask which of {len(beside)} reports is meant: their forms differ."
-        )
+        asked = f"Ask which of {len(beside)} reports is meant: their forms differ."
+        graded = replace(graded, pending=asked)
     elif len(beside) > 1 and any(stamps):
         flags.append(f"{len(beside)} reports came at the same time; the best of them counts.")
     for stamp, one, _ in ordered:
@@ -222,11 +280,7 @@ def _chosen(attempts: Sequence[Attempt], course: Course) -> Entry:
 
 
 def _settled(
-    entry: Entry,
-    said: Mapping[str, Override],
-    alike: Mapping[str, Sequence[str]],
-    most: float,
-    include_pending: bool,
+    entry: Entry, said: Mapping[str, Override], alike: Mapping[str, Sequence[str]], course: Course
 ) -> Entry:
     """With the instructor's word on items and on all of it, the total that follows, and flags."""
     one, total, flags = entry.counting, None, entry.flags
@@ -234,7 +288,7 @@ def _settled(
         items = (_overruled(item, said.get(item.title)) for item in one.items)
         one = replace(one, items=tuple(items))
         flags = (*flags, *one.flags, *alike.get(one.submission, ()))
-        if one.counted is not None or include_pending:
+        if one.counted is not None or course.include_pending:
             total = round(max(one.points - entry.deduction, 0.0), 2)
     final = said.get(TOTAL, Override())
     return replace(
@@ -243,7 +297,6 @@ def _settled(
         overrides=said,
         comment="\n".join(filter(None, (said.get("", Override()).comment, final.comment))),
         total=total if final.points is None else final.points,
-        of=one.of if one else most,
         flags=flags,
     )
 
@@ -258,3 +311,152 @@ def _overruled(item: Item, said: Override | None) -> Item:
     if said.points != item.points:
         comment = f"{comment} (Your instructor gave {number(said.points)} points.)"
     return replace(item, points=said.points, comment=comment, waits=False)
+
+
+# ------------------------------------------------------------------ the instructor's word
+
+
+def read_overrides(path: Path) -> Overrides:
+    """Read ``overrides.csv``; nothing where it is not there.
+
+    Its columns are id (as in class.csv, or the file's name), item (a title of the rubric, "total",
+    or empty for a comment on all of it), points and comment.
+
+    Raises
+    ------
+    SettingsError
+        A column is missing, or a row says no number of points where it should.
+    """
+    if not path.exists():
+        return {}
+    sheet = read_sheet(path)
+    missing = [title for title in TITLES if sheet.column((title,)) is None]
+    if missing:
+        raise SettingsError(
+            f"{path}: no column {', '.join(missing)}", f"Its columns are {', '.join(TITLES)}."
+        )
+    found: dict[str, dict[str, Override]] = defaultdict(dict)
+    for at, row in enumerate(sheet.rows, start=2):
+        student, item, points, comment = (
+            sheet.cell(row, (title,)).removeprefix("'") for title in TITLES
+        )
+        value = decimal(points)
+        wrong = ""
+        if item in found[student]:
+            wrong = f"{one_line(student, 40)}, {one_line(item, 40) or 'all'} stands there twice"
+        elif points and (value is None or not 0.0 <= value <= MOST or not item):
+            given = one_line(points, 20)
+            wrong = f"points {given!r}: give a number from 0 up, and an item or total"
+        if wrong:
+            raise SettingsError(f"{path}: row {at}: {wrong}.")
+        found[student][item] = Override(value, cleaned(comment[:MAX_COMMENT]))
+    return found
+
+
+def matched(
+    overrides: Overrides, entries: Sequence[Entry]
+) -> tuple[list[dict[str, Override]], tuple[str, ...]]:
+    """What is said of whom, and a sentence for every row that fits nobody, or no item.
+
+    Returns
+    -------
+    said : list of dict
+        For each entry, by the title of an item, "total", or "" for all of it.
+    notes : tuple of str
+    """
+    said: list[dict[str, Override]] = [{} for _ in entries]
+    whole = max((one.of for entry in entries for one in entry.files), default=MOST)
+    files = (entry.counting.submission if entry.counting else "" for entry in entries)
+    people = Register(
+        Person(entry.student_id, login=file) for entry, file in zip(entries, files, strict=True)
+    )
+    notes = []
+    for student, rows in overrides.items():
+        # by the very id, the id but for leading zeros, or the file's name
+        place = people.place(Person(student, login=student))
+        if place is None:
+            notes.append(f"{NAME}: nobody has the id {one_line(student, 40) or '(empty)'}.")
+            continue
+        one = entries[place].counting
+        most = {item.title: item.of for item in one.items} if one else {}
+        most |= {TOTAL: one.of if one else whole, "": MOST}
+        titles = {folded(title): title for title in most}
+        for item, override in rows.items():
+            title, wrong = titles.get(folded(item)), ""
+            if title is None:
+                wrong = f"has no item {one_line(item, 60)!r}"
+            elif title in said[place]:
+                wrong = f"has {title or 'a comment on all'!r} from another row already"
+            elif (override.points or 0.0) > most[title]:
+                wrong = f"cannot have more than {most[title]:g} points of {one_line(title, 60)!r}"
+            else:
+                said[place][title] = override
+            notes += [f"{NAME}: {one_line(student, 40)} {wrong}."] if wrong else []
+    return said, tuple(notes)
+
+
+# ------------------------------------------------------------------ when it was due
+
+
+def late_rule(text: str) -> LateRule:
+    """Read ``10%/day`` or ``10%/day up to 50%``.
+
+    Raises
+    ------
+    SettingsError
+        It is not such a rule.
+    """
+    match = _RULE.fullmatch(text.strip())
+    if match is None or not 0.0 <= float(match["rate"]) <= 100.0:
+        raise SettingsError(f"--late {text!r}: give a rule such as 10%/day or 10%/day up to 50%.")
+    unit_s = {"day": 86_400.0, "hour": 3_600.0}[match["unit"]]
+    most = min(float(match["most"] or 100.0) / 100.0, 1.0)
+    return LateRule(float(match["rate"]) / 100.0, unit_s, most, text.strip())
+
+
+def due_time(text: str) -> datetime:
+    """Read a due time: ``2026-11-20 23:59``, with a zone ``+01:00`` or ``Europe/Berlin`` behind it.
+
+    Without a zone it is that of this computer. A date alone means the end of that day, and a time
+    without seconds the end of that minute.
+
+    Raises
+    ------
+    SettingsError
+        It is not such a time.
+    """
+    words = text.split()
+    try:
+        zone = ZoneInfo(words.pop()) if words and words[-1][0].isalpha() else None
+        found = datetime.fromisoformat("T".join(words[:2]) + "".join(words[2:]))
+    except (ZoneInfoNotFoundError, ValueError, OSError) as error:
+        raise SettingsError(
+            f"--due {text!r}: give a time such as '2026-11-20 23:59', with or without a time zone "
+            "('+01:00' or 'Europe/Berlin') behind it."
+        ) from error
+    clock = re.search(r"\d\d:\d\d(:\d\d)?", text)
+    if clock is None:
+        found = found.replace(hour=23, minute=59)
+    if clock is None or clock[1] is None:
+        found = found.replace(second=59)
+    return found.replace(tzinfo=zone) if zone else found if found.tzinfo else found.astimezone()
+
+
+def in_zone_of(time: datetime, due: datetime | None) -> datetime:
+    """A platform's time, which is in the zone of the due time where it says none."""
+    if time.tzinfo is not None:
+        return time
+    return time.replace(tzinfo=due.tzinfo) if due is not None else time.astimezone()
+
+
+def moodle_time(text: str) -> datetime | None:
+    """When Moodle's worksheet says that something was handed in; None where it cannot be read.
+
+    >>> moodle_time("Friday, 20 November 2026, 11:58 PM").isoformat()
+    '2026-11-20T23:58:00'
+    >>> moodle_time("-")
+    """
+    for form in _MOODLE_FORMATS:
+        with suppress(ValueError):
+            return datetime.strptime(text.strip(), form)
+    return None

@@ -14,13 +14,14 @@ from itertools import combinations
 from operator import attrgetter
 from typing import Any
 
-from px4fuse.assignment.key import folded
+from px4fuse.assignment.roster import folded
 from px4fuse.filter.tuning import Tuned
 from px4fuse.grading.model import Graded
 from px4fuse.plain import few_words
 from px4fuse.results.contract import LoopResults, Reported, to_plain
 from px4fuse.results.reading import one_line
 from px4fuse.simulation import flights
+from px4fuse.verification.model import Verdict
 
 # Numbers of a form that two students do not have in common by chance, also where one of them has
 # changed each a little
@@ -54,6 +55,22 @@ TO_A_GRADER = re.compile(
 
 # Two reports that have something in common, and how much where that is not all of it
 Pairs = Iterator[tuple[Graded, Graded, str]]
+
+
+def page_flags(verdict: Verdict) -> Iterator[str]:
+    """Which pages are not as px4fuse draws them, or that nobody could see them."""
+    if verdict.pages:
+        first, *others = verdict.pages
+        more = f" Also: page {', '.join(str(one.page) for one in others)}." if others else ""
+        yield (
+            f"Page {first.page} of the PDF that was handed in is not what px4fuse draws from the "
+            f"log: {first.what}.{more} Read the redrawn report."
+        )
+    elif verdict.with_log and verdict.page_status == "not compared":
+        yield (
+            "The pages that were handed in could not be drawn: do not open them, read the redrawn "
+            "report."
+        )
 
 
 def own_flags(results: Reported, handed_out: bool = False) -> Iterator[str]:
@@ -117,11 +134,6 @@ def _same_numbers(one: Mapping[Any, float], other: Mapping[Any, float]) -> int:
     )
 
 
-def _results_numbers(one: Graded) -> tuple[float, ...]:
-    whole = len(one.numbers) >= SAME_NUMBERS and one.verdict.status == "verified"
-    return tuple(one.numbers.values()) if whole else ()
-
-
 def _who(one: Graded) -> str:
     return folded(one.student_id) or folded(one.student) or one.submission
 
@@ -133,25 +145,24 @@ COMMON: tuple[tuple[str, Callable[[Graded], object], Callable[[Graded], str]], .
     ("The same student id as in {}.", lambda one: folded(one.student_id), attrgetter("submission")),
     ("The same log as {}.", attrgetter("log_sha256"), _who),
     ("The same numbers to the last digit, from a log of another hash, as {}: a copy of the log.",
-     _results_numbers, attrgetter("log_sha256")),
+     lambda one: one.verdict.status == "verified" and len(one.numbers) >= SAME_NUMBERS
+     and tuple(one.numbers.values()), attrgetter("log_sha256")),
 )  # fmt: skip
 
 
 def class_flags(graded: Sequence[Graded]) -> Mapping[str, Sequence[str]]:
     """What stands out between the reports of a class: sentences, by names of submissions."""
     found: dict[str, list[str]] = defaultdict(list)
-    named = {one.submission: _name(one) for one in graded}
-    files = {name: _line(name) for name in named}
     for said, pairs in (
         *((said, _same(graded, what, whose)) for said, what, whose in COMMON),
         ("The form has the numbers of {}.", _copied_forms(graded)),
         ("The text shares whole passages with those of {}.", _copied_notes(graded)),
     ):
         others: dict[str, list[str]] = defaultdict(list)
-        for pair in pairs:
-            for one, other in (pair[:2], pair[1::-1]):
-                name = other.submission
-                others[one.submission].append(f"{named[name]} ({pair[2] or files[name]})")
+        for first, second, share in pairs:
+            for one, other in ((first, second), (second, first)):
+                how = share or one_line(other.submission, 80)
+                others[one.submission].append(f"{_name(other)} ({how})")
         for name, those in others.items():
             found[name].append(said.format(few_words(those, SHOWN, "; ")))
     return found
@@ -198,11 +209,7 @@ def _copied_notes(graded: Sequence[Graded]) -> Pairs:
 def _name(one: Graded) -> str:
     """A student in a sentence."""
     parts = filter(None, (one.student.strip(), one.student_id.strip()))
-    return _line(", ".join(parts) or one.submission)
-
-
-def _line(text: str) -> str:
-    return one_line(text, 80)
+    return one_line(", ".join(parts) or one.submission, 80)
 
 
 def _digits(number: float) -> int:

@@ -8,25 +8,17 @@ from functools import partial
 from pathlib import Path
 
 from px4fuse.assignment.key import AnswerKey
-from px4fuse.assignment.roster import Person, Register, people_of_sheet
 from px4fuse.grading import submissions
-from px4fuse.grading.entries import Course, class_entries
-from px4fuse.grading.exports import grade_column
-from px4fuse.grading.flags import own_flags
+from px4fuse.grading.entries import NAME, Course, Overrides, class_entries, read_overrides
 from px4fuse.grading.model import Entry, Graded, Submission
-from px4fuse.grading.outputs import write_class
-from px4fuse.grading.overrides import NAME, read_overrides
+from px4fuse.grading.outputs import grade_column, write_class
 from px4fuse.grading.records import RECORDS, verified
-from px4fuse.grading.rubric import Rubric
-from px4fuse.grading.scoring import assess, refused
+from px4fuse.grading.rubric import Rubric, assess, refused
 from px4fuse.reading import files_by_sha256, max_log_bytes
 from px4fuse.results.reading import one_line
-from px4fuse.verification.model import Refused, Verdict
+from px4fuse.verification.model import Refused
 from px4fuse.verification.workers import Failed, run_bounded
 
-UNSEEN = (
-    "The pages that were handed in could not be drawn: do not open them, read the redrawn report."
-)
 FAILED = "Do not open it: ask for the report as px4fuse wrote it."
 
 
@@ -57,13 +49,9 @@ class GradeOutcome:
 
 def grade(
     paths: Sequence[Path],
-    logs: Sequence[Path],
-    rubric: Rubric,
+    course: Course,
     output: Path,
     *,
-    key: AnswerKey | None = None,
-    course: Course | None = None,
-    title: str = "",
     processes: int | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> GradeOutcome:
@@ -73,16 +61,10 @@ def grade(
     ----------
     paths : sequence of Path
         PDFs, folders and zip files.
-    logs : sequence of Path
-        Flight logs and folders of them; a report names its log by SHA-256.
     output : Path
         Folder for the class table (``class.csv``, ``class.html``), the redrawn ``reports/``,
         ``feedback/``, ``grades/`` for learning platforms, and the records that
         make a second run quick. Its ``overrides.csv`` is read.
-    key : AnswerKey, optional
-        Which mistakes each student's flight has.
-    title : str
-        Of the class page; by default the rubric's.
     processes : int, optional
         By default as many as there are cores.
     progress : callable
@@ -95,57 +77,43 @@ def grade(
     OutputError
         The folder cannot be written.
     """
-    course = course or Course()
     overrides = read_overrides(output / NAME)
     for sheet in course.worksheets:
         grade_column(sheet, course.column)
     unread = sorted(one.name for one in output.glob("overrides*") if one.name != NAME)
     renamed = [f"{one_line(name, 80)}: not read; only {NAME} is." for name in unread]
     found, notes = submissions.collect(paths)
-    register = register_of(course, key)
-    records = output / RECORDS
-    graded, reused = grade_all(found, logs, rubric, records, key, register, processes, progress)
-    entries, unknown = class_entries(graded, found, register, course, overrides)
-    name = title or rubric.title or "Class"
-    written, more = write_class(entries, register, course, name, output)
+    entries, unknown, reused = grade_all(
+        found, course, output / RECORDS, overrides, processes, progress
+    )
+    written, more = write_class(entries, course, output)
     return GradeOutcome(entries, (*notes, *renamed, *unknown, *more), reused, written)
-
-
-def register_of(course: Course, key: AnswerKey | None) -> Register:
-    """Who is in the class, with what all worksheets know of them."""
-    listed = [people_of_sheet(sheet) for sheet in course.worksheets]
-    handed_out = tuple(Person(one.student_id, one.name) for one in key.answers) if key else ()
-    people = course.roster or handed_out or next(iter(listed), ())
-    register = Register(people)
-    for others in listed:
-        register.add(others)
-    return register
 
 
 def grade_all(
     found: Sequence[Submission],
-    logs: Sequence[Path],
-    rubric: Rubric,
+    course: Course,
     records: Path,
-    key: AnswerKey | None,
-    register: Register,
+    overrides: Overrides,
     processes: int | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
-) -> tuple[tuple[Graded, ...], int]:
-    """Verify, or recall, and score every file, each within bounds; and how many were recalled."""
+) -> tuple[tuple[Entry, ...], tuple[str, ...], int]:
+    """Verify, or recall, and score every file, each within bounds, and lay out the class.
+
+    Returns
+    -------
+    entries, notes
+        As :func:`~px4fuse.grading.entries.class_entries` gives them.
+    reused : int
+        How many reports were recalled.
+    """
     jobs = []
     for submission in found:
-        place = register.place(submission.origin.person)
-        owner = "" if place is None else register.people[place].student_id
+        place = course.register.place(submission.origin.person)
+        owner = "" if place is None else course.register.people[place].student_id
         jobs.append((submission, owner))
-    scored = partial(
-        grade_one,
-        logs=files_by_sha256(logs),
-        rubric=rubric,
-        key=key,
-        records=records,
-        largest_log_bytes=max_log_bytes.get(),
-    )
+    rules, logs = (course.rubric, course.key), files_by_sha256(course.logs)
+    scored = partial(grade_one, *rules, logs, records, max_log_bytes.get())
     made: dict[int, Graded] = {}
     reused = 0
     progress(0, len(found))
@@ -153,7 +121,7 @@ def grade_all(
         for index, result in work:
             if isinstance(result, Failed):
                 why = Refused(f"Grading it failed: {result.reason}", FAILED)
-                one, recalled = refused(rubric, key, why), False
+                one, recalled = refused(*rules, why), False
             else:
                 one, recalled = result
             submission = found[index]
@@ -162,16 +130,17 @@ def grade_all(
             made[index] = replace(one, submission=submission.name, student=student)
             reused += recalled
             progress(len(made), len(found))
-    return tuple(made[index] for index in range(len(found))), reused
+    graded = [made[index] for index in range(len(found))]
+    return (*class_entries(graded, found, course, overrides), reused)
 
 
 def grade_one(
-    job: tuple[Submission, str],
-    logs: Mapping[str, Path],
     rubric: Rubric,
     key: AnswerKey | None,
+    logs: Mapping[str, Path],
     records: Path,
     largest_log_bytes: int,
+    job: tuple[Submission, str],
 ) -> tuple[Graded, bool]:
     """Read, verify or recall, and score a file, whoever it is from; in a process of its own."""
     max_log_bytes.set(largest_log_bytes)
@@ -184,24 +153,4 @@ def grade_one(
     found, recalled = verified(records, content, logs, handed_out)
     if isinstance(found, Refused):
         return replace(refused(rubric, key, found), sha256=sha256), recalled
-    results, verdict, page = found
-    made = assess(results, verdict, rubric, key, owner_id)
-    whole = replace(
-        made,
-        flags=(*_page_flags(verdict), *own_flags(results, key is not None), *made.flags),
-        sha256=sha256,
-        page=page,
-    )
-    return whole, recalled
-
-
-def _page_flags(verdict: Verdict) -> tuple[str, ...]:
-    if not verdict.pages:
-        unseen = verdict.with_log and verdict.page_status == "not compared"
-        return (UNSEEN,) if unseen else ()
-    first, *others = verdict.pages
-    more = f" Also: page {', '.join(str(one.page) for one in others)}." if others else ""
-    return (
-        f"Page {first.page} of the PDF that was handed in is not what px4fuse draws from the log: "
-        f"{first.what}.{more} Read the redrawn report.",
-    )
+    return replace(assess(*found, rubric, key, owner_id), sha256=sha256), recalled

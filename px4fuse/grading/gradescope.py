@@ -27,12 +27,10 @@ import msgspec
 from px4fuse.assignment.key import key_text, read_key
 from px4fuse.assignment.roster import Person
 from px4fuse.errors import SettingsError
-from px4fuse.grading.entries import Course, class_entries
-from px4fuse.grading.feedback import returned_text
-from px4fuse.grading.grade import grade_all, register_of
-from px4fuse.grading.lateness import LateRule
-from px4fuse.grading.model import Entry
-from px4fuse.grading.platforms import NOBODY, ExportOrigin
+from px4fuse.grading.entries import Course, LateRule
+from px4fuse.grading.grade import grade_all
+from px4fuse.grading.model import NOBODY, Entry, ExportOrigin
+from px4fuse.grading.outputs import returned_text
 from px4fuse.grading.rubric import read_rubric, rubric_text
 from px4fuse.grading.submissions import collect
 from px4fuse.reading import files_by_sha256, read_log_bytes, read_text
@@ -123,28 +121,20 @@ def autograder_zip(
     python = ".".join(platform.python_version_tuple()[:2])
     options = f' --late "{late.text}"' if late else ""
     package = Path(__file__).parents[1]
-    scripts = {
-        name: Template((package / "grading" / file).read_text(encoding="utf-8"))
-        for name, file in SCRIPTS.items()
-    }
+    contents: dict[str, str | bytes] = {}
+    for name, file in SCRIPTS.items():
+        script = Template((package / "grading" / file).read_text(encoding="utf-8"))
+        contents[name] = script.substitute(python=python, options=options)
+    contents["requirements.txt"] = "".join(f"{one}\n" for one in sorted(set(_requirements())))
     about = metadata.distribution("px4fuse")
     described = about.read_text("METADATA") or about.read_text("PKG-INFO") or ""
-    modules = (path for path in sorted(package.rglob("*")) if "__pycache__" not in path.parts)
-    contents = {
-        **{
-            name: script.substitute(python=python, options=options).encode()
-            for name, script in scripts.items()
-        },
-        "requirements.txt": "".join(f"{one}\n" for one in sorted(set(_requirements()))).encode(),
-        f"px4fuse-{about.version}.dist-info/METADATA": described.encode(),
-        **{
-            f"px4fuse/{path.relative_to(package).as_posix()}": path.read_bytes()
-            for path in modules
-            if path.is_file()
-        },
-        "rubric.toml": text.encode(),
-        **({} if key is None else {"key.json": key_text(read_key(key)).encode()}),
-    }
+    contents[f"px4fuse-{about.version}.dist-info/METADATA"] = described
+    for path in sorted(package.rglob("*")):
+        if path.is_file() and "__pycache__" not in path.parts:
+            contents[f"px4fuse/{path.relative_to(package).as_posix()}"] = path.read_bytes()
+    contents["rubric.toml"] = text
+    if key is not None:
+        contents["key.json"] = key_text(read_key(key))
     for number, path in enumerate(paths):
         contents[f"logs/{number}{path.suffix}"] = read_log_bytes(path)
     out = io.BytesIO()
@@ -180,12 +170,10 @@ def run_autograder(folder: Path, late: LateRule | None) -> None:
         Rubric, key or metadata are not what they should be: Gradescope shows it to the instructor.
     """
     source = folder / "source"
-    rubric = read_rubric(source / "rubric.toml")
-    key_path = source / "key.json"
-    key = read_key(key_path) if key_path.exists() else None
+    rubric, key = read_rubric(source / "rubric.toml"), source / "key.json"
     origin, due = submission_metadata(folder)
-    course = Course(due=due, late=late)
-    register = register_of(course, key)
+    answers, logs = read_key(key) if key.exists() else None, [source / "logs"]
+    course = Course(rubric, answers, logs, due=due, late=late)
     try:
         found, _ = collect([folder / "submission"])
     except SettingsError as error:  # an empty folder, or other files than PDFs
@@ -193,14 +181,13 @@ def run_autograder(folder: Path, late: LateRule | None) -> None:
     else:
         found = tuple(replace(one, origin=origin) for one in found)
         with tempfile.TemporaryDirectory(prefix="px4fuse-") as records:
-            graded, _ = grade_all(found, [source / "logs"], rubric, Path(records), key, register, 1)
-        entries, _ = class_entries(graded, found, register, course, {})
+            entries, *_ = grade_all(found, course, Path(records), {}, 1)
         entry = max(
             (one for one in entries if one.counting),
             key=lambda one: -1.0 if one.total is None else one.total,
         )
         text = returned_text(entry)
-        if register.people and register.place(origin.person) is None:
+        if course.register.people and course.register.place(origin.person) is None:
             name = origin.person.name or "(none)"
             unknown = f"The answer key has nobody of the name {name}: compare the report's."
             entry = replace(entry, flags=(unknown, *entry.flags))

@@ -6,8 +6,43 @@ from datetime import datetime
 from pathlib import Path
 
 from px4fuse.answers import Answers
-from px4fuse.grading.platforms import NOBODY, ExportOrigin
+from px4fuse.assignment.roster import Person
 from px4fuse.verification.model import Verdict
+
+# What the sum over the items is called
+TOTAL = "total"
+
+
+UNKNOWN = Person("")
+
+
+@dataclass(frozen=True)
+class ExportOrigin:
+    """What a platform says of a file that was handed in.
+
+    Attributes
+    ----------
+    platform : str
+        One of :data:`px4fuse.grading.submissions.PLATFORMS`; "" where the name is of no platform.
+    person : Person
+        The student, as far as the platform says; its number is the platform's own (Moodle's
+        participant, Canvas's and ILIAS's user, Gradescope's submission), never the university's.
+    time : datetime or None
+        Without a time zone where the platform leaves it out.
+    late : bool
+        Whether the platform marks it so.
+    imitated : bool
+        Whether a student's own part of the name looks like a platform's.
+    """
+
+    platform: str = ""
+    person: Person = UNKNOWN
+    time: datetime | None = None
+    late: bool = False
+    imitated: bool = False
+
+
+NOBODY = ExportOrigin()
 
 
 @dataclass(frozen=True)
@@ -81,11 +116,8 @@ class Graded:
     mistakes : mapping
         What the answer key says is wrong in the student's flight, and whether the form names it.
     handed_in, sheets, redrawn_name : str, tuple of str, str
-        Where the picture of a page as it was handed in (the cover where nothing could be redrawn,
-        else the one that differs most), pictures of the redrawn pages, and the redrawn PDF stand,
-        relative to the class page.
-    page : int
-        Which page was pictured as it was handed in, counted from 1.
+        Where the picture of a page as it was handed in (the verdict's), pictures of the redrawn
+        pages, and the redrawn PDF stand, relative to the class page.
     """
 
     submission: str
@@ -103,15 +135,14 @@ class Graded:
     notes: str = field(default="", repr=False)
     mistakes: Mapping[str, bool] = field(default_factory=dict)
     handed_in: str = ""
-    page: int = 1
     redrawn_name: str = ""
     sheets: tuple[str, ...] = ()
 
     @property
     def status(self) -> str:
         """That of the verdict, or "page differs" where only the numbers are verified."""
-        altered = self.verdict.status == "verified" and self.verdict.page_status == "differ"
-        return "page differs" if altered else self.verdict.status
+        differ = self.verdict.page_status == "differ"
+        return self.verdict.outcome if differ else self.verdict.status
 
     @property
     def points(self) -> float:

@@ -1,23 +1,43 @@
-"""What grading a class writes: table, page, redrawn reports, feedback, and platforms' tables."""
+"""What grading a class writes: table, page, redrawn reports, feedback, and platforms' tables.
 
+A table that a platform exports for this purpose is given back with two kinds of cells filled, the
+grade and, where it has a column for it, the feedback; everything else stays. Rows of students with
+no grade yet (pending, or nothing handed in) stay as they are: a platform would take an empty cell
+for one to delete, and zero for a grade.
+
+- Moodle: "Using Assignment", Offline grading worksheet, docs.moodle.org; read back by
+  ``mod/assign/feedback/offline/importgradeslib.php``, which finds "Identifier" ("Participant 12"),
+  "Grade" and "Last modified (grade)" by their titles, takes "Feedback comments" as HTML, passes
+  over grades above "Maximum Grade", and numbers in the language of the site.
+- Canvas: "How do I import grades in the Gradebook?", Instructor Guide: the exported gradebook, with
+  Student, ID, SIS User ID, SIS Login ID, Section, and ``Title (12345)`` for an assignment; columns
+  marked "(read only)" in the row "Points Possible" are ignored.
+- Any other: a table with a column of ids, logins, emails or names, and one for the grade, whose
+  title is given or one of :data:`GRADE`.
+"""
+
+import html
 import itertools
 import random
+import re
+import textwrap
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 
-from px4fuse.assignment.roster import Register, distinct, file_names
-from px4fuse.assignment.sheet import Sheet, read_sheet
-from px4fuse.grading import exports
+from px4fuse.assignment.roster import Register, distinct, file_names, folded, person_of_row
+from px4fuse.assignment.sheet import Sheet, decimal, number, read_sheet
+from px4fuse.errors import SettingsError
+from px4fuse.grading.checks import text_of
 from px4fuse.grading.class_page import html_text
-from px4fuse.grading.class_table import csv_text
-from px4fuse.grading.entries import Course
-from px4fuse.grading.feedback import returned_text
-from px4fuse.grading.model import Entry, Graded
-from px4fuse.grading.overrides import NAME, TEMPLATE
+from px4fuse.grading.entries import NAME, TEMPLATE, Course
+from px4fuse.grading.model import TOTAL, Entry, Graded, columns
 from px4fuse.grading.records import HANDED_IN, PAGE, RECORDS, REDRAWN, file_of
+from px4fuse.plain import few_words
+from px4fuse.results.reading import one_line
 from px4fuse.spreadsheet import neutral, neutral_id
+from px4fuse.verification.model import Verdict
 from px4fuse.writing import write_all
 
 # Reports drawn again from their logs: what to read instead of what was handed in
@@ -26,14 +46,42 @@ FEEDBACK = "feedback"
 GRADES = "grades"
 NAMES = "names.csv"
 NAMES_HEAD = ("pseudonym", "id", "name")
+# Columns of the class table, before and behind those of items and numbers
+FIRST = ("file", "student", "id", "status", "points", "pending points", "of", "deducted", "total")
+LAST = (
+    "handed in", "hours late", "pending", "comment", "flags", "other files", "reasons",
+    "log SHA-256",
+)  # fmt: skip
+BETWEEN = " | "
+# A list of reasons is cut where it would become longer than a sentence
+NAMED = 4
+NEXT = (
+    "Your instructor has these points as a proposal and decides; ask if you think that something "
+    "was overlooked."
+)
+AGAIN = (
+    "Make it again with px4fuse, of the log that you were given, and hand in the PDF as it was "
+    "written."
+)
+FOUND = {
+    "verified": "Your report was verified: its numbers are what px4fuse computes from your log",
+    "numbers differ": "Your report's numbers are not those that px4fuse computes from its log",
+    "other log": "The log of your report is not one of those that your instructor has",
+    "cannot verify": "Your report could not be verified",
+}
+# Titles of columns of platforms' tables
+GRADE = ("grade", "bewertung", "points", "punkte", "mark", "note", "score")
+MAX_GRADE = ("maximumgrade", "hoechstebewertung", "höchstebewertung")
+# Read as HTML, and read as text
+HTML_COMMENTS = ("feedbackcomments", "feedbackalskommentar")
+COMMENTS = (*HTML_COMMENTS, "feedbacktolearner", "feedback", "comment")
+ASSIGNMENT = re.compile(r" \(\d+\)$")
+# Never written into: of Canvas, what it computes
+READ_ONLY = "(read only)"
 
 
 def write_class(
-    entries: Sequence[Entry],
-    register: Register,
-    course: Course,
-    title: str,
-    output: Path,
+    entries: Sequence[Entry], course: Course, output: Path
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """Write everything, and say what could not be entered.
 
@@ -41,8 +89,8 @@ def write_class(
 
     Parameters
     ----------
-    register : Register
-        Its people are those of the first entries.
+    entries : sequence of Entry
+        Those of the people in the course's register first, in its order.
 
     Returns
     -------
@@ -54,6 +102,7 @@ def write_class(
     OutputError
         The folder cannot be written.
     """
+    title = course.title or course.rubric.title or "Class"
     stems = file_names([_identity(entry, stem=True) for entry in entries])
     shown = [_with_files(entry, stem, output) for entry, stem in zip(entries, stems, strict=True)]
     drawn = any(entry.counting and entry.counting.redrawn_name for entry in shown)
@@ -71,7 +120,7 @@ def write_class(
     notes: list[str] = []
     names = distinct((sheet.path.name for sheet in course.worksheets), "{1}-{0}")
     for sheet, name in zip(course.worksheets, names, strict=True):
-        made, said = exports.filled(sheet, entries, register, course.column, texts)
+        made, said = filled(sheet, entries, course.register, course.column, texts)
         contents[f"{GRADES}/{name}"] = made.content()
         notes += said
     write_all({output / name: content for name, content in contents.items()})
@@ -142,3 +191,204 @@ def nameless(entry: Entry, pseudonym: str) -> Entry:
         pseudonym, "", one, (), entry.handed_in, entry.late_s, entry.deduction,
         total=entry.total, of=entry.of, flags=("Flagged.",) * bool(entry.flags),
     )  # fmt: skip
+
+
+# ------------------------------------------------------------------ the class table
+
+
+def csv_text(entries: Sequence[Entry]) -> str:
+    """Lay out a class as CSV, for Excel and LibreOffice.
+
+    Points of the items are those that count, the instructor's where there are some.
+
+    Returns
+    -------
+    str
+        Begins with the byte order mark by which Excel knows UTF-8; lines end with CRLF. Write it
+        without translating line ends.
+    """
+    items, numbers = columns(entries)
+    head = tuple(map(neutral, (*FIRST, *items, *numbers, *LAST)))
+    rows = []
+    for entry in entries:
+        one = entry.counting
+        points = {item.title: item.points for item in one.items} if one else {}
+        row: list[str | float | None] = [
+            one.submission if one else "", entry.student, None, one.status if one else "missing",
+            one.counted if one else None, one.points if one and one.counted is None else None,
+            entry.of, entry.deduction or None, entry.total,
+            *map(points.get, items),
+            *(one.numbers.get(title) if one else None for title in numbers),
+            entry.handed_in, None if entry.late_s is None else entry.late_s / 3600.0,
+            one.pending if one else "", entry.comment, BETWEEN.join(entry.flags),
+            BETWEEN.join(other.submission for other in entry.others),
+            BETWEEN.join(one.verdict.reasons) if one else "", one.log_sha256 if one else "",
+        ]  # fmt: skip
+        cells = [neutral(part) if isinstance(part, str) else number(part) for part in row]
+        cells[FIRST.index("id")] = neutral_id(entry.student_id)
+        rows.append(tuple(cells))
+    return "\ufeff" + Sheet(Path(), head, tuple(rows)).text
+
+
+# ------------------------------------------------------------------ feedback
+
+
+def returned_text(entry: Entry, class_name: str = "") -> str:
+    """Plain text for one student: points and why, what being late costs, and the instructor's word.
+
+    Flags and remarks are for the instructor and are not in it.
+    """
+    graded = entry.counting
+    lines = [class_name] if class_name else []
+    if graded is None:
+        lines += ["Nothing was handed in.", ""]
+    else:
+        # a total that the instructor has said leaves no proposal beside it
+        lines += _feedback(graded, final=TOTAL in entry.overrides and entry.total is not None)
+    if entry.deduction:
+        hours = (entry.late_s or 0.0) / 3600.0
+        off = number(entry.deduction)
+        lines.append(f"Handed in {hours:.1f} hours late: {off} points taken off.")
+    if entry.total is not None and (entry.deduction or TOTAL in entry.overrides):
+        lines.append(f"Total    {number(entry.total)} of {number(entry.of)}")
+    if entry.comment:
+        lines += ["", "From your instructor:", "", entry.comment]
+    return "\n".join(lines).rstrip("\n") + "\n"
+
+
+def _feedback(graded: Graded, final: bool) -> list[str]:
+    """The points, and why."""
+    who = ", ".join(filter(None, map(text_of, (graded.student, graded.student_id))))
+    lines = [f"Report   {text_of(graded.submission)}", *([f"Student  {who}"] if who else [])]
+    points = f"{number(graded.points)} of {number(graded.of)}"
+    if graded.counted is None:
+        points = f"pending: they do not count yet (as it is: {points})"
+    proposed = bool(graded.items) and not final
+    lines += [f"Points   {points}"] if proposed else []
+    lines += ["", *_wrapped(verdict_text(graded.verdict)), ""]
+    for item in graded.items:
+        lines.append(f"{number(item.points)} of {number(item.of)}  {text_of(item.title)}")
+        lines += [f"    {line}" for line in _wrapped(item.comment, 84)]
+    return [*lines, *(["", *_wrapped(NEXT)] if proposed else []), ""]
+
+
+def verdict_text(verdict: Verdict) -> str:
+    """What verification found, and what to do about it, for the student."""
+    said = FOUND[verdict.status]
+    if verdict.status == "verified":
+        return f"{said}."
+    reasons = (text_of(one).rstrip(".") for one in verdict.reasons[:NAMED])
+    said = f"{said}: {'; '.join(filter(None, reasons))}"
+    if verdict.missing:
+        return f"{said}. Hand in {text_of(verdict.missing)}, if your instructor does not have it."
+    return f"{said}. {AGAIN}"
+
+
+def _wrapped(text: str, width: int = 88) -> list[str]:
+    return textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False)
+
+
+# ------------------------------------------------------------------ platforms' tables
+
+
+def grade_column(sheet: Sheet, wanted: str) -> int:
+    """Where the grade goes.
+
+    Parameters
+    ----------
+    wanted : str
+        Title of the column, of Canvas without its number; "" where there is only one.
+
+    Raises
+    ------
+    SettingsError
+        There is none, or several and none was named.
+    """
+    titles = {
+        at: title
+        for at, title in enumerate(sheet.head)
+        if not any(READ_ONLY in row[at] for row in sheet.rows[:3])
+    }
+    usual = sheet.column(GRADE)
+    assignments = [at for at in titles if ASSIGNMENT.search(titles[at])]
+    named = [at for at, title in titles.items()
+             if folded(wanted) in (folded(title), folded(ASSIGNMENT.sub("", title)))]  # fmt: skip
+    found = assignments if usual is None else [usual]
+    # the title may be meant for another table than Moodle's
+    if wanted and (named or sheet.column(("identifier",)) is None):
+        found = named
+    if len(found) == 1:
+        return found[0]
+    several = "several columns for the grade" if found else "no column for the grade"
+    shown = (ASSIGNMENT.sub("", titles[at]) for at in assignments or titles)
+    others = one_line(", ".join(one_line(title, 40) for title in shown), 300)
+    raise SettingsError(f"{sheet.path}: {several}", f"Name one with --column: {others}.")
+
+
+def filled(
+    sheet: Sheet, entries: Sequence[Entry], register: Register, column: str, feedback: Sequence[str]
+) -> tuple[Sheet, tuple[str, ...]]:
+    """Enter the grades of a class into a platform's table, and say what could not be entered.
+
+    Parameters
+    ----------
+    entries : sequence of Entry
+        The first ones of the people in ``register``, in its order.
+    column : str
+        As :func:`grade_column` takes it.
+    feedback : sequence of str
+        What the student of each entry reads.
+
+    Raises
+    ------
+    SettingsError
+        From :func:`grade_column`.
+    """
+    place, comments = grade_column(sheet, column), sheet.column(COMMENTS)
+    as_read = neutral if sheet.column(HTML_COMMENTS) is None else as_html
+    cells = [list(row) for row in sheet.rows]
+    comma = any(re.fullmatch(r"\d+,\d+", cell.strip()) for row in cells for cell in row)
+    notes, seen = [], set()
+    for row in cells:
+        person = person_of_row(sheet, row)
+        at = register.place(person) if person else None
+        if at is None:
+            continue
+        seen.add(at)
+        total = entries[at].total
+        if total is None:
+            continue
+        most = _most(sheet, row, place)
+        if most is not None and total > most:
+            notes.append(
+                f"{sheet.path.name}: {number(total)} points of {_who(entries[at])} are more than "
+                f"the platform's {number(most)}, and will not be taken: change its maximum."
+            )
+        row[place] = number(total).replace(".", "," if comma else ".")
+        if comments is not None and comments != place:
+            row[comments] = as_read(feedback[at])
+    left = [_who(entries[at]) for at in range(len(register.people))
+            if at not in seen and entries[at].total is not None]  # fmt: skip
+    if left:
+        notes.append(f"{sheet.path.name}: it has no row for {few_words(left, 4)}.")
+    return replace(sheet, rows=tuple(map(tuple, cells))), tuple(notes)
+
+
+def _most(sheet: Sheet, row: Sequence[str], place: int) -> float | None:
+    """The most points that the platform takes, where the table says it."""
+    possible = (one[place] for one in sheet.rows[:3] if "points possible" in one[0].casefold())
+    return decimal(next(possible, sheet.cell(row, MAX_GRADE)))
+
+
+def _who(entry: Entry) -> str:
+    return one_line(entry.student or entry.student_id, 40)
+
+
+def as_html(text: str) -> str:
+    r"""Plain text for a field that is shown as HTML, in which nothing of it is markup.
+
+    >>> as_html("a <b>\n 1")
+    'a &lt;b&gt;<br>&nbsp;1'
+    """
+    lines = html.escape(text, quote=False).rstrip("\n").split("\n")
+    return "<br>".join(re.sub(r"^ +", lambda m: "&nbsp;" * len(m[0]), line) for line in lines)

@@ -21,8 +21,7 @@ from px4fuse.results.reading import read_results
 from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import Refused, Verdict
 from px4fuse.verification.pages import MEMORY_BYTES, TIMEOUT_S, pictures
-from px4fuse.verification.rerun import log_sha256
-from px4fuse.verification.verification import verify
+from px4fuse.verification.verification import log_sha256, verify
 from px4fuse.verification.workers import bounded
 from px4fuse.writing import write_all
 
@@ -46,8 +45,6 @@ class VerificationRecord:
     files : dict
         SHA-256 of every file that the report rests on, and whether it was "here", "handed out" by
         the answer key and not at hand, which is the instructor's gap, or "away".
-    page : int
-        Which page the picture of what was handed in shows, counted from 1.
     """
 
     made_with: dict[str, str]
@@ -55,7 +52,6 @@ class VerificationRecord:
     results: str = ""
     files: dict[str, str] = field(default_factory=dict)
     verdict: Verdict | None = None
-    page: int = 1
 
 
 def file_of(records: Path, sha256: str, end: str = ".json") -> Path:
@@ -65,7 +61,7 @@ def file_of(records: Path, sha256: str, end: str = ".json") -> Path:
 
 def verified(
     records: Path, pdf: bytes, logs: Mapping[str, Path], handed_out: frozenset[str]
-) -> tuple[tuple[Reported, Verdict, int] | Refused, bool]:
+) -> tuple[tuple[Reported, Verdict] | Refused, bool]:
     """Read and verify a report, or recall what an earlier run found.
 
     Parameters
@@ -80,7 +76,7 @@ def verified(
 
     Returns
     -------
-    (results, verdict, page to show), or Refused
+    (results, verdict), or Refused
     recalled : bool
     """
     sha256 = hashlib.sha256(pdf).hexdigest()
@@ -95,10 +91,9 @@ def verified(
     rests_on = _files(results, logs, handed_out)
     gap = rests_on.get(log_sha256(report.results)) == "handed out"
     verdict = verify(report, {} if gap else logs)
-    page = max(verdict.pages, key=lambda one: (one.picture, one.words)).page if verdict.pages else 1
     parts: dict[str, bytes] = {}
     if verdict.pages or not verdict.redrawn:
-        handed_in = bounded(partial(pictures, page=page - 1), pdf, TIMEOUT_S, MEMORY_BYTES)
+        handed_in = bounded(partial(pictures, page=verdict.page - 1), pdf, TIMEOUT_S, MEMORY_BYTES)
         if isinstance(handed_in, tuple) and handed_in:
             parts[HANDED_IN] = handed_in[0]
     if verdict.redrawn:
@@ -107,9 +102,9 @@ def verified(
         parts |= {PAGE.format(at): made for at, made in enumerate(shown, start=1)}
         parts[REDRAWN] = verdict.redrawn
     unread = replace(verdict, redrawn=b"")
-    kept = VerificationRecord(_versions(), None, results, rests_on, unread, page)
+    kept = VerificationRecord(_versions(), None, results, rests_on, unread)
     _keep(records, sha256, kept, parts)
-    return (report.results, unread, page), False
+    return (report.results, unread), False
 
 
 def _files(results: str, logs: Mapping[str, Path], handed_out: frozenset[str]) -> dict[str, str]:
@@ -138,7 +133,7 @@ def _keep(records: Path, sha256: str, kept: VerificationRecord, parts: Mapping[s
 
 def _recalled(
     records: Path, sha256: str, logs: Mapping[str, Path], handed_out: frozenset[str]
-) -> tuple[Reported, Verdict, int] | Refused | None:
+) -> tuple[Reported, Verdict] | Refused | None:
     """What an earlier run found, if nothing that it rests on has changed."""
     try:
         kept = msgspec.json.decode(file_of(records, sha256).read_bytes(), type=VerificationRecord)
@@ -151,4 +146,4 @@ def _recalled(
     same = kept.files == _files(kept.results, logs, handed_out)
     if not same or not isinstance(results, ComparisonResults | LoopResults):
         return None
-    return results, kept.verdict, kept.page
+    return results, kept.verdict

@@ -1,6 +1,23 @@
-"""What was handed in: PDFs in folders and in zip files as learning platforms export them.
+"""What was handed in, by whom and when: PDFs in folders and in zip files as platforms export them.
 
 Nothing is unpacked to disk. Names from a zip file are shown and never used as paths.
+
+A student chooses the name of the file and what is in a zip file, and nothing outside of it: what
+the platform wrote stands first in a path, and the first match is taken.
+
+Sources of the names:
+
+- Moodle: ``mod/assign/feedback/file/importziplib.php`` of its repository, which reads the names
+  back: ``{full name}_{participant}_assignsubmission_{plugin}_``, since 4.1 without the last ``_``.
+- Canvas: "How do I download all student submissions for an assignment?", Instructor Guide:
+  ``{surnamefirst}[_LATE]_{user}_{submission}_{file}``.
+- Blackboard Learn: "Download assignments", Instructor Help:
+  ``{assignment}_{user name}_attempt_{year-month-day-hour-minute-second}_{file}``.
+- Gradescope: "Exporting submissions", Help Center: ``submission_{number}``, and beside them
+  ``submission_metadata.yml`` with names, ids (``:sid:``) and times.
+- ILIAS: multi-feedback of ``components/ILIAS/Exercise`` in its repository:
+  ``{last}_{first}_{login}_{user}/``, where a late file's name begins with "Late Submission - " if
+  the instructor's language is English; in others only ``--due`` tells.
 """
 
 import re
@@ -8,17 +25,17 @@ import stat
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO
 
-from px4fuse.assignment.roster import distinct
+from px4fuse.assignment.roster import Person, distinct
 from px4fuse.errors import SettingsError
-from px4fuse.grading.model import Submission
-from px4fuse.grading.platforms import METADATA, ExportOrigin, gradescope_metadata, origins_of
+from px4fuse.grading.model import NOBODY, ExportOrigin, Submission
 from px4fuse.reading import files_below
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification.intake import MAX_BYTES
@@ -38,6 +55,30 @@ ZIP_EPOCH = 1980
 _TOO_LARGE = f"larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB."
 _ENCRYPTED = 1
 _UTF8 = 0x800
+METADATA = "submission_metadata.yml"
+# By platform: how its exports name files
+PLATFORMS = {
+    "moodle": re.compile(
+        r"(?P<name>[^/]+?)_(?P<number>\d+)_assignsubmission_[a-z]+(?P<rest>_?(?:/|$)|_[^/]*$)"
+    ),
+    "canvas": re.compile(
+        r"(?P<name>[^\W\d_][^/_]*)(?P<late>_LATE)?_(?P<number>\d+)_\d+_[^/]+(?:/|$)"
+    ),
+    "blackboard": re.compile(
+        r"[^/]*?_(?P<login>[^/_]+)_attempt_(?P<time>\d{4}-\d\d-\d\d-\d\d-\d\d-\d\d)(?:_[^/]*|\.[^/.]+)$"
+    ),
+    "gradescope": re.compile(r"submission_(?P<number>\d+)(?:/|\.pdf$)"),
+    # a login has a letter, and a number is not a year: "flight_lab_reports_2026/" is a folder
+    "ilias": re.compile(
+        r"(?P<last>[^\W\d_][^/_]*)_(?P<first>[^\W\d_][^/_]*)_(?P<login>[^/]*[^\W\d_][^/]*)"
+        r"_(?P<number>(?!(?:19|20)\d\d/)\d+)/(?P<late>Late Submission - )?"
+    ),
+}
+# What a platform writes into a name once, and nobody else by chance
+_PARTS = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")
+TIME_IN_NAMES = "%Y-%m-%d-%H-%M-%S"
+_SUBMISSION = re.compile(r"^(?:submission_)?(\d+)(?:\.pdf)?:\s*\n((?:[ -].*\n?)*)", re.MULTILINE)
+_SUBMITTERS = re.compile(r"^  :submitters:\s*\n((?:  - .*\n?|    .*\n?)*)", re.MULTILINE)
 
 
 class _EntryError(Exception):
@@ -111,14 +152,34 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
         found.values(), key=lambda one: (one.name.casefold(), one.name, one.file, one.entry)
     )
     names = distinct(_shown(one.name) for one in order)
-    exports = [
-        (one.file if one.entry else None, name) for one, name in zip(order, names, strict=True)
-    ]
-    made = (
-        replace(one, name=name, origin=origin)
-        for one, name, origin in zip(order, names, origins_of(exports, people), strict=True)
-    )
-    return tuple(made), tuple(notes)
+    named = [replace(one, name=name) for one, name in zip(order, names, strict=True)]
+    return tuple(with_origins(named, people)), tuple(notes)
+
+
+def with_origins(
+    those: Sequence[Submission], people: Mapping[str, ExportOrigin]
+) -> Iterator[Submission]:
+    """Submissions with who handed in each, and by which platform.
+
+    An export is of one platform: that of most of its files. What a student called a file, in the
+    way of another platform, says nothing.
+
+    Parameters
+    ----------
+    people : mapping
+        Of Gradescope's metadata, by number of a submission.
+    """
+    exports = [one.file if one.entry else one.name.partition("/")[0] for one in those]
+    counted: dict[object, Counter[str]] = defaultdict(Counter)
+    for export, one in zip(exports, those, strict=True):
+        counted[export].update(filter(None, [origin_of(one.name).platform]))
+    for export, one in zip(exports, those, strict=True):
+        origin = origin_of(one.name, [platform for platform, _ in counted[export].most_common(1)])
+        if origin.platform in ("gradescope", ""):
+            # PDF assignments are exported as 123456.pdf
+            stem = one.name.rpartition("/")[2].casefold().removesuffix(".pdf")
+            origin = people.get(origin.person.numbers.get("gradescope", stem), origin)
+        yield replace(one, origin=origin)
 
 
 def read(submission: Submission) -> bytes | Refused:
@@ -268,3 +329,80 @@ def _shown(name: str) -> str:
     if len(line) > MAX_NAME:
         line = f"{line[: MAX_NAME // 2]}…{line[-(MAX_NAME - MAX_NAME // 2 - 1) :]}"
     return line or "nameless"
+
+
+# ------------------------------------------------------------------ who and when, as platforms say
+
+
+def origin_of(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> ExportOrigin:
+    """Who handed a file in, by its path in the export.
+
+    >>> origin_of("Doe Jane_4711_assignsubmission_file_/report.pdf").person.name
+    'Doe Jane'
+    >>> origin_of("doejane_LATE_12345_67890_report-1.pdf").person.numbers
+    {'canvas': '12345'}
+    >>> origin_of("Lab 3_jdoe_attempt_2026-11-20-12-34-56_report.pdf").time
+    datetime.datetime(2026, 11, 20, 12, 34, 56)
+    >>> origin_of("report.pdf") == ExportOrigin()
+    True
+    """
+    parts = name.split("/")
+    for index in range(len(parts)):
+        tail = "/".join(parts[index:])
+        for platform in platforms:
+            match = PLATFORMS[platform].match(tail)
+            if match is None:
+                continue
+            said = {key: value or "" for key, value in match.groupdict().items()}
+            stamp = said.get("time", "")
+            try:
+                time = datetime.strptime(stamp, TIME_IN_NAMES) if stamp else None
+            except ValueError:  # a 99th month: a student's own name
+                continue
+            whole = said.get("name") or f"{said.get('first', '')} {said.get('last', '')}".strip()
+            numbers = {platform: said["number"]} if "number" in said else {}
+            person = Person("", whole, "", said.get("login", ""), numbers)
+            imitated = len(_PARTS.findall(name)) > (platform in ("moodle", "blackboard"))
+            return ExportOrigin(platform, person, time, bool(said.get("late")), imitated)
+    return NOBODY
+
+
+def gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
+    r"""People and times of Gradescope's ``submission_metadata.yml``, by number of submission.
+
+    Only what stands where Gradescope writes it: outputs of autograders are in it as well, deeper.
+    Of a group the first member is named.
+
+    >>> text = "submission_7:\n  :submitters:\n  - :name: Ada\n    :sid: '12'\n"
+    >>> gradescope_metadata(text)["7"].person.student_id
+    '12'
+    """
+    found = {}
+    for number, block in _SUBMISSION.findall(text.replace("\r\n", "\n")):
+        people = _SUBMITTERS.search(block)
+        name, student_id, email = (
+            _value(people[1] if people else "", rf"  (?:- |  ):{key}")
+            for key in ("name", "sid", "email")
+        )
+        person = Person(student_id, name, email, "", {"gradescope": number})
+        found[number] = ExportOrigin("gradescope", person, _time_of(_value(block, "  :created_at")))
+    return found
+
+
+def _value(block: str, key: str) -> str:
+    """The first value of a key, without quotes."""
+    match = re.search(rf"^{key}: *(['\"]?)(.*)\1 *$", block, re.MULTILINE)
+    return match[2] if match else ""
+
+
+def _time_of(value: str) -> datetime | None:
+    """A time as YAML of Gradescope has it, with its zone.
+
+    >>> _time_of("2026-11-20 12:34:56.123456000 Z").isoformat()
+    '2026-11-20T12:34:56.123456+00:00'
+    """
+    try:
+        found = datetime.fromisoformat(re.sub(r" (?=Z|[+-]\d)", "", value))
+    except ValueError:
+        return None
+    return found if found.tzinfo else found.replace(tzinfo=UTC)

@@ -9,12 +9,11 @@ drawn again. A file that another program saved again is therefore as good as the
 as its results are still attached.
 """
 
-import hashlib
 import io
 import logging
 import re
 import zlib
-from dataclasses import dataclass, field
+from collections.abc import Iterator
 from typing import Any
 
 import pypdf
@@ -87,15 +86,6 @@ _STREAM = re.compile(rb"(?<!end)stream *\r?\n?")
 logging.getLogger("pypdf").setLevel(logging.CRITICAL + 1)
 
 
-@dataclass
-class _Contents:
-    """What the walk over a document met."""
-
-    files: list[DictionaryObject] = field(default_factory=list)
-    embedded: list[StreamObject] = field(default_factory=list)
-    found: set[str] = field(default_factory=set)
-
-
 def read_report(pdf: bytes, name: str) -> Report | Refused:
     """Read a report that was handed in.
 
@@ -116,12 +106,11 @@ def read_report(pdf: bytes, name: str) -> Report | Refused:
     except ResultsError as refusal:
         return Refused(f"{refusal.reason}.", refusal.remedy)
     if not isinstance(results, ComparisonResults | LoopResults):
-        alone = isinstance(results, AidsResults)
-        held = (
-            "the aids of EKF2 alone, nothing of our filter" if alone else "no results of a report"
-        )
+        held = "no results of a report"
+        if isinstance(results, AidsResults):
+            held = "the aids of EKF2 alone, nothing of our filter"
         return Refused(f"{one_line(name, 200)}: {RESULTS_NAME} in it holds {held}.")
-    return Report(hashlib.sha256(pdf).hexdigest(), results, pdf)
+    return Report(results, pdf)
 
 
 def attached_results(pdf: bytes, name: str) -> Results:
@@ -144,11 +133,7 @@ def attached_results(pdf: bytes, name: str) -> Results:
                 raise ResultsError(_LOCKED)
             if not 0 < len(reader.pages) <= MAX_PAGES:
                 raise ResultsError(f"a PDF without pages, or with more than {MAX_PAGES}.")
-            contents = _walk(reader)
-            if contents.found:
-                found = ", ".join(sorted(contents.found))
-                raise ResultsError(f"it contains {found}; no report does.")
-            return read_results(_attachment(contents), f"{RESULTS_NAME} in it")
+            return read_results(_attachment(reader), f"{RESULTS_NAME} in it")
     except ResultsError as refusal:
         reason, remedy = refusal.reason, refusal.remedy
     except (LimitReachedError, RecursionError, MemoryError):
@@ -183,9 +168,8 @@ def _inflated_bytes(pdf: bytes, start: int, limit: int) -> int:
         return 0  # RFC 1950, section 2.2: not zlib data
     inflate = zlib.decompressobj()
     taken = given = 0
-    feed = b""
     while not inflate.eof and max(taken, given) <= limit:
-        if not feed:
+        if not (feed := inflate.unconsumed_tail):
             feed = pdf[start + taken : start + taken + 16_384]
             taken += len(feed)
         if not feed:
@@ -194,18 +178,18 @@ def _inflated_bytes(pdf: bytes, start: int, limit: int) -> int:
             given += len(inflate.decompress(feed, 1_000_000))
         except zlib.error:  # pypdf, told not to repair, has no more use for it
             break
-        feed = inflate.unconsumed_tail
     taken -= len(inflate.unused_data)
     # the least is what a try costs, however little is there
     return min(max(taken, given, 1000), limit + 1)
 
 
-def _walk(reader: pypdf.PdfReader) -> _Contents:
-    """Look at everything that a viewer can reach, each object once, without decoding it."""
-    contents = _Contents()
+def _dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObject, bool]]:
+    """All that a viewer can reach, each object once, without decoding it.
+
+    With whether a viewer comes there by a click alone: the action of a link or of an outline.
+    """
     seen: set[tuple[IndirectObject, bool]] = set()
     missing = values = 0
-    # with whether a viewer comes there by a click alone: the action of a link or of an outline
     left: list[tuple[Any, bool]] = [(reader.trailer, False)]
     while left:
         value, clicked = left.pop()
@@ -214,7 +198,10 @@ def _walk(reader: pypdf.PdfReader) -> _Contents:
             if (value, clicked) in seen:
                 continue
             seen.add((value, clicked))
-            listed = _is_listed(reader, value.idnum, value.generation)
+            # in the cross-reference table, so that no search is needed for it
+            number, generation = value.idnum, value.generation
+            packed = generation == 0 and number in reader.xref_objStm
+            listed = packed or number in reader.xref.get(generation, {})
             missing += not listed
             if len(seen) > MAX_OBJECTS or missing > MAX_MISSING:
                 raise ResultsError(_COSTLY)
@@ -223,46 +210,30 @@ def _walk(reader: pypdf.PdfReader) -> _Contents:
         if values > MAX_VALUES:
             raise ResultsError(_COSTLY)
         if isinstance(value, DictionaryObject):
-            _look_at(value, contents)
-            if not clicked and _name(value.get("/S")) == "/URI":
-                contents.found.add("an action that opens an address")
+            yield value, clicked
             left.extend((value.raw_get(key), key == "/A") for key in value)
         elif isinstance(value, ArrayObject):
             left.extend((each, False) for each in list.__iter__(value))
-    return contents
 
 
-def _is_listed(reader: pypdf.PdfReader, number: int, generation: int) -> bool:
-    """Whether the cross-reference table has an object, so that no search is needed for it."""
-    return number in reader.xref.get(generation, {}) or (
-        generation == 0 and number in reader.xref_objStm
-    )
-
-
-def _look_at(value: DictionaryObject, contents: _Contents) -> None:
-    """Note what a dictionary has that a report has not."""
-    contents.found.update(key[1:] for key in value if _KEYS.fullmatch(key))
-    action = _name(value.get("/S")) or ""
+def _foreign(value: DictionaryObject, clicked: bool) -> Iterator[str]:
+    """What a dictionary has that a report has not."""
+    yield from (key[1:] for key in value if _KEYS.fullmatch(key))
+    action, kind = _name(value.get("/S")) or "", _name(value.get("/Type"))
     if _ACTIONS.fullmatch(action):
-        contents.found.add(action[1:])
-    if "/EF" in value:
-        contents.files.append(value)
-        versions = _resolved(value.get("/EF"))
-        parts = map(_resolved, versions.values() if isinstance(versions, DictionaryObject) else ())
-        contents.embedded += [part for part in parts if isinstance(part, StreamObject)]
-    elif _name(value.get("/Type")) in {"/Filespec", "/F"}:
-        contents.found.add("a reference to another file")
-    if isinstance(value, StreamObject):
-        if _name(value.get("/Type")) == "/EmbeddedFile":
-            contents.embedded.append(value)
-        if "/F" in value:
-            contents.found.add("a reference to another file")
+        yield action[1:]
+    if action == "/URI" and not clicked:
+        yield "an action that opens an address"
+    stream = isinstance(value, StreamObject)
+    if ("/EF" not in value and kind in {"/Filespec", "/F"}) or (stream and "/F" in value):
+        yield "a reference to another file"
+    if stream:
         filters = _resolved(value.get("/Filter"))
         names = list(filters) if isinstance(filters, ArrayObject) else [filters]
         used = [_name(each) for each in names if each is not None]
         if not _FILTERS.issuperset(used) or len(set(used)) != len(used):
             listed = " ".join(each or "?" for each in used[:3])
-            contents.found.add(f"a stream packed by other means ({one_line(listed, 60)})")
+            yield f"a stream packed by other means ({one_line(listed, 60)})"
 
 
 def _resolved(value: object) -> object:
@@ -274,25 +245,37 @@ def _name(value: object) -> str | None:
     return str(value) if isinstance(value, str) else None
 
 
-def _attachment(contents: _Contents) -> bytes:
+def _attachment(reader: pypdf.PdfReader) -> bytes:
     """Bytes of the one attached file; its name is compared and used for nothing else."""
-    if not contents.files and not contents.embedded:
+    files: list[DictionaryObject] = []
+    streams: dict[int, StreamObject] = {}
+    found: set[str] = set()
+    for value, clicked in _dictionaries(reader):
+        found.update(_foreign(value, clicked))
+        parts: list[object] = [value] if _name(value.get("/Type")) == "/EmbeddedFile" else []
+        if "/EF" in value:
+            files.append(value)
+            versions = _resolved(value.get("/EF"))
+            parts += versions.values() if isinstance(versions, DictionaryObject) else ()
+        held = map(_resolved, parts)
+        streams |= {id(part): part for part in held if isinstance(part, StreamObject)}
+    if found:
+        raise ResultsError(f"it contains {', '.join(sorted(found))}; no report does.")
+    if not files and not streams:
         raise ResultsError(
             f"no {RESULTS_NAME} is attached: not a report of px4fuse, or one that was printed to "
             "PDF, which leaves the results out. Hand in the original file that px4fuse wrote."
         )
-    streams = {id(stream): stream for stream in contents.embedded}
-    if len(contents.files) != 1 or len(streams) != 1:
+    if len(files) != 1 or len(streams) != 1:
         raise ResultsError(
             "more than one file is attached, or none that can be read: hand in one report per PDF."
         )
-    file = contents.files[0]
+    (file,), (stream,) = files, streams.values()
     names = {str(_resolved(file.get(key))) for key in ("/UF", "/F", "/DOS", "/Mac", "/Unix")
              if key in file}  # fmt: skip
     if names != {RESULTS_NAME}:
         shown = one_line(" / ".join(sorted(names)), 80)
         raise ResultsError(f"the attached file is called {shown!r}, not {RESULTS_NAME!r}.")
-    (stream,) = streams.values()
     data = bytes(stream.get_data())
     if len(data) > MAX_ATTACHMENT_BYTES:
         limit = MAX_ATTACHMENT_BYTES // 1_000_000

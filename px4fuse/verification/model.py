@@ -16,15 +16,12 @@ class Report:
 
     Attributes
     ----------
-    sha256 : str
-        Of the PDF.
     results : ComparisonResults or LoopResults
         The attached results.
     pdf : bytes
         The file itself.
     """
 
-    sha256: str
     results: Reported
     pdf: bytes = field(repr=False)
 
@@ -115,6 +112,12 @@ class Verdict:
     redrawn: bytes = field(default=b"", repr=False)
     remedy: str = ""
     missing: str = ""
+
+    @property
+    def page(self) -> int:
+        """The page that differs most, counted from 1; the cover where none does."""
+        most = max(self.pages, key=lambda one: (one.picture, one.words), default=None)
+        return most.page if most else 1
 
     @property
     def outcome(self) -> str:

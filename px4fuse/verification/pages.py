@@ -215,11 +215,8 @@ def pictures(pdf: bytes, page: int | None = None) -> tuple[bytes, ...] | Unavail
     tuple of bytes or Unavailable
         PNGs of at most :data:`MAX_PICTURE_BYTES`; none for a page that is not there.
     """
-    return _of_pages(pdf, _picture, slice(None) if page is None else slice(page, page + 1))
-
-
-def _picture(document: Any, page: int) -> bytes:
-    return _small_png(rendered(document[page], WIDTH_PX))
+    which = slice(None) if page is None else slice(page, page + 1)
+    return _of_pages(pdf, lambda sheets, at: _small_png(rendered(sheets[at], WIDTH_PX)), which)
 
 
 def undrawn(error: BaseException) -> Unavailable:

@@ -7,32 +7,45 @@ report with another name on it.
 
 The pages that were handed in prove nothing and are not read: the report is redrawn from what the
 log gives. Pages that look otherwise are named, for somebody to look at.
+
+The recorded request is a stranger's. It is decoded strictly, and the analysis knows the range of
+every value; files are found by their SHA-256 among those that were given, never by name; and
+nothing in it names an output.
 """
 
 import re
+import shutil
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from dataclasses import replace as replaced
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from px4fuse.flight import Unavailable
-from px4fuse.reading import files_by_sha256
-from px4fuse.results.contract import Reported, to_plain
-from px4fuse.results.model import Provenance
-from px4fuse.results.reading import cleaned, one_line
-from px4fuse.verification import rerun
-from px4fuse.verification.model import (
-    Mismatch,
-    PageDifference,
-    PageStatus,
-    Refused,
-    Report,
-    Verdict,
-)
-from px4fuse.verification.pages import NumbersAlike, compare_pages
-from px4fuse.verification.rerun import ADD, Recomputed
+from msgspec.structs import replace
 
+from px4fuse.errors import Px4FuseError, ResultsError, SettingsError
+from px4fuse.flight import Unavailable
+from px4fuse.report.document import Document, LoopDocument
+from px4fuse.results.contract import (
+    ComparisonResults,
+    LoopResults,
+    Reported,
+    to_json,
+    to_plain,
+)
+from px4fuse.results.model import LIBRARIES, Provenance
+from px4fuse.results.reading import cleaned, one_line
+from px4fuse.verification.model import Mismatch, PageStatus, Refused, Report, Status, Verdict
+from px4fuse.verification.pages import NumbersAlike, compare_pages
+
+ADD = "Add {} to --logs."
+ASK = "Ask how the report was made, and for the log and all files that it was made from."
+NOT_OURS = "the recorded request is not one that px4fuse can have made"
+# A flight of ten minutes has 60,000 steps of it, which take half a minute
+MIN_DT_S = 0.01
 LIMIT = "A verified report proves that its numbers belong to the log, not who wrote them."
 NO_LOG = "no log was given, so that no number could be computed again"
 # Sums over a flight differ between machines in the last few of 16 digits; what is left of a
@@ -56,9 +69,25 @@ SHOWN_TEXT = 120
 PRINTED_SCALES = (1.0, 100.0, 1000.0)
 # Of notes that are drawn again; a page holds about 60
 MAX_NOTES_LINES = 5_000
-_NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[+-]?\d+)?")
+_NUMBER = re.compile(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)")
 
-Recompute = Callable[[Reported, Mapping[str, Path]], Recomputed | Refused]
+_Place = Callable[[str, str | None, str], Path]
+
+
+@dataclass(frozen=True)
+class Recomputed:
+    """What the analysis gives now.
+
+    Attributes
+    ----------
+    results : ComparisonResults or LoopResults
+        As a report attaches them.
+    draw : callable
+        Draws the report: with the student, and with the versions, that were recorded.
+    """
+
+    results: Reported
+    draw: Callable[[], bytes]
 
 
 @dataclass(frozen=True)
@@ -68,34 +97,167 @@ class Numbers:
     Attributes
     ----------
     differences : tuple of Mismatch
-        The first of those beyond the tolerances.
-    differing : int
-        How many there are.
-    pairs : tuple of (float, float)
-        Recorded and recomputed numbers that agree within the tolerances and are not the same.
+        What is beyond the tolerances.
+    alike : callable
+        Whether two printed numbers are a recorded number and its recomputed twin, each rounded.
     compared : int
         How many values.
     """
 
     differences: tuple[Mismatch, ...]
-    differing: int
-    pairs: tuple[tuple[float, float], ...]
+    alike: NumbersAlike
     compared: int
+
+
+class FileMissingError(ResultsError):
+    """A file that a report rests on is not among those given; ``missing`` is what it is called."""
+
+    def __init__(self, text: str, missing: str) -> None:
+        super().__init__(text, ADD.format(missing))
+        self.missing = missing
+
+
+def log_sha256(results: Reported) -> str:
+    """SHA-256 of the log that a report is about."""
+    return results.track.sha256 if isinstance(results, LoopResults) else results.log.sha256
+
+
+def log_name(results: Reported) -> str:
+    """Name of the log that a report is about, as the report gives it."""
+    loop = isinstance(results, LoopResults)
+    return split_part(results.track.name)[0] if loop else results.log.name  # type: ignore[union-attr]
+
+
+def recompute(results: Reported, logs: Mapping[str, Path]) -> Recomputed | Refused:
+    """Repeat the analysis from what a report recorded.
+
+    Parameters
+    ----------
+    results : ComparisonResults or LoopResults
+        What is attached to the report.
+    logs : mapping of str to Path
+        Files by their SHA-256.
+
+    Returns
+    -------
+    Recomputed or Refused
+        Refused where the command is not px4fuse's, a file is missing, or the analysis fails.
+    """
+    try:
+        if tuple(results.provenance.libraries) != LIBRARIES:
+            raise ResultsError("the results do not say which libraries they were made with", ASK)
+        with tempfile.TemporaryDirectory(prefix="px4fuse-") as folder:
+            place = partial(_place, logs, Path(folder))
+            if isinstance(results, LoopResults):
+                return _looped(results, place)
+            return _compared(results, place)
+    except SettingsError as error:  # no run with these settings can have made a report
+        return Refused(f"{NOT_OURS}: {error}", ASK)
+    except ResultsError as error:
+        return Refused(error.reason, error.remedy, getattr(error, "missing", ""))
+    except Px4FuseError as error:
+        return Refused(str(error), ASK)
+    except Exception as error:  # noqa: BLE001 - settings made to fail may fail anywhere
+        return Refused(f"the analysis cannot be repeated ({type(error).__name__})", ASK)
+
+
+def _place(
+    logs: Mapping[str, Path], within: Path, recorded: str, sha256: str | None, what: str
+) -> Path:
+    """A file with this content where the analysis finds it, under the recorded name.
+
+    Names are printed in the report. They are those of links in a folder of this run alone, and
+    only where they are plain names.
+    """
+    path = None if sha256 is None else logs.get(sha256)
+    if path is None:
+        asked = f"none of the files given has the SHA-256 of {what}"
+        raise FileMissingError(asked, one_line(recorded, 80) or "its file")
+    name = recorded
+    plain = name == Path(name).name != ".." and "\\" not in name and name.isprintable()
+    if not plain:
+        raise ResultsError(f"{NOT_OURS}: a file name in it is not a plain name", ASK)
+    # each in a folder of its own: two may have one name
+    folder = Path(tempfile.mkdtemp(dir=within))
+    target = folder / name
+    try:
+        target.symlink_to(path.resolve())
+    except OSError:  # on Windows for administrators only
+        shutil.copyfile(path, target)
+    return target
+
+
+def split_part(source: str) -> tuple[str, str]:
+    """File and part of ``LOG:vio``, without a look at any file."""
+    from px4fuse.loop.tracks import PARTS  # noqa: PLC0415
+
+    name, colon, tail = source.rpartition(":")
+    return (name, f":{tail}") if colon and tail in PARTS else (source, "")
+
+
+def _compared(handed_in: ComparisonResults, place: _Place) -> Recomputed:
+    from px4fuse.analysis import run  # noqa: PLC0415
+    from px4fuse.results.build import results  # noqa: PLC0415
+
+    recorded = handed_in.request
+    if recorded.dt_s < MIN_DT_S:
+        raise ResultsError(f"DT is below {MIN_DT_S:g} s, which takes too long to repeat", ASK)
+    joined = {file.role: file.sha256 for file in handed_in.log.joined}
+    request = replace(recorded, log=str(place(recorded.log, handed_in.log.sha256, "the log")))
+    if (mavlink := recorded.mavlink) is not None:
+        placed = place(mavlink, joined.get("mavlink"), "--mavlink")
+        request = replace(request, mavlink=str(placed))
+    if (position := recorded.position) is not None:
+        placed = place(position.path, joined.get("position"), "--position")
+        request = replace(request, position=replace(position, path=str(placed)))
+    analysis = run(request)
+    document = Document(analysis, results(recorded, analysis, handed_in.student))
+    return Recomputed(document.results, partial(_drawn, document, handed_in.provenance))
+
+
+def _looped(handed_in: LoopResults, place: _Place) -> Recomputed:
+    from px4fuse.analysis import run_loop  # noqa: PLC0415
+    from px4fuse.results.build import loop_results  # noqa: PLC0415
+
+    recorded = handed_in.request
+    path, part = split_part(recorded.source)
+    placed = place(path, handed_in.track.sha256, "the log")
+    request = replace(recorded, source=f"{placed}{part}")
+    if recorded.reference is not None:
+        path, part = split_part(recorded.reference)
+        sha256 = handed_in.references[-1].sha256 if handed_in.references else None
+        placed = place(path, sha256, "--reference")
+        request = replace(request, reference=f"{placed}{part}")
+    found = run_loop(request)
+    document = LoopDocument(found, loop_results(recorded, found, handed_in.student))
+    return Recomputed(document.results, partial(_drawn, document, handed_in.provenance))
+
+
+def _drawn(document: Document | LoopDocument, versions: Provenance) -> bytes:
+    """Draw the report with the versions that were recorded."""
+    from px4fuse.report.pdf import render  # noqa: PLC0415
+
+    made = replace(versions, command=document.results.provenance.command)
+    shown = replace(document.results, provenance=made)
+    drawn = replaced(document, results=shown)  # type: ignore[arg-type]
+    return render(drawn, to_json(document.results))
+
+
+# ------------------------------------------------------------------ the verdict
 
 
 def verify(
     report: Report,
-    logs: Sequence[Path] | Mapping[str, Path] = (),
+    logs: Mapping[str, Path],
     *,
-    recompute: Recompute = rerun.recompute,
+    recompute: Callable[[Reported, Mapping[str, Path]], Recomputed | Refused] = recompute,
 ) -> Verdict:
     """Say whether a report's numbers are what its log gives, and draw it again.
 
     Parameters
     ----------
-    logs : sequence of Path, or mapping of str to Path
-        Logs and other recordings, or folders of such; or files by their SHA-256, where many
-        reports share them.
+    logs : mapping of str to Path
+        Logs and other recordings by their SHA-256.
     recompute : callable
         Repeats the analysis.
 
@@ -105,31 +267,25 @@ def verify(
         "verified" where the log gives every number; without a log never. It proves that the
         numbers belong to the log, not who wrote them. ``redrawn`` is the report to read, and
         ``pages`` names those of the PDF that look otherwise.
-
-    Raises
-    ------
-    OSError
-        A log cannot be read.
     """
     theirs, ours = report.results.provenance.px4fuse, metadata.version("px4fuse")
     if theirs != ours:
         named = one_line(theirs, 40)
         why = f"made with px4fuse {named}, this is {ours}"
         return _unknown(Refused(why, f"Run it with px4fuse {named}."))
-    name = one_line(rerun.log_name(report.results), 80) or "its log"
+    name = one_line(log_name(report.results), 80) or "its log"
     if not logs:
         return _unknown(Refused(NO_LOG, ADD.format(name), name))
-    files = logs if isinstance(logs, Mapping) else files_by_sha256(logs)
-    sha256 = rerun.log_sha256(report.results)
-    if sha256 not in files:
+    sha256 = log_sha256(report.results)
+    if sha256 not in logs:
         asked = one_line(sha256, 64) or "none"
-        reason = f"none of the {len(files)} files given is the log, whose SHA-256 is {asked}"
+        reason = f"none of the {len(logs)} files given is the log, whose SHA-256 is {asked}"
         remedy = f"If it is a log of yours, a{ADD.format(name)[1:]}"
         return Verdict("other log", (reason,), False, remedy=remedy, missing=name)
     if report.results.student.notes.count("\n") > MAX_NOTES_LINES:
         reason = f"its notes have more than {MAX_NOTES_LINES} lines, which is no report"
-        return _unknown(Refused(reason, rerun.ASK))
-    again = recompute(report.results, files)
+        return _unknown(Refused(reason, ASK))
+    again = recompute(report.results, logs)
     return _unknown(again) if isinstance(again, Refused) else _with_log(report, again)
 
 
@@ -144,35 +300,27 @@ def _with_log(report: Report, again: Recomputed) -> Verdict:
         reason = "the log gives the same file again, byte for byte"
         return Verdict("verified", (reason, LIMIT), True, page_status="same", redrawn=redrawn)
     numbers = compare_results(to_plain(report.results), to_plain(again.results))
-    alike = _rounding(numbers.pairs)
-    pages = compare_pages(report.pdf, redrawn, lambda one, other: same_words(one, other, alike))
-    first = ", ".join(one.path for one in numbers.differences[:3]) + ", …" * (numbers.differing > 3)
+    wrong, alike = numbers.differences, partial(same_words, alike=numbers.alike)
+    first = ", ".join(one.path for one in wrong[:3]) + ", …" * (len(wrong) > 3)
     reasons = [
-        f"{numbers.differing} of {numbers.compared} values are not what the log gives: {first}"
-        if numbers.differing
+        f"{len(wrong)} of {numbers.compared} values are not what the log gives: {first}"
+        if wrong
         else f"the log gives all {numbers.compared} values again (within {RELATIVE:g}, estimates "
         f"within {ESTIMATE_RELATIVE:g})"
     ]
     page_status: PageStatus = "not compared"
-    differing: tuple[PageDifference, ...] = ()
+    pages = compare_pages(report.pdf, redrawn, alike)
     if isinstance(pages, Unavailable):
         reasons.append(f"the pages were not compared: {pages.reason}. {pages.remedy}")
+        pages = ()
     else:
-        differing, page_status = pages, "differ" if pages else "same"
-        reasons += [f"page {one.page} differs: {one.what}" for one in pages]
-    if differing:
+        page_status = "differ" if pages else "same"
+    reasons += [f"page {one.page} differs: {one.what}" for one in pages]
+    if pages:
         reasons += _other_machine(report.results.provenance, again.results.provenance)
-    if not numbers.differing:
-        reasons.append(LIMIT)
-    return Verdict(
-        "numbers differ" if numbers.differing else "verified",
-        tuple(reasons),
-        True,
-        numbers.differences,
-        page_status,
-        differing,
-        redrawn,
-    )
+    status: Status = "numbers differ" if wrong else "verified"
+    said = (*reasons, *([] if wrong else [LIMIT]))
+    return Verdict(status, said, True, wrong[:SHOWN], page_status, pages, redrawn)
 
 
 def _other_machine(theirs: Provenance, ours: Provenance) -> tuple[str, ...]:
@@ -190,30 +338,30 @@ def compare_results(recorded: Mapping[str, Any], recomputed: Mapping[str, Any]) 
     """Compare every value of two results, of which the first is a stranger's."""
     command = str(recomputed["provenance"]["command"])
     # everything rests on an offset or placement that was estimated
-    everywhere = "auto" in command.split() or "--position" in command.split()
-    wrong: dict[str, tuple[Any, Any]] = {}
-    pairs: list[tuple[float, float]] = []
-    others: list[tuple[str, Any, Any]] = []
-    compared = 0
+    everywhere = not {"auto", "--position"}.isdisjoint(command.split())
     handed_in, made = dict(flattened(recorded)), dict(flattened(recomputed))
-    for path in {**made, **handed_in}:
-        if path.startswith(MACHINE):
-            continue
-        theirs, ours = handed_in.get(path, _ABSENT), made.get(path, _ABSENT)
-        compared += 1
-        if not (is_number(theirs) and is_number(ours)):
-            others.append((path, theirs, ours))
-        elif not _near(path, theirs, ours, everywhere or path.startswith(ESTIMATES)):
-            wrong[path] = theirs, ours
-        elif theirs != ours:
-            pairs.append((float(theirs), float(ours)))
-    rounded = _rounding(pairs)
-    wrong |= {path: (a, b) for path, a, b in others if not _same(a, b, rounded)}
-    found = tuple(
-        Mismatch(one_line(path, SHOWN_TEXT), _shown(theirs), _shown(ours))
-        for path, (theirs, ours) in list(wrong.items())[:SHOWN]
+    pairs = {
+        path: (handed_in.get(path, _ABSENT), made.get(path, _ABSENT))
+        for path in {**made, **handed_in}
+        if not path.startswith(MACHINE)
+    }
+    numbers = {path: pair for path, pair in pairs.items() if all(map(is_number, pair))}
+    near = {
+        path: pair
+        for path, pair in numbers.items()
+        if _near(path, *pair, everywhere or path.startswith(ESTIMATES))
+    }
+    alike = _rounding([(float(one), float(other)) for one, other in near.values() if one != other])
+    wrong = {path: pair for path, pair in numbers.items() if path not in near}
+    wrong |= {
+        path: pair
+        for path, pair in pairs.items()
+        if path not in numbers and not _same(*pair, alike)
+    }
+    found = (
+        Mismatch(one_line(path, SHOWN_TEXT), *map(_shown, pair)) for path, pair in wrong.items()
     )
-    return Numbers(found, len(wrong), tuple(pairs), compared)
+    return Numbers(tuple(found), alike, len(pairs))
 
 
 # Stands where there is nothing
@@ -264,12 +412,10 @@ def same_words(one: str, other: str, alike: NumbersAlike) -> bool:
     """
     if one == other:
         return True
-    numbers, our_numbers = _NUMBER.findall(one), _NUMBER.findall(other)
-    return (
-        _NUMBER.split(one) == _NUMBER.split(other)
-        and len(numbers) == len(our_numbers)
-        and all(a == b or alike(a, b) for a, b in zip(numbers, our_numbers, strict=True))
-    )
+    # every second part is a number
+    parts, others = _NUMBER.split(one), _NUMBER.split(other)
+    numbers = zip(parts[1::2], others[1::2], strict=False)
+    return parts[::2] == others[::2] and all(a == b or alike(a, b) for a, b in numbers)
 
 
 def _rounding(pairs: Sequence[tuple[float, float]]) -> NumbersAlike:

@@ -108,23 +108,18 @@ def run_bounded(
         they finish.
     """
     waiting = list(range(len(jobs)))[::-1]
-    workers: list[_Worker] = []
-
-    def drop(worker: _Worker) -> None:
-        workers.remove(worker)
-        worker.end()
-
+    workers: dict[Connection, _Worker] = {}
     try:
         while waiting or workers:
             while waiting and len(workers) < (processes or os.cpu_count() or 1):
                 # given now, sent when the process is ready: a start that fails costs one job
-                workers.append(_Worker(function, memory_bytes, waiting.pop()))
+                started = _Worker(function, memory_bytes, waiting.pop())
+                workers[started.pipe] = started
             # the latest when somebody's time is up
-            soonest = min(worker.deadline for worker in workers)
-            pipes = [worker.pipe for worker in workers]
-            answered = wait(pipes, max(0.0, soonest - time.monotonic()))
-            for worker in list(workers):
-                if worker.pipe in answered:
+            soonest = min(worker.deadline for worker in workers.values())
+            answered = wait(workers, max(0.0, soonest - time.monotonic()))
+            for pipe, worker in list(workers.items()):
+                if pipe in answered:
                     sound, result = _received(worker)
                     if sound and not worker.ready:
                         worker.ready = True
@@ -132,28 +127,24 @@ def run_bounded(
                         yield worker.job, result
                         worker.jobs_done += 1
                         if not sound or worker.jobs_done >= JOBS_PER_WORKER or not waiting:
-                            drop(worker)
+                            workers.pop(pipe).end()
                             continue
                         worker.job = waiting.pop()
                     worker.deadline = time.monotonic() + timeout_s
                     # a process that died in between shows at the next look at its pipe
                     with suppress(BrokenPipeError, ConnectionResetError):
-                        worker.pipe.send(jobs[worker.job])
+                        pipe.send(jobs[worker.job])
                 elif time.monotonic() >= worker.deadline:
                     limit = timeout_s if worker.ready else START_S
-                    failed = Failed(f"it took longer than {limit:g} s and was ended.")
-                    drop(worker)
-                    yield worker.job, failed
+                    workers.pop(pipe).end()
+                    yield worker.job, Failed(f"it took longer than {limit:g} s and was ended.")
     finally:
-        for worker in workers:
+        for worker in workers.values():
             worker.end()
 
 
 def bounded(
-    function: Callable[[Job], Result],
-    job: Job,
-    timeout_s: float,
-    memory_bytes: int = MEMORY_BYTES,
+    function: Callable[[Job], Result], job: Job, timeout_s: float, memory_bytes: int = MEMORY_BYTES
 ) -> Result | Failed:
     """One call in a process of its own, within bounds: see :func:`run_bounded`."""
     work = run_bounded(function, [job], timeout_s=timeout_s, memory_bytes=memory_bytes)
@@ -218,8 +209,7 @@ def _limit_memory(memory_bytes: int | None) -> None:
     except ImportError:
         return
     # a crash leaves no memory image of a student's file behind
-    with suppress(ValueError, OSError):
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    if memory_bytes is not None:
-        with suppress(ValueError, OSError):  # macOS refuses some values
-            resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
+    for kind, most in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_AS, memory_bytes)):
+        if most is not None:
+            with suppress(ValueError, OSError):  # macOS refuses some values
+                resource.setrlimit(kind, (most, most))

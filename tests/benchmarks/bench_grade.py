@@ -30,12 +30,13 @@ from px4fuse.simulation.scenario import Scenario
 GRADE = """
 import json, re, resource, sys, time
 from pathlib import Path
+from px4fuse.grading.entries import Course
 from px4fuse.grading.grade import grade
 from px4fuse.grading.rubric import read_rubric
 if __name__ == "__main__":
     reports, logs, output, rubric = (Path(word) for word in sys.argv[1:])
     start = time.perf_counter()
-    outcome = grade([reports], [logs], read_rubric(rubric), output)
+    outcome = grade([reports], Course(read_rubric(rubric), logs=[logs]), output)
     print(json.dumps({
         "reports": len(outcome.graded),
         "verified": sum(one.verdict.status == "verified" for one in outcome.graded),

@@ -50,7 +50,7 @@ from px4fuse.errors import Px4FuseError  # noqa: E402
 from px4fuse.fleet.regressions import read_baseline  # noqa: E402
 from px4fuse.fleet.rows import table_of  # noqa: E402
 from px4fuse.grading import grade as grading  # noqa: E402
-from px4fuse.grading.overrides import read_overrides  # noqa: E402
+from px4fuse.grading.entries import read_overrides  # noqa: E402
 from px4fuse.grading.rubric import read_rubric, rubric_text  # noqa: E402
 from px4fuse.readers import read_log  # noqa: E402
 from px4fuse.readers.g2o import read_g2o  # noqa: E402
