@@ -43,7 +43,7 @@ def diff(
         results = found.results
         if output is None and not alone:
             output = outputs.free_report(f"{a.stem}_to_{b.stem}", "", results)
-        contents = outputs.result_files(results, json_path, output, results, step)
+        contents = outputs.result_files(results, json_path, output, found, step)
     outputs.finish(contents, summary(results))
     if fail_on is not None and found.is_worse:
         sys.exit(1)

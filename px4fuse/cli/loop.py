@@ -95,7 +95,6 @@ def loop(
     """
     from px4fuse.analysis import run_loop
     from px4fuse.loop.tracks import file_name, is_g2o, split_part
-    from px4fuse.report.document import LoopDocument
     from px4fuse.report.loop import summary
     from px4fuse.results.build import loop_results
 
@@ -115,7 +114,7 @@ def loop(
         if output is None and not alone:
             output = outputs.free_report(f"{file_name(source)}_loop", settings_name(request), made)
         contents = _files(found, tum, g2o)
-        contents |= outputs.result_files(made, json_path, output, LoopDocument(found, made), step)
+        contents |= outputs.result_files(made, json_path, output, found, step)
     outputs.finish(contents, summary(found, made.findings), request)
 
 

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from px4fuse.report.page import Page
-    from px4fuse.report.pdf import Report
     from px4fuse.request import Request
     from px4fuse.results.contract import Results
 
@@ -179,7 +178,7 @@ def result_files(
     results: Struct | dict[str, Any],
     json_path: Path | None,
     output: Path | None = None,
-    document: Report | None = None,
+    found: object = None,
     step: ShowStep = silent,
 ) -> dict[Path, bytes]:
     """Results where --json says, and a document as a PDF that holds them and has them beside it.
@@ -189,20 +188,20 @@ def result_files(
     results : Struct or dict
     json_path, output : Path or None
         As given with --json and -o.
-    document : Report, optional
-        What is drawn.
+    found : object, optional
+        What the results are of, which is drawn.
     step : callable
         Told what is being done.
     """
     from px4fuse.results.contract import to_json
 
     text, contents = to_json(results), dict[Path, bytes]()
-    if output is not None and document is not None:
+    if output is not None and found is not None:
         from px4fuse.report.pdf import render
 
         step("drawing the report")
         output, beside = report_paths(output, json_path)
-        contents |= {output: render(document, text), beside: text.encode()}
+        contents |= {output: render(found, results, text), beside: text.encode()}
     if json_path is not None:
         contents[json_path] = text.encode()
     return contents

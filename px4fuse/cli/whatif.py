@@ -57,7 +57,6 @@ def whatif(
     (see tune and sync). --without gnss_pos --from 60 goes on from there without that aid.
     """
     from px4fuse.analysis import run_what_if
-    from px4fuse.report.document import WhatIfDocument
     from px4fuse.report.whatif import summary
     from px4fuse.request import WhatIfRequest
     from px4fuse.results.build import whatif_results
@@ -75,8 +74,7 @@ def whatif(
     with outputs.progress(json_path) as step:
         found = run_what_if(request, step)
         results = whatif_results(request, found)
-        document = WhatIfDocument(found, results)
-        contents = outputs.result_files(results, json_path, output, document, step)
+        contents = outputs.result_files(results, json_path, output, found, step)
     outputs.finish(contents, summary(found))
 
 

@@ -11,7 +11,6 @@ import pandas as pd
 from scipy import stats
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.events import happened
 from px4fuse.comparison.interventions import CONTENT_NIS, NEES_LARGE
 from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
 from px4fuse.comparison.preparation import choose_source
@@ -66,7 +65,7 @@ def flight_data(
     """
     signals = signals_of(analysis, packer)
     settings, segment = analysis.settings, analysis.segment
-    events = happened(analysis)
+    events = analysis.events
     return {
         "log": analysis.flight.log.name,
         "source": analysis.source.name,

@@ -227,15 +227,14 @@ def report(analysis: Analysis, path: Pathlike) -> Path:
     OutputError, SettingsError
         It cannot be written, or the analysis was made without a request.
     """
-    from px4fuse.report.document import Document  # noqa: PLC0415 - for who writes a report
-    from px4fuse.report.pdf import render  # noqa: PLC0415
+    from px4fuse.report.pdf import render  # noqa: PLC0415 - for who writes a report
     from px4fuse.results.build import results  # noqa: PLC0415
     from px4fuse.results.contract import to_json  # noqa: PLC0415
 
     target = _ending(path, ".pdf")
-    document = Document(analysis, results(_request(analysis), analysis))
-    text = to_json(document.results)
-    write_all({target: render(document, text), target.with_suffix(".json"): text.encode()})
+    found = results(_request(analysis), analysis)
+    text = to_json(found)
+    write_all({target: render(analysis, found, text), target.with_suffix(".json"): text.encode()})
     return target
 
 

@@ -66,6 +66,15 @@ def aids_results(
     )
 
 
+def judged_results(
+    request: ComparisonRequest, found: Analysis | AidsAlone, student: Student = NOBODY
+) -> contract.ComparisonResults | contract.AidsResults:
+    """What ``px4fuse compare`` found."""
+    if isinstance(found, AidsAlone):
+        return aids_results(request, found, student)
+    return results(request, found, student)
+
+
 def tuning_results(
     request: ComparisonRequest,
     comparison: Comparison,
