@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -276,34 +276,27 @@ def check_targets(targets: Iterable[Path | None]) -> None:
 
 def finish(
     contents: Mapping[Path, bytes],
-    told: Page | Callable[[Console], None] | None = None,
+    page: Page | None = None,
     request: Request | None = None,
+    written: Iterable[Path] = (),
 ) -> None:
-    """Write all outputs or none; then tell people what was found and written.
+    """Write all outputs or none; then tell people what was found and written, and open it if asked.
 
     Nothing is told where the results have standard output to themselves. Commands in the words are
-    printed so that they run, where the request is given.
+    printed so that they run, where the request is given. ``written`` is what is there already.
     """
-    from px4fuse.report.screen import print_file, show
+    from px4fuse.report.screen import print_line, show
 
     write_outputs(contents)
+    files = [*contents, *written]
     if STANDARD_OUTPUT not in contents:
         console = terminal()
-        if callable(told):
-            told(console)
-        elif told is not None:
-            show(console, told.blocks, request)
-        for path in contents:
-            print_file(console, "Wrote", path)
-    open_written()
-
-
-def open_written(*besides: Path) -> None:
-    """Open what was written to be looked at, where --open asks for it."""
-    meta = click.get_current_context().meta
-    written: list[Path] = [*besides, *meta.get(WRITTEN, [])]
-    seen = [path for ending in TO_LOOK_AT for path in written if path.suffix.lower() == ending]
-    if meta.get(OPENED) and seen:
+        if page is not None:
+            show(console, page.blocks, request)
+        for path in files:
+            print_line(console, "Wrote", on_one_line(str(path)), "bold")
+    seen = [path for ending in TO_LOOK_AT for path in files if path.suffix.lower() == ending]
+    if click.get_current_context().meta.get(OPENED) and seen:
         click.launch(str(seen[0].resolve()))
 
 
