@@ -35,7 +35,6 @@ def explore(logs: tuple[Path, ...], output: Path | None, **given: Any) -> None:
     requests = [inputs.comparison_request(log, dict(given)) for log in logs]
     stems = "_".join(log.stem for log in logs)
     target = outputs.web_page(output, Path("reports", f"{stems}{settings_name(requests[0])}.html"))
-    outputs.check_targets([target])  # before the work, not after it
     with outputs.progress(target) as step:
         found = []
         for request in requests:

@@ -146,12 +146,13 @@ def web_page(output: Path | None, default: Path) -> Path:
     Raises
     ------
     OutputError
-        The name does not end as that of a web page.
+        The name does not end as that of a web page, or as :func:`check_targets` says.
     """
-    endings = (".html", ".htm")
-    if output is not None and output.suffix.lower() not in endings and output != STANDARD_OUTPUT:
-        raise OutputError(f"{output}: a web page. Give a name that ends in .html with -o.")
-    return output or default
+    target = output or default
+    if target.suffix.lower() not in (".html", ".htm") and target != STANDARD_OUTPUT:
+        raise OutputError(f"{target}: a web page. Give a name that ends in .html with -o.")
+    check_targets([target])
+    return target
 
 
 def report_paths(output: Path | None, json_path: Path | None) -> list[Path]:
