@@ -187,24 +187,15 @@ def close_loop(
     TrajectoryError, LogError, MissingDataError, SettingsError
         A file cannot be read or lacks what was asked for, or a number is out of range.
     """
-    return analyse(
-        LoopSource(source, None)
-        if isinstance(source, Trajectory)
-        else read_source(str(source), frame=frame),
-        request.LoopRequest(
-            source=str(source),
-            start_s=start_s,
-            end_s=end_s,
-            landed_at=None if landed_at is None else request.Landing(*landed_at),
-            came_back=came_back,
-            closures=tuple(closures),
-            position_drift_m=position_drift_m,
-            heading_drift_deg=heading_drift_deg,
-            key_frames_m=key_frames_m,
-        ),
-        None if reference is None else _reference(reference),
-        progress,
-    )
+    asked = {name: value for name, value in locals().items() if name != "progress"}
+    asked |= {"source": str(source), "reference": None, "closures": tuple(closures)}
+    asked["landed_at"] = None if landed_at is None else request.Landing(*landed_at)
+    if isinstance(source, Trajectory):
+        flown = LoopSource(source, None)
+    else:
+        flown = read_source(str(source), frame=frame)
+    against = None if reference is None else _reference(reference)
+    return analyse(flown, request.LoopRequest(**asked), against, progress)
 
 
 def report(analysis: Analysis, path: Pathlike) -> Path:
