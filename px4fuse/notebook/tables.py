@@ -201,16 +201,7 @@ def _at(series: pd.Series, times: pd.Index) -> Any:
 
 @words.register
 def _(why: Why) -> str:
-    heaviest = sorted(why.steps, key=lambda step: -abs(step.position_mean_square_m2))[:2]
-    said = " and ".join(
-        f"{step.name} ({step.position_mean_square_m2 / why.position_mean_square_m2:.0%})"
-        for step in heaviest
-    )
-    apart = why.position_mean_square_m2**0.5
-    return (
-        f"{OURS} and EKF2 are {apart:.3g} m RMS apart, mostly by {said} of the mean square; "
-        f"{why.position_left_share:.1%} is left unexplained"
-    )
+    return "\n".join(line for sentence in why.sentences for line in wrap(sentence, WIDTH))
 
 
 @frame.register
