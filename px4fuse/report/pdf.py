@@ -71,7 +71,7 @@ def render(found: Any, results: Any, results_json: str) -> bytes:
 
     Parameters
     ----------
-    found : Analysis, AidsAlone, Loop, Counterfactual, Evaluation or Changes
+    found : Analysis, AidsAlone, Loop, Counterfactual, Evaluation or ChangeResults
         What is drawn.
     results : Results
         What is written of it; each kind has its :data:`PAGES`.
