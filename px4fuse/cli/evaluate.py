@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from px4fuse.trajectory.scores import Delta
 
 MAX_DELTA = 1e6
+# What the score takes by the names of the options
+AS_GIVEN = ("alignment", "association", "max_gap_s", "time_offset_s")
 _DELTA = re.compile(r"(\d+\.?\d*|\.\d+) ?(m|s|frames|f)")
 
 
@@ -80,12 +82,9 @@ def evaluate(
         found = score(
             first.trajectory,
             second.trajectory,
-            alignment=given["alignment"],
-            association=given["association"],
-            max_gap_s=request.max_gap_s,
-            time_offset_s=given["time_offset_s"],
             rpe_deltas=deltas or None,
             all_pairs=not request.consecutive,
+            **{name: given[name] for name in AS_GIVEN},
         )
         results = evaluation_results(request, found)
         if output is None and not alone:

@@ -90,7 +90,6 @@ class TypedQuantity(click.ParamType["float | str"]):
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
         """Its unit, as the help shows what to type."""
-        del param, ctx
         unit = "DEG" if self.unit == "°" else self.unit.upper() or "NUMBER"
         return f"{unit}|auto" if self.auto else unit
 
@@ -224,8 +223,7 @@ json_option = option(
 def _opened(typed: str, name: str) -> Option:
     """That what was written is to be opened; :func:`~px4fuse.cli.outputs.finish` does."""
 
-    def keep(ctx: click.Context, parameter: click.Parameter, value: bool) -> None:
-        del parameter
+    def keep(ctx: click.Context, _: click.Parameter, value: bool) -> None:
         ctx.meta[OPENED] = value
 
     meaning = "Open what was written, in the program for it."

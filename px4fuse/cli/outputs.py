@@ -64,7 +64,6 @@ class ShowStep(Protocol):
 
 def silent(what: str, done: int = 0, of: int | None = None) -> None:
     """Show nothing."""
-    del what, done, of
 
 
 @contextmanager

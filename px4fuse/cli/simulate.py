@@ -51,7 +51,6 @@ class WithMistakes(click.Command):
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the mistakes."""
-        del ctx
         with formatter.section("Mistakes (without =VALUE: a clear case)"):
             formatter.write_dl(
                 [
