@@ -222,12 +222,10 @@ json_option = option(
 
 def _opened(typed: str, name: str) -> Option:
     """That what was written is to be opened; :func:`~px4fuse.cli.outputs.finish` does."""
-
-    def keep(ctx: click.Context, _: click.Parameter, value: bool) -> None:
-        ctx.meta[OPENED] = value
-
-    meaning = "Open what was written, in the program for it."
-    return option(typed, meaning, name=name, is_flag=True, expose_value=False, callback=keep)
+    return option(
+        typed, "Open what was written, in the program for it.", name=name, is_flag=True,
+        expose_value=False, callback=lambda ctx, _, value: ctx.meta.update({OPENED: value}),
+    )  # fmt: skip
 
 
 #: Of every command that writes something to look at
