@@ -42,7 +42,10 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
             page.write(f"{capital(why.reason)}. {why.remedy}")
         else:
             _axis(page, name, why, analysis)
-    page.numbers(_believed(analysis.ekf2_replay))
+    replay = analysis.ekf2_replay  # without one nothing is concluded
+    assert isinstance(replay, Ekf2Replay)
+    assert replay.agreement is not None
+    page.numbers(f"Replay against log: {agreement_words(replay.agreement)}.")
     yield page
 
 
@@ -67,14 +70,6 @@ def nothing_concluded(analysis: Analysis) -> str:
         return ""
     reasons = {f"{why.reason}. {why.remedy}": None for why in found if isinstance(why, Unavailable)}
     return f"{TITLE}: nothing is concluded, {' '.join(reasons)}" if reasons else ""
-
-
-def _believed(replay: Ekf2Replay | Unavailable) -> str:
-    """The agreement that entitles one to believe the page."""
-    if isinstance(replay, Unavailable):
-        return "EKF2 could not be replayed from this log."
-    assert replay.agreement is not None
-    return f"Replay against log: {agreement_words(replay.agreement)}."
 
 
 def agreement_words(agreement: Agreement) -> str:
