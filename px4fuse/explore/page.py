@@ -10,13 +10,10 @@ from px4fuse.analysis import Analysis
 from px4fuse.explore.data import flight_data, ranges
 from px4fuse.explore.figures import document_json
 from px4fuse.explore.packing import Packer
-from px4fuse.findings.model import Finding
-from px4fuse.request import ComparisonRequest
 from px4fuse.webpage.safe import cleaned, inert_json, part, policy_hash, template
 
 # Longer text from a log is cut
 MAX_CHARACTERS = 2000
-Explored = tuple[Analysis, tuple[Finding, ...], ComparisonRequest]
 SCRIPTS = ("dom", "story", "grid", "step", "times", "tour")
 HERE = "px4fuse.explore"
 # Plots of a flight, each with what it shows
@@ -33,13 +30,13 @@ PANELS = (
 )
 
 
-def html_text(flights: list[Explored]) -> str:
+def html_text(analyses: Sequence[Analysis]) -> str:
     """Lay out the page.
 
     Parameters
     ----------
-    flights : list of (Analysis, tuple of Finding, ComparisonRequest)
-        One, or two to be shown side by side.
+    analyses : sequence of Analysis
+        One, or two to be shown side by side; each made from a request.
 
     Returns
     -------
@@ -47,9 +44,9 @@ def html_text(flights: list[Explored]) -> str:
         Write it as UTF-8.
     """
     packer = Packer()
-    data = [flight_data(*flight, packer, beside=len(flights) > 1) for flight in flights]
+    data = [flight_data(one, packer, beside=len(analyses) > 1) for one in analyses]
     return page_text(
-        data_scripts(data, [analysis for analysis, _, _ in flights], packer),
+        data_scripts(data, analyses, packer),
         data,
         command="explore",
         heading="Turn the knobs and watch",

@@ -10,7 +10,6 @@ from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.whatif import WhatIf
 from px4fuse.errors import MissingDataError, OutputError, SettingsError
-from px4fuse.findings import find
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.model import Loop
@@ -251,8 +250,9 @@ def explore(analysis: Analysis, path: Pathlike) -> Path:
     """
     from px4fuse.explore.page import html_text  # noqa: PLC0415 - Bokeh takes its time
 
-    target, asked = _ending(path, ".html"), _request(analysis)
-    write_all({target: html_text([(analysis, find(analysis), asked)]).encode()})
+    target = _ending(path, ".html")
+    _request(analysis)
+    write_all({target: html_text([analysis]).encode()})
     return target
 
 
