@@ -50,26 +50,19 @@ def results(
     )
 
 
-def aids_results(
-    request: ComparisonRequest, alone: AidsAlone, student: Student = NOBODY
-) -> contract.AidsResults:
-    """What ``px4fuse compare`` found on a flight without a position source."""
-    return contract.AidsResults(
-        **_begun(contract.AIDS, request, alone.flight),
-        aids=dict(alone.aids),
-        findings=find_aids(alone.aids),
-        missing=(alone.lacking, *alone.flight.missing),
-        student=student,
-    )
-
-
 def judged_results(
     request: ComparisonRequest, found: Analysis | AidsAlone, student: Student = NOBODY
 ) -> contract.ComparisonResults | contract.AidsResults:
-    """What ``px4fuse compare`` found."""
-    if isinstance(found, AidsAlone):
-        return aids_results(request, found, student)
-    return results(request, found, student)
+    """What ``px4fuse compare`` found; of a flight without a position source EKF2's aids alone."""
+    if isinstance(found, Analysis):
+        return results(request, found, student)
+    return contract.AidsResults(
+        **_begun(contract.AIDS, request, found.flight),
+        aids=dict(found.aids),
+        findings=find_aids(found.aids),
+        missing=(found.lacking, *found.flight.missing),
+        student=student,
+    )
 
 
 def tuning_results(
