@@ -236,8 +236,7 @@ def write_new(path: Path, content: bytes) -> None:
     """
     if path.exists():
         raise OutputError(f"{path}: exists already; it was not overwritten. Give another name.")
-    write_outputs({path: content})
-    click.echo(f"Wrote    {on_one_line(str(path))}")
+    finish({path: content})
 
 
 def check_targets(targets: Iterable[Path | None]) -> None:
