@@ -29,7 +29,6 @@ if _typing.TYPE_CHECKING:
     from px4fuse.filter.tuning import tune as tune
     from px4fuse.findings import Finding as Finding
     from px4fuse.findings import find as find
-    from px4fuse.fleet.changes import Changes as Changes
     from px4fuse.fleet.changes import diff as diff
     from px4fuse.fleet.run import batch as batch
     from px4fuse.flight import Flight as Flight
@@ -46,6 +45,7 @@ if _typing.TYPE_CHECKING:
     from px4fuse.request import ComparisonRequest as ComparisonRequest
     from px4fuse.request import LoopRequest as LoopRequest
     from px4fuse.request import PositionFile as PositionFile
+    from px4fuse.results.contract import ChangeResults as ChangeResults
     from px4fuse.trajectory.evaluation import Evaluation as Evaluation
     from px4fuse.trajectory.model import Trajectory as Trajectory
 
@@ -62,7 +62,7 @@ _PUBLIC = {
     "filter.settings": ("Settings",),
     "filter.tuning": ("AxisTuning", "tune"),
     "findings": ("Finding", "find"),
-    "fleet.changes": ("Changes", "diff"),
+    "fleet.changes": ("diff",),
     "fleet.run": ("batch",),
     "flight": ("Flight", "Unavailable"),
     "loop.model": ("Loop",),
@@ -70,6 +70,7 @@ _PUBLIC = {
     "readers": ("read_log",),
     "readers.trajectory": ("read_trajectory",),
     "request": ("ComparisonRequest", "LoopRequest", "PositionFile"),
+    "results.contract": ("ChangeResults",),
     "trajectory.evaluation": ("Evaluation",),
     "trajectory.model": ("Trajectory",),
 }

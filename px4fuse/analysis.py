@@ -23,8 +23,9 @@ from px4fuse.comparison.estimates import (
     size,
     turned_frame,
 )
+from px4fuse.comparison.events import Events, happened
 from px4fuse.comparison.interventions import Intervention, interventions, to_try
-from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.comparison.preparation import no_source, prepare
 from px4fuse.comparison.remedy import asked_of_ekf2
 from px4fuse.comparison.why import to_walk, why_ekf2_differs
@@ -93,6 +94,16 @@ class Analysis(Comparison):
         """EKF2 replayed as flown, with its agreement with the log."""
         model = self.ekf2_model
         return model if isinstance(model, Unavailable) else model.flown
+
+    @cached_property
+    def events(self) -> Events:
+        """What is marked on every time axis."""
+        return happened(self)
+
+    @property
+    def others(self) -> list[AxisComparison]:
+        """The axes beside the main one."""
+        return [axis for axis in self.axes.values() if axis is not self.main]
 
     @cached_property
     def causes(self) -> tuple[Intervention, ...]:

@@ -58,7 +58,6 @@ def frame(result: object) -> pd.DataFrame:
 @singledispatch
 def draw(result: object, **options: Any) -> Any:
     """Draw a result."""
-    del options
     raise TypeError(f"{type(result).__name__} has no picture")
 
 

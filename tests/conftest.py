@@ -17,6 +17,7 @@ import signal
 from collections.abc import Callable, Iterator
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import pytest
 from browser import browser  # noqa: F401 - a fixture
@@ -114,11 +115,11 @@ def shared_logs() -> Path:
     return SHARED_LOGS
 
 
-def page_of(_: object, text: str) -> bytes:
-    """An empty page with results attached."""
+def page_of(*drawn: Any) -> bytes:
+    """An empty page with results attached: the text that is last of what is drawn."""
     writer = PdfWriter()
     writer.add_blank_page(100, 100)
-    writer.add_attachment(pdf.RESULTS_NAME, text.encode())
+    writer.add_attachment(pdf.RESULTS_NAME, drawn[-1].encode())
     out = io.BytesIO()
     writer.write(out)
     return out.getvalue()
@@ -140,9 +141,9 @@ def drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """The same results are drawn once; for tests of what follows."""
     render = pdf.render
 
-    def from_memory(document: pdf.Report, text: str) -> bytes:
+    def from_memory(found: object, results: object, text: str) -> bytes:
         if text not in _drawn:
-            _drawn[text] = render(document, text)
+            _drawn[text] = render(found, results, text)
             if len(_drawn) > MOST_ANALYSES:
                 del _drawn[next(iter(_drawn))]
         return _drawn[text]

@@ -13,7 +13,6 @@ import pytest
 from browser import Browser
 
 from px4fuse.analysis import Analysis, run
-from px4fuse.findings import find
 from px4fuse.request import ComparisonRequest
 
 
@@ -22,10 +21,9 @@ def explored(sample_log: Path, tmp_path_factory: pytest.TempPathFactory) -> tupl
     """The page of the sample flight."""
     from px4fuse.explore.page import html_text  # Bokeh takes long, and few tests need it
 
-    request = ComparisonRequest(log=str(sample_log))
-    analysis = run(request)
+    analysis = run(ComparisonRequest(log=str(sample_log)))
     file = tmp_path_factory.mktemp("explore") / "sample.html"
-    file.write_bytes(html_text([(analysis, find(analysis), request)]).encode())
+    file.write_bytes(html_text([analysis]).encode())
     return file, analysis
 
 

@@ -39,7 +39,8 @@ from px4fuse.fleet.job import Job
 from px4fuse.fleet.logs import find_logs
 from px4fuse.fleet.rows import COLUMNS, csv_bytes, rows_of, table_of
 from px4fuse.fleet.run import Fleet, kept_in
-from px4fuse.fleet.terminal import print_fleet
+from px4fuse.fleet.terminal import summary
+from px4fuse.report.screen import show
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.contract import schema, to_json
 from px4fuse.results.reading import read_results
@@ -149,7 +150,7 @@ def test_every_log_is_in_the_table_with_its_numbers_or_its_line(tmp_path):
 
 def test_the_terminal_counts_what_is_wrong_with_whole_logs(capsys):
     table = made_up(60).fillna({"axis": "", "change": ""})
-    print_fleet(terminal(), Fleet(table, 3, frozenset(), ()))
+    show(terminal(), summary(Fleet(table, 3, frozenset(), ())).blocks)
     said = " ".join(capsys.readouterr().out.split())
     failed = table[table["status"] == "failed"]
     assert f"{len(failed)} logs, one is {failed['log'].iloc[0]}: failed: {DAMAGED[0]}" in said

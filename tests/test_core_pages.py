@@ -11,35 +11,38 @@ from matplotlib.figure import Figure
 from msgspec import structs
 from page_tools import axes_of, set_by_typst, texts, words
 
+from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
 from px4fuse.findings import Finding
 from px4fuse.flight import FlightMode, Reset
 from px4fuse.recording import Dropout
 from px4fuse.report import cover, flight, marks, panels
-from px4fuse.report.document import Document
 from px4fuse.report.page import Page
 from px4fuse.report.style import report_style
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
+from px4fuse.results.contract import ComparisonResults
 from px4fuse.results.model import Student
 
 MODES = (FlightMode(0.0, 40.0, "Offboard"), FlightMode(40.0, 100.0, "Land"))
 
 
-def document(comparison: Comparison, findings: tuple[Finding, ...] = ()) -> Document:
+def document(
+    comparison: Comparison, findings: tuple[Finding, ...] = ()
+) -> tuple[Analysis, ComparisonResults]:
     analysis = unexplained(comparison)
     made = results(ComparisonRequest(log="aisle.ulg"), analysis, Student("Ada"))
-    return Document(analysis, structs.replace(made, findings=findings))
+    return analysis, structs.replace(made, findings=findings)
 
 
-def drawn(draw, of: Document) -> list[Page]:
+def drawn(draw, of: tuple[Analysis, ComparisonResults]) -> list[Page]:
     with report_style():
-        return list(draw(of))
+        return list(draw(*of))
 
 
 @pytest.fixture(scope="module")
-def eventful() -> Document:
+def eventful() -> Analysis:
     """A flight on which everything happens that is marked."""
     made = aisle_flight(
         duration_s=100.0,
@@ -49,10 +52,10 @@ def eventful() -> Document:
     )
     made = replace(made, airborne=((20.0, 90.0),), modes=MODES)
     comparison = compare(made, start_s=5.0, end_s=95.0)
-    return replace(document(comparison), analysis=with_noises(comparison))
+    return with_noises(comparison)
 
 
-def test_every_kind_of_mark_is_drawn_once_with_its_name(eventful: Document) -> None:
+def test_every_kind_of_mark_is_drawn_once_with_its_name(eventful: Analysis) -> None:
     said = [artist.get_label() for artist in marks.handles(eventful)]
     assert said == [
         "flight modes, in turn", "on the ground", "source silent", "log dropout", "EKF2 rejected",
@@ -91,7 +94,7 @@ def test_the_zoom_is_where_the_filter_is_updated() -> None:
     assert ((updates >= start) & (updates <= end)).sum() == flight.ZOOM_UPDATES + 1
     assert end - start < 4.0  # beside the gap in the middle, not across it
     assert abs((start + end) / 2.0 - 60.0) < 12.5
-    assert "In the 20." in panels.sigma_words(document(comparison), comparison.main)
+    assert "In the 20." in panels.sigma_words(unexplained(comparison), comparison.main)
 
 
 @pytest.mark.parametrize("count", [3, 40])

@@ -19,7 +19,7 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import FilterSummary
 from px4fuse.ekf2.aids import AidAxis, AidResult
 from px4fuse.filter.consistency import assess
-from px4fuse.fleet.changes import Changes, changes, number_changes
+from px4fuse.fleet.changes import changes, number_changes
 from px4fuse.fleet.inputs import DiffInput
 from px4fuse.fleet.measures import (
     Z95,
@@ -37,7 +37,7 @@ from px4fuse.flight import Unavailable
 from px4fuse.report.changes import change_line, printed
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
-from px4fuse.results.contract import NumberChange, to_json
+from px4fuse.results.contract import ChangeResults, NumberChange, to_json
 from px4fuse.results.reading import read_results
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
@@ -257,21 +257,21 @@ def noisy() -> DiffInput:
     return flown("noisy.ulg", 502, sigma_uwb_m=0.2)
 
 
-def significant(found: Changes) -> dict[str, str]:
-    numbers = found.results.numbers
+def significant(found: ChangeResults) -> dict[str, str]:
+    numbers = found.numbers
     return {c.path: c.judgement for c in numbers if c.status == "significant"}
 
 
 def test_two_flights_with_the_same_truth_show_nothing(clean):
     found = changes(clean, flown("again.ulg", 503))
-    assert sum(change.q is not None for change in found.results.numbers) >= 50
+    assert sum(change.q is not None for change in found.numbers) >= 50
     assert (significant(found), found.is_worse) == ({}, False)
-    assert found.results.summary[0].startswith("None of")
+    assert found.summary[0].startswith("None of")
 
 
 def test_a_doubled_noise_of_the_source_is_the_first_that_is_told(clean, noisy):
     found = changes(clean, noisy)
-    first = found.results.numbers[0]
+    first = found.numbers[0]
     assert (first.path, first.judgement) == ("tuning.horizontal.sigma_z_m", "worse")
     assert first.change_interval[0] < 2.0 < first.change_interval[1]
     judged = significant(found)
@@ -285,14 +285,14 @@ def test_a_doubled_noise_of_the_source_is_the_first_that_is_told(clean, noisy):
     assert {"tuning.horizontal.sigma_z_m", "axes.aisle.filters.kf.nis_mean"} <= set(
         significant(alone)
     )
-    errors = [c for c in alone.results.numbers if c.path.endswith("kf.truth.position_rmse_m")]
+    errors = [c for c in alone.numbers if c.path.endswith("kf.truth.position_rmse_m")]
     assert {c.status for c in errors} == {"not tested"}
-    assert any("RMSE is not tested without the logs" in note for note in alone.results.notes)
+    assert any("RMSE is not tested without the logs" in note for note in alone.notes)
 
 
 def test_late_stamps_are_the_first_that_is_told(clean):
     found = changes(clean, flown("late.ulg", 505, "clock-offset=0.25", with_log=False))
-    first = found.results.numbers[0]
+    first = found.numbers[0]
     assert (first.path, first.judgement) == ("clock.offset_s", "worse")
     assert first.change_interval[0] < -0.25 < first.change_interval[1]
 
@@ -301,11 +301,9 @@ def test_another_noise_of_ekf2_is_named_as_setting_and_in_its_nis(clean):
     found = changes(clean, flown("modest.ulg", 506, "ekf2-noise=0.3", with_log=False))
     assert significant(found)["axes.aisle.filters.ekf2.nis_mean"] == "worse"
     assert "axes.aisle.filters.kf.nis_mean" not in significant(found)
-    (text,) = [t for t in found.results.texts if t.what == "EKF2_EVP_NOISE"]
+    (text,) = [t for t in found.texts if t.what == "EKF2_EVP_NOISE"]
     assert (text.kind, text.a, text.b) == ("parameter", "0.1", "0.3")
-    assert "ekf2_variance_overstated" in {
-        one.id for one in found.results.findings if one.only_in == "B"
-    }
+    assert "ekf2_variance_overstated" in {one.id for one in found.findings if one.only_in == "B"}
 
 
 # -- what was measured -----------------------------------------------------------------------------
@@ -373,6 +371,6 @@ def test_aids_are_compared_by_their_nis_and_what_was_rejected(clean):
 def test_what_one_side_lacks_is_listed(clean):
     part = replace(clean.results, axes={"north": clean.results.axes["north"]})
     whole, part = (DiffInput("r.json", "results", found) for found in (clean.results, part))
-    status = {change.path: change.status for change in changes(whole, part).results.numbers}
+    status = {change.path: change.status for change in changes(whole, part).numbers}
     assert status["axes.down.filters.kf.nis_mean"] == "only in A"
     assert set(status.values()) == {"only in A", "same"}

@@ -78,7 +78,7 @@ def test_two_settings_of_one_flight_are_exact(settings, changed):
     assert changed["summary"][0].startswith("Both are of aisle_uwb.ulg:")
     # Python gives the same
     found = px4fuse.diff(*settings)
-    assert [c.path for c in found.results.numbers] == [n["path"] for n in changed["numbers"]]
+    assert [c.path for c in found.numbers] == [n["path"] for n in changed["numbers"]]
     assert repr(found).startswith(changed["summary"][0])
     assert len(found.to_frame()) == len(numbers)
 

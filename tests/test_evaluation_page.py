@@ -30,12 +30,15 @@ from px4fuse.report.evaluation import (
 from px4fuse.report.page import Page
 from px4fuse.report.pdf import render
 from px4fuse.report.style import report_style
+from px4fuse.request import EvaluationRequest
+from px4fuse.results.build import evaluation_results
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
 from px4fuse.trajectory.model import Frame, Trajectory
 from px4fuse.trajectory.scores import Delta
 
 LOOP = REPOSITORY / "sample_logs" / "loop_vio.ulg"
 DELTAS = (Delta(1.0, "m"), Delta(10.0, "m"))
+REQUEST = EvaluationRequest(estimate="a.tum", reference="b.tum")
 
 
 @cache
@@ -67,7 +70,7 @@ def across(values: np.ndarray) -> np.ndarray:
 
 def pages(score: Evaluation) -> list[Page]:
     with report_style():
-        return list(draw(score))
+        return list(draw(score, None))
 
 
 def panels(score: Evaluation) -> dict[str, Axes]:
@@ -82,7 +85,7 @@ def panel(score: Evaluation, title: str) -> Axes:
 
 
 def said(score: Evaluation) -> str:
-    pages = PdfReader(io.BytesIO(render(score, "{}"))).pages
+    pages = PdfReader(io.BytesIO(render(score, evaluation_results(REQUEST, score), "{}"))).pages
     return " ".join(" ".join(page.extract_text().split()) for page in pages)
 
 

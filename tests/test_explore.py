@@ -45,12 +45,12 @@ VALUES = "[...document.querySelectorAll('.knob input[type=number]')].map((node) 
 
 def bare(flight: Flight) -> Analysis:
     """Without what takes long and the page can do without."""
-    return unexplained(compare(flight))
+    asked = ComparisonRequest(log=flight.log.name)
+    return replace(unexplained(compare(flight)), request=asked)
 
 
 def page_of(analysis: Analysis, file: Path) -> Path:
-    request = ComparisonRequest(log=analysis.flight.log.name)
-    file.write_bytes(html_text([(analysis, (), request)]).encode())
+    file.write_bytes(html_text([analysis]).encode())
     return file
 
 
@@ -357,11 +357,15 @@ def test_a_box_on_the_track_is_a_time(page: Browser) -> None:
 
 
 def test_two_flights_stand_on_the_same_axes(browser: Browser, tmp_path: Path) -> None:
-    pair = [bare(aisle_flight(duration_s=length, length_m=length)) for length in (20.0, 30.0)]
-    requests = [ComparisonRequest(log=name) for name in ("first.ulg", "second.ulg")]
+    pair = [
+        replace(
+            bare(aisle_flight(duration_s=length, length_m=length)),
+            request=ComparisonRequest(log=name),
+        )
+        for length, name in ((20.0, "first.ulg"), (30.0, "second.ulg"))
+    ]
     file = tmp_path / "two.html"
-    told = [(one, (), request) for one, request in zip(pair, requests, strict=True)]
-    file.write_bytes(html_text(told).encode())
+    file.write_bytes(html_text(pair).encode())
     show(browser, file)
     drag(browser, "sigma-z", 0.6)
     ranges = ask(
@@ -378,7 +382,7 @@ def test_two_flights_stand_on_the_same_axes(browser: Browser, tmp_path: Path) ->
         shown = browser.ask(TABLE.replace("#tables", f"#table-{number}"))
         assert shown["Mean NIS (1 is consistent)"][0] == f"{statement.nis_mean:.2f}"
         line = browser.ask(f"document.querySelector('#command-{number}').textContent")
-        assert line == f"px4fuse compare {requests[number].log} --sigma-z {z:g}"
+        assert line == f"px4fuse compare {analysis.request.log} --sigma-z {z:g}"
     assert browser.complaints() == []
 
 

@@ -157,12 +157,10 @@ def find_story(analysis: Analysis) -> str:
 def test_findings_of_the_settings_follow_and_the_others_stay(
     browser: Browser, sample_log: Path, tmp_path: Path
 ) -> None:
-    request = ComparisonRequest(log=str(sample_log), sigma_z_m=1.0)
-    analysis = run(request)
-    findings = find(analysis)
-    assert any(one.id == "sigma_z_large" for one in findings)
+    analysis = run(ComparisonRequest(log=str(sample_log), sigma_z_m=1.0))
+    assert any(one.id == "sigma_z_large" for one in find(analysis))
     file = tmp_path / "large.html"
-    file.write_bytes(html_text([(analysis, findings, request)]).encode())
+    file.write_bytes(html_text([analysis]).encode())
     show(browser, file)
     open_view(browser, "recorded")
     said = "[...document.querySelectorAll('.now-said')].map((one) => one.textContent)"

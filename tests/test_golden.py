@@ -30,11 +30,9 @@ from px4fuse.cli import COMMANDS as CLI_COMMANDS
 from px4fuse.explore.data import flight_data
 from px4fuse.explore.figures import document_json
 from px4fuse.explore.packing import Packer
-from px4fuse.findings import find
 from px4fuse.fleet.page import html_text
 from px4fuse.plain import plain
 from px4fuse.report import pdf
-from px4fuse.request import ComparisonRequest
 from px4fuse.simulation.flights import answer, simulate
 from px4fuse.simulation.mistakes import MISTAKES, parse
 from px4fuse.simulation.scenario import KINDS, scenario_of
@@ -211,9 +209,8 @@ def test_the_page_of_a_fleet_holds_what_it_held() -> None:
 
 @pytest.mark.usefixtures("analysed_once")
 def test_the_plots_to_explore_are_what_they_were(sample_log: Path) -> None:
-    request = ComparisonRequest(log=str(sample_log))
     analysis = px4fuse.compare(str(sample_log))
-    data = flight_data(analysis, find(analysis), request, Packer(), beside=False)
+    data = flight_data(analysis, Packer())
     document, _ = document_json([data], [analysis.tuning])
     ids: dict[str, str] = {}
 

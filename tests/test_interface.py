@@ -77,7 +77,7 @@ def results(sample_log, analysis) -> dict[str, Shown]:
         "Evaluation": evaluation,
         "PairwiseError": evaluation.rpe[0],
         "WhatIf": px4fuse.what_if(analysis.ekf2_model, {"EKF2_EVP_NOISE": 0.3}),
-        "Changes": changes(
+        "ChangeResults": changes(
             DiffInput("aisle_uwb.json", "results", read_results(SHIPPED.read_bytes())),
             DiffInput("small.ulg", "log", results_of(analysis), analysis),
         ),

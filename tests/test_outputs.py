@@ -37,7 +37,7 @@ def test_a_name_that_no_font_has_is_said_before_the_report(
 ) -> None:
     told = []
 
-    def render(document: object, text: str) -> bytes:
+    def render(found: object, results: object, text: str) -> bytes:
         told.append(capsys.readouterr().err)
         return b"%PDF-"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,13 +17,13 @@ from hypothesis import strategies as st
 from matplotlib import font_manager
 from page_tools import set_by_typst
 
+from px4fuse.analysis import Analysis
 from px4fuse.filter.clock import ClockOffset, PartOffset
 from px4fuse.filter.likelihood import preintegrate, states
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
 from px4fuse.report import clock, fonts, notes
-from px4fuse.report.document import Document
 from px4fuse.report.notes import write
 from px4fuse.report.page import Block, Page, printable
 from px4fuse.report.pdf import compiled
@@ -137,21 +138,22 @@ def test_any_markdown_is_read(text: str) -> None:
     assert all(block["kind"] in ("text", "table") for block in written(text))
 
 
-def document(student: Student) -> Document:
-    return Document(SimpleNamespace(), SimpleNamespace(student=student))  # type: ignore[arg-type]
+def pages_of(student: Student) -> Iterator[Page]:
+    nothing = object.__new__(Analysis)  # of a comparison, which they do not look into
+    return notes.draw(nothing, SimpleNamespace(student=student))  # type: ignore[arg-type]
 
 
 def test_long_notes_run_over_pages_and_lose_nothing() -> None:
     words = [f"word{number}" for number in range(1500)]
     table = "| a | b |\n|---|---|\n" + "".join(f"| r{i} | {'cell ' * 30} |\n" for i in range(40))
     student = Student("", "", " ".join(words) + "\n\n" + table)
-    sheets = set_by_typst(*notes.draw(document(student)))
+    sheets = set_by_typst(*pages_of(student))
     assert len(sheets) > 2
     assert sheets[0].strip().startswith("Appendix: what the student found")
     text = " ".join(sheets).split()
     assert [word for word in text if word.startswith("word")] == words
     assert sum(word == "cell" for word in text) == 1200
-    assert not list(notes.draw(document(Student("", "", " \n <!-- nothing --> \n"))))
+    assert not list(pages_of(Student("", "", " \n <!-- nothing --> \n")))
 
 
 def test_words_without_end_are_broken() -> None:
@@ -159,7 +161,7 @@ def test_words_without_end_are_broken() -> None:
     endless = "a" * 33_000
     code = '{"x": 1, ' * 4_000
     student = Student("", "", f"{endless}\n\n| {endless} |\n|---|\n\n```\n{code}\n```\n")
-    text = "".join(set_by_typst(*notes.draw(document(student))))
+    text = "".join(set_by_typst(*pages_of(student)))
     assert text.count("a") >= 66_000
     assert text.count("{") == 4_000
 
@@ -200,29 +202,29 @@ def offset(**changes: Any) -> ClockOffset:
     )  # fmt: skip
 
 
-def with_clock(found: ClockOffset | Unavailable, *findings: str, delay_ms: float = 0.0) -> Document:
+def with_clock(found: ClockOffset | Unavailable, delay_ms: float = 0.0) -> Any:
     log = SimpleNamespace(name="x.ulg", parameters={"EKF2_EV_DELAY": delay_ms})
-    analysis = SimpleNamespace(
+    return SimpleNamespace(
         clock=found,
         settings=SimpleNamespace(clock_offset_s=0.0),
         flight=SimpleNamespace(log=log),
         source=source(),
     )
-    named = tuple(Finding(name, "error", "", "") for name in findings)
-    return Document(analysis, SimpleNamespace(findings=named))  # type: ignore[arg-type]
 
 
 def test_the_clock_has_its_page_when_there_is_something_to_say() -> None:
     whole = offset(parts=())
     fine, unknown = with_clock(whole), replace(whole, determinable=False, reason="no motion")
-    assert "the stamps are right" in clock.line(fine)
-    assert not list(clock.draw(fine))
-    for made in (with_clock(unknown), *(with_clock(whole, name) for name in clock.FINDINGS)):
-        assert clock.line(made) == "see its page"
-        assert len(list(clock.draw(made))) == 1
+    named = [SimpleNamespace(findings=[Finding(name, "error", "", "")]) for name in clock.FINDINGS]
+    nothing: Any = SimpleNamespace(findings=[])
+    assert "the stamps are right" in clock.line(fine, [])
+    assert not list(clock.draw(fine, nothing))
+    for made, results in ((with_clock(unknown), nothing), *((fine, each) for each in named)):
+        assert clock.line(made, results.findings) == "see its page"
+        assert len(list(clock.draw(made, results))) == 1
     none = with_clock(Unavailable("clock offset", "no IMU", "Give the ULog."))
-    assert clock.line(none) == "not determinable: no IMU. Give the ULog."
-    assert not list(clock.draw(none))
+    assert clock.line(none, []) == "not determinable: no IMU. Give the ULog."
+    assert not list(clock.draw(none, nothing))
 
 
 @pytest.mark.parametrize(
@@ -246,7 +248,7 @@ def test_the_clock_has_its_page_when_there_is_something_to_say() -> None:
 def test_what_follows_from_the_clock(
     changes: dict[str, Any], delay_ms: float, said: dict[str, str]
 ) -> None:
-    analysis = with_clock(offset(**changes), delay_ms=delay_ms).analysis
+    analysis = with_clock(offset(**changes), delay_ms)
     advice = clock.clock_advice(analysis, analysis.clock)
     assert all(words in advice[label] for label, words in said.items()), advice
 

@@ -15,7 +15,6 @@ import px4fuse
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import UnjudgedFilter
 from px4fuse.errors import ResultsError
-from px4fuse.report.document import Document
 from px4fuse.report.pdf import render
 from px4fuse.request import ComparisonRequest
 from px4fuse.results import build
@@ -26,14 +25,14 @@ ROOT = Path(__file__).parent.parent
 NOTHING = {"what": "noises", "reason": "too short", "remedy": ""}
 
 
-def document(flight: px4fuse.Flight, explained: bool = True, **options: object) -> Document:
+def document(flight: px4fuse.Flight, explained: bool = True, **options: object):
     comparison = compare(flight, **options)
     analysis = px4fuse.explain(comparison) if explained else unexplained(comparison)
-    return Document(analysis, build.results(ComparisonRequest(log=flight.log.name), analysis))
+    return analysis, build.results(ComparisonRequest(log=flight.log.name), analysis)
 
 
-def results(made: Document) -> ComparisonResults:
-    return made.results
+def results(made: tuple[px4fuse.Analysis, ComparisonResults]) -> ComparisonResults:
+    return made[1]
 
 
 def numbers(part: object, where: str = "") -> dict[str, object]:
@@ -110,7 +109,7 @@ def test_results_of_every_kind_validate_and_render(sample_flight, options):
     made = document(sample_flight, **options)
     text = to_json(results(made))
     assert_valid(text)
-    assert render(made, text).startswith(b"%PDF-")
+    assert render(*made, text).startswith(b"%PDF-")
 
 
 def test_nothing_that_could_not_be_computed_is_zero(sample_flight):

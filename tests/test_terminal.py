@@ -16,11 +16,11 @@ from conftest import page_of
 from exchange import replace
 from rich.console import Console
 
+from px4fuse.analysis import Analysis
 from px4fuse.analysis import run as analyse
 from px4fuse.cli import cli
 from px4fuse.cli.outputs import free_report, progress, terminal
 from px4fuse.report import screen
-from px4fuse.report.document import Document
 from px4fuse.report.screen import runnable, say
 from px4fuse.report.terminal import summary
 from px4fuse.request import (
@@ -72,15 +72,17 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flown: bytes) -> Path:
 
 
 @pytest.fixture(scope="module")
-def document(sample_log: Path) -> Document:
+def document(sample_log: Path) -> tuple[Analysis, ComparisonResults]:
     """The sample with a setting that gives a finding."""
     request = ComparisonRequest(log=str(sample_log), sigma_z_m=0.3)
     analysis = analyse(request)
-    return Document(analysis, results(request, analysis))
+    return analysis, results(request, analysis)
 
 
 @pytest.fixture(scope="module")
-def summaries(document: Document, sample_log: Path) -> dict[int | None, str]:
+def summaries(
+    document: tuple[Analysis, ComparisonResults], sample_log: Path
+) -> dict[int | None, str]:
     """Its summary on a screen, on a narrow one, and in a pipe."""
     request = ComparisonRequest(log=str(sample_log), sigma_z_m=0.3)
     made: dict[int | None, str] = {}
@@ -91,7 +93,7 @@ def summaries(document: Document, sample_log: Path) -> dict[int | None, str]:
                 patch.setenv("COLUMNS", str(width))
             console = terminal()
             with console.capture() as captured:
-                screen.show(console, summary(document, "reports/a.pdf").blocks, request)
+                screen.show(console, summary(*document, "reports/a.pdf").blocks, request)
             made[width] = captured.get()
     return made
 
@@ -107,7 +109,8 @@ def test_nothing_is_cut_and_words_are_whole(summaries, document) -> None:
     assert "\x1b" not in whole
     # in a pipe a paragraph is one line; the first ones are the story, and the rest is not it again
     lines = whole.splitlines()
-    assert lines[: len(document.results.story) + 1] == [*document.results.story, ""]
+    story = document[1].story
+    assert lines[: len(story) + 1] == [*story, ""]
     assert len(re.findall("(?:Most|The largest part) of what ours and EKF2", whole)) == 1
 
 
@@ -200,11 +203,11 @@ def test_results_on_standard_output_write_no_file(command, desk) -> None:
 
 
 @pytest.fixture
-def made(document: Document, sample_log: Path, tmp_path, monkeypatch) -> ComparisonResults:
+def made(document, sample_log: Path, tmp_path, monkeypatch) -> ComparisonResults:
     """Results of a run in an empty folder."""
     monkeypatch.chdir(tmp_path)
     request = ComparisonRequest(log=str(sample_log))
-    return results(request, document.analysis)
+    return results(request, document[0])
 
 
 def reported(made: ComparisonResults, **changes: object) -> str:

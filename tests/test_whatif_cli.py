@@ -18,7 +18,7 @@ from px4fuse.ekf2.whatif import Summary
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.errors import MissingDataError, Px4FuseError, SettingsError
 from px4fuse.flight import Flight
-from px4fuse.report.whatif import heads, reading, rows, sweep_heads, sweep_rows
+from px4fuse.report.whatif import heads, reading, rows, sweep_table
 from px4fuse.request import Sweep, WhatIfRequest, command_line
 from px4fuse.results.contract import WhatIfResults, schema
 from px4fuse.results.reading import read_results
@@ -112,8 +112,8 @@ def test_a_sweep_changes_the_rest_as_set(swept: Counterfactual) -> None:
     assert all(value.changed["EKF2_EVP_GATE"] == 3.0 for value in values)
     nis = [value.nis_mean for value in values]
     assert nis == sorted(nis, reverse=True)
-    assert sweep_heads(swept)[0] == "EKF2_EVP_NOISE (m)"
-    assert [row[0] for row in sweep_rows(swept)] == ["0.05", "0.1", "0.2"]
+    assert sweep_table(swept)[0][0] == "EKF2_EVP_NOISE (m)"
+    assert [row[0] for row in sweep_table(swept)[1]] == ["0.05", "0.1", "0.2"]
     best, error, *_ = reading(swept)
     assert "nearest to 1 at EKF2_EVP_NOISE 0.1" in best
     least = min(values, key=lambda value: value.position_rmse_to_truth_m)
@@ -234,7 +234,7 @@ def test_what_is_chaotic_has_no_numbers(sample_flight: Flight) -> None:
     table = rows(told)
     assert {line[3] for line in table} == {"chaotic"}
     assert all("chaotic" not in line[:3] for line in table)
-    assert [line[1] for line in sweep_rows(told)] == ["chaotic", "chaotic"]
+    assert [line[1] for line in sweep_table(told)[1]] == ["chaotic", "chaotic"]
     said = " ".join(reading(told))
     assert "Chaotic: more than 35% would be rejected, or 2 mm of noise" in said
     assert "nearest to 1" not in said

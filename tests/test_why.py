@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,6 @@ from px4fuse.ekf2.walk import SAMPLES, Why
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import Flight, Unavailable
-from px4fuse.report.document import Document
 from px4fuse.report.style import report_style
 from px4fuse.report.why import draw, nothing_concluded
 
@@ -93,13 +91,9 @@ def test_without_a_horizontal_axis_or_a_model_the_reason_stands(sample: Analysis
         assert (why.reason, why.remedy) == ("no IMU", "Record it.")
 
 
-def document(analysis: Analysis) -> Document:
-    return Document(analysis, SimpleNamespace(findings=()))  # type: ignore[arg-type]
-
-
 def drawn(analysis: Analysis) -> list:
     with report_style():
-        return list(draw(document(analysis)))
+        return list(draw(analysis, None))
 
 
 def test_doubtful_and_absent_replays_conclude_nothing(sample: Analysis) -> None:
@@ -112,12 +106,12 @@ def test_doubtful_and_absent_replays_conclude_nothing(sample: Analysis) -> None:
     without = replace(sample, ekf2_model=absent, why={"north": absent, "east": absent})
     for analysis, reason in ((parted, "they part"), (without, "no IMU")):
         assert drawn(analysis) == []
-        line = nothing_concluded(document(analysis))
+        line = nothing_concluded(analysis)
         assert line.startswith("Why EKF2 differs: nothing is concluded")
         assert line.count(reason) == 1
     assert drawn(unexplained(sample)) == []
-    assert not nothing_concluded(document(unexplained(sample)))
-    assert not nothing_concluded(document(sample))
+    assert not nothing_concluded(unexplained(sample))
+    assert not nothing_concluded(sample)
 
 
 @pytest.mark.parametrize(

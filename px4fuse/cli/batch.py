@@ -86,7 +86,7 @@ def batch(
     from px4fuse.fleet.junit import junit as as_junit
     from px4fuse.fleet.regressions import read_baseline
     from px4fuse.fleet.run import run
-    from px4fuse.fleet.terminal import print_fleet
+    from px4fuse.fleet.terminal import summary
 
     gc.enable()  # a long run, of a library that leaves circles
     try:
@@ -106,10 +106,8 @@ def batch(
     except KeyboardInterrupt as stopped:
         left = f"what is done is kept in {output}. The same command goes on from there."
         raise outputs.Interrupted(stopped, left) from None
-    if junit is not None:
-        outputs.write_outputs({junit: as_junit(fleet.table)})
-    print_fleet(outputs.terminal(), fleet)
-    outputs.open_written(output / "fleet.html")
+    contents = {} if junit is None else {junit: as_junit(fleet.table)}
+    outputs.finish(contents, summary(fleet), written=fleet.written)
     severities = SEVERITIES[: SEVERITIES.index(fail_on) + 1] if fail_on in SEVERITIES else ()
     failed = fail_on is not None and bool((fleet.table["status"] == FAILED).any())
     failed |= fail_on == WORSE and bool((fleet.table["change"] != "").any())

@@ -40,37 +40,27 @@ def compare(
     LOG is a PX4 ULog or a MAVLink recording (.tlog or raw stream). Writes a PDF report and its
     results as JSON, for example reports/LOG_sigma-z-0.05.pdf and .json.
     """
-    from px4fuse.analysis import AidsAlone, bad_verdicts, run_or_judge_aids
-    from px4fuse.report.document import AidsDocument, Document
-    from px4fuse.report.terminal import aids_summary, summary
-    from px4fuse.results.build import aids_results, results
+    from px4fuse.analysis import bad_verdicts, run_or_judge_aids
+    from px4fuse.report.terminal import summary
+    from px4fuse.results.build import judged_results
 
     person = inputs.read_person(given)
     request = inputs.comparison_request(log, given)
     alone = json_path == STANDARD_OUTPUT
     outputs.report_paths(output, json_path)  # before the work, not after it
     with outputs.progress(json_path) as step:
-        analysis = run_or_judge_aids(request, step)
-        document: AidsDocument | Document
-        if isinstance(analysis, AidsAlone):
-            document = AidsDocument(analysis, aids_results(request, analysis, person))
-        else:
-            document = Document(analysis, results(request, analysis, person))
+        found = run_or_judge_aids(request, step)
+        results = judged_results(request, found, person)
         if output is None and not alone:
-            output = outputs.free_report(log.stem, settings_name(request), document.results)
-        contents = outputs.result_files(document.results, json_path, output, document, step)
-    if isinstance(document, AidsDocument):
-        outputs.finish(contents, aids_summary(document))
-    else:
-        outputs.finish(contents, summary(document, output), request)
-    bad = bad_verdicts(analysis) if checks else {}
+            output = outputs.free_report(log.stem, settings_name(request), results)
+        contents = outputs.result_files(results, json_path, output, found, step)
+    outputs.finish(contents, summary(found, results, output), request)
+    bad = bad_verdicts(found) if checks else {}
     for name, verdict in bad.items():
         click.echo(f"{name}: {verdict}", err=True)
     if bad:
         sys.exit(1)
     if fail_on is not None:
         worst = SEVERITIES[: SEVERITIES.index(fail_on) + 1]
-        if any(
-            one.severity in worst and one.caused_by is None for one in document.results.findings
-        ):
+        if any(one.severity in worst and one.caused_by is None for one in results.findings):
             sys.exit(1)

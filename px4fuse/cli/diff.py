@@ -39,11 +39,10 @@ def diff(
     alone = json_path == STANDARD_OUTPUT
     outputs.report_paths(output, json_path)  # before the work, not after it
     with outputs.progress(json_path) as step:
-        found = compared(a, b, progress=step)
-        results = found.results
+        results = compared(a, b, progress=step)
         if output is None and not alone:
             output = outputs.free_report(f"{a.stem}_to_{b.stem}", "", results)
         contents = outputs.result_files(results, json_path, output, results, step)
     outputs.finish(contents, summary(results))
-    if fail_on is not None and found.is_worse:
+    if fail_on is not None and results.is_worse:
         sys.exit(1)

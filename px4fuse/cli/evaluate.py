@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from px4fuse.trajectory.scores import Delta
 
 MAX_DELTA = 1e6
+# What the score takes by the names of the options
+AS_GIVEN = ("alignment", "association", "max_gap_s", "time_offset_s")
 _DELTA = re.compile(r"(\d+\.?\d*|\.\d+) ?(m|s|frames|f)")
 
 
@@ -35,14 +37,12 @@ def delta(text: str) -> Delta:
 @click.command()
 @click.argument("estimate", type=inputs.Named())
 @click.argument("reference", type=inputs.Named())
-@click.option(
-    "--rpe",
-    type=delta,
-    multiple=True,
-    metavar="DELTA",
-    help="RPE over a distance (5m), a time (10s) or frames (1f); may be repeated.  [default: some "
+@inputs.option(
+    "--rpe DELTA",
+    "RPE over a distance (5m), a time (10s) or frames (1f); may be repeated.  [default: some "
     "that suit the path]",
-)
+    type=delta, multiple=True,
+)  # fmt: skip
 @inputs.request_options(EvaluationRequest, EVALUATION_OPTIONS)
 @inputs.max_size_option
 @inputs.report_options("The page.  [default: reports/A_against_B.pdf]")
@@ -50,7 +50,6 @@ def delta(text: str) -> Delta:
 def evaluate(
     estimate: Path,
     reference: Path,
-    rpe: tuple[Delta, ...],
     output: Path | None,
     json_path: Path | None,
     **given: Any,
@@ -67,8 +66,9 @@ def evaluate(
     from px4fuse.results.build import evaluation_results
     from px4fuse.trajectory.evaluation import evaluate as score
 
+    deltas = given.pop("rpe")
     request = EvaluationRequest(
-        estimate=str(estimate), reference=str(reference), rpe=tuple(map(str, rpe)), **given
+        estimate=str(estimate), reference=str(reference), rpe=tuple(map(str, deltas)), **given
     )
     if request.max_gap_s is not None and request.max_gap_s <= 0.0:
         raise SettingsError(f"--max-gap {request.max_gap_s:g}: give more than 0 seconds.")
@@ -82,12 +82,9 @@ def evaluate(
         found = score(
             first.trajectory,
             second.trajectory,
-            alignment=given["alignment"],
-            association=given["association"],
-            max_gap_s=request.max_gap_s,
-            time_offset_s=given["time_offset_s"],
-            rpe_deltas=rpe or None,
+            rpe_deltas=deltas or None,
             all_pairs=not request.consecutive,
+            **{name: given[name] for name in AS_GIVEN},
         )
         results = evaluation_results(request, found)
         if output is None and not alone:

@@ -25,7 +25,6 @@ def explore(logs: tuple[Path, ...], output: Path | None, **given: Any) -> None:
     step at a time if you like, and takes you on a tour of the flight.
     """
     from px4fuse.analysis import run
-    from px4fuse.findings import find
 
     if len(logs) > 2:
         raise SettingsError(f"{len(logs)} logs: give one, or two to see them side by side.")
@@ -35,12 +34,8 @@ def explore(logs: tuple[Path, ...], output: Path | None, **given: Any) -> None:
     requests = [inputs.comparison_request(log, dict(given)) for log in logs]
     stems = "_".join(log.stem for log in logs)
     target = outputs.web_page(output, Path("reports", f"{stems}{settings_name(requests[0])}.html"))
-    outputs.check_targets([target])  # before the work, not after it
     with outputs.progress(target) as step:
-        found = []
-        for request in requests:
-            analysis = run(request, step)
-            found.append((analysis, find(analysis), request))
+        found = [run(request, step) for request in requests]
         step("writing the page")
         # Bokeh takes long to import, and bad input needs none of it
         from px4fuse.explore.page import html_text

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Literal
 import click
 
 from px4fuse.cli.inputs import Named, max_size_option, open_option, option
-from px4fuse.cli.outputs import Interrupted, open_written, progress, terminal, write_new
+from px4fuse.cli.outputs import Interrupted, finish, progress, write_new
 from px4fuse.errors import OutputError, SettingsError
 
 if TYPE_CHECKING:
     from px4fuse.grading.grade import GradeOutcome
+    from px4fuse.report.page import Page
 
 
 @click.command()
@@ -132,8 +133,7 @@ def grade(
     except KeyboardInterrupt as stopped:
         left = "but what is graded is kept. The same command goes on from there."
         raise Interrupted(stopped, left) from None
-    _print(outcome)
-    open_written(output / "class.html")
+    finish({}, _page(outcome), written=outcome.written)
 
 
 def _check_place(output: Path, given: tuple[Path, ...]) -> None:
@@ -147,11 +147,10 @@ def _check_place(output: Path, given: tuple[Path, ...]) -> None:
             )
 
 
-def _print(outcome: GradeOutcome) -> None:
+def _page(outcome: GradeOutcome) -> Page:
     from collections import Counter
 
     from px4fuse.report.page import Page
-    from px4fuse.report.screen import print_file, show
     from px4fuse.report.style import GOOD, MUTED, SEVERITY_COLOURS
     from px4fuse.results.reading import one_line
 
@@ -175,7 +174,4 @@ def _print(outcome: GradeOutcome) -> None:
     )
     for note in outcome.notes:
         page.write(note, colour=MUTED)
-    console = terminal()
-    show(console, page.blocks)
-    for path in outcome.written:
-        print_file(console, "Wrote", path)
+    return page

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
 from inspect import Parameter, signature
 from pathlib import Path
 from types import NoneType, UnionType
@@ -91,7 +90,6 @@ class TypedQuantity(click.ParamType["float | str"]):
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
         """Its unit, as the help shows what to type."""
-        del param, ctx
         unit = "DEG" if self.unit == "°" else self.unit.upper() or "NUMBER"
         return f"{unit}|auto" if self.auto else unit
 
@@ -115,12 +113,14 @@ class TypedQuantity(click.ParamType["float | str"]):
         return number
 
 
-# An option that names a file or folder
-path_option = partial(click.option, type=Named())
-
-
 def option(
-    typed: str, meaning: str, least: float | None = None, most: float | None = None
+    typed: str,
+    meaning: str,
+    least: float | None = None,
+    most: float | None = None,
+    *,
+    name: str = "",
+    **more: Any,
 ) -> Option:
     """An option of the command below: what it takes and its default are its parameter's there.
 
@@ -132,21 +132,27 @@ def option(
         Its help.
     least, most : float, optional
         Of a number.
+    name : str
+        Of its parameter, where that is called otherwise.
+    **more
+        As click has them: what it takes where the command has no parameter of its name.
     """
     names, _, metavar = typed.replace(", ", ",").partition(" ")
+    field = name or names.rpartition("--")[2].replace("-", "_")
 
     def add(command: Callable[..., None]) -> Callable[..., None]:
-        field = names.rpartition("--")[2].replace("-", "_")
-        hint, default = get_type_hints(command)[field], signature(command).parameters[field].default
-        details = _taken(hint) | {"help": meaning, "metavar": metavar or None}
-        if default is not Parameter.empty:
-            details["default"] = default
-        elif hint is Path:
-            details["required"] = True
+        details: dict[str, Any] = {"help": meaning, "metavar": metavar or None}
+        if "type" not in more and (hint := get_type_hints(command).get(field)) is not None:
+            default = signature(command).parameters[field].default
+            details |= _taken(hint)
+            if default is not Parameter.empty:
+                details["default"] = default
+            elif hint is Path:
+                details["required"] = True
         if (least, most) != (None, None):
-            within: Any = click.FloatRange if details["type"] is float else click.IntRange
+            within: Any = click.FloatRange if details.get("type") is float else click.IntRange
             details["type"] = within(least, most)
-        return click.option(*names.split(","), **details)(command)
+        return click.option(*names.split(","), field, **details | more)(command)
 
     return add
 
@@ -200,54 +206,44 @@ def _allow_size(ctx: click.Context, _: click.Parameter, megabytes: int | None) -
 
 
 # It says what this machine can take, not what is analysed, so it is no setting of the analysis
-max_size_option = click.option(
-    "--max-size",
-    type=click.IntRange(min=1),
-    expose_value=False,
-    callback=_allow_size,
-    metavar="MB",
-    help=f"Largest log that is read.  [default: {max_log_bytes.get() // 1_000_000}]",
-)
+max_size_option = option(
+    "--max-size MB",
+    f"Largest log that is read.  [default: {max_log_bytes.get() // 1_000_000}]", 1,
+    expose_value=False, callback=_allow_size,
+)  # fmt: skip
 #: The results, which stand beside a report where there is one
-json_option = path_option(
-    "--json",
-    "json_path",
-    metavar="FILE",
-    help="The results as JSON; - prints them alone on standard output. Without -o, no report is "
+json_option = option(
+    "--json FILE",
+    "The results as JSON; - prints them alone on standard output. Without -o, no report is "
     "written then.  [default: beside the report, where there is one]",
+    name="json_path",
 )
 
 
-def _opened(*names: str) -> Option:
+def _opened(typed: str, name: str) -> Option:
     """That what was written is to be opened; :func:`~px4fuse.cli.outputs.finish` does."""
-
-    def keep(ctx: click.Context, parameter: click.Parameter, value: bool) -> None:
-        del parameter
-        ctx.meta[OPENED] = value
-
-    return click.option(
-        *names, is_flag=True, expose_value=False, callback=keep,
-        help="Open what was written, in the program for it.",
+    return option(
+        typed, "Open what was written, in the program for it.", name=name, is_flag=True,
+        expose_value=False, callback=lambda ctx, _, value: ctx.meta.update({OPENED: value}),
     )  # fmt: skip
 
 
 #: Of every command that writes something to look at
-open_option = _opened("--open", "--show", "opened")
+open_option = _opened("--open, --show", "opened")
 #: Of the command whose --open is of a loop that did not close
 show_option = _opened("--show", "shown")
 #: Whose report it is
 person_options = _together(
-    click.option("--student", metavar="NAME", help="Name on the report."),
-    click.option("--id", "student_id", metavar="ID", help="Student number on the report."),
-    path_option("--notes", metavar="FILE.md", help="Your own words, printed in the report."),
-    path_option("--answers", metavar="FILE.toml", help="The form of px4fuse answers, filled in."),
+    option("--student NAME", "Name on the report."),
+    option("--id ID", "Student number on the report.", name="student_id"),
+    option("--notes FILE.md", "Your own words, printed in the report.", type=Named()),
+    option("--answers FILE.toml", "The form of px4fuse answers, filled in.", type=Named()),
 )
 
 
 def report_options(meaning: str) -> Option:
     """Of every command that makes a report: the PDF and its results."""
-    output = path_option("-o", "--output", metavar="FILE.pdf", help=meaning)
-    return _together(output, json_option)
+    return _together(option("-o, --output FILE.pdf", meaning), json_option)
 
 
 system_option = request_options(EvaluationRequest, {"system": OPTIONS["system"]})

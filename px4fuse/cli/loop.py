@@ -53,24 +53,20 @@ def closure(text: str) -> GivenClosure:
 
 @click.command()
 @click.argument("source", type=inputs.Named())
-@click.option(
-    "--landed-at",
-    type=landing,
-    metavar="FORWARD,RIGHT[,DEG]",
-    help="Where it really landed, by tape from the place of take-off: m along its nose there, m to "
+@inputs.option(
+    "--landed-at FORWARD,RIGHT[,DEG]",
+    "Where it really landed, by tape from the place of take-off: m along its nose there, m to "
     "the right, and degrees it was turned clockwise.  [default: the log's ground truth, else 0,0]",
+    type=landing,
 )
-@click.option("--open", "opened", is_flag=True, help="It did not come back: use no landing.")
-@click.option(
-    "--closure",
-    "closures",
-    type=closure,
-    multiple=True,
-    metavar="T1,T2[,SIGMA]",
-    help="It was at the same place at two times, within SIGMA m (0.10); may be repeated.",
-)
-@click.option(
-    "--robust", is_flag=True, help="Solve a pose graph of over 1000 closures robustly too: minutes."
+@inputs.option("--open", "It did not come back: use no landing.", name="opened", is_flag=True)
+@inputs.option(
+    "--closure T1,T2[,SIGMA]",
+    "It was at the same place at two times, within SIGMA m (0.10); may be repeated.",
+    name="closures", type=closure, multiple=True,
+)  # fmt: skip
+@inputs.option(
+    "--robust", "Solve a pose graph of over 1000 closures robustly too: minutes.", is_flag=True
 )
 @inputs.request_options(LoopRequest, LOOP_OPTIONS)
 @inputs.max_size_option
@@ -95,7 +91,6 @@ def loop(
     """
     from px4fuse.analysis import run_loop
     from px4fuse.loop.tracks import file_name, is_g2o, split_part
-    from px4fuse.report.document import LoopDocument
     from px4fuse.report.loop import summary
     from px4fuse.results.build import loop_results
 
@@ -115,7 +110,7 @@ def loop(
         if output is None and not alone:
             output = outputs.free_report(f"{file_name(source)}_loop", settings_name(request), made)
         contents = _files(found, tum, g2o)
-        contents |= outputs.result_files(made, json_path, output, LoopDocument(found, made), step)
+        contents |= outputs.result_files(made, json_path, output, found, step)
     outputs.finish(contents, summary(found, made.findings), request)
 
 

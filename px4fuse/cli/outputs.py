@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from px4fuse.report.page import Page
-    from px4fuse.report.pdf import Report
     from px4fuse.request import Request
     from px4fuse.results.contract import Results
 
@@ -65,7 +64,6 @@ class ShowStep(Protocol):
 
 def silent(what: str, done: int = 0, of: int | None = None) -> None:
     """Show nothing."""
-    del what, done, of
 
 
 @contextmanager
@@ -147,12 +145,13 @@ def web_page(output: Path | None, default: Path) -> Path:
     Raises
     ------
     OutputError
-        The name does not end as that of a web page.
+        The name does not end as that of a web page, or as :func:`check_targets` says.
     """
-    endings = (".html", ".htm")
-    if output is not None and output.suffix.lower() not in endings and output != STANDARD_OUTPUT:
-        raise OutputError(f"{output}: a web page. Give a name that ends in .html with -o.")
-    return output or default
+    target = output or default
+    if target.suffix.lower() not in (".html", ".htm") and target != STANDARD_OUTPUT:
+        raise OutputError(f"{target}: a web page. Give a name that ends in .html with -o.")
+    check_targets([target])
+    return target
 
 
 def report_paths(output: Path | None, json_path: Path | None) -> list[Path]:
@@ -179,7 +178,7 @@ def result_files(
     results: Struct | dict[str, Any],
     json_path: Path | None,
     output: Path | None = None,
-    document: Report | None = None,
+    found: object = None,
     step: ShowStep = silent,
 ) -> dict[Path, bytes]:
     """Results where --json says, and a document as a PDF that holds them and has them beside it.
@@ -189,20 +188,20 @@ def result_files(
     results : Struct or dict
     json_path, output : Path or None
         As given with --json and -o.
-    document : Report, optional
-        What is drawn.
+    found : object, optional
+        What the results are of, which is drawn.
     step : callable
         Told what is being done.
     """
     from px4fuse.results.contract import to_json
 
     text, contents = to_json(results), dict[Path, bytes]()
-    if output is not None and document is not None:
+    if output is not None and found is not None:
         from px4fuse.report.pdf import render
 
         step("drawing the report")
         output, beside = report_paths(output, json_path)
-        contents |= {output: render(document, text), beside: text.encode()}
+        contents |= {output: render(found, results, text), beside: text.encode()}
     if json_path is not None:
         contents[json_path] = text.encode()
     return contents
@@ -237,8 +236,7 @@ def write_new(path: Path, content: bytes) -> None:
     """
     if path.exists():
         raise OutputError(f"{path}: exists already; it was not overwritten. Give another name.")
-    write_outputs({path: content})
-    click.echo(f"Wrote    {on_one_line(str(path))}")
+    finish({path: content})
 
 
 def check_targets(targets: Iterable[Path | None]) -> None:
@@ -277,34 +275,27 @@ def check_targets(targets: Iterable[Path | None]) -> None:
 
 def finish(
     contents: Mapping[Path, bytes],
-    told: Page | Callable[[Console], None] | None = None,
+    page: Page | None = None,
     request: Request | None = None,
+    written: Iterable[Path] = (),
 ) -> None:
-    """Write all outputs or none; then tell people what was found and written.
+    """Write all outputs or none; then tell people what was found and written, and open it if asked.
 
     Nothing is told where the results have standard output to themselves. Commands in the words are
-    printed so that they run, where the request is given.
+    printed so that they run, where the request is given. ``written`` is what is there already.
     """
-    from px4fuse.report.screen import print_file, show
+    from px4fuse.report.screen import print_line, show
 
     write_outputs(contents)
+    files = [*contents, *written]
     if STANDARD_OUTPUT not in contents:
         console = terminal()
-        if callable(told):
-            told(console)
-        elif told is not None:
-            show(console, told.blocks, request)
-        for path in contents:
-            print_file(console, "Wrote", path)
-    open_written()
-
-
-def open_written(*besides: Path) -> None:
-    """Open what was written to be looked at, where --open asks for it."""
-    meta = click.get_current_context().meta
-    written: list[Path] = [*besides, *meta.get(WRITTEN, [])]
-    seen = [path for ending in TO_LOOK_AT for path in written if path.suffix.lower() == ending]
-    if meta.get(OPENED) and seen:
+        if page is not None:
+            show(console, page.blocks, request)
+        for path in files:
+            print_line(console, "Wrote", on_one_line(str(path)), "bold")
+    seen = [path for ending in TO_LOOK_AT for path in files if path.suffix.lower() == ending]
+    if click.get_current_context().meta.get(OPENED) and seen:
         click.launch(str(seen[0].resolve()))
 
 

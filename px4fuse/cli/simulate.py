@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 import click
 
 from px4fuse.cli.inputs import TypedQuantity, option, typed_parameters
-from px4fuse.cli.outputs import check_targets, progress, terminal, write_outputs
+from px4fuse.cli.outputs import check_targets, finish, progress
 from px4fuse.errors import OutputError, SettingsError, on_one_line
 from px4fuse.reading import read_text
 from px4fuse.simulation.mistakes import MISTAKES, as_typed, made, parse
@@ -19,6 +19,7 @@ from px4fuse.simulation.scenario import OF_KIND, Kind, Scenario, Yaw, quantities
 
 if TYPE_CHECKING:
     from px4fuse.assignment.drawing import Kinds
+    from px4fuse.report.page import Page
     from px4fuse.simulation.flights import Simulation
 
 _DEFAULT = Scenario()
@@ -50,7 +51,6 @@ class WithMistakes(click.Command):
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the mistakes."""
-        del ctx
         with formatter.section("Mistakes (without =VALUE: a clear case)"):
             formatter.write_dl(
                 [
@@ -153,12 +153,7 @@ def simulate(
         contents = {output: flights.to_ulog(simulation)}
     if answer is not None:
         contents[answer] = to_json(flights.answer(simulation)).encode()
-    write_outputs(contents)
-    for line in _summary(simulation):
-        click.echo(line)
-    click.echo(on_one_line(f"Log       {output}"))
-    if answer is not None:
-        click.echo(on_one_line(f"Answer    {answer} (not for students)"))
+    finish(contents, _page(simulation, answer))
 
 
 def _check_options(assignment: Path | None) -> None:
@@ -204,11 +199,11 @@ def _assign(
 ) -> None:
     """Write a flight for everyone and the answer key, or only say what would be drawn."""
     from px4fuse.assignment import assignment
+    from px4fuse.assignment.drawing import EASIEST, HARDEST
     from px4fuse.assignment.roster import read_roster
     from px4fuse.report.page import Page
-    from px4fuse.report.screen import show
 
-    students = read_roster(roster)
+    students, page, ends = read_roster(roster), Page(), dict[str, str]()
     key_file = assignment.key_path(folder, answer_path)
     if key_file.exists() and key_file.samefile(roster):
         raise OutputError(f"{key_file}: is the roster. Give another name with --answer.")
@@ -217,19 +212,14 @@ def _assign(
         found = assignment.preview(students, key_file, secret, kind, count)
         drawn = [(one.typed, one.difficulty) for one in found]
         rows = [
-            (
-                student.student_id,
-                student.name,
-                one.scenario.kind,
-                " ".join(one.typed) or "none",
-                f"{one.difficulty:.2f}",
-            )
+            (student.student_id, student.name, one.scenario.kind, " ".join(one.typed) or "none",
+             f"{one.difficulty:.2f}")
             for student, one in zip(students, found, strict=True)
-        ]
-        page = Page()
+        ]  # fmt: skip
         page.table(("student", "name", "flight", "mistakes", "difficulty"), rows, right=(4,))
-        show(terminal(), page.blocks)
-        end = ["Nothing was written. Not for students: this says what is wrong in every flight."]
+        ends["Preview"] = (
+            "Nothing was written. Not for students: this says what is wrong in every flight."
+        )
     else:
         with progress() as step:
             told = partial(step, "simulating")
@@ -237,55 +227,51 @@ def _assign(
                 students, folder, key_file, secret, kind, count, truth, told
             )
         drawn = [(answer.mistakes, answer.difficulty) for answer in key.answers]
-        end = [
-            f"Flights   {folder} ({written} written, {len(drawn) - written} were there already)",
-            f"Answers   {key_file} (not for students: it says what is wrong in every flight)",
-        ]
+        at, key_at = (on_one_line(str(path)) for path in (folder, key_file))
+        there = len(drawn) - written
+        ends["Flights"] = f"{at} ({written} written, {there} were there already)"
+        ends["Answers"] = f"{key_at} (not for students: it says what is wrong in every flight)"
         if key.secret:
-            end.append(
-                "Secret    made up, and kept in the answers: the same flights can be made again, "
-                "and later students added, while that file is there"
+            ends["Secret"] = (
+                "made up, and kept in the answers: the same flights can be made again, and later "
+                "students added, while that file is there"
             )
-    for line in (*_class_summary(kind, drawn), *end):
-        click.echo(line)
-
-
-def _class_summary(kind: str, drawn: list[tuple[tuple[str, ...], float | None]]) -> list[str]:
-    """What the class was given, one line each, of everyone's mistakes and difficulty."""
-    from px4fuse.assignment.drawing import EASIEST, HARDEST
-
     counts = Counter(one.partition("=")[0] for typed, _ in drawn for one in typed or ("none",))
     difficulties = [difficulty for _, difficulty in drawn if difficulty is not None]
-    return [
-        f"Class     {len(drawn)} student{'s' * (len(drawn) != 1)}, {kind}",
-        f"Mistakes  {', '.join(f'{name} {number}' for name, number in sorted(counts.items()))}",
-        f"Difficult {min(difficulties):.2f} to {max(difficulties):.2f}, drawn between "
+    page.advice({
+        "Class": f"{len(drawn)} student{'s' * (len(drawn) != 1)}, {kind}",
+        "Mistakes": ", ".join(f"{name} {number}" for name, number in sorted(counts.items())),
+        "How hard": f"{min(difficulties):.2f} to {max(difficulties):.2f}, drawn between "
         f"{EASIEST:g} and {HARDEST:g} for everyone: the smallest size that px4fuse finds in 19 of "
         "20 flights over the size that was drawn, of the hardest mistake",
-    ]
+        **ends,
+    })  # fmt: skip
+    finish({}, page)
 
 
-def _summary(simulation: Simulation) -> list[str]:
-    """What was simulated, one line each."""
-    scenario, motion = simulation.scenario, simulation.motion
+def _page(simulation: Simulation, answer: Path | None) -> Page:
+    """What was simulated."""
+    from px4fuse.report.page import Page
+
+    scenario, page = simulation.scenario, Page()
     names = made(simulation.mistakes)
     loop, many = scenario.kind == "loop", scenario.passes > 1
     path = f"{scenario.passes} lap{'s' * many} of a square of {scenario.length_m:g} m"
     if scenario.kind == "aisle":
         path = f"{scenario.passes} pass{'es' * many} of {scenario.length_m:g} m"
-    return [
-        f"Flight    {scenario.kind}, {path} at {scenario.speed_m_s:g} m/s, "
-        f"{motion.duration_s:g} s, seed {scenario.seed}",
-        f"Position  {SOURCES[scenario.kind]}, {scenario.source_sigma_m:g} m at "
+    page.advice({
+        "Flight": f"{scenario.kind}, {path} at {scenario.speed_m_s:g} m/s, "
+        f"{simulation.motion.duration_s:g} s, seed {scenario.seed}",
+        "Position": f"{SOURCES[scenario.kind]}, {scenario.source_sigma_m:g} m at "
         f"{scenario.source_rate_hz:g} Hz"
         + (f", drift {scenario.vio_drift:.1%} of the path" if loop else ""),
-        f"IMU       {scenario.imu_rate_hz:g} Hz, SIGMA_A {scenario.sigma_a_m_s2:g} m/s²",
-        *(
-            f"Mistake   {as_typed(name, simulation.mistakes)}: {MISTAKES[name].help}"
-            for name in names
-        ),
-        *([] if names else ["Mistakes  none"]),
-        f"Truth     {'in the log' if scenario.truth else 'not in the log'}",
-        "EKF2      "
-        + ("px4fuse's model of it" if scenario.ekf2 else "none: there is nothing of it in the log"),
-    ]
+        "IMU": f"{scenario.imu_rate_hz:g} Hz, SIGMA_A {scenario.sigma_a_m_s2:g} m/s²",
+    })  # fmt: skip
+    told = [f"{as_typed(name, simulation.mistakes)}: {MISTAKES[name].help}" for name in names]
+    page.labelled("Mistakes", *(told or ["none"]))
+    page.labelled("Truth", "in the log" if scenario.truth else "not in the log")
+    none = "none: there is nothing of it in the log"
+    page.labelled("EKF2", "px4fuse's model of it" if scenario.ekf2 else none)
+    if answer is not None:
+        page.labelled("Answer", f"{on_one_line(str(answer))} (not for students)")
+    return page

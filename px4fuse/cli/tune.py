@@ -9,11 +9,11 @@ import click
 
 from px4fuse.cli.inputs import Named, analysis_options, comparison_request, json_option
 from px4fuse.cli.outputs import finish, progress, result_files
+from px4fuse.record import Unavailable
 
 if TYPE_CHECKING:
     from px4fuse.comparison.model import Comparison
     from px4fuse.filter.tuning import AxisTuning
-    from px4fuse.flight import Unavailable
     from px4fuse.report.page import Page
 
 HEAD = (
@@ -39,7 +39,6 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.analysis import run_preparation
     from px4fuse.comparison.estimates import tuned as tuned_noises
     from px4fuse.errors import MissingDataError
-    from px4fuse.flight import Unavailable
     from px4fuse.results.build import tuning_results
 
     request = comparison_request(log, given)
@@ -53,40 +52,29 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
 
 
 def _page(compared: Comparison, tuned: dict[str, AxisTuning | Unavailable]) -> Page:
-    from px4fuse.flight import Unavailable
     from px4fuse.notebook.tables import noise_words
     from px4fuse.report.page import Page
     from px4fuse.report.style import MUTED
     from px4fuse.report.words import settings_words, tuning_advice
 
-    page, rows, page_below = Page(), [], Page()
-    page.labelled("Chosen", settings_words(compared.settings))
+    page, rows, below = Page(), [], list[str]()
     for name, found in tuned.items():
         if isinstance(found, Unavailable):
-            page_below.write(f"{name}: {found.reason}. {found.remedy}", colour=MUTED)
+            below.append(f"{name}: {found.reason}. {found.remedy}")
             continue
-        held = found.held_out
-        rows.append(
-            (
-                name,
-                noise_words(found.filter_sigma_a),
-                noise_words(found.sigma_z),
-                f"{found.gain_nats:.3f}",
-                "" if isinstance(held, Unavailable) else f"{held.gain_nats:+.3f}",
-                _whiteness(found),
-            )
-        )
+        held, judged = found.held_out, (found.before, found.after)
+        lags = [
+            f"{one.lag1_autocorrelation:+.2f}" for one in judged if not isinstance(one, Unavailable)
+        ]
+        white = " ".join(lags) if len(lags) == len(judged) else ""
+        gain = "" if isinstance(held, Unavailable) else f"{held.gain_nats:+.3f}"
+        noises = [noise_words(noise) for noise in (found.filter_sigma_a, found.sigma_z)]
+        rows.append([name, *noises, f"{found.gain_nats:.3f}", gain, white])
+    page.labelled("Chosen", settings_words(compared.settings))
     if rows:
         page.table(HEAD, rows, right=(1, 2, 3, 4, 5))
-        page_below.write(NOTE, colour=MUTED)
-    page_below.advice(tuning_advice(compared, tuned))
-    page.blocks += page_below.blocks
+        below.append(NOTE)
+    for text in below:
+        page.write(text, colour=MUTED)
+    page.advice(tuning_advice(compared, tuned))
     return page
-
-
-def _whiteness(found: AxisTuning) -> str:
-    from px4fuse.flight import Unavailable
-
-    if isinstance(found.before, Unavailable) or isinstance(found.after, Unavailable):
-        return ""
-    return f"{found.before.lag1_autocorrelation:+.2f} {found.after.lag1_autocorrelation:+.2f}"

@@ -17,12 +17,10 @@ from px4fuse.errors import LogError
 from px4fuse.reading import files_by_sha256, read_whole, shown
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
+    from px4fuse.report.page import Page
     from px4fuse.verification.model import Report, Verdict
 
 SCHEMA = {"name": "px4fuse-verification", "version": "2.0"}
-STYLES = {"verified": "bold green", "cannot verify": "bold yellow"}
 # A flight of ten minutes takes about one; what takes longer than this was made to
 TIMEOUT_S = 1800.0
 
@@ -69,7 +67,7 @@ def verify(
         raise LogError(f"{shown(report)}: cannot be verified: {verdict.reason}")
     redrawn = {} if output is None or not verdict.redrawn else {output: verdict.redrawn}
     contents = redrawn | result_files(_plain(read, verdict), json_path)
-    finish(contents, lambda console: _print(console, shown(report), verdict, output))
+    finish(contents, _page(shown(report), verdict, output))
     sys.exit(0 if verdict.outcome == "verified" else 1)
 
 
@@ -88,22 +86,23 @@ def _plain(report: Report, verdict: Verdict) -> dict[str, object]:
     }
 
 
-def _print(console: Console, name: str, verdict: Verdict, output: Path | None) -> None:
-    from rich.text import Text
-
-    from px4fuse.report.screen import say
+def _page(name: str, verdict: Verdict, output: Path | None) -> Page:
+    from px4fuse.report.page import Page
+    from px4fuse.report.style import GOOD, MUTED, SEVERITY_COLOURS
     from px4fuse.results.reading import one_line
     from px4fuse.verification.verification import LIMIT
 
-    style = STYLES.get(verdict.outcome, "bold red")
-    say(console, Text.assemble(f"{one_line(name, 200)}: ", (verdict.outcome, style)))
-    for reason in verdict.reasons:
-        if reason != LIMIT:
-            say(console, one_line(reason, 400), "  ", 2)
-    for one in verdict.differences:
-        say(console, f"{one.path}: {one.recorded}, recomputed {one.recomputed}", "  ", 2)
+    page = Page()
+    colours = {"verified": GOOD, "cannot verify": SEVERITY_COLOURS["warning"]}
+    colour = colours.get(verdict.outcome, SEVERITY_COLOURS["error"])
+    page.write(f"{one_line(name, 200)}: {verdict.outcome}", bold=True, colour=colour)
+    said = [one_line(reason, 400) for reason in verdict.reasons if reason != LIMIT]
+    said += [f"{d.path}: {d.recorded}, recomputed {d.recomputed}" for d in verdict.differences]
+    for text in said:
+        page.write(text, indent=12.0)
     if output is not None and not verdict.redrawn:
-        say(console, "Nothing was redrawn, since the analysis was not run again.")
+        page.write("Nothing was redrawn, since the analysis was not run again.")
     elif output is None and verdict.pages:
-        say(console, "Read the redrawn report instead: -o writes it.")
-    say(console, Text(LIMIT, "dim"))
+        page.write("Read the redrawn report instead: -o writes it.")
+    page.write(LIMIT, colour=MUTED)
+    return page

@@ -17,25 +17,20 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("log", type=inputs.Named())
-@click.option(
-    "--set",
-    "changes",
-    multiple=True,
-    metavar="NAME=VALUE",
-    help="Parameter to change, in PX4's unit; may be repeated.  [default: what the data ask for]",
+@inputs.option(
+    "--set NAME=VALUE",
+    "Parameter to change, in PX4's unit; may be repeated.  [default: what the data ask for]",
+    name="changes",
 )
 @inputs.option("--sweep NAME=LOW:HIGH[:COUNT]", "Parameter to change over several values.")
 @inputs.option(
     "--without AID",
     "Aid that is no longer fused, as gnss_pos, gnss_vel, baro_hgt, mag or ev_pos; may be repeated.",
 )
-@click.option(
-    "--from",
-    "since",
-    type=inputs.TypedQuantity("s", 60.0),
-    metavar="SECONDS",
-    help="When the aids of --without are lost.  [default: from the start]",
-)
+@inputs.option(
+    "--from SECONDS", "When the aids of --without are lost.  [default: from the start]",
+    name="since", type=inputs.TypedQuantity("s", 60.0),
+)  # fmt: skip
 @inputs.flight_options
 @inputs.report_options("A page, and its results beside it.")
 @inputs.open_option
@@ -57,7 +52,6 @@ def whatif(
     (see tune and sync). --without gnss_pos --from 60 goes on from there without that aid.
     """
     from px4fuse.analysis import run_what_if
-    from px4fuse.report.document import WhatIfDocument
     from px4fuse.report.whatif import summary
     from px4fuse.request import WhatIfRequest
     from px4fuse.results.build import whatif_results
@@ -75,8 +69,7 @@ def whatif(
     with outputs.progress(json_path) as step:
         found = run_what_if(request, step)
         results = whatif_results(request, found)
-        document = WhatIfDocument(found, results)
-        contents = outputs.result_files(results, json_path, output, document, step)
+        contents = outputs.result_files(results, json_path, output, found, step)
     outputs.finish(contents, summary(found))
 
 

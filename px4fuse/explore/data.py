@@ -11,7 +11,6 @@ import pandas as pd
 from scipy import stats
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.events import happened
 from px4fuse.comparison.interventions import CONTENT_NIS, NEES_LARGE
 from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
 from px4fuse.comparison.preparation import choose_source
@@ -24,9 +23,9 @@ from px4fuse.filter.model import INITIAL_COVARIANCE
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, along, imu_gaps, within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.findings import Finding, by_root, find
 from px4fuse.findings.causes import NOISES
 from px4fuse.findings.hidden_errors import hidden_error
-from px4fuse.findings.model import Finding, by_root
 from px4fuse.findings.story import story
 from px4fuse.flight import Columns, PositionTrack, Unavailable
 from px4fuse.request import ComparisonRequest, command_line
@@ -42,22 +41,14 @@ OF_KNOBS = frozenset(name for name in NOISES if not name.startswith("ekf2_"))
 
 
 def flight_data(
-    analysis: Analysis,
-    findings: tuple[Finding, ...],
-    request: ComparisonRequest,
-    packer: Packer,
-    *,
-    beside: bool = False,
-    replays: bool = True,
+    analysis: Analysis, packer: Packer, *, beside: bool = False, replays: bool = True
 ) -> dict[str, Any]:
     """Everything about one flight, as JSON can hold it; arrays are places in the packer.
 
     Parameters
     ----------
     analysis : Analysis
-    findings : tuple of Finding
-    request : ComparisonRequest
-        That the analysis was made from.
+        Made from a request.
     packer : Packer
     beside : bool
         Whether it stands beside another flight: then times are from the start of its segment.
@@ -66,7 +57,8 @@ def flight_data(
     """
     signals = signals_of(analysis, packer)
     settings, segment = analysis.settings, analysis.segment
-    events = happened(analysis)
+    events, findings, request = analysis.events, find(analysis), analysis.request
+    assert request is not None
     return {
         "log": analysis.flight.log.name,
         "source": analysis.source.name,

@@ -5,7 +5,6 @@ made up.
 """
 
 import itertools
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,11 +13,12 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.model import Model, replay_settings
-from px4fuse.ekf2.replay import HORIZONTAL, Ekf2Replay, along, rms_to_truth, settled
+from px4fuse.ekf2.model import replay_settings
+from px4fuse.ekf2.replay import HORIZONTAL, Ekf2Replay, Spans, along, rms_to_truth, settled
 from px4fuse.ekf2.whatif import MOST_REJECTED
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.explore.packing import Packer
+from px4fuse.filter import signals
 from px4fuse.filter.consistency import Consistency, assess
 from px4fuse.filter.signals import within
 from px4fuse.flight import Columns, Ekf2, Unavailable
@@ -39,27 +39,21 @@ def grid_data(analysis: Analysis, packer: Packer) -> dict[str, Any] | str:
         return model.reason
     if not model.agreement.good:
         return model.agreement.doubted("EKF2").reason
-    stops = _stops(model.inputs)
+    stops, flown = _stops(model.inputs), model.inputs.settings
     settings = [
         dict(zip(stops, values, strict=True)) for values in itertools.product(*stops.values())
     ]
-    segment = analysis.segment
     replays = replay_settings(model, settings)
-    count = sum(len(within(replay.updates, segment)) for replay in replays)
-    every = -(-count // MOST_DRAWN) if count else 1
-    directions = {
-        result.axis.name: result.axis.direction
-        for result in analysis.axes.values()
-        if result.axis.direction[2] == 0.0
-    }
-    flown = model.inputs.settings
+    count = sum(len(within(replay.updates, analysis.segment)) for replay in replays)
+    every = max(1, -(-count // MOST_DRAWN))
+    judged = model.flown.judged_s
     return {
         "stops": [[name, PARAMETERS[name].unit, values] for name, values in stops.items()],
         "flown": [stops[name].index(_told(flown[name])) for name in stops],
         "agreement": model.agreement.reason,
         "every": every,
         "most": MOST_REJECTED,
-        "cases": [_case(analysis, model, replay, directions, every, packer) for replay in replays],
+        "cases": [_case(analysis, replay, judged, every, packer) for replay in replays],
     }
 
 
@@ -90,69 +84,46 @@ def _stops(inputs: Inputs) -> dict[str, list[float]]:
 
 
 def _case(
-    analysis: Analysis,
-    model: Model,
-    replay: Ekf2Replay,
-    directions: Mapping[str, Array],
-    every: int,
-    packer: Packer,
+    analysis: Analysis, replay: Ekf2Replay, judged: Spans, every: int, packer: Packer
 ) -> dict[str, Any]:
     """One stop: north and east as drawn, and the numbers of each horizontal axis."""
-    judged = model.flown.judged_s
-    used = replay.updates[settled(replay.updates.index.to_numpy(), judged)]
-    shown = within(replay.updates, analysis.segment)
+    used = replay.updates[settled(replay.updates.index, judged)]
+    shown, published = within(replay.updates, analysis.segment), replay.published
     drawn = shown.iloc[::every]
+
+    def column(name: str, scale: float, power: float = 1.0) -> list[int]:
+        values = (drawn[name.format(axis)].to_numpy() ** power for axis in HORIZONTAL)
+        return [packer.add(each, scale) for each in values]
+
+    def state(names: list[str]) -> list[int]:
+        values = (np.interp(drawn.index, published.index, published[name]) for name in names[:2])
+        return [packer.add(each, HALF_CENTIMETRES) for each in values]
+
+    def moments(name: str) -> int:
+        times_s = shown.index.to_numpy()[shown[name].to_numpy() > 0]
+        return packer.add(np.round(times_s, 3), MILLIMETRES)
+
     return {
         "time": packer.add_times(np.round(drawn.index.to_numpy(), 6)),
-        "nu": [
-            packer.add(drawn[f"innovation_{axis}_m"].to_numpy(), MILLIMETRES) for axis in HORIZONTAL
-        ],
-        "sigma": [
-            packer.add(np.sqrt(drawn[f"innovation_variance_{axis}_m2"].to_numpy()), TENTHS)
-            for axis in HORIZONTAL
-        ],
+        "nu": column("innovation_{}_m", MILLIMETRES),
+        "sigma": column("innovation_variance_{}_m2", TENTHS, 0.5),
         "flag": packer.add(drawn["rejected"].to_numpy(), 1.0),
-        **_state(replay, drawn, packer),
-        "rejected": packer.add(np.round(_times(shown, "rejected"), 3), MILLIMETRES),
-        "reset": packer.add(np.round(_times(shown, "reset"), 3), MILLIMETRES),
+        # what is published at the innovations' times, and σ after them
+        "p": state(Columns.POSITION),
+        "v": state(Columns.VELOCITY),
+        "sp": column("position_variance_{}_m2", MILLIMETRES, 0.5),
+        "sv": column("velocity_variance_{}_m2_s2", MILLIMETRES, 0.5),
+        "rejected": moments("rejected"),
+        "reset": moments("reset"),
         "share": float(used["rejected"].mean()) if len(used) else 0.0,
         "resets": int(used["reset"].sum()),
         "lost": replay.late + replay.lost,
         "axes": {
-            name: _numbers(analysis, replay, used, direction, judged)
-            for name, direction in directions.items()
+            name: _numbers(analysis, replay, used, result.axis.direction, judged)
+            for name, result in analysis.axes.items()
+            if result.axis.direction[2] == 0.0
         },
     }
-
-
-def _state(replay: Ekf2Replay, drawn: pd.DataFrame, packer: Packer) -> dict[str, list[int]]:
-    """What is published at the innovations' times, and σ after them, north and east."""
-    times, published = drawn.index.to_numpy(), replay.published
-    made: dict[str, list[int]] = {"p": [], "v": [], "sp": [], "sv": []}
-    for axis, position, velocity in zip(
-        HORIZONTAL, Columns.POSITION[:2], Columns.VELOCITY[:2], strict=True
-    ):
-        for name, column in (("p", position), ("v", velocity)):
-            state = np.interp(times, published.index, published[column])
-            made[name].append(packer.add(state, HALF_CENTIMETRES))
-        for name, column in (
-            ("sp", f"position_variance_{axis}_m2"), ("sv", f"velocity_variance_{axis}_m2_s2")
-        ):  # fmt: skip
-            made[name].append(packer.add(np.sqrt(drawn[column].to_numpy()), MILLIMETRES))
-    return made
-
-
-def _times(updates: pd.DataFrame, column: str) -> Array:
-    times: Array = updates.index.to_numpy()[updates[column].to_numpy() > 0]
-    return times
-
-
-def _along(updates: pd.DataFrame, direction: Array) -> tuple[Array, Array]:
-    """Innovation and variance along a horizontal direction; EKF2 fuses north and east apart."""
-    c, s = float(direction[0]), float(direction[1])
-    north, east = (updates[f"innovation_{axis}_m"].to_numpy() for axis in HORIZONTAL)
-    s_north, s_east = (updates[f"innovation_variance_{axis}_m2"].to_numpy() for axis in HORIZONTAL)
-    return c * north + s * east, c * c * s_north + s * s * s_east
 
 
 def judged_numbers(statement: Consistency | Unavailable) -> dict[str, Any]:
@@ -170,20 +141,20 @@ def judged_numbers(statement: Consistency | Unavailable) -> dict[str, Any]:
 
 
 def _numbers(
-    analysis: Analysis,
-    replay: Ekf2Replay,
-    used: pd.DataFrame,
-    direction: Array,
-    judged: tuple[tuple[float, float], ...],
+    analysis: Analysis, replay: Ekf2Replay, used: pd.DataFrame, direction: Array, judged: Spans
 ) -> dict[str, Any]:
-    """EKF2's column of the table at this stop."""
+    """EKF2's column of the table at this stop; EKF2 fuses north and east apart."""
     flight = analysis.flight
-    made = judged_numbers(assess(*_along(used, direction)))
     assert isinstance(flight.ekf2, Ekf2)
+    nu, s = (
+        signals.along(used, [name.format(axis) for axis in HORIZONTAL], weights)
+        for name, weights in (
+            ("innovation_{}_m", direction[:2]), ("innovation_variance_{}_m2", direction[:2] ** 2)
+        )
+    )  # fmt: skip
+    made = judged_numbers(assess(nu, s))
     times = flight.ekf2.state.index.to_numpy()
     times = times[settled(times, judged)]
     position = along(replay.published, Columns.POSITION, direction, times)
     error = rms_to_truth(flight, position, direction, times)
-    if error is not None:
-        made["truthP"] = error
-    return made
+    return made if error is None else made | {"truthP": error}

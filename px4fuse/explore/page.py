@@ -2,8 +2,6 @@
 
 from collections.abc import Sequence
 from importlib.metadata import version
-from importlib.resources import files
-from string import Template
 from typing import Any, Literal
 
 from bokeh.resources import Resources
@@ -12,24 +10,33 @@ from px4fuse.analysis import Analysis
 from px4fuse.explore.data import flight_data, ranges
 from px4fuse.explore.figures import document_json
 from px4fuse.explore.packing import Packer
-from px4fuse.findings.model import Finding
-from px4fuse.request import ComparisonRequest
-from px4fuse.webpage.safe import cleaned, escaped, inert_json, policy_hash
-from px4fuse.webpage.safe import part as shared
+from px4fuse.webpage.safe import cleaned, inert_json, part, policy_hash, template
 
 # Longer text from a log is cut
 MAX_CHARACTERS = 2000
-Explored = tuple[Analysis, tuple[Finding, ...], ComparisonRequest]
 SCRIPTS = ("dom", "story", "grid", "step", "times", "tour")
+HERE = "px4fuse.explore"
+# Plots of a flight, each with what it shows
+PANELS = (
+    ("innovation", "Innovations with ±2√S; arrows mark what lies beyond the axis"),
+    ("sigma_p", "Standard deviation of position: grows on predict, shrinks on update"),
+    ("sigma_v", "Standard deviation of velocity"),
+    ("position", "Position"),
+    ("velocity", "Velocity"),
+    ("error", "Error of position against the truth"),
+    ("nis", "Running mean of NIS: 1 is right, the band holds 95 %"),
+    ("gain", "Gain K: position solid, velocity dotted"),
+    ("strip", "What happened"),
+)
 
 
-def html_text(flights: list[Explored]) -> str:
+def html_text(analyses: Sequence[Analysis]) -> str:
     """Lay out the page.
 
     Parameters
     ----------
-    flights : list of (Analysis, tuple of Finding, ComparisonRequest)
-        One, or two to be shown side by side.
+    analyses : sequence of Analysis
+        One, or two to be shown side by side; each made from a request.
 
     Returns
     -------
@@ -37,9 +44,9 @@ def html_text(flights: list[Explored]) -> str:
         Write it as UTF-8.
     """
     packer = Packer()
-    data = [flight_data(*flight, packer, beside=len(flights) > 1) for flight in flights]
+    data = [flight_data(one, packer, beside=len(analyses) > 1) for one in analyses]
     return page_text(
-        data_scripts(data, [analysis for analysis, _, _ in flights], packer),
+        data_scripts(data, analyses, packer),
         data,
         command="explore",
         heading="Turn the knobs and watch",
@@ -96,49 +103,22 @@ def page_text(
         # BokehJS itself, without widgets, tables and formulas; what follows it only sets a log
         # level, and says so on the console
         "bokeh": Resources(mode="inline", components=["bokeh"]).js_raw[0],
-        "engine": _file("engine.js"),
-        "script": "".join(_file(f"{name}.js") for name in (*SCRIPTS, practice, "page")),
+        "engine": part("engine.js", HERE),
+        "script": "".join(part(f"{name}.js", HERE) for name in (*SCRIPTS, practice, "page")),
     }
-    return Template(_file("page.html")).substitute(
+    return template("explore/page.html").render(
         {f"{name}_hash": policy_hash(text) for name, text in code.items()},
         **code,
-        style=shared("base.css") + _file("page.css"),
+        style=part("base.css") + part("page.css", HERE),
         command=command,
         heading=heading,
-        title=escaped(title),
-        made_with=escaped(f"px4fuse {version('px4fuse')}"),
+        title=title,
+        made_with=f"px4fuse {version('px4fuse')}",
         data=scripts,
         quiz=quiz,
-        plots="\n".join(_panels(number, one) for number, one in enumerate(data)),
-        count=len(data),
+        panels=PANELS,
+        flights=[
+            (one["log"], any(isinstance(axis["truth"], dict) for axis in one["axes"]))
+            for one in data
+        ],
     )
-
-
-def _file(name: str) -> str:
-    return files("px4fuse.explore").joinpath(name).read_text(encoding="utf-8")
-
-
-PANELS = (
-    ("innovation", "Innovations with ±2√S; arrows mark what lies beyond the axis"),
-    ("sigma_p", "Standard deviation of position: grows on predict, shrinks on update"),
-    ("sigma_v", "Standard deviation of velocity"),
-    ("position", "Position"),
-    ("velocity", "Velocity"),
-    ("error", "Error of position against the truth"),
-    ("nis", "Running mean of NIS: 1 is right, the band holds 95 %"),
-    ("gain", "Gain K: position solid, velocity dotted"),
-    ("strip", "What happened"),
-)
-
-
-def _panels(number: int, data: dict[str, Any]) -> str:
-    """Places of the plots of one flight."""
-    truth = any(isinstance(axis["truth"], dict) for axis in data["axes"])
-    shown = [
-        f'<figure class="plot" data-plot="{name}"><figcaption>{title}</figcaption>'
-        f'<div id="{name}-{number}"></div></figure>'
-        for name, title in PANELS
-        if name != "error" or truth
-    ]
-    head = f'<h2 dir="auto">{escaped(data["log"])}</h2>'
-    return f'<section class="flight">{head}{"".join(shown)}</section>'

@@ -3,16 +3,11 @@
 import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from textwrap import shorten
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
-import numpy as np
-import pandas as pd
 
-from px4fuse.display import Shown, draw, frame, words
 from px4fuse.findings import named
 from px4fuse.fleet import measures
 from px4fuse.fleet.inputs import DiffInput, Progress, read_inputs
@@ -41,65 +36,11 @@ _FLIGHT = {
     "px4fuse": "provenance.px4fuse",
 }
 Results = contract.ComparisonResults | contract.AidsResults
-MAX_LINE, MAX_CHANGES, MAX_DRAWN = 160, 4, 20
 
 
-@dataclass(frozen=True, repr=False)
-class Changes(Shown):
-    """What changed from A to B.
-
-    Attributes
-    ----------
-    results : ChangeResults
-        Its numbers, significant changes first.
-    a, b : DiffInput
-    """
-
-    results: contract.ChangeResults
-    a: DiffInput
-    b: DiffInput
-
-    @property
-    def is_worse(self) -> bool:
-        """Whether a number is significantly worse, or B has an error that A has not."""
-        new = (f for f in self.results.findings if f.only_in == "B")
-        worse = any(change.judgement == "worse" for change in self.results.numbers)
-        return worse or any(finding.severity == "error" for finding in new)
-
-
-@words.register
-def _(found: Changes) -> str:
-    judged = [change_line(change) for change in found.results.numbers if change.judgement]
-    # a few lines: the table has them all
-    lines = [*found.results.summary, *judged[:MAX_CHANGES]]
-    return "\n".join(shorten(line, MAX_LINE) for line in lines)
-
-
-@frame.register
-def _(found: Changes) -> pd.DataFrame:
-    table = pd.DataFrame(map(msgspec.structs.asdict, found.results.numbers))
-    for name in ("a_interval", "b_interval", "change_interval"):
-        ends = table.pop(name).map(lambda span: span or (np.nan, np.nan))
-        table[[f"{name[:-8]}low", f"{name[:-8]}high"]] = ends.tolist()
-    return table
-
-
-@draw.register
-def _(found: Changes, ax: Any = None) -> Any:
-    """The first ratios with their intervals."""
-    from matplotlib import pyplot as plt  # noqa: PLC0415 - takes its time
-
-    ax = ax or plt.subplots(layout="constrained")[1]
-    table = frame(found)
-    table = table[(table["scale"] == "ratio") & table["change"].notna()].head(MAX_DRAWN).iloc[::-1]
-    ends = table[["change_low", "change_high"]].sub(table["change"], axis=0).abs().fillna(0.0)
-    ax.errorbar(table["change"], table["label"], xerr=ends.to_numpy().T, fmt="o", color="black")
-    ax.axvline(1.0, color="black", lw=0.8)
-    ax.set(xscale="log", xlabel="B / A, with 95 % intervals")
-    return ax
-
-
-def diff(a: str | Path, b: str | Path, *, progress: Progress = lambda _: None) -> Changes:
+def diff(
+    a: str | Path, b: str | Path, *, progress: Progress = lambda _: None
+) -> contract.ChangeResults:
     """What changed from A to B, number by number.
 
     Parameters
@@ -118,7 +59,7 @@ def diff(a: str | Path, b: str | Path, *, progress: Progress = lambda _: None) -
     return changes(*read_inputs(Path(a), Path(b), progress))
 
 
-def changes(a: DiffInput, b: DiffInput) -> Changes:
+def changes(a: DiffInput, b: DiffInput) -> contract.ChangeResults:
     """Hold two comparisons against each other."""
     paired = a.results.log.sha256 == b.results.log.sha256
     found = contract.ChangeResults(
@@ -137,8 +78,7 @@ def changes(a: DiffInput, b: DiffInput) -> Changes:
         notes=tuple(_notes(a, b, paired=paired)),
         provenance=provenance(shlex.join(["px4fuse", "diff", a.given, b.given])),
     )
-    said = tuple(_sentences(found))
-    return Changes(msgspec.structs.replace(found, summary=said), a, b)
+    return msgspec.structs.replace(found, summary=tuple(_sentences(found)))
 
 
 def number_changes(

@@ -7,12 +7,12 @@ from typing import Literal
 
 from msgspec.structs import replace
 
-from px4fuse.analysis import AidsAlone, Analysis, run_or_judge_aids
+from px4fuse.analysis import Analysis, run_or_judge_aids
 from px4fuse.display import brief
 from px4fuse.errors import LogError, ResultsError
 from px4fuse.reading import files_by_sha256, read_head, read_whole, shown
 from px4fuse.request import ComparisonRequest
-from px4fuse.results.build import aids_results, results
+from px4fuse.results.build import judged_results
 from px4fuse.results.contract import AidsResults, ComparisonResults
 from px4fuse.results.reading import MAX_BYTES as MAX_RESULTS_BYTES
 from px4fuse.results.reading import read_results
@@ -94,7 +94,6 @@ def _analysed(path: Path, other: DiffInput | None, progress: Progress) -> DiffIn
         request = replace(
             request, **{name: getattr(other.results.request, name) for name in fields}
         )
-    analysis = run_or_judge_aids(request, progress)
-    if isinstance(analysis, AidsAlone):
-        return DiffInput(shown(path), "log", aids_results(request, analysis))
-    return DiffInput(shown(path), "log", results(request, analysis), analysis)
+    found = run_or_judge_aids(request, progress)
+    analysis = found if isinstance(found, Analysis) else None
+    return DiffInput(shown(path), "log", judged_results(request, found), analysis)

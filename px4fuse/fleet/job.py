@@ -108,10 +108,9 @@ def _compared(job: Job, path: Path, sha256: str) -> Outcome:
         found = results(request, analysis)
         text, report = to_json(found), b""
         if job.reports:
-            from px4fuse.report.document import Document  # noqa: PLC0415
             from px4fuse.report.pdf import render  # noqa: PLC0415
 
-            report = render(Document(analysis, found), text)
+            report = render(analysis, found, text)
     except Px4FuseError as error:
         status = NOT_JUDGED if isinstance(error, MissingDataError) else FAILED
         return Outcome(sha256, (known | refused(error, status, path.name),))

@@ -69,7 +69,10 @@ def _logs_in(given: str) -> list[FoundLog]:
     try:
         if files.isdir(root):
             every = files.find(root, detail=True)
-            infos = {path: info for path, info in every.items() if _suffix(path) in SUFFIXES}
+            infos = {
+                path: info for path, info in every.items()
+                if PurePosixPath(path).suffix.lower() in SUFFIXES
+            }  # fmt: skip
         elif files.exists(root):  # of a device or pipe its worker says that it is none
             infos = {root: files.info(root) if files.isfile(root) else {}}
         else:
@@ -145,10 +148,6 @@ def _is_local(files: AbstractFileSystem) -> bool:
     from fsspec.implementations.local import LocalFileSystem  # noqa: PLC0415
 
     return isinstance(files, LocalFileSystem)
-
-
-def _suffix(path: str) -> str:
-    return PurePosixPath(path).suffix.lower()
 
 
 def _name(path: str) -> str:

@@ -1,32 +1,29 @@
-"""What ``px4fuse batch`` prints when it is done."""
-
-from rich.console import Console
-from rich.text import Text
+"""What ``px4fuse batch`` says when it is done."""
 
 from px4fuse.findings import named
 from px4fuse.fleet.rows import BETWEEN_FINDINGS, FAILED
 from px4fuse.fleet.run import Fleet
 from px4fuse.plain import factor_words
 from px4fuse.report.page import Page
-from px4fuse.report.screen import print_file, say, show
+from px4fuse.report.style import MUTED, SEVERITY_COLOURS
 
 # Reasons why logs are not compared, findings and what is worse
 SHOWN = 8
+RED, YELLOW = SEVERITY_COLOURS["error"], SEVERITY_COLOURS["warning"]
 
 
-def print_fleet(console: Console, fleet: Fleet) -> None:
-    """Print what could not be compared, both filters by axis, findings and what is worse."""
-    logs = fleet.table.drop_duplicates("log")
+def summary(fleet: Fleet) -> Page:
+    """What could not be compared, both filters by axis, findings and what is worse."""
+    page, logs = Page(), fleet.table.drop_duplicates("log")
     alone = logs[logs["axis"] == ""].groupby(["status", "reason", "remedy"], sort=False)["log"]
     causes = alone.agg(["count", "first"]).reset_index()
     most = causes.sort_values("count", ascending=False, kind="stable")
     for cause in most.head(SHOWN).to_dict("records"):
         one = "" if cause["count"] == 1 else f"{cause['count']} logs, one is "
-        style = "red" if cause["status"] == FAILED else "yellow"
         text = "{first}: {status}: {reason}. {remedy}".format_map(cause).rstrip()
-        say(console, Text(one + text, style))
+        page.write(one + text, colour=RED if cause["status"] == FAILED else YELLOW)
     if len(most) > SHOWN:
-        say(console, f"{len(most) - SHOWN} more reasons are in fleet.html.")
+        page.write(f"{len(most) - SHOWN} more reasons are in fleet.html.")
     heads = [f"{whose}\n{what}" for whose in ("ours", "EKF2") for what in ("logs", "factor")]
     lines = []
     for axis, rows in fleet.table[fleet.table["axis"] != ""].groupby("axis", sort=False):
@@ -35,23 +32,20 @@ def print_fleet(console: Console, fleet: Fleet) -> None:
             cells += [f"{len(factors)}", factor_words(factors.median()) if len(factors) else "–"]
         lines.append((str(axis), *cells))
     if lines:
-        page = Page()
         page.table(("axis", *heads), lines, right=(1, 2, 3, 4))
-        show(console, page.blocks)
-        say(console, Text("factor: median of how many times √S is overstated (above 1)", "dim"))
+        told = "factor: median of how many times √S is overstated (above 1)"
+        page.write(told, colour=MUTED)
     found = logs["findings"].str.split(BETWEEN_FINDINGS).explode()
     for finding, count in found[found != ""].value_counts().head(SHOWN).items():
-        say(console, f"{count} × {named(str(finding))}")
+        page.write(f"{count} × {named(str(finding))}")
     worse = fleet.table[fleet.table["change"] != ""]
     for row in worse.head(SHOWN).itertuples():
-        say(console, Text(f"worse: {row.log} {row.axis}: {row.change}", "red"))
+        page.write(f"worse: {row.log} {row.axis}: {row.change}", colour=RED)
     if len(worse) > SHOWN:
-        say(console, f"and {len(worse) - SHOWN} more in the column change")
-    if fleet.against:
-        say(console, fleet.against)
+        page.write(f"and {len(worse) - SHOWN} more in the column change")
+    page.write(fleet.against)
     counts = logs["status"].value_counts()
     said = ", ".join(f"{count} {status}" for status, count in counts.items())
     again = " The same command tries those that failed again." if FAILED in counts else ""
-    say(console, f"{len(logs)} logs: {said}; {fleet.reused} as before.{again}")
-    for path in fleet.written:
-        print_file(console, "Wrote", path)
+    page.write(f"{len(logs)} logs: {said}; {fleet.reused} as before.{again}")
+    return page

@@ -10,7 +10,6 @@ from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.whatif import WhatIf
 from px4fuse.errors import MissingDataError, OutputError, SettingsError
-from px4fuse.findings import find
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.model import Loop
@@ -187,24 +186,15 @@ def close_loop(
     TrajectoryError, LogError, MissingDataError, SettingsError
         A file cannot be read or lacks what was asked for, or a number is out of range.
     """
-    return analyse(
-        LoopSource(source, None)
-        if isinstance(source, Trajectory)
-        else read_source(str(source), frame=frame),
-        request.LoopRequest(
-            source=str(source),
-            start_s=start_s,
-            end_s=end_s,
-            landed_at=None if landed_at is None else request.Landing(*landed_at),
-            came_back=came_back,
-            closures=tuple(closures),
-            position_drift_m=position_drift_m,
-            heading_drift_deg=heading_drift_deg,
-            key_frames_m=key_frames_m,
-        ),
-        None if reference is None else _reference(reference),
-        progress,
-    )
+    asked = {name: value for name, value in locals().items() if name != "progress"}
+    asked |= {"source": str(source), "reference": None, "closures": tuple(closures)}
+    asked["landed_at"] = None if landed_at is None else request.Landing(*landed_at)
+    if isinstance(source, Trajectory):
+        flown = LoopSource(source, None)
+    else:
+        flown = read_source(str(source), frame=frame)
+    against = None if reference is None else _reference(reference)
+    return analyse(flown, request.LoopRequest(**asked), against, progress)
 
 
 def report(analysis: Analysis, path: Pathlike) -> Path:
@@ -227,15 +217,14 @@ def report(analysis: Analysis, path: Pathlike) -> Path:
     OutputError, SettingsError
         It cannot be written, or the analysis was made without a request.
     """
-    from px4fuse.report.document import Document  # noqa: PLC0415 - for who writes a report
-    from px4fuse.report.pdf import render  # noqa: PLC0415
+    from px4fuse.report.pdf import render  # noqa: PLC0415 - for who writes a report
     from px4fuse.results.build import results  # noqa: PLC0415
     from px4fuse.results.contract import to_json  # noqa: PLC0415
 
     target = _ending(path, ".pdf")
-    document = Document(analysis, results(_request(analysis), analysis))
-    text = to_json(document.results)
-    write_all({target: render(document, text), target.with_suffix(".json"): text.encode()})
+    found = results(_request(analysis), analysis)
+    text = to_json(found)
+    write_all({target: render(analysis, found, text), target.with_suffix(".json"): text.encode()})
     return target
 
 
@@ -261,8 +250,9 @@ def explore(analysis: Analysis, path: Pathlike) -> Path:
     """
     from px4fuse.explore.page import html_text  # noqa: PLC0415 - Bokeh takes its time
 
-    target, asked = _ending(path, ".html"), _request(analysis)
-    write_all({target: html_text([(analysis, find(analysis), asked)]).encode()})
+    target = _ending(path, ".html")
+    _request(analysis)
+    write_all({target: html_text([analysis]).encode()})
     return target
 
 

@@ -5,11 +5,12 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import pandas as pd
 
+from px4fuse.analysis import AidsAlone, Analysis
 from px4fuse.ekf2.aids import AidResult, flown
+from px4fuse.findings import Finding
 from px4fuse.flight import AidLog, Flight, Unavailable, at_times
 from px4fuse.plain import factor_words, number_words
 from px4fuse.report.cover import about, write_findings
-from px4fuse.report.document import AidsDocument, Document
 from px4fuse.report.marks import GROUND
 from px4fuse.report.page import Cell, Page, appendix
 from px4fuse.report.style import (
@@ -22,6 +23,7 @@ from px4fuse.report.style import (
     time_axis,
 )
 from px4fuse.request import with_options
+from px4fuse.results.contract import AidsResults
 
 TITLE = "What EKF2 fused"
 LEAD = (
@@ -36,18 +38,18 @@ DOTS = 400  # of each axis, at most
 OUTDOORS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
 
-def draw(document: Document) -> Iterator[Page]:
+def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw a page of the appendix where something besides external vision carried the flight."""
     page = Page(appendix(TITLE), LEAD)
-    found = write_appendix(page, document)
+    found = write_appendix(page, analysis)
     if found:
-        _strips(page, document.analysis.flight, found)
+        _strips(page, analysis.flight, found)
         yield page
 
 
-def write_appendix(page: Page, document: Document) -> Mapping[str, AidResult]:
+def write_appendix(page: Page, analysis: Analysis) -> Mapping[str, AidResult]:
     """Write the table of a comparison's aids, and return them; of the lab's flights none."""
-    found = document.analysis.aids
+    found = analysis.aids
     if isinstance(found, Unavailable):
         return {}
     if all(name not in found or found[name].verdict == "idle" for name in OUTDOORS):
@@ -56,22 +58,22 @@ def write_appendix(page: Page, document: Document) -> Mapping[str, AidResult]:
     return found
 
 
-def draw_alone(document: AidsDocument) -> Iterator[Page]:
+def draw_alone(alone: AidsAlone, results: AidsResults) -> Iterator[Page]:
     """Draw the page of a flight without a position source."""
-    alone, page = document.alone, Page(TITLE, LEAD)
-    page.write(about(document.results.student, alone.flight.log), colour=MUTED)
-    write_alone(page, document)
+    page = Page(TITLE, LEAD)
+    page.write(about(results.student, alone.flight.log), colour=MUTED)
+    write_alone(page, alone, results.findings)
     _strips(page, alone.flight, alone.aids)
     yield page
 
 
-def write_alone(page: Page, document: AidsDocument) -> None:
+def write_alone(page: Page, alone: AidsAlone, findings: tuple[Finding, ...]) -> None:
     """Write why there is no comparison, the table and the findings."""
-    lacking = document.alone.lacking
+    lacking = alone.lacking
     page.write(f"Our filter has nothing to compare with EKF2: {lacking.reason}.", above=2.0)
     page.write(with_options(lacking.remedy), colour=MUTED)
-    write_aids(page, document.alone.aids)
-    write_findings(page, document.results.findings)
+    write_aids(page, alone.aids)
+    write_findings(page, findings)
 
 
 def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:

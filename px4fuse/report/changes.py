@@ -25,7 +25,7 @@ _NOT_SHOWN = {
 }
 
 
-def draw(results: ChangeResults) -> Iterator[Page]:
+def draw(_: object, results: ChangeResults) -> Iterator[Page]:
     """One page, and more where much changed."""
     page = Page("What changed from A to B")
     _write(page, results)

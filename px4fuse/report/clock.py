@@ -1,16 +1,18 @@
 """Appendix: the clock. Its page when there is something to say, else a line of provenance."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
+from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import aid_of, delay_ms
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
+from px4fuse.findings import Finding
 from px4fuse.findings.source_clock import typed_offset_s
 from px4fuse.flight import Unavailable
 from px4fuse.plain import p_words
-from px4fuse.report.document import Document
 from px4fuse.report.page import Page, legend_above
 from px4fuse.report.style import OURS_BAND, OURS_LINE, Axes
+from px4fuse.results.contract import ComparisonResults
 
 CURVE = 170.0  # height of the axes in points
 # Beyond this the curve tells nothing more
@@ -23,20 +25,20 @@ NEGLIGIBLE_S = 0.010
 FINDINGS = ("source_clock_changes", "source_clock_offset", "ekf2_ev_delay_wrong")
 
 
-def line(document: Document) -> str:
+def line(analysis: Analysis, findings: Iterable[Finding]) -> str:
     """What the clock estimate says, in one line."""
-    if has_page(document):
+    if has_page(analysis, findings):
         return "see its page"
-    said = clock_advice(document.analysis, document.analysis.clock)
+    said = clock_advice(analysis, analysis.clock)
     return "; ".join(said[label] for label in ("Reading", "Offset") if label in said)
 
 
-def has_page(document: Document) -> bool:
+def has_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
     """Whether the flight says more about the clock than that it is right."""
-    clock = document.analysis.clock
+    clock = analysis.clock
     if isinstance(clock, Unavailable):
         return False
-    return not clock.determinable or any(one.id in FINDINGS for one in document.results.findings)
+    return not clock.determinable or any(one.id in FINDINGS for one in findings)
 
 
 def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> dict[str, str]:
@@ -82,10 +84,10 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
     return advice
 
 
-def draw(document: Document) -> Iterator[Page]:
+def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
     """Draw one page; none where a line says it all."""
-    clock = document.analysis.clock
-    if isinstance(clock, Unavailable) or not has_page(document):
+    clock = analysis.clock
+    if isinstance(clock, Unavailable) or not has_page(analysis, results.findings):
         return
     page = Page(
         "Appendix: the clock of the position source",
@@ -94,7 +96,7 @@ def draw(document: Document) -> Iterator[Page]:
         "maximised over the offset, jointly with sensor biases, attitude errors and noises; the "
         "attitude is from the gyros alone, because EKF2's was corrected by these very positions.",
     )
-    page.advice(clock_advice(document.analysis, clock), size=8.5)
+    page.advice(clock_advice(analysis, clock), size=8.5)
     (low, high), best = clock.interval_s, clock.offset_s
     say = (
         f"Best at {best:+.3f} s; 95 % from {low:+.3f} to {high:+.3f} s, wider than the curve alone "

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from px4fuse.analysis import Analysis
 from px4fuse.comparison.interventions import Of
 from px4fuse.comparison.model import AxisComparison, FilterSummary, UnjudgedFilter
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
@@ -15,7 +16,6 @@ from px4fuse.findings.since import change_words, share_words
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital, number_words, p_words
 from px4fuse.report import marks
-from px4fuse.report.document import Document
 from px4fuse.report.page import Cell, Page, halves, legend_above
 from px4fuse.report.style import DOTS, LINES, MUTED, OURS_BAND, Axes, curve, plain_ticks
 from px4fuse.report.words import VERDICT_HEAD, filters, verdict_rows, verdict_words
@@ -44,9 +44,9 @@ class Series(NamedTuple):
     statement: Consistency
 
 
-def draw(document: Document) -> Iterator[Page]:
+def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw one page: the axis of the lab in three panels, all axes in a table."""
-    result = document.analysis.main
+    result = analysis.main
     along = result.axis.called
     page = Page(
         "Appendix: consistency",
@@ -56,7 +56,7 @@ def draw(document: Document) -> Iterator[Page]:
     )
     series = _series(result)
     if series:
-        axes = marks.panel(page, document, "Mean NIS so far, log scale", _nis_words(series),
+        axes = marks.panel(page, analysis, "Mean NIS so far, log scale", _nis_words(series),
                            RUNNING, above=LEGEND)  # fmt: skip
         _running(axes, series)
         legend_above(axes)
@@ -74,14 +74,14 @@ def draw(document: Document) -> Iterator[Page]:
         page.write(f"Along {along}: {reason}.")
     page.heading("All axes", above=12.0)
     head = [*VERDICT_HEAD, "n", "beyond\n2√S", "t of\nmean", "lag 1", "Ljung-\nBox"]
-    page.table(head, verdict_rows(document.analysis.axes.values(), _cells), right=(2, 5, 6, 7, 8))
-    _tried(page, document)
+    page.table(head, verdict_rows(analysis.axes.values(), _cells), right=(2, 5, 6, 7, 8))
+    _tried(page, analysis)
     yield page
 
 
-def _tried(page: Page, document: Document) -> None:
+def _tried(page: Page, analysis: Analysis) -> None:
     """Write what each change would make of both filters along the axis of the lab."""
-    analysis, axis = document.analysis, document.analysis.main.axis
+    axis = analysis.main.axis
     rows: list[list[Cell]] = []
     for one in analysis.causes:
         if one.axis == axis.name:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.comparison.model import Comparison, FilterName
 from px4fuse.filter.consistency import Consistency
@@ -15,7 +16,6 @@ from px4fuse.findings.hidden_errors import hidden_error
 from px4fuse.flight import Ekf2, Truth, Unavailable
 from px4fuse.plain import length_words
 from px4fuse.recording import LogInfo
-from px4fuse.report.document import Document, who
 from px4fuse.report.marks import LANDING, TAKE_OFF
 from px4fuse.report.page import WIDTH, Page, halves, legend_above, words
 from px4fuse.report.style import EKF2, LINES, MEASURED, MUTED, OURS, SEVERITY_COLOURS, Axes, as_map
@@ -27,6 +27,7 @@ from px4fuse.report.words import (
     verdict_words,
     write_errors,
 )
+from px4fuse.results.contract import ComparisonResults
 from px4fuse.results.model import Student
 
 # A track so many times longer than wide lies along the page, else north is up
@@ -41,18 +42,16 @@ EXPLANATION = (
 )
 
 
-def draw(document: Document) -> Iterator[Page]:
+def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
     """Draw the cover; findings that it has no room for go to the next page."""
     page = Page("Two-state Kalman filter against EKF2")
-    page.foot(_plan(document, facts(document)))
-    page.write(
-        about(document.results.student, document.analysis.flight.log), colour=MUTED, above=-4.0
-    )
-    for sentence in document.results.story:
+    page.foot(_plan(analysis, facts(analysis)))
+    page.write(about(results.student, analysis.flight.log), colour=MUTED, above=-4.0)
+    for sentence in results.story:
         page.write(sentence, size=10.5, above=2.0)
-    _verdict(page, document)
-    write_errors(page, document)
-    write_findings(page, document.results.findings)
+    _verdict(page, analysis)
+    write_errors(page, analysis)
+    write_findings(page, results.findings)
     yield page
 
 
@@ -60,6 +59,11 @@ def about(student: Student, log: LogInfo) -> str:
     """Whose report it is, and of which flight, on one line."""
     told = (log.name, f"{log.duration_s:.1f} s", f"{log.firmware}, {log.hardware}")
     return " · ".join(filter(None, (who(student, ", "), *told)))
+
+
+def who(student: Student, between: str) -> str:
+    """Name and id, as far as they are given."""
+    return between.join(filter(None, (student.name, student.id)))
 
 
 def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
@@ -71,9 +75,9 @@ def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
         write_finding(page, group)
 
 
-def _verdict(page: Page, document: Document) -> None:
+def _verdict(page: Page, analysis: Analysis) -> None:
     """The main axis, large: each filter on its half of the page."""
-    result, columns = document.analysis.main, []
+    result, columns = analysis.main, []
     along = result.axis.called
     for (name, one), colour in zip(filters(result).items(), (OURS, EKF2), strict=False):
         judged = isinstance(one, Consistency)
@@ -81,7 +85,7 @@ def _verdict(page: Page, document: Document) -> None:
         owner = "our filter" if name == "ours" else name
         what, large = "variance is", verdict_words(one)
         which: FilterName = "kf" if name == "ours" else "ekf2"
-        if hidden := hidden_error(document.analysis, result, which):
+        if hidden := hidden_error(analysis, result, which):
             what, claimed = "error is", length_words(hidden.claimed_m)
             large = f"{length_words(hidden.rmse_m)}, claimed {claimed}"
         column.write(f"Along {along} {owner}'s {what}")
@@ -94,14 +98,14 @@ def _verdict(page: Page, document: Document) -> None:
     said = [EXPLANATION]
     if isinstance(result.ekf2_state, Unavailable):
         said.append(f"There is no EKF2 to compare with: {result.ekf2_state.reason}.")
-    if not document.truth_known:
+    if not isinstance(analysis.flight.truth, Truth):
         said.append("The log has no truth to say who is right.")
     page.write(" ".join(said), size=7.0, colour=MUTED)
 
 
-def facts(document: Document) -> dict[str, str]:
+def facts(comparison: Comparison) -> dict[str, str]:
     """What was compared, in labels and sentences."""
-    comparison, flight = document.analysis, document.analysis.flight
+    flight = comparison.flight
     log, source, segment = flight.log, comparison.source, comparison.segment
     position = (
         f"{source.name}: {source.description}, {source.rate_hz:.1f} Hz, {source.frame}; "
@@ -166,18 +170,18 @@ class MapView(NamedTuple):
 NORTH_UP = MapView(np.pi / 2.0, ("east", "north"))
 
 
-def _plan(document: Document, facts: Mapping[str, str]) -> Page:
-    """The map of a document's flight, with labelled sentences below or beside it.
+def _plan(analysis: Analysis, facts: Mapping[str, str]) -> Page:
+    """The map of a flight, with labelled sentences below or beside it.
 
     A long track lies along the page and takes its width, with the facts below it.
 
     Parameters
     ----------
-    document : Document
+    analysis : Analysis
     facts : mapping from labels to sentences
     """
-    tracks = _tracks(document.analysis)
-    along = _along(document.analysis)
+    tracks = _tracks(analysis)
+    along = _along(analysis)
     wide, high = (float(np.ptp(values)) for values in along.of(*tracks["measurement"]))
     is_long = wide >= LONG * max(high, 1e-6)
     page, view, height = Page(), NORTH_UP, BESIDE
@@ -187,7 +191,7 @@ def _plan(document: Document, facts: Mapping[str, str]) -> Page:
         height = float(np.clip(1.3 * high * WIDTH / (1.1 * wide), LOWEST, TALLEST))
     # beside the facts the legend needs two lines
     above = 16.0 if is_long else 28.0
-    _map(drawn.panel("From above", "", height, above=above, left=36.0), document, view, tracks)
+    _map(drawn.panel("From above", "", height, above=above, left=36.0), analysis, view, tracks)
     for label, text in facts.items():
         beside.labelled(label, text, size=7.0, above=-0.5)
     if not is_long:
@@ -225,17 +229,17 @@ def _along(comparison: Comparison) -> MapView:
     return MapView(np.deg2rad(degrees), (f"along {degrees:.0f}° from north", "to its left"))
 
 
-def _map(axes: Axes, document: Document, view: MapView, tracks: Mapping[str, Pair]) -> None:
+def _map(axes: Axes, analysis: Analysis, view: MapView, tracks: Mapping[str, Pair]) -> None:
     axes.plot(*view.of(*tracks["measurement"]), **{**MEASURED, "ms": 3.0}, label="measurement")
     for name in ("EKF2", "ours", "truth"):
         if name in tracks:
             north, east = tracks[name]
             every = max(1, len(north) // MOST_POINTS)
             axes.plot(*view.of(north[::every], east[::every]), **LINES[name], label=name)
-    samples = document.analysis.source.samples
+    samples = analysis.source.samples
     for times, looks, label in (
-        (document.events.take_off_s, TAKE_OFF, "take-off"),
-        (document.events.landing_s, LANDING, "landing"),
+        (analysis.events.take_off_s, TAKE_OFF, "take-off"),
+        (analysis.events.landing_s, LANDING, "landing"),
     ):
         if times:
             near = samples.iloc[samples.index.get_indexer(pd.Index(times), method="nearest")]

@@ -83,7 +83,7 @@ def views(score: Evaluation) -> list[View]:
     return seen if extent[vertical] > FLAT * extent[level] else seen[:1]
 
 
-def draw(score: Evaluation) -> Iterator[Page]:
+def draw(score: Evaluation, _: object) -> Iterator[Page]:
     """Draw the page, and another where the table of a run over many deltas fills the first."""
     page = Page(
         "Trajectory error",

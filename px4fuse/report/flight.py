@@ -8,12 +8,12 @@ from collections.abc import Iterator
 import numpy as np
 import pandas as pd
 
+from px4fuse.analysis import Analysis
 from px4fuse.comparison.events import Span
 from px4fuse.comparison.model import AxisComparison, Difference
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Unavailable
 from px4fuse.report import marks, panels, style
-from px4fuse.report.document import Document
 from px4fuse.report.page import WIDTH, Page
 from px4fuse.report.style import EKF2, LINES, OURS, Artist, Axes
 from px4fuse.report.why import nothing_concluded
@@ -25,29 +25,29 @@ ZOOM_LEAST_S = 1.0
 ZOOM = 125.0  # height of the axes in points
 
 
-def draw(document: Document) -> Iterator[Page]:
+def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw one page."""
-    result = document.analysis.main
+    result = analysis.main
     page = Page(f"The flight along {result.axis.called}")
-    _legend(page, document)
+    _legend(page, analysis)
     reference = panels.error_reference(result)
     shown = [panels.POSITION, panels.VELOCITY]
     if isinstance(reference, pd.DataFrame):
         shown.append(panels.ERROR)
     for panel in shown:
-        panel.put(page, document, result, last=panel is shown[-1], strip=panel is shown[0])
-    page.write(nothing_concluded(document), above=6.0)
+        panel.put(page, analysis, result, last=panel is shown[-1], strip=panel is shown[0])
+    page.write(nothing_concluded(analysis), above=6.0)
     if isinstance(reference, Unavailable):
         page.write(f"No error is drawn: {reference.reason}. {reference.remedy}", above=6.0)
     yield page
 
 
-def _legend(page: Page, document: Document) -> None:
+def _legend(page: Page, analysis: Analysis) -> None:
     """Write the legend of lines and marks that holds for all pages."""
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
 
-    result = document.analysis.main
+    result = analysis.main
     lines: list[Artist] = [
         Line2D([], [], **{**style.MEASURED, "ms": 5.0}, label="measurement"),
         Line2D([], [], **LINES["ours"], label="ours"),
@@ -56,26 +56,26 @@ def _legend(page: Page, document: Document) -> None:
     for name, frame in (("EKF2", result.ekf2_state), ("truth", result.truth)):
         if isinstance(frame, pd.DataFrame):
             lines.append(Line2D([], [], **LINES[name], label=name))
-    page.legend(lines, marks.handles(document))
+    page.legend(lines, marks.handles(analysis))
 
 
-def draw_innovations(document: Document) -> Iterator[Page]:
+def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw one page: innovations, σ_p and σ_v on one time axis, then a zoom."""
-    result = document.analysis.main
+    result = analysis.main
     page = Page(f"Innovations and variances along {result.axis.called}")
     for panel in (panels.INNOVATIONS, panels.SIGMA_P, panels.SIGMA_V):
         last, first = panel is panels.SIGMA_V, panel is panels.INNOVATIONS
-        panel.put(page, document, result, last=last, strip=first)
-    _zoom(page, document)
-    for note in verdict_notes(document.analysis):
+        panel.put(page, analysis, result, last=last, strip=first)
+    _zoom(page, analysis)
+    for note in verdict_notes(analysis):
         page.numbers(note)
     yield page
 
 
-def _zoom(page: Page, document: Document) -> None:
+def _zoom(page: Page, analysis: Analysis) -> None:
     """Predict and update, seen near."""
-    result = document.analysis.main
-    start_s, end_s = window = zoom_window(result, document.analysis.segment)
+    result = analysis.main
+    start_s, end_s = window = zoom_window(result, analysis.segment)
     title = f"σ of position (m), {end_s - start_s:.1f} s of the flight"
     axes = page.panel(title, zoom_words(result), ZOOM)
     _sawtooth(axes, result, window)
@@ -150,9 +150,9 @@ def zoom_words(result: AxisComparison) -> str:
     return f"{'; '.join(said)}." if said else ""
 
 
-def draw_other_axes(document: Document) -> Iterator[Page]:
+def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the axes that the core leaves out, a column each; no page where there is but one."""
-    others = document.other_axes
+    others = analysis.others
     if not others:
         return
     page = Page(
@@ -175,6 +175,6 @@ def draw_other_axes(document: Document) -> Iterator[Page]:
     for panel in shown:
         columns = [Page(width=width) for _ in others]
         for column, result in zip(columns, others, strict=True):
-            panel.put(column, document, result, last=panel is shown[-1], narrow=True)
+            panel.put(column, analysis, result, last=panel is shown[-1], narrow=True)
         page.beside(*columns, gap=GAP)
     yield page

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from px4fuse.analysis import Analysis
 from px4fuse.findings import Finding, by_root
 from px4fuse.flight import Unavailable
 from px4fuse.loop import corrections
@@ -13,11 +14,11 @@ from px4fuse.loop.corrections import SINGLE_LOOP
 from px4fuse.loop.model import LANDING, Closure, CorrectedPath, Loop
 from px4fuse.plain import capital, p_words
 from px4fuse.report import style
-from px4fuse.report.cover import write_finding
-from px4fuse.report.document import Document, LoopDocument, who
+from px4fuse.report.cover import who, write_finding
 from px4fuse.report.evaluation import interval_words, score_words, way
 from px4fuse.report.page import AXIS_LABEL, TICKS, Cell, Page, appendix
 from px4fuse.report.style import EKF2, LINES, MUTED, OURS, Axes, as_map
+from px4fuse.results.contract import LoopResults
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import MANY_CLOSURES, SOLUTIONS, SolvedGraph
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
@@ -51,21 +52,21 @@ MAP_POINTS = 2000
 MAP, LEGEND = 290.0, 38.0  # of the axes, and of the legend below them, in points
 
 
-def draw(document: Document) -> Iterator[Page]:
+def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the loop's page; none where the flight holds no loop."""
-    if isinstance(document.analysis.loop, Loop):
+    if isinstance(analysis.loop, Loop):
         page = Page(appendix(TITLE), LEAD)
-        _write(page, document.analysis.loop)
+        _write(page, analysis.loop)
         yield page
 
 
-def draw_report(document: LoopDocument) -> Iterator[Page]:
+def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
     """Draw the page of a report on a loop alone, with its findings."""
     page = Page(TITLE, LEAD)
-    if student := who(document.results.student, ", "):
+    if student := who(results.student, ", "):
         page.labelled("Student", student)
-    page.labelled("SHA-256", document.loop.odometry.trajectory.sha256)
-    _write(page, document.loop, document.results.findings)
+    page.labelled("SHA-256", loop.odometry.trajectory.sha256)
+    _write(page, loop, results.findings)
     yield page
 
 

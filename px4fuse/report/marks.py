@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.report.document import Document
 from px4fuse.report.page import Page
 from px4fuse.report.style import EKF2_REJECTED, MUTED, Artist, Axes, time_axis
 
@@ -37,9 +37,9 @@ class Mark(NamedTuple):
     height: float | None = None
 
 
-def _marks(document: Document, rejected_s: Sequence[float] | Array) -> tuple[Mark, ...]:
+def _marks(analysis: Analysis, rejected_s: Sequence[float] | Array) -> tuple[Mark, ...]:
     """Each kind of mark; bands lie on those before them."""
-    events = document.events
+    events = analysis.events
     modes = [(mode.start_s, mode.end_s) for mode in events.modes]
     return (
         Mark("flight modes, in turn", modes[1::2], MODE),
@@ -47,21 +47,21 @@ def _marks(document: Document, rejected_s: Sequence[float] | Array) -> tuple[Mar
         Mark("source silent", events.gaps, GAP),
         Mark("log dropout", events.dropouts, DROPOUT),
         Mark("EKF2 rejected", rejected_s, EKF2_REJECTED, REJECTED_LINE),
-        Mark("outlier", outliers(document), OUTLIER, OUTLIER_LINE),
+        Mark("outlier", outliers(analysis), OUTLIER, OUTLIER_LINE),
         Mark("EKF2 reset", events.resets_s, RESET, RESET_LINE),
         Mark("take-off", events.take_off_s, TAKE_OFF, 0.0),
         Mark("landing", events.landing_s, LANDING, 0.0),
     )
 
 
-def draw(axes: Axes, document: Document, *, axis: str | None = None, strip: bool = False) -> None:
+def draw(axes: Axes, analysis: Analysis, *, axis: str | None = None, strip: bool = False) -> None:
     """Mark what happened on a time axis, behind what is drawn there; it spans the segment.
 
     Parameters
     ----------
     axes : Axes
         x is seconds since the first data.
-    document : Document
+    analysis : Analysis
     axis : str, optional
         Whose rejections to mark at the foot; by default the main axis. Empty for none, where the
         axes show the rejected innovations themselves.
@@ -71,10 +71,10 @@ def draw(axes: Axes, document: Document, *, axis: str | None = None, strip: bool
     from matplotlib.collections import PolyCollection  # noqa: PLC0415
     from matplotlib.lines import Line2D  # noqa: PLC0415
 
-    segment, across = document.analysis.segment, axes.get_xaxis_transform()
+    segment, across = analysis.segment, axes.get_xaxis_transform()
     axes.set_xlim(segment.start_s, segment.end_s)
-    name = document.analysis.main.axis.name if axis is None else axis
-    marks = _marks(document, document.events.rejected_s.get(name, ()))
+    name = analysis.main.axis.name if axis is None else axis
+    marks = _marks(analysis, analysis.events.rejected_s.get(name, ()))
     for order, (_, where, style, height) in enumerate(marks, start=1):
         if not len(where):
             continue
@@ -88,11 +88,11 @@ def draw(axes: Axes, document: Document, *, axis: str | None = None, strip: bool
             signs = Line2D(shown, np.full(len(shown), height), **look)
             axes.add_artist(signs)  # which leaves the limits alone
     if strip:
-        _strip(axes, document)
+        _strip(axes, analysis)
 
 
 def panel(
-    page: Page, document: Document, title: str, say: str, height: float, *, above: float = 4.0,
+    page: Page, analysis: Analysis, title: str, say: str, height: float, *, above: float = 4.0,
     axis: str | None = None, strip: bool = False, last: bool = True,
 ) -> Axes:  # fmt: skip
     """A panel over the time of the flight, marked as by :func:`draw`.
@@ -102,34 +102,34 @@ def panel(
     last : bool
         Whether it says what its x axis is; else another one below it does.
     """
-    strip = strip and bool(document.events.modes)
+    strip = strip and bool(analysis.events.modes)
     axes = page.panel(title, say, height, above=max(above, STRIP if strip else 0.0))
-    draw(axes, document, axis=axis, strip=strip)
+    draw(axes, analysis, axis=axis, strip=strip)
     time_axis(axes, last)
     return axes
 
 
-def outliers(document: Document) -> Array:
+def outliers(analysis: Analysis) -> Array:
     """Times of the measurements that tuning takes for outliers, of all its axes together."""
-    names = HORIZONTAL, document.analysis.main.axis.name
+    names = HORIZONTAL, analysis.main.axis.name
     found = [
         tuned.outlier_time_s
-        for name, tuned in document.analysis.tuning.items()
+        for name, tuned in analysis.tuning.items()
         if isinstance(tuned, AxisTuning) and name in names
     ]
     times: Array = np.unique(np.concatenate(found)) if found else np.empty(0)
     return times
 
 
-def handles(document: Document) -> list[Artist]:
+def handles(analysis: Analysis) -> list[Artist]:
     """Legend entries of the kinds of marks that this flight has."""
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
 
-    rejected = [time for times in document.events.rejected_s.values() for time in times]
+    rejected = [time for times in analysis.events.rejected_s.values() for time in times]
     return [
         Patch(**style, label=label) if height is None else Line2D([], [], **style, label=label)
-        for label, where, style, height in _marks(document, rejected)
+        for label, where, style, height in _marks(analysis, rejected)
         if len(where)
     ]
 
@@ -141,11 +141,11 @@ def _apart(times: Any, least_s: float) -> Array:
     return kept
 
 
-def _strip(axes: Axes, document: Document) -> None:
+def _strip(axes: Axes, analysis: Analysis) -> None:
     """Names of the flight modes above the axes, as far as each has room for its name."""
     low, high = axes.get_xlim()
     width = 72.0 * axes.bbox.width / axes.figure.dpi
-    for mode in document.events.modes:
+    for mode in analysis.events.modes:
         start, end = max(mode.start_s, low), min(mode.end_s, high)
         if (end - start) / (high - low) * width >= STRIP_WIDTH * len(mode.name):
             axes.text(

@@ -12,10 +12,11 @@ from collections.abc import Iterator
 from html.entities import html5
 from typing import TYPE_CHECKING
 
+from px4fuse.analysis import Analysis
 from px4fuse.answers import Answers, form_rows
-from px4fuse.report.document import AidsDocument, Document, LoopDocument
 from px4fuse.report.page import Page, appendix
 from px4fuse.report.style import MUTED
+from px4fuse.results.contract import AidsResults, ComparisonResults, LoopResults
 
 if TYPE_CHECKING:
     from markdown_it.rules_inline import StateInline
@@ -39,15 +40,15 @@ SYMBOLS = {
 }  # fmt: skip
 
 
-def draw(document: Document | AidsDocument | LoopDocument) -> Iterator[Page]:
+def draw(found: object, results: ComparisonResults | AidsResults | LoopResults) -> Iterator[Page]:
     """Draw as many pages as the form and the notes need; none without both."""
-    title, answers = "What the student found", document.results.student.answers
-    page = Page(appendix(title) if isinstance(document, Document) else title)
+    title, answers = "What the student found", results.student.answers
+    page = Page(appendix(title) if isinstance(found, Analysis) else title)
     if isinstance(answers, Answers):
         page.heading("The form, as it was filled in")
         rows = [list(row) for row in form_rows(answers)]
         page.table(("Asked", "Answer"), rows, shares=[3.0, 4.0], size=TABLE_SIZE)
-    write(page, document.results.student.notes)
+    write(page, results.student.notes)
     if len(page.blocks) > 1:
         yield page
 

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import AxisComparison, Difference
 from px4fuse.filter.consistency import Consistency
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital
 from px4fuse.report import marks, style
-from px4fuse.report.document import Document
 from px4fuse.report.page import Page
 from px4fuse.report.style import DOTS, LINES, Axes, band, curve, log_ticks
 from px4fuse.report.words import filters, verdict_words
@@ -49,7 +49,7 @@ class Panel(NamedTuple):
     title: str
     height: float
     draw: Callable[[Axes, AxisComparison], None]
-    say: Callable[[Document, AxisComparison], str]
+    say: Callable[[Analysis, AxisComparison], str]
     numbers: Callable[[AxisComparison], str]
 
     def named(self, result: AxisComparison) -> str:
@@ -57,7 +57,7 @@ class Panel(NamedTuple):
         return self.title.format("truth" if isinstance(result.truth, pd.DataFrame) else "EKF2")
 
     def put(
-        self, page: Page, document: Document, result: AxisComparison, *, last: bool,
+        self, page: Page, analysis: Analysis, result: AxisComparison, *, last: bool,
         strip: bool = False, narrow: bool = False,
     ) -> None:  # fmt: skip
         """Draw it on a page, above others on the same time axis unless it is the last.
@@ -69,10 +69,10 @@ class Panel(NamedTuple):
         narrow : bool
             In a column of its own, without its sentence.
         """
-        say, height = ("", NARROW) if narrow else (self.say(document, result), self.height)
+        say, height = ("", NARROW) if narrow else (self.say(analysis, result), self.height)
         # rejected innovations are there themselves
         rejected = "" if self is INNOVATIONS else result.axis.name
-        axes = marks.panel(page, document, self.named(result), say, height, axis=rejected,
+        axes = marks.panel(page, analysis, self.named(result), say, height, axis=rejected,
                            strip=strip, last=last)  # fmt: skip
         if narrow:
             axes.locator_params(axis="x", nbins=4)
@@ -132,7 +132,7 @@ def draw_error(axes: Axes, result: AxisComparison) -> None:
     axes.set_ylim(-1.1 * max(highest), 1.1 * max(highest))
 
 
-def _position_words(_: Document, result: AxisComparison) -> str:
+def _position_words(_: Analysis, result: AxisComparison) -> str:
     travelled = float(np.ptp(result.axis.measurement_m))
     words = f"{len(result.replay.updates)} measurements over {travelled:.3g} m"
     if isinstance(result.ekf2_state, Unavailable) or isinstance(result.difference, Unavailable):
@@ -144,12 +144,12 @@ def _position_words(_: Document, result: AxisComparison) -> str:
     )
 
 
-def _velocity_words(_: Document, result: AxisComparison) -> str:
+def _velocity_words(_: Analysis, result: AxisComparison) -> str:
     words = "Never measured: each filter infers it from positions and IMU."
     return f"{words} {nearer(result, VELOCITIES)}".rstrip()
 
 
-def _error_words(_: Document, result: AxisComparison) -> str:
+def _error_words(_: Analysis, result: AxisComparison) -> str:
     share = inside_share(result)
     if isinstance(result.truth, pd.DataFrame):
         said = f"{share:.0%} of our error lies in our own ±2σ (blue), where 95% should."
@@ -245,7 +245,7 @@ def draw_innovations(axes: Axes, result: AxisComparison) -> None:
     axes.set_ylim(-edge, edge)
 
 
-def innovation_words(_: Document, result: AxisComparison) -> str:
+def innovation_words(_: Analysis, result: AxisComparison) -> str:
     """What to see in the innovations."""
     said = []
     for name, one in filters(result).items():
@@ -286,11 +286,11 @@ def _draw_sigma(axes: Axes, result: AxisComparison, of: Quantity) -> None:
     log_ticks(axes)
 
 
-def sigma_words(document: Document, result: AxisComparison) -> str:
+def sigma_words(analysis: Analysis, result: AxisComparison) -> str:
     """By how much σ grows in the longest gap of the source; empty where there is none."""
-    if not document.events.gaps:
+    if not analysis.events.gaps:
         return ""
-    start, end = max(document.events.gaps, key=lambda gap: gap[1] - gap[0])
+    start, end = max(analysis.events.gaps, key=lambda gap: gap[1] - gap[0])
     largest = {
         name: float(np.sqrt(frame.loc[start:end, "position_variance_m2"].max()))
         for name, frame in (("ours", result.replay.steps), ("EKF2's", result.ekf2_variance))

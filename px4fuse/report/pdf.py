@@ -29,58 +29,52 @@ from px4fuse.report import (
     whatif,
     why,
 )
-from px4fuse.report.document import (
-    AidsDocument,
-    Document,
-    LoopDocument,
-    WhatIfDocument,
-    who,
-)
+from px4fuse.report.cover import who
 from px4fuse.report.page import Page, data, printable
 from px4fuse.report.style import report_style
-from px4fuse.results.contract import ChangeResults
-from px4fuse.trajectory.evaluation import Evaluation
+from px4fuse.results import contract
+from px4fuse.results.model import NOBODY
 
-Report = Document | AidsDocument | LoopDocument | WhatIfDocument | Evaluation | ChangeResults
 RESULTS_NAME = "results.json"
 STANDARDS: list[Any] = ["a-3a", "ua-1"]
-PAGES: Mapping[type, tuple[Callable[[Any], Iterator[Page]], ...]] = {
-    Document: (
+# Of each kind of results
+PAGES: Mapping[type, tuple[Callable[[Any, Any], Iterator[Page]], ...]] = {
+    contract.ComparisonResults: (
         cover.draw, flight.draw, flight.draw_innovations, why.draw, flight.draw_other_axes,
         consistency.draw, sensitivity.draw, clock.draw, aids.draw, loop.draw, notes.draw,
         provenance.draw,
     ),
-    AidsDocument: (aids.draw_alone, notes.draw, provenance.draw_aids),
-    LoopDocument: (loop.draw_report, notes.draw, provenance.draw_loop),
-    WhatIfDocument: (whatif.draw,),
-    Evaluation: (evaluation.draw,),
-    ChangeResults: (changes.draw,),
+    contract.AidsResults: (aids.draw_alone, notes.draw, provenance.draw_aids),
+    contract.LoopResults: (loop.draw_report, notes.draw, provenance.draw_loop),
+    contract.WhatIfResults: (whatif.draw,),
+    contract.EvaluationResults: (evaluation.draw,),
+    contract.ChangeResults: (changes.draw,),
 }  # fmt: skip
 
 
-def _named(document: Report) -> tuple[str, str, str]:
+def _named(results: Any) -> tuple[str, str, str]:
     """Title of the PDF, and name and SHA-256 of the file that it is about."""
-    match document:
-        case Document(analysis=of) | AidsDocument(alone=of) | WhatIfDocument(made_of=of):
-            command = "whatif" if isinstance(document, WhatIfDocument) else "compare"
-            log = of.flight.log
-            return f"px4fuse {command} {log.name}", log.name, log.sha256
-        case LoopDocument(loop=found):
-            track = found.odometry.trajectory
+    match results:
+        case contract.LoopResults(track=track):
             return f"px4fuse loop {track.name}", track.name, track.sha256
-        case Evaluation(estimate=one, reference=other):
+        case contract.EvaluationResults(estimate=one, reference=other):
             return f"px4fuse evaluate {one.name} {other.name}", one.name, one.sha256
-        case ChangeResults(a=a, b=b):
+        case contract.ChangeResults(a=a, b=b):
             name = f"A {a.log}, SHA-256 {a.log_sha256[:12]} · B {b.log}"
             return f"px4fuse diff {a.given} {b.given}", name, b.log_sha256
+    log, command = results.log, results.request.__struct_config__.tag
+    return f"px4fuse {command} {log.name}", log.name, log.sha256
 
 
-def render(document: Report, results_json: str) -> bytes:
+def render(found: Any, results: Any, results_json: str) -> bytes:
     """Set the report.
 
     Parameters
     ----------
-    document : Document, AidsDocument, LoopDocument, WhatIfDocument, Evaluation or ChangeResults
+    found : Analysis, AidsAlone, Loop, Counterfactual, Evaluation or ChangeResults
+        What is drawn.
+    results : Results
+        What is written of it; each kind has its :data:`PAGES`.
     results_json : str
         Attached inside the PDF as ``results.json``, so that the PDF alone can be checked.
 
@@ -90,14 +84,12 @@ def render(document: Report, results_json: str) -> bytes:
         The same for the same input and the same versions: no dates, no random identifiers.
     """
     with report_style():
-        pages = [page for draw in PAGES[type(document)] for page in draw(document)]
+        pages = [page for draw in PAGES[type(results)] for page in draw(found, results)]
         written = [block for page in pages for block in page.blocks]
         blocks = data(written)
-    title, name, sha256 = _named(document)
+    title, name, sha256 = _named(results)
     made_by = f"px4fuse {metadata.version('px4fuse')}"
-    student = ""
-    if isinstance(document, Document | AidsDocument | LoopDocument):
-        student = who(document.results.student, " · ")
+    student = who(getattr(results, "student", NOBODY), " · ")
     # figures have no text of others
     words = title + name + student + json.dumps(written, ensure_ascii=False, default=repr)
     return compiled(

@@ -3,27 +3,31 @@
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from px4fuse.analysis import AidsAlone, Analysis
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
 from px4fuse.flight import Flight, PositionTrack, Unavailable
+from px4fuse.loop.model import Loop
 from px4fuse.report import clock, fonts
-from px4fuse.report.document import AidsDocument, Document, LoopDocument
 from px4fuse.report.page import Page
 from px4fuse.report.style import MUTED
 from px4fuse.report.words import alignment_words, clock_words
 from px4fuse.request import with_options
+from px4fuse.results.contract import AidsResults, ComparisonResults, LoopResults
 
 INDENT, SIZE = 140.0, 7.5
 
 
-def draw(document: Document) -> Iterator[Page]:
+def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
     """Draw one page or more."""
-    analysis, flight, source = document.analysis, document.analysis.flight, document.analysis.source
+    flight, source = analysis.flight, analysis.source
     placed = source.alignment
-    page = _begin("Appendix: provenance", document)
+    page = _begin("Appendix: provenance", results)
     _log(page, flight, source)
     clocks = map(clock_words, flight.clocks)
     _section(page, "Clocks, to the autopilot's boot clock", plain=clocks)
-    _section(page, f"Stamps of {source.name}, by the IMU", plain=[clock.line(document)])
+    _section(
+        page, f"Stamps of {source.name}, by the IMU", plain=[clock.line(analysis, results.findings)]
+    )
     if placed is not None:
         _section(page, f"Placement of {source.name}", alignment_words(placed).items())
     _section(page, "Choices made on the way", plain=analysis.notes or ["none"])
@@ -32,12 +36,12 @@ def draw(document: Document) -> Iterator[Page]:
     yield page
 
 
-def draw_aids(document: AidsDocument) -> Iterator[Page]:
+def draw_aids(alone: AidsAlone, results: AidsResults) -> Iterator[Page]:
     """Draw one page or more about a flight whose aids alone were judged."""
-    flight, page = document.alone.flight, _begin("Provenance", document)
+    flight, page = alone.flight, _begin("Provenance", results)
     _log(page, flight)
     _section(page, "Choices made on the way", plain=flight.log.notes or ["none"])
-    _missing(page, (document.alone.lacking, *flight.missing))
+    _missing(page, (alone.lacking, *flight.missing))
     yield page
 
 
@@ -75,9 +79,9 @@ def _missing(page: Page, parts: Iterable[Unavailable]) -> None:
     _section(page, "Looked for and not found", missing, none)
 
 
-def draw_loop(document: LoopDocument) -> Iterator[Page]:
+def draw_loop(loop: Loop, results: LoopResults) -> Iterator[Page]:
     """Draw one page or more about a loop alone."""
-    loop, page = document.loop, _begin("Provenance", document)
+    page = _begin("Provenance", results)
     tracks = [("track", loop.odometry.trajectory), *(("reference", r) for r in loop.references)]
     read = [
         (label, f"{track.name}, {track.size_bytes} bytes, SHA-256 {track.sha256}. "
@@ -90,9 +94,9 @@ def draw_loop(document: LoopDocument) -> Iterator[Page]:
     yield page
 
 
-def _begin(title: str, document: Document | AidsDocument | LoopDocument) -> Page:
+def _begin(title: str, results: ComparisonResults | AidsResults | LoopResults) -> Page:
     """A page that begins with what the report was made with."""
-    page, student, made = Page(title), document.results.student, document.results.provenance
+    page, student, made = Page(title), results.student, results.provenance
     facts = {
         "command": made.command,
         "px4fuse": f"{made.px4fuse} on Python {made.python}",

@@ -16,7 +16,6 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from px4fuse.errors import on_one_line
 from px4fuse.report.page import Block, Cell
 from px4fuse.report.style import GOOD, MUTED, SEVERITY_COLOURS
 from px4fuse.request import (
@@ -29,6 +28,7 @@ from px4fuse.request import (
 )
 
 INDENT = 9
+COLUMN = 6.0  # points
 # Colours of paper that a screen has too; others stand for lines of panels, and are left out
 STYLES = {
     MUTED: "dim", SEVERITY_COLOURS["error"]: "bold red", SEVERITY_COLOURS["warning"]: "yellow",
@@ -52,13 +52,13 @@ def show(console: Console, blocks: Iterable[Block], request: Request | None = No
     for block in blocks:
         match block["kind"]:
             case "text" | "heading":
-                say(console, _styled(block))
+                say(console, _styled(block), indent=round(block.get("indent", 0.0) / COLUMN))
             case "labelled":
                 _show_labelled(console, block, request)
             case "table":
                 console.print(_table(**block))
             case "command":
-                print_command(console, block["text"], block["label"])
+                print_line(console, block["label"], block["text"])
             case "blank":
                 console.print()
             case "beside":
@@ -77,7 +77,7 @@ def _show_labelled(console: Console, block: Block, request: Request | None) -> N
         words.append("" if place else aside)
         say(console, words, _styled({**block["label"], "text": label or ""}), INDENT)
         for command in commands:
-            print_command(console, command)
+            print_line(console, "", command)
 
 
 def runnable(text: str, request: Request) -> tuple[str, list[str]]:
@@ -147,16 +147,9 @@ def say(console: Console, text: str | Text, head: str | Text = "", indent: int =
         head = Text(" " * indent)
 
 
-def print_command(console: Console, command: str, label: str = "") -> None:
-    """Print a command on one line, however long: it is to be copied."""
-    console.print(
-        Text(label.ljust(INDENT), "bold").append(command, "bold cyan not dim"), soft_wrap=True
-    )
-
-
-def print_file(console: Console, label: str, path: object) -> None:
-    """Print where something was written, on one line."""
-    console.print(Text(f"{label:{INDENT}}{on_one_line(str(path))}", "bold"), soft_wrap=True)
+def print_line(console: Console, label: str, text: str, style: str = "bold cyan not dim") -> None:
+    """Print a command, or where something was written, on one line however long: to be copied."""
+    console.print(Text(f"{label:{INDENT}}", "bold").append(text, style), soft_wrap=True)
 
 
 def _table(

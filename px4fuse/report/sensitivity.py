@@ -5,14 +5,14 @@ from collections.abc import Iterator
 import numpy as np
 import pandas as pd
 
+from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.model import AxisComparison
+from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.filter.fitting import FIRST_WIDTH
 from px4fuse.filter.likelihood import States, preintegrate, states, total_over_grid
 from px4fuse.filter.tuning import HORIZONTAL, MIN_MEASUREMENTS, AxisTuning, Noise
 from px4fuse.flight import Unavailable
 from px4fuse.plain import factor_words, number_words
-from px4fuse.report.document import Document
 from px4fuse.report.page import Page, legend_above
 from px4fuse.report.style import OURS, plain_ticks
 
@@ -38,10 +38,10 @@ MARGIN, FINE_REACH = 1.3, 2.3
 MAP, BESIDE = 140.0, 40.0  # of the axes, and beside them, in points
 
 
-def draw(document: Document) -> Iterator[Page]:
+def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw one page; none where nothing was tuned, or the start is not forgotten."""
-    result, settings = document.analysis.main, document.analysis.settings
-    if not document.analysis.tuning or len(result.replay.updates) < MIN_MEASUREMENTS:
+    result, settings = analysis.main, analysis.settings
+    if not analysis.tuning or len(result.replay.updates) < MIN_MEASUREMENTS:
         return
     page = Page(
         "Appendix: what the knobs do",
@@ -52,17 +52,17 @@ def draw(document: Document) -> Iterator[Page]:
     chosen = np.array([settings.sigma_a_m_s2, settings.sigma_z_m])
     factors = np.array([(a, z) for _, a, z in SETTINGS]).T
     run = states(preintegrate(result.axis, settings), *(chosen[:, None] * factors))
-    _map(page, document)
+    _map(page, analysis)
     _table(page, result, run, chosen)
     yield page
 
 
-def _map(page: Page, document: Document) -> None:
+def _map(page: Page, analysis: Analysis) -> None:
     """Likelihood of every pair, with the lines on which the gain is the same."""
     from matplotlib.patches import Patch  # noqa: PLC0415
 
-    tuning, settings = document.analysis.tuning, document.analysis.settings
-    names = (HORIZONTAL, document.analysis.main.axis.name, *tuning)
+    tuning, settings = analysis.tuning, analysis.settings
+    names = (HORIZONTAL, analysis.main.axis.name, *tuning)
     name = next(name for name in names if name in tuning)
     found = tuning[name]
     title = f"How likely the innovations are ({name})"
@@ -73,7 +73,7 @@ def _map(page: Page, document: Document) -> None:
     chosen = settings.sigma_a_m_s2, settings.sigma_z_m
     noises = found.filter_sigma_a, found.sigma_z
     (a, a_limits), (z, z_limits) = map(_grid, chosen, noises)
-    axes.contourf(z, a, _drop(document, name, found, a, z), LEVELS, colors=SHADES)
+    axes.contourf(z, a, _drop(analysis, name, found, a, z), LEVELS, colors=SHADES)
     for factor in (1.0 / FACTOR, 1.0, FACTOR):
         same_gain = factor * chosen[0] / chosen[1] * z[[0, -1]]
         axes.plot(z[[0, -1]], same_gain, color="black", lw=0.7, ls=(0, (1, 1.5)))
@@ -134,9 +134,8 @@ def _point(noise: Noise) -> float:
     return noise.value or noise.high or noise.low or float("nan")
 
 
-def _drop(document: Document, name: str, found: AxisTuning, a: Array, z: Array) -> Array:
+def _drop(comparison: Comparison, name: str, found: AxisTuning, a: Array, z: Array) -> Array:
     """Ln of how much less likely each pair is than the best of them, shape (n, m)."""
-    comparison = document.analysis
     axes = [
         one.axis for one in comparison.axes.values()
         if one.axis.name == name or (name == HORIZONTAL and one.axis.name in ("north", "east"))

@@ -1,10 +1,12 @@
 """The summary on the terminal: what happened, what was compared with what, verdicts, findings."""
 
+from typing import Any
+
+from px4fuse.analysis import AidsAlone, Analysis
 from px4fuse.ekf2.walk import Why
 from px4fuse.findings import by_root
 from px4fuse.report.aids import write_alone, write_appendix
 from px4fuse.report.cover import facts, write_finding
-from px4fuse.report.document import AidsDocument, Document
 from px4fuse.report.page import Page
 from px4fuse.report.style import MUTED
 from px4fuse.report.why import write_why
@@ -16,46 +18,43 @@ LEGEND = "Apart: ours - EKF2, RMS of position and velocity. NIS in the band: con
 FACTS = ("Filter", "Position", "Placed", "Segment")
 
 
-def summary(document: Document, report: object = None) -> Page:
-    """The summary of one comparison.
+def summary(analysis: Analysis | AidsAlone, results: Any, report: object = None) -> Page:
+    """The summary of one comparison, or of the aids alone of a flight without a position source.
 
     Parameters
     ----------
-    document : Document
+    analysis : Analysis or AidsAlone
+    results : ComparisonResults or AidsResults
     report : Path, optional
         Where the report was written.
     """
-    analysis, page = document.analysis, Page()
-    for sentence in document.results.story:
+    page = Page()
+    log = analysis.flight.log
+    if isinstance(analysis, AidsAlone):
+        page.labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
+        write_alone(page, analysis, results.findings)
+        return page
+    for sentence in results.story:
         page.write(sentence)
     page.add("blank")
-    log = analysis.flight.log
     names = " + ".join([log.name, *(file.name for file in analysis.flight.inputs)])
     page.labelled("Log", f"{names}, {log.firmware}, {log.duration_s:.1f} s")
-    for label, text in facts(document).items():
+    for label, text in facts(analysis).items():
         if label in FACTS:
             page.labelled(label, text)
-    write_errors(page, document)
+    write_errors(page, analysis)
     for note in (LEGEND, *verdict_notes(analysis)):
         page.write(note, colour=MUTED)
     why = analysis.why.get(analysis.main.axis.name)
-    is_told = isinstance(why, Why) and why.cause in document.results.story
+    is_told = isinstance(why, Why) and why.cause in results.story
     if why is not None and not is_told:
         write_why(page, why)
-    write_appendix(page, document)
-    if not document.results.findings:
+    write_appendix(page, analysis)
+    if not results.findings:
         page.write("No findings.")
-    groups = by_root(document.results.findings)
+    groups = by_root(results.findings)
     for group in groups[:MOST_FINDINGS]:
         write_finding(page, group)
     if (more := len(groups) - MOST_FINDINGS) > 0:
         page.write(f"and {more} more in the report" if report else f"and {more} more")
-    return page
-
-
-def aids_summary(document: AidsDocument) -> Page:
-    """The summary of a flight without a position source."""
-    page, log = Page(), document.alone.flight.log
-    page.labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
-    write_alone(page, document)
     return page

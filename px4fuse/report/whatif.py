@@ -2,57 +2,44 @@
 
 import math
 from collections.abc import Callable, Iterator
+from typing import Any
 
 from px4fuse.analysis import Counterfactual
 from px4fuse.ekf2.replay import HORIZONTAL
-from px4fuse.ekf2.whatif import (
-    DISTURBED_M,
-    HEIGHT_TIMEOUT_S,
-    MOST_REJECTED,
-    HeightSummary,
-    Summary,
-)
+from px4fuse.ekf2.whatif import DISTURBED_M, HEIGHT_TIMEOUT_S, MOST_REJECTED, Summary
 from px4fuse.ekf2_parameters import AIDS, PARAMETERS
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
 from px4fuse.plain import number_words
-from px4fuse.report.document import WhatIfDocument
 from px4fuse.report.page import Page
 from px4fuse.report.why import agreement_words, write_why
+from px4fuse.results.contract import WhatIfResults
 
 SIZE = 8.0
 CHAOTIC = "chaotic"
-# Of each EKF2 along an axis
-AXIS_ROWS: tuple[tuple[str, Callable[[Summary, str], str]], ...] = (
-    ("{}: mean NIS", lambda s, axis: number_words(s.axes[axis].nis_mean)),
-    ("    consistent is", lambda s, axis: "{:.2f} to {:.2f}".format(*s.axes[axis].nis_band)),
-    ("    std ν (m)", lambda s, axis: _number(s.axes[axis].innovation_std_m)),
-    ("    σ_p (m)", lambda s, axis: _number(s.axes[axis].sigma_p_median_m)),
-    ("    RMSE to truth (m)", lambda s, axis: _number(s.axes[axis].position_rmse_to_truth_m)),
+Rows = tuple[tuple[str, Callable[[Any], str]], ...]
+# Of each EKF2 along an axis or by a sensor of height
+NIS_ROWS: Rows = (
+    ("{}: mean NIS", lambda one: number_words(one.nis_mean)),
+    ("    consistent is", lambda one: "{:.2f} to {:.2f}".format(*one.nis_band)),
+    ("    std ν (m)", lambda one: _number(one.innovation_std_m)),
 )
-# and over both
-ROWS: tuple[tuple[str, Callable[[Summary], str]], ...] = (
+AXIS_ROWS: Rows = (
+    *NIS_ROWS,
+    ("    σ_p (m)", lambda axis: _number(axis.sigma_p_median_m)),
+    ("    RMSE to truth (m)", lambda axis: _number(axis.position_rmse_to_truth_m)),
+)
+HEIGHT_ROWS: Rows = (*NIS_ROWS, ("    rejected", lambda height: f"{height.rejected_share:.1%}"))
+# and over all
+ROWS: Rows = (
     ("samples", lambda s: f"{s.samples}"),
     ("rejected", lambda s: f"{s.rejected_share:.1%}"),
     ("longest without fusion (s)", lambda s: _number(s.longest_without_fusion_s, 2)),
     ("position resets", lambda s: f"{s.resets}"),
 )
-# and where EKF2's heading follows what is changed
+# and where EKF2's heading and height follow what is changed
 HEADING_ROW = ("heading - truth (°)", lambda s: _number(s.heading_error_mean_deg, 1))
-# and its height: of each sensor, and over all
-HEIGHT_ROWS: tuple[tuple[str, Callable[[HeightSummary], str]], ...] = (
-    ("{}: mean NIS", lambda s: number_words(s.nis_mean)),
-    ("    consistent is", lambda s: "{:.2f} to {:.2f}".format(*s.nis_band)),
-    ("    std ν (m)", lambda s: _number(s.innovation_std_m)),
-    ("    rejected", lambda s: f"{s.rejected_share:.1%}"),
-)
 HEIGHT_ROW = ("height: RMSE to truth (m)", lambda s: _number(s.height_rmse_to_truth_m))
-
-
-def _named(name: str) -> str:
-    """A parameter with its unit in brackets."""
-    unit = PARAMETERS[name].unit
-    return f"{name} ({unit})" if unit else name
 
 
 def heads(made_of: Counterfactual) -> list[str]:
@@ -70,55 +57,45 @@ def heads(made_of: Counterfactual) -> list[str]:
 def rows(made_of: Counterfactual) -> list[list[str]]:
     """Label and one cell per EKF2: as logged, as replayed, and with the changes."""
     found = made_of.whatif
+    over_all, heights = list(ROWS), found.replayed.heights
+    if isinstance(found.replayed.heading_error_mean_deg, float):
+        over_all.append(HEADING_ROW)
+    if heights:
+        over_all.append(HEIGHT_ROW)
+    tables = dict.fromkeys(HORIZONTAL, AXIS_ROWS) | {"": tuple(over_all)}
     every = [found.logged, found.replayed, *found.whatif[: made_of.first]]
-    made = [
-        [label.format(axis), *(cell(s, axis) if s.steady else CHAOTIC for s in every)]
-        for axis in HORIZONTAL
-        for label, cell in AXIS_ROWS
-    ]
-    follows = isinstance(found.replayed.heading_error_mean_deg, float)
-    heights = found.replayed.heights
-    more = [*([HEADING_ROW] if follows else []), *([HEIGHT_ROW] if heights else [])]
-    made += [
-        [label, *(cell(s) if s.steady else CHAOTIC for s in every)]
-        for label, cell in (*ROWS, *more)
-    ]
-    return made + [
-        [label.format(AIDS[name].label),
-         *(CHAOTIC if not s.steady else cell(s.heights[name]) if name in s.heights else "n/a"
-           for s in every)]
-        for name in heights
-        for label, cell in HEIGHT_ROWS
+    return [
+        [label.format(AIDS[name].label if name in heights else name),
+         *(_cell(summary, name, cell) for summary in every)]
+        for name, table in (tables | dict.fromkeys(heights, HEIGHT_ROWS)).items()
+        for label, cell in table
     ]  # fmt: skip
 
 
-def sweep_heads(made_of: Counterfactual) -> list[str]:
-    """Heads of the columns of :func:`sweep_rows`."""
-    return [
-        _named(swept(made_of)), "mean NIS N/E", "rejected", "longest gap (s)", "resets",
-        "σ_p N/E (m)", "RMSE to truth N/E (m)",
+def _cell(summary: Summary, name: str, cell: Callable[[Any], str]) -> str:
+    """Of one EKF2: along an axis, by a sensor of height, or over all where the name is empty."""
+    if not summary.steady:
+        return CHAOTIC
+    part = {"": summary, **summary.axes, **summary.heights}.get(name)
+    return "n/a" if part is None else cell(part)
+
+
+def sweep_table(made_of: Counterfactual) -> tuple[list[str], list[list[str]]]:
+    """Heads, and a row per value of the sweep."""
+    name, rows = swept(made_of), []
+    unit = PARAMETERS[name].unit
+    (_, nis), _, _, (_, sigma), (_, rmse) = AXIS_ROWS
+    for one in sweep_of(made_of):
+        cells = [CHAOTIC, *[""] * 5]
+        if one.steady:
+            both = ["/".join(map(cell, one.axes.values())) for cell in (nis, sigma, rmse)]
+            cells = [both[0], *(cell(one) for _, cell in ROWS[1:]), *both[1:]]
+        rows.append([number_words(one.changed[name]), *cells])
+    head = [
+        f"{name} ({unit})" if unit else name, "mean NIS N/E", "rejected", "longest gap (s)",
+        "resets", "σ_p N/E (m)", "RMSE to truth N/E (m)",
     ]  # fmt: skip
-
-
-def sweep_rows(made_of: Counterfactual) -> list[list[str]]:
-    """One row per value of the sweep."""
-    name = swept(made_of)
-    return [
-        [
-            number_words(summary.changed[name]),
-            *([CHAOTIC] + [""] * 5 if not summary.steady else _sweep_cells(summary)),
-        ]
-        for summary in sweep_of(made_of)
-    ]
-
-
-def _sweep_cells(summary: Summary) -> list[str]:
-    nis, _, _, sigma, rmse = (cell for _, cell in AXIS_ROWS)
-    return [
-        "/".join(nis(summary, axis) for axis in HORIZONTAL),
-        *(cell(summary) for _, cell in ROWS[1:]),
-        *("/".join(cell(summary, axis) for axis in HORIZONTAL) for cell in (sigma, rmse)),
-    ]
+    return head, rows
 
 
 def sweep_of(made_of: Counterfactual) -> tuple[Summary, ...]:
@@ -167,15 +144,15 @@ def _number(value: float | Unavailable, digits: int = 3) -> str:
     return "n/a" if isinstance(value, Unavailable) else f"{value:.{digits}f}"
 
 
-def draw(document: WhatIfDocument) -> Iterator[Page]:
+def draw(made_of: Counterfactual, results: WhatIfResults) -> Iterator[Page]:
     """One page of tables."""
     page = Page(
         "EKF2 with other parameters",
         "EKF2 replayed from the log by px4fuse's model of it, which is not PX4's own code: as "
         "flown, and with other parameters. All columns are judged over the same times.",
     )
-    page.labelled("Command", document.results.provenance.command)
-    _tables(page, document.made_of)
+    page.labelled("Command", results.provenance.command)
+    _tables(page, made_of)
     yield page
 
 
@@ -199,6 +176,6 @@ def _tables(page: Page, made_of: Counterfactual) -> None:
     head = ["", *heads(made_of)]
     page.table(head, rows(made_of), right=range(1, len(head)), size=SIZE)
     if sweep_of(made_of):
-        page.table(sweep_heads(made_of), sweep_rows(made_of), right=range(1, 7), size=SIZE)
+        page.table(*sweep_table(made_of), right=range(1, 7), size=SIZE)
     for line in reading(made_of):
         page.write(line, size=8.5, above=2.0)

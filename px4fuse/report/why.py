@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.ekf2.replay import Agreement, Ekf2Replay
 from px4fuse.ekf2.walk import Why
@@ -14,7 +15,6 @@ from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital
 from px4fuse.report import marks
-from px4fuse.report.document import Document
 from px4fuse.report.page import Page, halves
 from px4fuse.report.style import EKF2, EKF2_BAND, LINES, MUTED, OURS, OURS_BAND, Axes, curve
 
@@ -30,9 +30,9 @@ TIME_POINTS = 105.0
 AWAY = {"color": "white", "hatch": "////"}  # bars of steps that lead away from EKF2
 
 
-def draw(document: Document) -> Iterator[Page]:
+def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw as many pages as the axes need; none where nothing is concluded for any."""
-    found = _walks(document)
+    found = _walks(analysis)
     if not any(isinstance(why, Why) for why in found.values()):
         return
     page = Page(TITLE, LEAD)
@@ -41,14 +41,17 @@ def draw(document: Document) -> Iterator[Page]:
             page.heading(f"{name}: nothing is concluded", 9.5, above=10.0)
             page.write(f"{capital(why.reason)}. {why.remedy}")
         else:
-            _axis(page, name, why, document)
-    page.numbers(_believed(document.analysis.ekf2_replay))
+            _axis(page, name, why, analysis)
+    replay = analysis.ekf2_replay  # without one nothing is concluded
+    assert isinstance(replay, Ekf2Replay)
+    assert replay.agreement is not None
+    page.numbers(f"Replay against log: {agreement_words(replay.agreement)}.")
     yield page
 
 
-def _walks(document: Document) -> Mapping[str, Why | Unavailable]:
+def _walks(analysis: Analysis) -> Mapping[str, Why | Unavailable]:
     """Of the aisle, or else of every axis."""
-    found = document.analysis.why
+    found = analysis.why
     return {AISLE: found[AISLE]} if AISLE in found else found
 
 
@@ -60,23 +63,13 @@ def write_why(page: Page, why: Why | Unavailable) -> None:
         page.labelled("Why", why.sentences[0])
 
 
-def nothing_concluded(document: Document) -> str:
+def nothing_concluded(analysis: Analysis) -> str:
     """Why there is no such page, in a line; empty where there is one, or no EKF2 to explain."""
-    found = list(_walks(document).values())
-    if isinstance(document.analysis.flight.ekf2, Unavailable) or any(
-        isinstance(why, Why) for why in found
-    ):
+    found = list(_walks(analysis).values())
+    if isinstance(analysis.flight.ekf2, Unavailable) or any(isinstance(why, Why) for why in found):
         return ""
     reasons = {f"{why.reason}. {why.remedy}": None for why in found if isinstance(why, Unavailable)}
     return f"{TITLE}: nothing is concluded, {' '.join(reasons)}" if reasons else ""
-
-
-def _believed(replay: Ekf2Replay | Unavailable) -> str:
-    """The agreement that entitles one to believe the page."""
-    if isinstance(replay, Unavailable):
-        return "EKF2 could not be replayed from this log."
-    assert replay.agreement is not None
-    return f"Replay against log: {agreement_words(replay.agreement)}."
 
 
 def agreement_words(agreement: Agreement) -> str:
@@ -100,7 +93,7 @@ def agreement_words(agreement: Agreement) -> str:
     )
 
 
-def _axis(page: Page, name: str, why: Why, document: Document) -> None:
+def _axis(page: Page, name: str, why: Why, analysis: Analysis) -> None:
     spans = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in why.spans_s)
     page.heading(f"{name}, {spans}", 9.5, above=10.0)
     for sentence in why.sentences:
@@ -119,7 +112,7 @@ def _axis(page: Page, name: str, why: Why, document: Document) -> None:
     axes.set_yticklabels([])
     page.beside(*columns, gap=GAP)
     title = "Position apart (m): ours - EKF2 (dark), and what the model leaves of it (light)"
-    axes = marks.panel(page, document, title, _time_words(why), TIME_POINTS, axis=name, strip=True)
+    axes = marks.panel(page, analysis, title, _time_words(why), TIME_POINTS, axis=name, strip=True)
     apart, left_over = (pd.Series(v, why.times_s) for v in (why.apart_m, why.left_m))
     for start, end in why.spans_s:
         curve(axes, apart.loc[start:end], **LINES["ours"])

@@ -11,13 +11,13 @@ from px4fuse.filter.consistency import SIGMA_OFF, Consistency
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings import Finding
-from px4fuse.flight import Alignment, Unavailable
+from px4fuse.flight import Alignment, Truth, Unavailable
 from px4fuse.plain import factor_words, number_words, p_words
 from px4fuse.recording import ClockMap
 from px4fuse.report.style import GOOD, MUTED, SEVERITY_COLOURS
 
 if TYPE_CHECKING:
-    from px4fuse.report.document import Document
+    from px4fuse.analysis import Analysis
     from px4fuse.report.page import Cell, Page
 
 # Below, "white" is wrong: of the eight verdicts of a flight one in a hundred by chance
@@ -72,21 +72,22 @@ def verdict_rows(
     return rows
 
 
-def write_errors(page: Page, document: Document) -> None:
+def write_errors(page: Page, analysis: Analysis) -> None:
     """Write verdicts and errors as a table, the main axis first.
 
     Between both filters, and between each and the truth, where the flight has these.
     """
-    axes = (document.analysis.main, *document.other_axes)
+    axes = (analysis.main, *analysis.others)
     has_ekf2 = any(isinstance(result.difference, Difference) for result in axes)
+    has_truth = isinstance(analysis.flight.truth, Truth)
 
     def more(result: AxisComparison, name: str, one: FilterSummary | Unjudged) -> list[str]:
         found: list[Any] = [result.difference if name == "ours" else None] if has_ekf2 else []
-        found += [one.truth] if document.truth_known else []
+        found += [one.truth] if has_truth else []
         return [_metres(part, field) for part in found for field in RMSE]
 
     head = [*VERDICT_HEAD, *(["apart\n(m)", "\n(m/s)"] if has_ekf2 else [])]
-    head += ["to truth\n(m)", "\n(m/s)"] if document.truth_known else []
+    head += ["to truth\n(m)", "\n(m/s)"] if has_truth else []
     page.table(head, verdict_rows(axes, more), right=(2, 3, 5, 6, 7, 8))
 
 

@@ -50,19 +50,18 @@ def results(
     )
 
 
-def aids_results(
-    request: ComparisonRequest, alone: AidsAlone, student: Student = NOBODY
-) -> contract.AidsResults:
-    """What ``px4fuse compare`` found on a flight without a position source."""
+def judged_results(
+    request: ComparisonRequest, found: Analysis | AidsAlone, student: Student = NOBODY
+) -> contract.ComparisonResults | contract.AidsResults:
+    """What ``px4fuse compare`` found; of a flight without a position source EKF2's aids alone."""
+    if isinstance(found, Analysis):
+        return results(request, found, student)
     return contract.AidsResults(
-        schema=schema_of(contract.AIDS),
-        request=request.recorded(),
-        log=log_part(alone.flight),
-        aids=dict(alone.aids),
-        findings=find_aids(alone.aids),
-        missing=(alone.lacking, *alone.flight.missing),
+        **_begun(contract.AIDS, request, found.flight),
+        aids=dict(found.aids),
+        findings=find_aids(found.aids),
+        missing=(found.lacking, *found.flight.missing),
         student=student,
-        provenance=provenance(command_line(request)),
     )
 
 
@@ -86,12 +85,9 @@ def sync_results(
 
 def whatif_results(request: WhatIfRequest, made_of: Counterfactual) -> contract.WhatIfResults:
     """What ``px4fuse whatif`` found."""
-    found = made_of.whatif
-    first = made_of.first
+    found, first = made_of.whatif, made_of.first
     return contract.WhatIfResults(
-        schema=schema_of(contract.WHATIF),
-        request=request.recorded(),
-        log=log_part(made_of.flight),
+        **_begun(contract.WHATIF, request, made_of.flight),
         agreement=found.agreement,
         judged_s=found.judged,
         asked=made_of.asked,
@@ -100,7 +96,6 @@ def whatif_results(request: WhatIfRequest, made_of: Counterfactual) -> contract.
         whatif=found.whatif[0] if first else None,
         sweep=found.whatif[first:],
         notes=found.notes,
-        provenance=provenance(command_line(request)),
     )
 
 
@@ -141,6 +136,19 @@ def log_part(flight: Flight) -> Log:
     return Log(**msgspec.structs.asdict(flight.log), joined=flight.inputs, clocks=flight.clocks)
 
 
+def _begun(
+    name: str, request: ComparisonRequest | WhatIfRequest, flight: Flight,
+    command: str | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """What all results of a flight have: which they are, what was asked of which log, versions."""
+    return {
+        "schema": schema_of(name),
+        "request": request.recorded(),
+        "log": log_part(flight),
+        "provenance": provenance(command_line(request, command)),
+    }
+
+
 def _of_flight(
     name: str, request: ComparisonRequest, comparison: Comparison, command: str | None = None
 ) -> dict[str, Any]:
@@ -162,10 +170,7 @@ def _of_flight(
         not_in_log=tuple(part for part in comparison.missing if part.source),
     )
     used: dict[str, Any] = asdict(settings) | {"clock_offset_s": settings.clock_offset_s + placed_s}
-    return {
-        "schema": schema_of(name),
-        "request": request.recorded(),
-        "log": log_part(comparison.flight),
+    return _begun(name, request, comparison.flight, command) | {
         "source": source,
         "settings": ChosenSettings(
             **used,
@@ -173,5 +178,4 @@ def _of_flight(
             end_s=segment.end_s,
             segment_reason=segment.reason,
         ),
-        "provenance": provenance(command_line(request, command)),
     }

@@ -14,6 +14,7 @@ from msgspec import Meta
 
 from px4fuse.comparison.interventions import Intervention
 from px4fuse.comparison.model import AxisResult, FilterName
+from px4fuse.display import Shown
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.replay import Agreement, Replayed
 from px4fuse.ekf2.walk import WhySteps
@@ -319,7 +320,7 @@ class WhatIfResults(Record, frozen=True, kw_only=True):
     provenance: Provenance
 
 
-class ChangeResults(Record, frozen=True, kw_only=True):
+class ChangeResults(Shown, Record, frozen=True, kw_only=True):
     """Results of ``px4fuse diff``: what changed from A to B.
 
     Attributes
@@ -349,6 +350,12 @@ class ChangeResults(Record, frozen=True, kw_only=True):
     findings: tuple[FindingChange, ...]
     notes: tuple[str, ...]
     provenance: Provenance
+
+    @property
+    def is_worse(self) -> bool:
+        """Whether a number is significantly worse, or B has an error that A has not."""
+        worse = any(change.judgement == "worse" for change in self.numbers)
+        return worse or any((f.only_in, f.severity) == ("B", "error") for f in self.findings)
 
 
 Reported = ComparisonResults | LoopResults

@@ -18,7 +18,6 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from dataclasses import replace as replaced
 from functools import partial
 from importlib import metadata
 from pathlib import Path
@@ -28,7 +27,6 @@ from msgspec.structs import replace
 
 from px4fuse.errors import Px4FuseError, ResultsError, SettingsError
 from px4fuse.flight import Unavailable
-from px4fuse.report.document import Document, LoopDocument
 from px4fuse.results.contract import (
     ComparisonResults,
     LoopResults,
@@ -211,8 +209,8 @@ def _compared(handed_in: ComparisonResults, place: _Place) -> Recomputed:
         placed = place(position.path, joined.get("position"), "--position")
         request = replace(request, position=replace(position, path=str(placed)))
     analysis = run(request)
-    document = Document(analysis, results(recorded, analysis, handed_in.student))
-    return Recomputed(document.results, partial(_drawn, document, handed_in.provenance))
+    made = results(recorded, analysis, handed_in.student)
+    return Recomputed(made, partial(_drawn, analysis, made, handed_in.provenance))
 
 
 def _looped(handed_in: LoopResults, place: _Place) -> Recomputed:
@@ -229,18 +227,16 @@ def _looped(handed_in: LoopResults, place: _Place) -> Recomputed:
         placed = place(path, sha256, "--reference")
         request = replace(request, reference=f"{placed}{part}")
     found = run_loop(request)
-    document = LoopDocument(found, loop_results(recorded, found, handed_in.student))
-    return Recomputed(document.results, partial(_drawn, document, handed_in.provenance))
+    made = loop_results(recorded, found, handed_in.student)
+    return Recomputed(made, partial(_drawn, found, made, handed_in.provenance))
 
 
-def _drawn(document: Document | LoopDocument, versions: Provenance) -> bytes:
+def _drawn(found: object, results: Reported, versions: Provenance) -> bytes:
     """Draw the report with the versions that were recorded."""
     from px4fuse.report.pdf import render  # noqa: PLC0415
 
-    made = replace(versions, command=document.results.provenance.command)
-    shown = replace(document.results, provenance=made)
-    drawn = replaced(document, results=shown)  # type: ignore[arg-type]
-    return render(drawn, to_json(document.results))
+    made = replace(versions, command=results.provenance.command)
+    return render(found, replace(results, provenance=made), to_json(results))
 
 
 # ------------------------------------------------------------------ the verdict

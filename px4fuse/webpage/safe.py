@@ -5,7 +5,6 @@ import hashlib
 import json
 import re
 from functools import cache
-from html import escape
 from importlib.resources import files
 from pathlib import PurePosixPath
 from typing import Any
@@ -43,11 +42,6 @@ def cleaned(value: Any, most: int = MAX_CHARACTERS) -> Any:
     return value.item() if hasattr(value, "item") else value
 
 
-def escaped(text: str) -> str:
-    """Clean text for HTML, between tags or in an attribute's quotes."""
-    return escape(clean(text))
-
-
 def inert_json(value: object) -> str:
     """JSON in which an HTML parser finds nothing: no <, > or &, and ASCII only."""
     text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
@@ -83,6 +77,6 @@ def template(name: str) -> Template:
     return environment.get_template(name)
 
 
-def part(name: str) -> str:
-    """A file of this package."""
-    return files("px4fuse.webpage").joinpath(name).read_text(encoding="utf-8")
+def part(name: str, package: str = "px4fuse.webpage") -> str:
+    """A file of a package, by default what all pages share."""
+    return files(package).joinpath(name).read_text(encoding="utf-8")

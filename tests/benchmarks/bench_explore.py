@@ -43,21 +43,18 @@ def main() -> None:
 
     from px4fuse.analysis import run
     from px4fuse.explore.page import html_text
-    from px4fuse.findings import find
     from px4fuse.request import ComparisonRequest
 
     program = next(filter(None, map(shutil.which, BROWSERS)), None)
     if program is None:
         sys.exit("no Chromium or Chrome is installed")
-    request = ComparisonRequest(log=str(LOG))
     with tempfile.TemporaryDirectory() as folder:
         browser = Browser(program, Path(folder, "profile"))
         try:
-            analysis = run(request)
+            analysis = run(ComparisonRequest(log=str(LOG)))
             for name, logs in (("one log", 1), ("two logs", 2)):
                 file = Path(folder, f"page{logs}.html")
-                told = [(analysis, find(analysis), request)] * logs
-                file.write_bytes(html_text(told).encode())
+                file.write_bytes(html_text([analysis] * logs).encode())
                 show(browser, file)
                 print(f"{name}: {file.stat().st_size / 1e6:.2f} MB")
                 for knob in ("sigma-a", "sigma-z", "dt", "clock-offset"):

@@ -335,15 +335,11 @@ def tried(target: Target, count: int, seed: int, folder: Path) -> Outcome:
 
 def pipeline(path: Path) -> object:
     """All of ``compare`` but the drawing: findings and results of a log."""
-    from px4fuse.analysis import AidsAlone
-    from px4fuse.results.build import aids_results, results
+    from px4fuse.results.build import judged_results
     from px4fuse.results.contract import to_json
 
     request = ComparisonRequest(log=str(path))
-    found = run_or_judge_aids(request)
-    if isinstance(found, AidsAlone):
-        return to_json(aids_results(request, found))
-    return to_json(results(request, found))
+    return to_json(judged_results(request, run_or_judge_aids(request)))
 
 
 def main() -> None:
