@@ -18,7 +18,7 @@ from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import mavlink_senders as senders
 from px4fuse.readers import parts
 from px4fuse.readers.mavlink_clocks import UNIX_FROM_S
-from px4fuse.readers.mavlink_frames import message_ids, read_frames
+from px4fuse.readers.mavlink_frames import MESSAGE_IDS, read_frames
 from px4fuse.readers.mavlink_positions import pressure_altitude, read_positions, read_truth
 from px4fuse.readers.mavlink_recording import RECEIPT_CLOCK, Recording, settle_clocks, unix_of_boot
 from px4fuse.readers.px4_positions import barometer
@@ -91,7 +91,7 @@ def read_mavlink(path: Path, system: int | None = None) -> Flight:
         unused=tuple(
             Unused(name, count, reason)
             for name, reason in messages.UNUSED.items()
-            if (count := int(np.count_nonzero(frames.message_id == message_ids()[name])))
+            if (count := int(np.count_nonzero(frames.message_id == MESSAGE_IDS[name])))
         ),
     )
 
