@@ -20,11 +20,13 @@ from fastcrc.crc16 import mcrf4xx  # CRC-16/MCRF4XX is MAVLink's X.25 checksum
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import all as dialect
 
-from px4fuse.arrays import IntArray
+from px4fuse.arrays import BoolArray, IntArray
 from px4fuse.errors import LogError
 from px4fuse.reading import read_log_bytes, shown
 
 Integers = NDArray[np.int64]
+# MAVLink system and component
+Address = tuple[int, int]
 
 MAGIC_1, MAGIC_2 = 0xFE, 0xFD
 HEADER_1, HEADER_2 = 6, 10
@@ -108,6 +110,11 @@ class Frames:
     def rows(self, message: str) -> IntArray:
         """Indices of the frames of one message, by its MAVLink name."""
         return np.flatnonzero(self.message_id == MESSAGE_IDS[message])
+
+    def sent_by(self, address: Address, rows: IntArray | slice = slice(None)) -> BoolArray:
+        """Whether frames, by default all, are from one system and component."""
+        system, component = address
+        return np.asarray((self.system[rows] == system) & (self.component[rows] == component))
 
     def table(self, message: str, rows: IntArray) -> NDArray[Any]:
         """Decode frames of one message.
