@@ -302,11 +302,10 @@ def _start_unix_s(recording: Recording) -> float | None:
     """UNIX time of time zero: the autopilot's own, or else the recording computer's."""
     if recording.zero_s >= UNIX_FROM_S:
         return recording.zero_s
-    zero = np.array([recording.zero_s])
     unix = unix_of_boot(recording)
     if unix is not None:
-        return float(unix.at(zero)[0])
+        return float(unix.at(recording.zero_s))
     received_us = recording.frames.received_us
     if received_us is None or not recording.boot_of_receipt.pairs:
         return None
-    return float(received_us[0] * 1e-6 + recording.boot_of_receipt.inverse().at(zero)[0])
+    return float(received_us[0] * 1e-6 + recording.boot_of_receipt.inverse().at(recording.zero_s))

@@ -108,13 +108,10 @@ class Topics:
 
     def find(self, layouts: tuple[Layout, ...]) -> Layout | None:
         """First layout that this log holds, or None."""
-        held = (
-            layout
-            for layout in layouts
-            for table in self.of(layout.topic)
-            if all(column in table for column in layout.columns.values())
-        )
-        return next(held, None)
+        for layout in layouts:
+            if any({*layout.columns.values()} <= {*table} for table in self.of(layout.topic)):
+                return layout
+        return None
 
     def frame(self, layout: Layout, instance: int = 0, *, step: bool = False) -> pd.DataFrame:
         """Read one layout as a frame of float64 columns, indexed by measurement time in s.
@@ -150,7 +147,9 @@ class Topics:
                 index=pd.Index((time_us[keep] - self.zero_us) * _MICROSECOND, name="time_s"),
             )
         frame = frame.where(np.isfinite(frame))  # an infinite value is as unusable as NaN
-        return frame if step else self.window(frame)
+        # what lies outside the span of the data by more than the margin is dropped
+        end = self.log.duration_s + WINDOW_MARGIN_S
+        return frame if step else frame[(frame.index >= -WINDOW_MARGIN_S) & (frame.index <= end)]
 
     def read(self, layouts: tuple[Layout, ...], *, step: bool = False) -> pd.DataFrame | None:
         """:meth:`frame` of the first layout that this log holds; None where it holds none."""
@@ -194,12 +193,6 @@ class Topics:
         )
         clock = f"autopilot boot clock, at {'measurement' if measured else 'publication'}"
         self.streams[part] = Stream(topics, clock, self.log.name)
-
-    def window(self, frame: pd.DataFrame) -> pd.DataFrame:
-        """Drop what lies outside the span of the data by more than the margin."""
-        end = self.log.duration_s + WINDOW_MARGIN_S
-        inside = (frame.index >= -WINDOW_MARGIN_S) & (frame.index <= end)
-        return frame[inside]
 
 
 def measurement_time_us(table: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
@@ -268,15 +261,13 @@ def read_topics(path: Path) -> Topics:
     """
     name, content = shown(path), read_log_bytes(path)
     chatter = io.StringIO()
-    wanted = topics()
     framing = whole_messages(content)
-    whole = framing.content
     try:
         with contextlib.redirect_stdout(chatter):  # pyulog prints its warnings
-            ulog = ULog(io.BytesIO(whole), message_name_filter_list=wanted)
+            ulog = ULog(io.BytesIO(framing.content), message_name_filter_list=topics())
             tables = _tables(ulog)
             # a log of other topics can still be placed in time, by all that it holds
-            placed = tables or _tables(ULog(io.BytesIO(whole)))
+            placed = tables or _tables(ULog(io.BytesIO(framing.content)))
     except _PARSE_ERRORS as error:
         raise LogError(
             f"{name}: not a readable ULog ({str(error) or type(error).__name__})",
