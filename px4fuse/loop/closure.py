@@ -122,8 +122,7 @@ def distribute_by_distance(
     """
     cumulative = cumulative_distance(position_m) if cumulative_m is None else cumulative_m
     share = cumulative / cumulative[-1]
-    corrected: Array = position_m - share[:, np.newaxis] * misclosure_m
-    return corrected
+    return np.asarray(position_m - share[:, np.newaxis] * misclosure_m)
 
 
 def heading_change_rad(rotation: Rotation) -> float:

@@ -388,5 +388,4 @@ def _attitude_variance(quaternion: Array, variance: Array) -> Array:
     """
     w, x, y, z = quaternion.T
     turns = np.array([[-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]])
-    squared: Array = 4.0 * np.einsum("ijn,nj->ni", turns**2, variance)
-    return squared
+    return np.asarray(4.0 * np.einsum("ijn,nj->ni", turns**2, variance))
