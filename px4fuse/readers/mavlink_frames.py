@@ -45,12 +45,6 @@ PIECE = 1 << 12
 MIN_GOOD_SHARE = 0.01
 # A stamp further than this from the median one is damaged (pymavlink's own limit)
 MAX_STAMP_DISTANCE_US = 3 * 24 * 3600 * 1_000_000
-_WIRE_TYPES = {
-    "char": "S1", "double": "<f8", "float": "<f4",
-    "int8_t": "i1", "int16_t": "<i2", "int32_t": "<i4", "int64_t": "<i8",
-    "uint8_t": "u1", "uint16_t": "<u2", "uint32_t": "<u4", "uint64_t": "<u8",
-    "uint8_t_mavlink_version": "u1",
-}  # fmt: skip
 MESSAGE_IDS: Mapping[str, int] = {
     message.msgname: number for number, message in dialect.mavlink_map.items()
 }
@@ -157,14 +151,15 @@ def message_name(number: int) -> str:
 def wire_layout(number: int) -> np.dtype[Any]:
     """Payload of a message as a packed structured dtype, from pymavlink's field tables."""
     message = dialect.mavlink_map[number]
-    kinds = dict(zip(message.fieldnames, message.fieldtypes, strict=True))
+    kinds = message.native_format.decode().removeprefix("<")  # struct's, which numpy knows too
     fields: list[Any] = []
-    for name, length in zip(message.ordered_fieldnames, message.array_lengths, strict=True):
-        kind = _WIRE_TYPES[kinds[name]]
-        if length and kind == "S1":
-            fields.append((name, f"S{length}"))
+    for name, kind, length in zip(
+        message.ordered_fieldnames, kinds, message.array_lengths, strict=True
+    ):
+        if kind == "c":
+            fields.append((name, f"S{length or 1}"))
         else:
-            fields.append((name, kind, (length,)) if length else (name, kind))
+            fields.append((name, f"<{kind}", (length,)) if length else (name, f"<{kind}"))
     return np.dtype(fields)
 
 

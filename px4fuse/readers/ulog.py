@@ -1,7 +1,5 @@
 """PX4 ULog to :class:`~px4fuse.flight.Flight`, for PX4 v1.9 to today."""
 
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 from msgspec import structs
@@ -22,19 +20,15 @@ LEAST_LOST, LOST_FROM_S = 65_538, 0.2
 UTC_RANGE_S = (1_234_567_890.0, 4_102_444_800.0)
 
 
-def read_ulog(path: Path) -> Flight:
-    """Read a PX4 ULog.
+def read_ulog(name: str, content: bytes) -> Flight:
+    """Read a PX4 ULog of this name.
 
     Raises
     ------
     LogError
-        The file cannot be read, is no ULog, or holds no usable data.
+        It is no ULog, or holds no usable data.
     """
-    return to_flight(read_topics(path))
-
-
-def to_flight(topics: Topics) -> Flight:
-    """Make a flight of the topics of a log."""
+    topics = read_topics(name, content)
     running = "Check that the logger ran while the sensors did."
     imu = _enough(topics, _read_imu(topics), "IMU", px4.IMU[0].topic, running)
     logged = topics.read(px4.ATTITUDE)

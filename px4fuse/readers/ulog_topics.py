@@ -12,7 +12,6 @@ from bisect import bisect_left
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -29,7 +28,6 @@ from px4fuse.plain import few_words
 from px4fuse.readers.layouts import Layout
 from px4fuse.readers.px4_topics import IMU, SELECTOR, topics
 from px4fuse.readers.ulog_framing import Framing, whole_messages
-from px4fuse.reading import read_log_bytes, shown
 from px4fuse.recording import Dropout, LogInfo, Stream
 
 _MICROSECOND = 1e-6
@@ -82,8 +80,8 @@ class Topics:
     tables: dict[tuple[str, int], dict[str, NDArray[Any]]]
     zero_us: int
     dropped: dict[tuple[str, int], int]
-    ekf2_parameters: Mapping[str, float] = field(default_factory=dict)
-    framing: Framing = field(default_factory=lambda: Framing(b""))
+    ekf2_parameters: Mapping[str, float]
+    framing: Framing
     streams: dict[str, Stream] = field(default_factory=dict)
 
     def instances(self, topic: str) -> list[int]:
@@ -251,15 +249,14 @@ def dropped_note(count: int, name: str, why: str) -> str:
     return f"{count} samples of {name} were dropped: their time stamps are {why}"
 
 
-def read_topics(path: Path) -> Topics:
-    """Decode the topics that px4fuse uses.
+def read_topics(name: str, content: bytes) -> Topics:
+    """Decode the topics that px4fuse uses, of a log of this name.
 
     Raises
     ------
     LogError
-        The file cannot be read, is no ULog, or holds no data with usable time stamps.
+        It is no ULog, or holds no data with usable time stamps.
     """
-    name, content = shown(path), read_log_bytes(path)
     chatter = io.StringIO()
     framing = whole_messages(content)
     try:
