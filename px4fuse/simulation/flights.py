@@ -1,4 +1,4 @@
-"""Scenario and mistakes to a flight: in memory, as ULog, and the answer for the instructor."""
+"""Scenario and mistakes to a flight, as ULog, and the answer for the instructor."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -42,7 +42,7 @@ class Simulation:
     positions : Positions
         The position source with its outliers and errors.
     topics : tuple of Topic
-        All that a reader looks at.
+        All that is logged.
     parameters : mapping
     """
 
