@@ -72,7 +72,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
             "Set SYS_MC_EST_GROUP to 2.",
         )
     local = topics.read(px4.LOCAL_POSITION)
-    if local is None:
+    if topics.find(px4.LOCAL_POSITION) is None:
         return Unavailable("EKF2", "no topic vehicle_local_position", px4.DEFAULT_PROFILE)
     state = local[Columns.STATE].dropna()
     if state.empty:
@@ -183,7 +183,7 @@ def _step_s(topics: Topics) -> float:
     """Time between two predictions: EKF2 gathers whole IMU samples (ImuDownSampler.cpp)."""
     target = target_step_s(topics)
     imu = topics.read(px4.IMU)
-    if imu is None or len(imu) < 2:
+    if len(imu) < 2:
         return target
     time = imu.index.to_numpy()
     interval = float(np.median(np.diff(time)))
@@ -226,8 +226,7 @@ def _accelerometer_bias(
     topics: Topics, delayed: pd.DataFrame | Unavailable
 ) -> pd.DataFrame | Unavailable:
     """Accelerometer bias from its own topic, or else from the state vector."""
-    layout = topics.find(px4.SENSOR_BIAS)
-    if layout is not None and len(own := topics.of_primary(layout).dropna()):
+    if len(own := topics.of_primary(px4.SENSOR_BIAS).dropna()):
         return own
     if isinstance(delayed, Unavailable) or delayed.empty:
         return BIAS_NOT_LOGGED
@@ -338,25 +337,20 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
     """What the magnetometer measured, of the two topics that have it the one with more rows."""
     found = []
     for topic, name in px4.MAGNETOMETER:
-        layout = Layout(topic, elements(list(FIELD_COLUMNS), name))
-        if topics.find((layout,)) is not None:
-            frame = topics.of_primary(layout).dropna()
-            if name == "observation":  # by the time that EKF2 takes it to be of
-                delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3
-                frame = frame.set_axis(frame.index + delay_s + 0.5 * step_s)
-            found.append(frame)
-    bits = topics.read((Layout(STATUS, {"bits": "control_mode_flags"}),), step=True)
-    if not found or bits is None:
+        frame = topics.of_primary(Layout(topic, elements(list(FIELD_COLUMNS), name))).dropna()
+        if name == "observation":  # by the time that EKF2 takes it to be of
+            delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3
+            frame = frame.set_axis(frame.index + delay_s + 0.5 * step_s)
+        found.append(frame)
+    used, bits = max(found, key=len), topics.read((px4.CONTROL_BITS,), step=True)["bits"].dropna()
+    if used.empty or bits.empty:
         return pd.DataFrame()
-    used = max(found, key=len)
-    flags = at_times(bits["bits"].dropna(), used.index).astype(np.int64)
+    flags = at_times(bits, used.index).astype(np.int64)
     return used.assign(fused_3d=(flags >> MAG_3D_BIT & 1).astype(float))
 
 
 def _read_flow(topics: Topics, meant: Mapping[str, pd.Series[float]]) -> pd.DataFrame:
     """What optical flow measured: of the samples between two rows the mean, by the low pass."""
-    if any(topics.find((layout,)) is None for layout in px4.FLOW):
-        return pd.DataFrame()
     speed, interval, noise = (topics.of_primary(layout).dropna() for layout in px4.FLOW)
     interval_s = float(interval["interval_us"].median()) * 1e-6
     if not interval_s > 0.0 or noise.empty:

@@ -277,7 +277,7 @@ def _local_origin(topics: Topics) -> tuple[float, float, float] | None:
     """EKF2's geographic origin (degrees, degrees, m), where it had one."""
     local = topics.read(px4.LOCAL_POSITION)
     columns = ["ref_lat", "ref_lon", "ref_alt"]
-    if local is None or not set(columns) <= set(local.columns):
+    if not {*columns} <= {*local}:
         return None
     origin = finite_rows(local[columns], columns)
     origin = origin[origin["ref_lat"] != 0]
@@ -364,10 +364,10 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     return replace(found, origin=structs.replace(found.origin, automatic=fuses(ekf2)))
 
 
-def barometer(altitude_m: pd.Series[float] | None, delay_s: float = 0.0) -> pd.DataFrame | None:
+def barometer(altitude_m: pd.Series[float], delay_s: float = 0.0) -> pd.DataFrame | None:
     """Height by the pressure, ``down_m``, None where there is none."""
-    heights = None if altitude_m is None else altitude_m[np.isfinite(altitude_m)]
-    if heights is None or len(heights) < MIN_TRACK_SAMPLES:
+    heights = altitude_m[np.isfinite(altitude_m)]
+    if len(heights) < MIN_TRACK_SAMPLES:
         return None
     return _later(-heights.to_frame("down_m"), -delay_s)
 
@@ -389,14 +389,13 @@ def read_truth(
     is not: the truth is moved there.
     """
     attitude = attitude_of(topics.read(px4.TRUTH_ATTITUDE))
-    local = topics.read(px4.TRUTH_LOCAL)
-    geo = topics.read(px4.TRUTH_GLOBAL)
-    geo = None if geo is None else finite_rows(geo, GLOBAL_COLUMNS[:2])
-    if local is not None and len(local := local.dropna()):
-        if geo is not None and len(geo) and fuses(ekf2):
+    local = topics.read(px4.TRUTH_LOCAL).dropna()
+    geo = finite_rows(topics.read(px4.TRUTH_GLOBAL), GLOBAL_COLUMNS[:2])
+    if len(local):
+        if len(geo) and fuses(ekf2):
             local = _about_origin(local, projected(geo, _local_origin(topics)))
         return Truth(px4.TRUTH_LOCAL[0].topic, local, attitude)
-    if geo is not None and len(geo):
+    if len(geo):
         velocity = geo.reindex(columns=Columns.VELOCITY)
         samples = projected(geo, _local_origin(topics)).join(velocity)
         return Truth(px4.TRUTH_GLOBAL[0].topic, samples, attitude)

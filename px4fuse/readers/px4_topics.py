@@ -71,7 +71,7 @@ ATTITUDE_VARIANCES: Mapping[tuple[int, int], int] = {
 QUATERNION_FILTER = 4
 
 # EKF2's accelerometer bias in m/s², whatever the generation of the state vector
-SENSOR_BIAS = (Layout("estimator_sensor_bias", elements(Columns.SPECIFIC_FORCE, "accel_bias")),)
+SENSOR_BIAS = Layout("estimator_sensor_bias", elements(Columns.SPECIFIC_FORCE, "accel_bias"))
 
 SELECTOR = (Layout("estimator_selector_status", {"instance": "primary_instance"}),)  # v1.12
 
@@ -362,6 +362,7 @@ FLAG_ALWAYS_SET = ("gravity", "drag")
 # Their observation is a position in EKF2's frame (that of GNSS is latitude and longitude)
 WITH_OBSERVATION = ("ev_pos", "ev_hgt")
 STATUS_FLAGS, STATUS = "estimator_status_flags", "estimator_status"
+CONTROL_BITS = Layout(STATUS, {"bits": "control_mode_flags"})
 # Every aid in one topic: innovations and variances, before v1.12 both
 INNOVATIONS = "estimator_innovations", "estimator_innovation_variances"
 OLD_INNOVATIONS = "ekf2_innovations"
@@ -378,8 +379,8 @@ UNUSED: Mapping[str, str] = {
 def topics() -> list[str]:
     """Every topic named in this table, sorted: all that a reader needs to decode."""
     groups = (
-        IMU, ATTITUDE, LOCAL_POSITION, SENSOR_BIAS, SELECTOR, LAND_DETECTED, FLIGHT_MODE, FAILURE,
-        BAROMETER, TRUTH_LOCAL, TRUTH_GLOBAL, TRUTH_ATTITUDE, AID_OBSERVATION_HORIZONTAL,
+        IMU, ATTITUDE, LOCAL_POSITION, (SENSOR_BIAS,), SELECTOR, LAND_DETECTED, FLIGHT_MODE,
+        FAILURE, BAROMETER, TRUTH_LOCAL, TRUTH_GLOBAL, TRUTH_ATTITUDE, AID_OBSERVATION_HORIZONTAL,
         AID_OBSERVATION_VERTICAL, HEIGHT_BIAS.values(), FLOW, *(track.layouts for track in _TRACKS),
     )  # fmt: skip
     named = {layout.topic for group in groups for layout in group}

@@ -95,8 +95,7 @@ class Topics:
     @cached_property
     def primary(self) -> Instances:
         """Primary EKF2 instance from each time on (``EKF2Selector.cpp``)."""
-        status = self.read(SELECTOR, step=True)
-        selected = pd.Series(dtype=float) if status is None else status["instance"]
+        selected = self.read(SELECTOR, step=True)["instance"]
         selected = selected[selected < 255]  # 255: none selected yet
         if selected.empty:
             return NO_SELECTOR
@@ -149,10 +148,10 @@ class Topics:
         end = self.log.duration_s + WINDOW_MARGIN_S
         return frame if step else frame[(frame.index >= -WINDOW_MARGIN_S) & (frame.index <= end)]
 
-    def read(self, layouts: tuple[Layout, ...], *, step: bool = False) -> pd.DataFrame | None:
-        """:meth:`frame` of the first layout that this log holds; None where it holds none."""
+    def read(self, layouts: tuple[Layout, ...], *, step: bool = False) -> pd.DataFrame:
+        """:meth:`frame` of the first layout that this log holds; empty where it holds none."""
         layout = self.find(layouts)
-        return None if layout is None else self.frame(layout, step=step)
+        return _nothing(layouts[0]) if layout is None else self.frame(layout, step=step)
 
     def of_primary(
         self,
@@ -163,6 +162,8 @@ class Topics:
     ) -> pd.DataFrame:
         """Rows of each instance of a topic of EKF2 from when that instance was the primary one.
 
+        Empty where the log does not hold the layout.
+
         Parameters
         ----------
         layout, step
@@ -170,6 +171,8 @@ class Topics:
         select : callable, optional
             Which rows of an instance count; all by default.
         """
+        if self.find((layout,)) is None:
+            return _nothing(layout)
         available = self.instances(layout.topic)
         alone = self.primary == NO_SELECTOR
         starts, numbers = (np.array(part) for part in zip(*self.primary, strict=True))
@@ -191,6 +194,12 @@ class Topics:
         )
         clock = f"autopilot boot clock, at {'measurement' if measured else 'publication'}"
         self.streams[part] = Stream(topics, clock, self.log.name)
+
+
+def _nothing(layout: Layout) -> pd.DataFrame:
+    """What a log without a topic has of it."""
+    times = pd.Index([], dtype=np.float64, name="time_s")
+    return pd.DataFrame(columns=list(layout.columns), index=times, dtype=np.float64)
 
 
 def measurement_time_us(table: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
