@@ -59,7 +59,7 @@ def intentions(topics: Topics) -> dict[str, pd.Series[float]]:
             group = next((group for group in source.flags if {*group} <= {*known}), None)
             if group is not None:
                 meant[name] = flags[list(group)].max(axis=1)
-    if not known and topics.find((px4.CONTROL_BITS,)) is not None:
+    if not known and topics.find(px4.CONTROL_BITS) is not None:
         bits = topics.of_primary(px4.CONTROL_BITS, step=True)["bits"].dropna()
         for name, source in px4.SOURCES.items():
             if source.bit is not None:

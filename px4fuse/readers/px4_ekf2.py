@@ -79,7 +79,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         return Unavailable(
             "EKF2", "vehicle_local_position holds no finite sample", "Wait until EKF2 has started."
         )
-    topics.came_from("ekf2_state", px4.LOCAL_POSITION[0].topic)
+    topics.came_from("ekf2_state", px4.LOCAL_POSITION.topic)
     meant = intentions(topics)
     fusing = _fusing(topics, meant)
     gate = settings_in_force(parameters)[EV_POS.gate]
@@ -328,7 +328,7 @@ def _read_record(
         height_bias={
             name: topics.of_primary(layout).dropna()
             for name, layout in px4.HEIGHT_BIAS.items()
-            if topics.find((layout,)) is not None
+            if topics.find(layout) is not None
         },
     )
 
@@ -342,7 +342,7 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
             delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3
             frame = frame.set_axis(frame.index + delay_s + 0.5 * step_s)
         found.append(frame)
-    used, bits = max(found, key=len), topics.read((px4.CONTROL_BITS,), step=True)["bits"].dropna()
+    used, bits = max(found, key=len), topics.read(px4.CONTROL_BITS, step=True)["bits"].dropna()
     if used.empty or bits.empty:
         return pd.DataFrame()
     flags = at_times(bits, used.index).astype(np.int64)

@@ -122,7 +122,7 @@ def _track(
 
 
 def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
-    layout = topics.find(px4.TRACKS[name].layouts)
+    layout = topics.find(*px4.TRACKS[name].layouts)
     if layout is None:
         return unavailable(name, f"no topic {name} in the log")
     is_ekf2 = layout.topic.startswith("estimator_")  # only EKF2's own topics have its instances
@@ -306,7 +306,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     Those are the stamps less EKF2_GPS_DELAY, and since main of 2026 the driver's own times of
     measurement where those differ (EKF2.cpp UpdateGpsSample, estimator_interface.cpp).
     """
-    layout = topics.find(px4.GPS)
+    layout = topics.find(*px4.GPS)
     if layout is None:
         return unavailable(px4.GPS_POSITION, f"no topic {px4.GPS_POSITION} in the log")
     gps = topics.frame(layout)
@@ -394,11 +394,11 @@ def read_truth(
     if len(local):
         if len(geo) and fuses(ekf2):
             local = _about_origin(local, projected(geo, _local_origin(topics)))
-        return Truth(px4.TRUTH_LOCAL[0].topic, local, attitude)
+        return Truth(px4.TRUTH_LOCAL.topic, local, attitude)
     if len(geo):
         velocity = geo.reindex(columns=Columns.VELOCITY)
         samples = projected(geo, _local_origin(topics)).join(velocity)
-        return Truth(px4.TRUTH_GLOBAL[0].topic, samples, attitude)
+        return Truth(px4.TRUTH_GLOBAL.topic, samples, attitude)
     captured = motion_capture(positions, "vehicle_mocap_odometry")
     if captured is None:
         return Unavailable(

@@ -96,7 +96,7 @@ def _lost(topics: Topics, imu: pd.DataFrame | Unavailable, in_flight: bool) -> t
 
 def _start_unix(topics: Topics) -> float | None:
     """UNIX time (s) of time zero by the GPS receiver, the median over its fixes."""
-    gps = topics.read(px4.GPS)
+    gps = topics.read(*px4.GPS)
     if "utc_us" not in gps:
         return None
     utc_s = gps["utc_us"] * 1e-6
@@ -107,11 +107,11 @@ def _start_unix(topics: Topics) -> float | None:
 
 
 def _enough(
-    topics: Topics, samples: pd.DataFrame, what: str, layouts: tuple[Layout, ...], remedy: str
+    topics: Topics, samples: pd.DataFrame, what: str, layout: Layout, remedy: str
 ) -> pd.DataFrame | Unavailable:
     """The usable samples of a topic, or why there are none."""
-    topic = layouts[0].topic
-    if topics.find(layouts) is None:
+    topic = layout.topic
+    if topics.find(layout) is None:
         return Unavailable(what, f"no topic {topic}", px4.DEFAULT_PROFILE)
     if len(samples) < 2:
         return Unavailable(what, f"{topic} holds {len(samples)} usable samples", remedy)
@@ -140,7 +140,7 @@ def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavaila
             "no usable topic vehicle_land_detected",
             "Record with SDLOG_PROFILE bit 0 (default), or give --start and --end.",
         )
-    topics.came_from("airborne", px4.LAND_DETECTED[0].topic)
+    topics.came_from("airborne", px4.LAND_DETECTED.topic)
     return parts.stretches_of_flight(detected["landed"], topics.log.duration_s)
 
 

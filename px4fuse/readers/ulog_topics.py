@@ -103,7 +103,7 @@ class Topics:
         times = [-np.inf, *changes.index[1:]]
         return tuple((float(at), int(number)) for at, number in zip(times, changes, strict=True))
 
-    def find(self, layouts: tuple[Layout, ...]) -> Layout | None:
+    def find(self, *layouts: Layout) -> Layout | None:
         """First layout that this log holds, or None."""
         for layout in layouts:
             if any({*layout.columns.values()} <= {*table} for table in self.of(layout.topic)):
@@ -148,9 +148,9 @@ class Topics:
         end = self.log.duration_s + WINDOW_MARGIN_S
         return frame if step else frame[(frame.index >= -WINDOW_MARGIN_S) & (frame.index <= end)]
 
-    def read(self, layouts: tuple[Layout, ...], *, step: bool = False) -> pd.DataFrame:
+    def read(self, *layouts: Layout, step: bool = False) -> pd.DataFrame:
         """:meth:`frame` of the first layout that this log holds; empty where it holds none."""
-        layout = self.find(layouts)
+        layout = self.find(*layouts)
         return _nothing(layouts[0]) if layout is None else self.frame(layout, step=step)
 
     def of_primary(
@@ -171,7 +171,7 @@ class Topics:
         select : callable, optional
             Which rows of an instance count; all by default.
         """
-        if self.find((layout,)) is None:
+        if self.find(layout) is None:
             return _nothing(layout)
         available = self.instances(layout.topic)
         alone = self.primary == NO_SELECTOR
@@ -345,7 +345,7 @@ def _data_span(
 ) -> tuple[int, int]:
     """First and last time (µs) of the IMU, or else of the topic with most samples."""
     candidates = sorted(
-        tables, key=lambda key: (key[0] != IMU[0].topic, -len(tables[key]["timestamp"]))
+        tables, key=lambda key: (key[0] != IMU.topic, -len(tables[key]["timestamp"]))
     )
     for key in candidates:
         time_us = tables[key]["timestamp"].astype(np.int64)
