@@ -268,7 +268,7 @@ def settle_clocks(frames: Frames, address: Address) -> Recording:
         received = stamps[at]
     else:
         notes.append("no message in the stream carries a time: nothing in it can be placed in time")
-    back = int(np.count_nonzero(np.diff(received) < 0.0)) if frames.received_us is not None else 0
+    back = int(np.count_nonzero(np.diff(received) < 0.0))
     said = {
         "whole frames of messages that px4fuse does not know were passed over: "
         f"{frames.passed_over}": frames.passed_over,
