@@ -57,4 +57,4 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
             raise LogError(f"{name}: {what}", remedy.format(name=name))
     from px4fuse.readers.mavlink import read_mavlink  # noqa: PLC0415
 
-    return read_mavlink(path, system)
+    return read_mavlink(name, read_log_bytes(path), system)

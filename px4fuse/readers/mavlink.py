@@ -5,7 +5,6 @@ v1.16) and MAVLink's ``common.xml``; ``mavlink_messages`` holds them as tables.
 """
 
 from collections.abc import Mapping
-from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
@@ -32,12 +31,14 @@ PARAMETER_REAL = 9
 
 # hostile values become NaN or infinite without a word, and are dropped where samples are made
 @np.errstate(invalid="ignore", over="ignore", divide="ignore")
-def read_mavlink(path: Path, system: int | None = None) -> Flight:
+def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight:
     """Read a MAVLink recording.
 
     Parameters
     ----------
-    path : Path
+    name : str
+        Of the file.
+    content : bytes
         ``.tlog`` of QGroundControl or MAVProxy, or a raw stream of MAVLink 1 and 2.
     system : int, optional
         MAVLink system id of the vehicle; by default the autopilot with the most messages.
@@ -50,11 +51,11 @@ def read_mavlink(path: Path, system: int | None = None) -> Flight:
     Raises
     ------
     LogError
-        The file cannot be read or holds no MAVLink.
+        It holds no MAVLink.
     SettingsError
         No autopilot in it has that system id.
     """
-    frames = read_frames(path)
+    frames = read_frames(name, content)
     address, autopilot = senders.choose_autopilot(frames, system)
     recording = settle_clocks(frames, address)
     mapped = senders.map_senders(recording)

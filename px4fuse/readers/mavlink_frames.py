@@ -12,7 +12,6 @@ import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,6 @@ from pymavlink.dialects.v20 import all as dialect
 
 from px4fuse.arrays import BoolArray, IntArray
 from px4fuse.errors import LogError
-from px4fuse.reading import read_log_bytes, shown
 
 Integers = NDArray[np.int64]
 # MAVLink system and component
@@ -163,20 +161,21 @@ def wire_layout(number: int) -> np.dtype[Any]:
     return np.dtype(fields)
 
 
-def read_frames(path: Path) -> Frames:
+def read_frames(name: str, content: bytes) -> Frames:
     """Find all good frames of a recording.
 
     Parameters
     ----------
-    path : Path
+    name : str
+        Of the file, for messages.
+    content : bytes
         A ``.tlog`` with time stamps, or a raw stream of MAVLink 1 and 2.
 
     Raises
     ------
     LogError
-        The file cannot be read or holds no MAVLink.
+        It holds no MAVLink.
     """
-    name, content = shown(path), read_log_bytes(path)
     start, end, number = _without_overlap(_scan(content)).T
     stamp = STAMP if len(start) and _is_stamped(start, end) else 0
     good = int(np.sum(end - start))

@@ -29,10 +29,8 @@ def _vehicles(frames: Frames) -> dict[Address, tuple[int, int]]:
     rows = frames.rows("HEARTBEAT")
     beats = frames.table("HEARTBEAT", rows)
     given = zip(beats["type"].tolist(), beats["autopilot"].tolist(), strict=True)
-    found: dict[Address, tuple[int, int]] = {}
-    for address, said in zip(_addresses(frames, rows), given, strict=True):
-        found.setdefault(address, said)
-    return found
+    said = [*zip(_addresses(frames, rows), given, strict=True)]
+    return dict(said[::-1])
 
 
 def _addresses(frames: Frames, rows: IntArray | slice) -> Iterator[Address]:

@@ -189,9 +189,8 @@ def _step_s(topics: Topics) -> float:
     interval = float(np.median(np.diff(time)))
     if interval >= target:
         return target
-    known = pd.Index([])
-    if topic := _state_vector(topics)[0]:
-        known = topics.of_primary(Layout(topic, {"states[0]": "states[0]"})).index
+    layout = Layout(_state_vector(topics)[0], {"states[0]": "states[0]"})
+    known = topics.of_primary(layout).index
     return samples_per_step(target, interval, same_stamps(time, known)) * interval
 
 
