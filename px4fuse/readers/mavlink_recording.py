@@ -205,7 +205,7 @@ def _in_ned(samples: pd.DataFrame) -> pd.DataFrame:
 def _boot_stamps(frames: Frames, address: Address) -> tuple[IntArray, Array]:
     """Frames of the autopilot that carry its boot clock, in file order, and that clock (s)."""
     own = frames.sent_by(address)
-    all_rows, all_stamps = [], []
+    all_rows, all_stamps = [np.zeros(0, dtype=np.intp)], [np.zeros(0)]
     for number in np.unique(frames.message_id[own]).tolist():
         name = message_name(number)
         if "time_boot_ms" in (wire_layout(number).names or ()):
@@ -218,8 +218,6 @@ def _boot_stamps(frames: Frames, address: Address) -> tuple[IntArray, Array]:
         rows = rows[own[rows]]
         all_rows.append(rows)
         all_stamps.append(frames.table(name, rows)[stamp] * unit)
-    if not all_rows:
-        return np.zeros(0, dtype=np.intp), np.zeros(0)
     rows, stamps = np.concatenate(all_rows), np.concatenate(all_stamps)
     from_boot, from_1970 = (stamps > 0.0) & (stamps < UNIX_FROM_S), stamps >= UNIX_FROM_S
     good = from_boot if np.any(from_boot) else from_1970
