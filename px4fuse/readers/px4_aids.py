@@ -86,6 +86,8 @@ def _own_topic(
     layout = Layout(
         f"estimator_aid_src_{name}", columns | {"fused": "fused", "rejected": "innovation_rejected"}
     )
+    if topics.find(layout) is None:  # most aids of most logs: an empty table takes its time
+        return None
     frame = topics.of_primary(layout).dropna()
     if meant is not None and name in px4.FLAG_ALWAYS_SET:
         frame["fused"] = at_times(meant, frame.index)

@@ -106,7 +106,7 @@ class Topics:
     def find(self, *layouts: Layout) -> Layout | None:
         """First layout that this log holds, or None."""
         for layout in layouts:
-            if any({*layout.columns.values()} <= {*table} for table in self.of(layout.topic)):
+            if any({*layout.columns.values()} <= table.keys() for table in self.of(layout.topic)):
                 return layout
         return None
 
