@@ -64,7 +64,7 @@ def read(tmp_path):
     def write_and_read(content: bytes) -> Frames:
         path = tmp_path / "made.tlog"
         path.write_bytes(content)
-        return read_frames(path)
+        return read_frames(path.name, path.read_bytes())
 
     return write_and_read
 
@@ -108,7 +108,7 @@ def same_values(kind, name: str, table: np.ndarray, heard: list[Heard]) -> None:
 def agrees(path: Path) -> None:
     with_stamps = path.suffix == ".tlog"
     heard, unknown = heard_by_pymavlink(path, stamped=with_stamps)
-    frames = read_frames(path)
+    frames = read_frames(path.name, path.read_bytes())
     at = {start: row for row, start in enumerate(frames.start.tolist())}
     count = 0
     for name, all_heard in heard.items():
@@ -137,7 +137,7 @@ def test_the_sample_tlog_is_read_as_pymavlink_reads_it(sample_log):
 def test_real_recordings_are_read_as_pymavlink_reads_them(path, tmp_path):
     """Of long ones beginning and end, as pymavlink takes half a minute for each."""
     if path.stat().st_size > LONG_BYTES and path.name not in BEYOND_PYMAVLINK:
-        frames, content = read_frames(path), path.read_bytes()
+        frames, content = read_frames(path.name, path.read_bytes()), path.read_bytes()
         gap = 8 if path.suffix == ".tlog" else 0
         starts = frames.start - gap
         first = int(starts[np.searchsorted(starts, LONG_BYTES // 2)])
@@ -357,7 +357,7 @@ def test_any_mixture_gives_back_its_good_frames(tmp_path_factory, kinds):
         good += 1
     path = tmp_path_factory.mktemp("mixture") / "made.raw"
     path.write_bytes(b"".join(parts))
-    frames = read_frames(path)
+    frames = read_frames(path.name, path.read_bytes())
     assert len(frames) == good
     assert frames.passed_over <= kinds.count("unknown")
 
@@ -401,7 +401,7 @@ def test_the_scan_reads_no_byte_more_than_a_frames_length_for_each_start(tmp_pat
     path.write_bytes(content)
     monkeypatch.setattr(mavlink_frames, "mcrf4xx", counting)
     with pytest.raises(LogError):
-        read_frames(path)
+        read_frames(path.name, path.read_bytes())
     assert 200 * len(content) < summed < 280 * len(content)
 
 
@@ -435,7 +435,7 @@ def test_shortest_frames_of_random_senders_cost_a_bounded_amount_each(tmp_path, 
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert len(flight.log.senders) == 32
-    frames = read_frames(path)
+    frames = read_frames(path.name, path.read_bytes())
     assert peak < len(content) + FRAME_BYTES * len(frames) + SENDER_BYTES
 
 
@@ -464,5 +464,5 @@ def test_frames_cut_to_their_stamp_cost_a_bounded_amount_each(tmp_path, name, se
     read_log(path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert len(read_frames(path)) == count + 3
+    assert len(read_frames(path.name, path.read_bytes())) == count + 3
     assert peak < path.stat().st_size + DECODED_BYTES * count + TINY_BYTES

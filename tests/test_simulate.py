@@ -1,6 +1,5 @@
 """Simulated flights against their own truth: motion, sensors, mistakes, ULog and command."""
 
-import dataclasses
 import json
 
 import numpy as np
@@ -21,7 +20,7 @@ from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, make_axes, project_acceleration, step_means
 from px4fuse.findings import find
-from px4fuse.flight import Columns, Truth
+from px4fuse.flight import Columns
 from px4fuse.simulation import sensors
 from px4fuse.simulation.flights import answer, simulate, simulate_flight, to_flight, to_ulog
 from px4fuse.simulation.mistakes import MISTAKES, Mistakes, as_typed, made, parse
@@ -358,46 +357,6 @@ def test_what_does_not_fit_is_refused():
 
 
 # --- as ULog and in memory
-
-
-@pytest.mark.parametrize(
-    ("scenario", "texts"),
-    [
-        (AISLE, []),
-        (LOOP, ["jump=1m"]),
-        (replace(AISLE, truth=False, passes=4), ["clock-jump=0.3", "nlos=5%"]),
-        (AISLE, ["no-vvo", "imu-dropout=1s,0s"]),
-    ],
-    ids=["aisle", "loop", "clock-jump", "no-vvo"],
-)
-def test_reader_gives_the_flight_that_is_made_in_memory(scenario, texts, tmp_path):
-    simulation = simulate(scenario, parse(texts))
-    path = tmp_path / "simulation.ulg"
-    path.write_bytes(to_ulog(simulation))
-    read, made_here = px4fuse.read_log(path), to_flight(simulation)
-    for part in dataclasses.fields(read):
-        a, b = getattr(read, part.name), getattr(made_here, part.name)
-        if part.name == "log":
-            same = {"sha256": "", "bytes": 0, "bytes_read": 0}
-            a, b = (replace(log, parameters=dict(log.parameters), **same) for log in (a, b))
-            assert a == b
-        elif isinstance(a, pd.DataFrame):
-            pd.testing.assert_frame_equal(a, b, check_exact=True)
-        elif isinstance(a, Truth):
-            assert a.name == b.name
-            pd.testing.assert_frame_equal(a.samples, b.samples, check_exact=True)
-        elif part.name == "ekf2":
-            for one, other in ((a.state, b.state), (a.variance, b.variance)):
-                pd.testing.assert_frame_equal(one, other, check_exact=True)
-            pd.testing.assert_frame_equal(a.record.delayed, b.record.delayed, check_exact=True)
-            assert (a.resets, a.horizon_s, a.gate) == (b.resets, b.horizon_s, b.gate)
-        elif part.name == "positions":
-            for one, other in zip(a, b, strict=True):
-                pd.testing.assert_frame_equal(one.samples, other.samples, check_exact=True)
-                empty = pd.DataFrame()
-                assert repr(replace(one, samples=empty)) == repr(replace(other, samples=empty))
-        else:
-            assert a == b, part.name
 
 
 def test_log_does_not_give_the_mistakes_away():

@@ -62,12 +62,11 @@ def in_frame(trajectory: Trajectory, frame: Frame) -> Trajectory:
 
 def _turned(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:
     """The same poses in another frame; a camera's axes turn with its world."""
-    turn, rotation = Rotation.from_matrix(matrix), trajectory.rotation
-    if rotation is not None:
-        rotation = turn * rotation
-        if "camera" in (trajectory.frame, frame):
-            rotation = rotation * turn.inv()
-    return replace(trajectory.moved(trajectory.position_m @ matrix.T, rotation), frame=frame)
+    turn = Rotation.from_matrix(matrix)
+    made = replace(trajectory.moved(trajectory.position_m @ matrix.T, turn), frame=frame)
+    if made.rotation is None or "camera" not in (trajectory.frame, frame):
+        return made
+    return replace(made, rotation=made.rotation * turn.inv())
 
 
 def key_frame_spacing_m(position_m: Array) -> float:
@@ -122,8 +121,7 @@ def distribute_by_distance(
     """
     cumulative = cumulative_distance(position_m) if cumulative_m is None else cumulative_m
     share = cumulative / cumulative[-1]
-    corrected: Array = position_m - share[:, np.newaxis] * misclosure_m
-    return corrected
+    return np.asarray(position_m - share[:, np.newaxis] * misclosure_m)
 
 
 def heading_change_rad(rotation: Rotation) -> float:
@@ -165,8 +163,4 @@ def correct_by_distance(
     steps = between.apply(np.diff(position, axis=0))
     turned = position[0] + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     left = turned[-1] - (position[-1] - misclosure_m)
-    rotation = trajectory.rotation
-    return trajectory.moved(
-        distribute_by_distance(turned, left, cumulative_m),
-        None if rotation is None else turn * rotation,
-    )
+    return trajectory.moved(distribute_by_distance(turned, left, cumulative_m), turn)

@@ -54,7 +54,7 @@ def by_distance(
     plain = distribute_by_distance(path.position_m, misclosure_m, distance)
     turned = 0.0 if isinstance(heading, Unavailable) else float(np.radians(heading))
     return {
-        "by_distance_plain": (path.moved(plain, path.rotation), None),
+        "by_distance_plain": (path.moved(plain), None),
         "by_distance": (correct_by_distance(path, distance, misclosure_m, turned), None),
     }
 
@@ -140,8 +140,7 @@ def _carried(path: Trajectory, nodes: IntArray, before: Array, after: Array) -> 
     ]
     weight = np.clip(share, 0.0, 1.0)[:, np.newaxis]
     position = (1.0 - weight) * moved[0] + weight * moved[1]
-    turned = Slerp(time[nodes], turn)(time)
-    return path.moved(position, None if path.rotation is None else turned * path.rotation)
+    return path.moved(position, Slerp(time[nodes], turn)(time))
 
 
 def score_all(

@@ -180,11 +180,6 @@ def split_part(argument: str) -> tuple[Path, Part | None]:
     return whole, None
 
 
-def _is_text(head: bytes) -> bool:
-    """Whether a file that begins like this is text, and so no flight log."""
-    return bool(head) and text_of(head) is not None
-
-
 def is_g2o(path: Path) -> bool:
     """Whether a file is a pose graph in g2o's format.
 
@@ -194,7 +189,9 @@ def is_g2o(path: Path) -> bool:
         It cannot be read.
     """
     head = read_head(path, _HEAD_BYTES, TrajectoryError)
-    return _is_text(head) and any(line.strip().startswith(_G2O) for line in head.splitlines())
+    return text_of(head) is not None and any(
+        line.strip().startswith(_G2O) for line in head.splitlines()
+    )
 
 
 def read_source(
@@ -234,7 +231,7 @@ def read_source(
             f"{shown(path)}: a pose graph, not a trajectory",
             f"Solve it with px4fuse loop {shown(path)}.",
         )
-    if _is_text(head):
+    if text_of(head) is not None:  # and so no flight log
         if part is not None:
             raise TrajectoryError(
                 f"{shown(path)}: a trajectory file has no part {part!r}", "Leave it out."

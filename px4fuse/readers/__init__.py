@@ -4,7 +4,7 @@ from pathlib import Path
 
 from px4fuse.errors import LogError, SettingsError
 from px4fuse.flight import Flight
-from px4fuse.reading import read_head, shown
+from px4fuse.reading import read_head, read_log_bytes, shown
 
 _SNIFF_BYTES = 16
 ULOG_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
@@ -50,11 +50,11 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
             raise SettingsError(f"{name}: `system` is for MAVLink recordings; this is a ULog.")
         from px4fuse.readers.ulog import read_ulog  # noqa: PLC0415
 
-        return read_ulog(path)
+        return read_ulog(name, read_log_bytes(path))
     for magic, suffixes, what, remedy in _FOREIGN:
         named_so = path.suffix.lower() in suffixes and head.isascii()
         if named_so or (magic and head.startswith(magic)):
             raise LogError(f"{name}: {what}", remedy.format(name=name))
     from px4fuse.readers.mavlink import read_mavlink  # noqa: PLC0415
 
-    return read_mavlink(path, system)
+    return read_mavlink(name, read_log_bytes(path), system)

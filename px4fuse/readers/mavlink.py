@@ -5,7 +5,6 @@ v1.16) and MAVLink's ``common.xml``; ``mavlink_messages`` holds them as tables.
 """
 
 from collections.abc import Mapping
-from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
@@ -18,7 +17,7 @@ from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import mavlink_senders as senders
 from px4fuse.readers import parts
 from px4fuse.readers.mavlink_clocks import UNIX_FROM_S
-from px4fuse.readers.mavlink_frames import message_ids, read_frames
+from px4fuse.readers.mavlink_frames import MESSAGE_IDS, read_frames
 from px4fuse.readers.mavlink_positions import pressure_altitude, read_positions, read_truth
 from px4fuse.readers.mavlink_recording import RECEIPT_CLOCK, Recording, settle_clocks, unix_of_boot
 from px4fuse.readers.px4_positions import barometer
@@ -32,12 +31,14 @@ PARAMETER_REAL = 9
 
 # hostile values become NaN or infinite without a word, and are dropped where samples are made
 @np.errstate(invalid="ignore", over="ignore", divide="ignore")
-def read_mavlink(path: Path, system: int | None = None) -> Flight:
+def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight:
     """Read a MAVLink recording.
 
     Parameters
     ----------
-    path : Path
+    name : str
+        Of the file.
+    content : bytes
         ``.tlog`` of QGroundControl or MAVProxy, or a raw stream of MAVLink 1 and 2.
     system : int, optional
         MAVLink system id of the vehicle; by default the autopilot with the most messages.
@@ -50,11 +51,11 @@ def read_mavlink(path: Path, system: int | None = None) -> Flight:
     Raises
     ------
     LogError
-        The file cannot be read or holds no MAVLink.
+        It holds no MAVLink.
     SettingsError
         No autopilot in it has that system id.
     """
-    frames = read_frames(path)
+    frames = read_frames(name, content)
     address, autopilot = senders.choose_autopilot(frames, system)
     recording = settle_clocks(frames, address)
     mapped = senders.map_senders(recording)
@@ -91,7 +92,7 @@ def read_mavlink(path: Path, system: int | None = None) -> Flight:
         unused=tuple(
             Unused(name, count, reason)
             for name, reason in messages.UNUSED.items()
-            if (count := int(np.count_nonzero(frames.message_id == message_ids()[name])))
+            if (count := int(np.count_nonzero(frames.message_id == MESSAGE_IDS[name])))
         ),
     )
 
@@ -302,11 +303,10 @@ def _start_unix_s(recording: Recording) -> float | None:
     """UNIX time of time zero: the autopilot's own, or else the recording computer's."""
     if recording.zero_s >= UNIX_FROM_S:
         return recording.zero_s
-    zero = np.array([recording.zero_s])
     unix = unix_of_boot(recording)
     if unix is not None:
-        return float(unix.at(zero)[0])
+        return float(unix.at(recording.zero_s))
     received_us = recording.frames.received_us
     if received_us is None or not recording.boot_of_receipt.pairs:
         return None
-    return float(received_us[0] * 1e-6 + recording.boot_of_receipt.inverse().at(zero)[0])
+    return float(received_us[0] * 1e-6 + recording.boot_of_receipt.inverse().at(recording.zero_s))

@@ -8,7 +8,7 @@ same way.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import theilslopes
@@ -52,7 +52,7 @@ class Line:
     jitter: float
     pairs: int
 
-    def at(self, x: Array) -> Array:
+    def at(self, x: Array | float) -> Array:
         """The other clock's reading y at readings x."""
         return np.asarray(self.y0 + self.slope * (x - self.x0), dtype=np.float64)
 
@@ -195,13 +195,8 @@ def map_clock(
         if abs(float(np.median(line.at(stamp_s) - boot_at_receipt))) <= SAME_CLOCK_S:
             return Mapped(line, _statement(clock, method, line, stamp_s, note))
     late = least_delay(stamp_s, received_s)
-    by_receipt = Line(
-        late.x0,
-        float(boot_of_receipt.at(np.array([late.y0]))[0]),
-        late.slope * boot_of_receipt.slope,
-        late.jitter,
-        late.pairs,
-    )
+    there, slope = float(boot_of_receipt.at(late.y0)), late.slope * boot_of_receipt.slope
+    by_receipt = replace(late, y0=there, slope=slope)
     note = "no usable TIMESYNC or SYSTEM_TIME; late by the least delay of the link"
     return Mapped(by_receipt, _statement(clock, receipt, by_receipt, stamp_s, note))
 
@@ -217,23 +212,12 @@ def _by_exchange(replies: tuple[Array, Array], answers: tuple[Array, Array]) -> 
     if not lines:
         return None
     x0 = lines[0].x0
-    return Line(
-        x0,
-        float(np.mean([line.at(np.array([x0]))[0] for line in lines])),
-        float(np.mean([line.slope for line in lines])),
-        float(np.mean([line.jitter for line in lines])),
-        sum(line.pairs for line in lines),
-    )
+    each = [(float(line.at(x0)), line.slope, line.jitter) for line in lines]
+    y0, slope, jitter = np.mean(each, axis=0).tolist()
+    return Line(x0, y0, slope, jitter, sum(line.pairs for line in lines))
 
 
 def _statement(clock: str, method: str, line: Line, stamp_s: Array, note: str) -> ClockMap:
     middle = float(0.5 * (stamp_s.min() + stamp_s.max()))
-    return ClockMap(
-        clock=clock,
-        method=method,
-        pairs=line.pairs,
-        offset_s=float(line.at(np.array([middle]))[0] - middle),
-        drift_ppm=(line.slope - 1.0) * 1e6,
-        jitter_s=line.jitter,
-        note=note,
-    )
+    offset_s, drift_ppm = float(line.at(middle)) - middle, (line.slope - 1.0) * 1e6
+    return ClockMap(clock, method, line.pairs, offset_s, drift_ppm, line.jitter, note)

@@ -12,7 +12,6 @@ import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,11 +19,12 @@ from fastcrc.crc16 import mcrf4xx  # CRC-16/MCRF4XX is MAVLink's X.25 checksum
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import all as dialect
 
-from px4fuse.arrays import IntArray
+from px4fuse.arrays import BoolArray, IntArray
 from px4fuse.errors import LogError
-from px4fuse.reading import read_log_bytes, shown
 
 Integers = NDArray[np.int64]
+# MAVLink system and component
+Address = tuple[int, int]
 
 MAGIC_1, MAGIC_2 = 0xFE, 0xFD
 HEADER_1, HEADER_2 = 6, 10
@@ -43,12 +43,14 @@ PIECE = 1 << 12
 MIN_GOOD_SHARE = 0.01
 # A stamp further than this from the median one is damaged (pymavlink's own limit)
 MAX_STAMP_DISTANCE_US = 3 * 24 * 3600 * 1_000_000
-_WIRE_TYPES = {
-    "char": "S1", "double": "<f8", "float": "<f4",
-    "int8_t": "i1", "int16_t": "<i2", "int32_t": "<i4", "int64_t": "<i8",
-    "uint8_t": "u1", "uint16_t": "<u2", "uint32_t": "<u4", "uint64_t": "<u8",
-    "uint8_t_mavlink_version": "u1",
-}  # fmt: skip
+MESSAGE_IDS: Mapping[str, int] = {
+    message.msgname: number for number, message in dialect.mavlink_map.items()
+}
+# Last byte of the checksum's input by message id; -1 where the dialect does not know the message
+_SEEDS = np.full(max(1 << 16, *(number + 1 for number in dialect.mavlink_map)), -1, dtype=np.int16)
+_SEEDS[[*dialect.mavlink_map]] = [message.crc_extra for message in dialect.mavlink_map.values()]
+# Checksum of each single byte, for the last step over the seed
+_LAST = np.array([mcrf4xx(bytes([byte]), 0) for byte in range(256)], dtype=np.uint16)
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,12 @@ class Frames:
 
     def rows(self, message: str) -> IntArray:
         """Indices of the frames of one message, by its MAVLink name."""
-        return np.flatnonzero(self.message_id == message_ids()[message])
+        return np.flatnonzero(self.message_id == MESSAGE_IDS[message])
+
+    def sent_by(self, address: Address, rows: IntArray | slice = slice(None)) -> BoolArray:
+        """Whether frames, by default all, are from one system and component."""
+        system, component = address
+        return np.asarray((self.system[rows] == system) & (self.component[rows] == component))
 
     def table(self, message: str, rows: IntArray) -> NDArray[Any]:
         """Decode frames of one message.
@@ -117,7 +124,7 @@ class Frames:
             One field per MAVLink field, in MAVLink's units; trailing zeros that MAVLink 2 cuts
             off the payload are put back.
         """
-        layout = wire_layout(message_ids()[message])
+        layout = wire_layout(MESSAGE_IDS[message])
         payload = np.zeros((len(rows), layout.itemsize), dtype=np.uint8)
         source = np.frombuffer(self.content, dtype=np.uint8)
         starts, lengths = self.payload_start[rows], self.payload_length[rows]
@@ -133,65 +140,43 @@ class Frames:
         return payload.view(layout)[:, 0]
 
 
-@cache
-def message_ids() -> Mapping[str, int]:
-    """MAVLink message ids by name."""
-    return {message.msgname: number for number, message in dialect.mavlink_map.items()}
-
-
 def message_name(number: int) -> str:
     """MAVLink's name of a message id."""
-    message = dialect.mavlink_map.get(number)
-    return f"message {number}" if message is None else str(message.msgname)
+    return str(dialect.mavlink_map[number].msgname)
 
 
 @cache
 def wire_layout(number: int) -> np.dtype[Any]:
     """Payload of a message as a packed structured dtype, from pymavlink's field tables."""
     message = dialect.mavlink_map[number]
-    kinds = dict(zip(message.fieldnames, message.fieldtypes, strict=True))
+    kinds = message.native_format.decode().removeprefix("<")  # struct's, which numpy knows too
     fields: list[Any] = []
-    for name, length in zip(message.ordered_fieldnames, message.array_lengths, strict=True):
-        kind = _WIRE_TYPES[kinds[name]]
-        if length and kind == "S1":
-            fields.append((name, f"S{length}"))
+    for name, kind, length in zip(
+        message.ordered_fieldnames, kinds, message.array_lengths, strict=True
+    ):
+        if kind == "c":
+            fields.append((name, f"S{length or 1}"))
         else:
-            fields.append((name, kind, (length,)) if length else (name, kind))
+            fields.append((name, f"<{kind}", (length,)) if length else (name, f"<{kind}"))
     return np.dtype(fields)
 
 
-@cache
-def _crc_extra() -> NDArray[np.int16]:
-    """Checksum seed by message id; -1 where the dialect does not know the message."""
-    seeds = np.full(1 << 16, -1, dtype=np.int16)
-    for number, message in dialect.mavlink_map.items():
-        if number < len(seeds):
-            seeds[number] = message.crc_extra
-    return seeds
-
-
-@cache
-def _crc_table() -> NDArray[np.uint16]:
-    """Checksum of each single byte, for the last step over the seed."""
-    return np.array([mcrf4xx(bytes([byte]), 0) for byte in range(256)], dtype=np.uint16)
-
-
-def read_frames(path: Path) -> Frames:
+def read_frames(name: str, content: bytes) -> Frames:
     """Find all good frames of a recording.
 
     Parameters
     ----------
-    path : Path
+    name : str
+        Of the file, for messages.
+    content : bytes
         A ``.tlog`` with time stamps, or a raw stream of MAVLink 1 and 2.
 
     Raises
     ------
     LogError
-        The file cannot be read or holds no MAVLink.
+        It holds no MAVLink.
     """
-    name, content = shown(path), read_log_bytes(path)
-    start, end = _scan(content)
-    start, end = _without_overlap(start, end)
+    start, end, number = _without_overlap(_scan(content)).T
     stamp = STAMP if len(start) and _is_stamped(start, end) else 0
     good = int(np.sum(end - start))
     if good < MIN_GOOD_SHARE * len(content) or not len(start):
@@ -202,11 +187,8 @@ def read_frames(path: Path) -> Frames:
         )
     source = np.frombuffer(content, dtype=np.uint8)
     second = source[start] == MAGIC_2
-    # sequence, system, component and the lowest byte of the message id follow one another
+    # sequence, system and component follow one another
     at = start + np.where(second, 4, 2)
-    number = source[at + 3].astype(np.int32)
-    for byte in (1, 2):
-        number[second] |= source[at[second] + 3 + byte].astype(np.int32) << 8 * byte
     passed_over, bad_bytes, in_frame = _between(content, start - stamp, end, stamp)
     received, bad_stamps = _stamps(source, start, end) if stamp else (None, 0)
     return Frames(
@@ -214,7 +196,7 @@ def read_frames(path: Path) -> Frames:
         content=content,
         sha256=hashlib.sha256(content).hexdigest(),
         start=start,
-        message_id=number,
+        message_id=number.astype(np.int32),
         system=source[at + 1],
         component=source[at + 2],
         sequence=source[at],
@@ -228,60 +210,59 @@ def read_frames(path: Path) -> Frames:
     )
 
 
-def _scan(content: bytes) -> tuple[Integers, Integers]:
-    """Offsets of all frames with a good checksum, and of the byte after each; may overlap."""
-    source = np.frombuffer(content, dtype=np.uint8)
-    view = memoryview(content)
-    starts, ends = [], []
+def _scan(content: bytes) -> Integers:
+    """Start, end and message id of all frames with a good checksum, shape (n, 3); may overlap."""
+    source, view = np.frombuffer(content, dtype=np.uint8), memoryview(content)
+    found = [np.zeros((0, 3), dtype=np.int64)]
     for low in range(0, len(source), BLOCK):
-        start, end, crc_end, seed = _candidates(source, low)
-        bodies = zip((start + 1).tolist(), crc_end.tolist(), strict=True)
+        frames, crc_end = _candidates(source, low)
+        bodies = zip((frames[:, 0] + 1).tolist(), crc_end.tolist(), strict=True)
         crc = np.array([mcrf4xx(view[a:b]) for a, b in bodies], dtype=np.uint16)
-        crc = (crc >> 8) ^ _crc_table()[(crc ^ seed) & 0xFF]
+        crc = (crc >> 8) ^ _LAST[(crc ^ _SEEDS[frames[:, 2]].astype(np.uint16)) & 0xFF]
         stored = source[crc_end] | source[crc_end + 1].astype(np.uint16) << 8
-        starts.append(start[crc == stored])
-        ends.append(end[crc == stored])
-    nothing = np.zeros(0, dtype=np.int64)
-    return np.concatenate([nothing, *starts]), np.concatenate([nothing, *ends])
+        found.append(frames[stored == crc])
+    return np.concatenate(found)
 
 
-def _without_overlap(start: Integers, end: Integers) -> tuple[Integers, Integers]:
+def _without_overlap(frames: Integers) -> Integers:
     """Frames in file order, without those that begin inside the one before.
 
     One frame may lie in another one's payload (a tunnel). By chance a stamp looks like the
     beginning of a frame, which must not hide the true one that follows the one before.
     """
-    if not np.any(start[1:] < end[:-1]):
-        return start, end
-    keep, reached, starts = [], 0, {*start.tolist()}
-    for row, begin in enumerate(start.tolist()):
-        next_to = {reached, reached + STAMP}
-        if begin >= reached and (begin in next_to or next_to.isdisjoint(starts)):
+    if not np.any(frames[1:, 0] < frames[:-1, 1]):
+        return frames
+    start, end = frames[:, 0].tolist(), frames[:, 1].tolist()
+    keep, reached, starts = [], 0, {*start}
+    for row, begin in enumerate(start):
+        next_to = reached, reached + STAMP
+        if begin >= reached and (begin in next_to or starts.isdisjoint(next_to)):
             keep.append(row)
-            reached = int(end[row])
-    return start[keep], end[keep]
+            reached = end[row]
+    return frames[keep]
 
 
-def _candidates(
-    source: NDArray[np.uint8], low: int
-) -> tuple[Integers, Integers, Integers, NDArray[np.uint16]]:
-    """Where a frame of a known message could begin in one block, its end, checksum and seed."""
+def _candidates(source: NDArray[np.uint8], low: int) -> tuple[Integers, Integers]:
+    """Where a frame of a known message could begin in one block, as :func:`_scan` has frames.
+
+    And where its checksum stands.
+    """
     block = source[low : low + BLOCK]
     start = np.flatnonzero((block == MAGIC_1) | (block == MAGIC_2)).astype(np.int64) + low
-    start = start[start + HEADER_1 + CHECKSUM <= len(source)]
-    second = source[start] == MAGIC_2
-    whole = ~second | (start + HEADER_2 + CHECKSUM <= len(source))
-    start, second = start[whole], second[whole]
-    crc_end = start + source[start + 1] + np.where(second, HEADER_2, HEADER_1)
-    number = source[start + 5].astype(np.int64)
+    header = np.where(source[start] == MAGIC_2, HEADER_2, HEADER_1)
+    whole = start + header + CHECKSUM <= len(source)
+    start, header = start[whole], header[whole]
+    second = header == HEADER_2
     at = start[second]
+    number = source[start + 5].astype(np.int64)
     number[second] = source[at + 7] | source[at + 8].astype(np.int64) << 8
-    known = _crc_extra()[number] >= 0
+    known = _SEEDS[number] >= 0
     known[second] &= (source[at + 9] == 0) & (source[at + 2] <= SIGNED)
+    crc_end = start + source[start + 1] + header
     end = crc_end + CHECKSUM
     end[second] += SIGNATURE * (source[at + 2] & SIGNED).astype(np.int64)
     known &= end <= len(source)
-    return (start[known], end[known], crc_end[known], _crc_extra()[number[known]].astype(np.uint16))
+    return np.stack([start, end, number], axis=1)[known], crc_end[known]
 
 
 def _is_stamped(start: Integers, end: Integers) -> bool:

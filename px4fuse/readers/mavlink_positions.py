@@ -15,7 +15,8 @@ from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import px4_positions
 from px4fuse.readers.layouts import GLOBAL_COLUMNS, Layout
 from px4fuse.readers.mavlink_clocks import Mapped
-from px4fuse.readers.mavlink_recording import BOOT_CLOCK, RECEIPT_CLOCK, Address, Recording
+from px4fuse.readers.mavlink_frames import Address
+from px4fuse.readers.mavlink_recording import BOOT_CLOCK, RECEIPT_CLOCK, Recording
 from px4fuse.readers.mavlink_senders import senders_of
 from px4fuse.readers.parts import attitude_of, orientation_of
 from px4fuse.readers.px4_positions import projected, unproject
@@ -48,21 +49,12 @@ def read_positions(
             for sender in senders
             for source in messages.POSITION_INPUTS
             if source.message == message
-            for track in _read_track(recording, source, sender, mapped[sender], remedy, senders)
+            if (track := _read_track(recording, source, sender, mapped[sender], remedy, senders))
         ]
-        found += tracks or [
-            Unavailable(
-                f"position source {message}",
-                f"no {message} to the autopilot in the recording",
-                remedy,
-                source=message,
-            )
-        ]
-    found += [
-        track
-        for layout in messages.GNSS_INPUTS
-        if (track := _read_gnss(recording, layout, delay_s))
-    ]
+        lacking = f"no {message} to the autopilot in the recording"
+        found += tracks or [px4_positions.unavailable(message, lacking, remedy)]
+    fixes = (_read_gnss(recording, layout, delay_s) for layout in messages.GNSS_INPUTS)
+    found += [track for track in fixes if track]
     missing = tuple(part for part in found if isinstance(part, Unavailable))
     return best_first(part for part in found if isinstance(part, PositionTrack)), missing
 
@@ -74,15 +66,15 @@ def _read_track(
     clock: Mapped,
     remedy: str,
     senders: list[Address],
-) -> tuple[PositionTrack | Unavailable, ...]:
-    """What one sender sent of one kind; nothing where it did not."""
+) -> PositionTrack | Unavailable | None:
+    """What one sender sent of one kind; None where it did not."""
     rows = recording.rows(source.message, sender)
     table = recording.frames.table(source.message, rows)
     if source.estimator is not None:
         own = table["estimator_type"] == source.estimator
         rows, table = rows[own], table[own]
     if not len(rows):
-        return ()
+        return None
     name = source.name + (f"_{sender[0]}_{sender[1]}" if len(senders) > 1 else "")
     stamp_s = table[source.stamp] * 1e-6
     boot_s = recording.receipt_boot_s(rows)
@@ -97,30 +89,28 @@ def _read_track(
     if source.drops_covariance:
         samples[Columns.POSITION_VARIANCE + Columns.ROTATION_VARIANCE] = np.nan
     orientation = orientation_of(samples)
-    samples = px4_positions.clean_positions(samples, Columns.POSITION)
-    if len(samples) < px4_positions.MIN_TRACK_SAMPLES:
-        reason = f"{len(samples)} finite samples are too few"
-        return (Unavailable(f"position source {name}", reason, remedy, source=name),)
     statement = clock.statement
-    is_boot = statement.method == "boot clock"
-    return (
-        PositionTrack(
-            name=name,
-            origin=with_orientation(source.origin, turns=orientation is not None),
-            description=source.description,
-            samples=samples,
-            frame=frame,
-            clock=statement.clock
-            + ("" if is_boot else f", mapped to boot time by {statement.method}"),
-            topics=(source.message,),
-            log=recording.frames.name,
-            clock_map=statement,
-            orientation=orientation,
-        ),
+    mapped = (
+        "" if statement.method == "boot clock" else f", mapped to boot time by {statement.method}"
+    )
+    return px4_positions.make_track(
+        name,
+        samples,
+        with_orientation(source.origin, turns=orientation is not None),
+        remedy=remedy,
+        description=source.description,
+        frame=frame,
+        clock=statement.clock + mapped,
+        topics=(source.message,),
+        log=recording.frames.name,
+        clock_map=statement,
+        orientation=orientation,
     )
 
 
-def _read_gnss(recording: Recording, layout: Layout, delay_s: float) -> PositionTrack | None:
+def _read_gnss(
+    recording: Recording, layout: Layout, delay_s: float
+) -> PositionTrack | Unavailable | None:
     """Fixes of a receiver, about the autopilot's own origin; None where there are none.
 
     PX4 and ArduPilot stamp a fix with their boot clock, and send it again until the next comes.
@@ -139,13 +129,12 @@ def _read_gnss(recording: Recording, layout: Layout, delay_s: float) -> Position
         return None
     samples = projected(fixes, local_origin(recording))
     accuracy = fixes[["eph_m", "eph_m", "epv_m"]].set_axis(Columns.POSITION_VARIANCE, axis=1) ** 2
-    return PositionTrack(
-        name=layout.topic,
-        origin=structs.replace(
-            GNSS, automatic=bool(recording.read(messages.GLOBAL_STATE)["latitude_deg"].any())
-        ),
+    automatic = bool(recording.read(messages.GLOBAL_STATE)["latitude_deg"].any())
+    return px4_positions.make_track(
+        layout.topic,
+        samples.join(accuracy),
+        structs.replace(GNSS, automatic=automatic),
         description="GNSS position",
-        samples=px4_positions.clean_positions(samples.join(accuracy), Columns.POSITION),
         frame="NED",
         clock=f"{BOOT_CLOCK}, less {1e3 * delay_s:g} ms",
         topics=(layout.topic,),

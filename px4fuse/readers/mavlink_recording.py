@@ -12,14 +12,11 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.flight import Columns
 from px4fuse.readers.layouts import Layout
 from px4fuse.readers.mavlink_clocks import UNIX_FROM_S, Line, least_delay, tells_time
-from px4fuse.readers.mavlink_frames import LONGEST_FRAME, Frames, message_name, wire_layout
+from px4fuse.readers.mavlink_frames import LONGEST_FRAME, Address, Frames, message_name, wire_layout
 from px4fuse.readers.mavlink_messages import FRAMES_OF_REFERENCE, STAMPED_BY_BOOT_CLOCK
 from px4fuse.readers.parts import MIN_NORM
 from px4fuse.readers.ulog_topics import increasing
 from px4fuse.recording import Stream
-
-# MAVLink system and component
-Address = tuple[int, int]
 
 BOOT_CLOCK = "autopilot boot clock"
 RECEIPT_CLOCK = "time of receipt, less the link's least delay"
@@ -83,16 +80,12 @@ class Recording:
     def of_anybody(self, message: str) -> IntArray:
         """Frames of one message within the session, whoever sent it."""
         rows = self.frames.rows(message)
-        within: IntArray = rows[(rows >= self.session.start) & (rows < self.session.stop)]
-        return within
+        return np.asarray(rows[(rows >= self.session.start) & (rows < self.session.stop)])
 
     def rows(self, message: str, address: Address | None = None) -> IntArray:
         """Frames of one message within the session, from the autopilot unless said otherwise."""
-        system, component = address or self.address
         rows = self.of_anybody(message)
-        own = (self.frames.system[rows] == system) & (self.frames.component[rows] == component)
-        chosen: IntArray = rows[own]
-        return chosen
+        return np.asarray(rows[self.frames.sent_by(address or self.address, rows)])
 
     def read(
         self,
@@ -135,7 +128,8 @@ class Recording:
             copy=False,
         )
         if "roll" in samples:
-            samples[Columns.QUATERNION] = _quaternions_of_angles(samples)
+            turns = Rotation.from_euler("ZYX", samples[["yaw", "pitch", "roll"]].to_numpy())
+            samples[Columns.QUATERNION] = turns.as_quat(scalar_first=True)
         return _in_ned(samples) if "frame_id" in samples else samples
 
     def _keep(self, name: str, boot_s: Array) -> IntArray:
@@ -170,16 +164,6 @@ class Recording:
     def came_from(self, part: str, *messages: str, clock: str = BOOT_CLOCK) -> None:
         """Note where a part of the flight came from."""
         self.streams[part] = Stream(messages, clock, self.frames.name)
-
-
-def _quaternions_of_angles(samples: pd.DataFrame) -> Array:
-    """Roll, pitch and yaw (rad) as w, x, y, z, shape (n, 4); NaN where not finite."""
-    angles = samples[["yaw", "pitch", "roll"]].to_numpy()
-    known = np.isfinite(angles).all(axis=1)
-    quaternion = np.full((len(angles), 4), np.nan)
-    if known.any():
-        quaternion[known] = Rotation.from_euler("ZYX", angles[known]).as_quat(scalar_first=True)
-    return quaternion
 
 
 def _in_ned(samples: pd.DataFrame) -> pd.DataFrame:
@@ -220,8 +204,8 @@ def _in_ned(samples: pd.DataFrame) -> pd.DataFrame:
 
 def _boot_stamps(frames: Frames, address: Address) -> tuple[IntArray, Array]:
     """Frames of the autopilot that carry its boot clock, in file order, and that clock (s)."""
-    own = (frames.system == address[0]) & (frames.component == address[1])
-    all_rows, all_stamps = [], []
+    own = frames.sent_by(address)
+    all_rows, all_stamps = [np.zeros(0, dtype=np.intp)], [np.zeros(0)]
     for number in np.unique(frames.message_id[own]).tolist():
         name = message_name(number)
         if "time_boot_ms" in (wire_layout(number).names or ()):
@@ -234,8 +218,6 @@ def _boot_stamps(frames: Frames, address: Address) -> tuple[IntArray, Array]:
         rows = rows[own[rows]]
         all_rows.append(rows)
         all_stamps.append(frames.table(name, rows)[stamp] * unit)
-    if not all_rows:
-        return np.zeros(0, dtype=np.intp), np.zeros(0)
     rows, stamps = np.concatenate(all_rows), np.concatenate(all_stamps)
     from_boot, from_1970 = (stamps > 0.0) & (stamps < UNIX_FROM_S), stamps >= UNIX_FROM_S
     good = from_boot if np.any(from_boot) else from_1970
@@ -284,8 +266,16 @@ def settle_clocks(frames: Frames, address: Address) -> Recording:
         received = stamps[at]
     else:
         notes.append("no message in the stream carries a time: nothing in it can be placed in time")
-    back = int(np.count_nonzero(np.diff(received) < 0.0)) if frames.received_us is not None else 0
-    notes += _frame_notes(frames, back)
+    back = int(np.count_nonzero(np.diff(received) < 0.0))
+    said = {
+        "whole frames of messages that px4fuse does not know were passed over: "
+        f"{frames.passed_over}": frames.passed_over,
+        f"{frames.bad_stamps} times of receipt are damaged and were interpolated": (
+            frames.bad_stamps
+        ),
+        f"the time of receipt went back {back} {'times' if back > 1 else 'time'}": back,
+    }
+    notes += [note for note, count in said.items() if count]
     share = frames.bad_bytes / len(frames.content)
     lost = f"{frames.bad_bytes:,} bytes ({share:.2%}) belong to no whole MAVLink frame"
     # a first and a last frame that are cut are no damage
@@ -309,20 +299,6 @@ def _without_strays(stamps: Array, rows: IntArray) -> IntArray:
     enough = STRAY_SHARE * max(len(part) for part in parts)
     many = [number for number, part in enumerate(parts) if len(part) >= enough]
     return np.concatenate(parts[many[0] : many[-1] + 1])
-
-
-def _frame_notes(frames: Frames, back: int) -> list[str]:
-    notes = []
-    if frames.passed_over:
-        notes.append(
-            "whole frames of messages that px4fuse does not know were passed over: "
-            f"{frames.passed_over}"
-        )
-    if frames.bad_stamps:
-        notes.append(f"{frames.bad_stamps} times of receipt are damaged and were interpolated")
-    if back:
-        notes.append(f"the time of receipt went back {back} {'times' if back > 1 else 'time'}")
-    return notes
 
 
 def unix_of_boot(recording: Recording) -> Line | None:

@@ -10,8 +10,8 @@ from px4fuse.arrays import IntArray
 from px4fuse.errors import SettingsError
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers.mavlink_clocks import OTHER_SPEED, Line, Mapped, map_clock, tells_time
-from px4fuse.readers.mavlink_frames import Frames
-from px4fuse.readers.mavlink_recording import RESTART_S, Address, Recording, unix_of_boot
+from px4fuse.readers.mavlink_frames import Address, Frames
+from px4fuse.readers.mavlink_recording import RESTART_S, Recording, unix_of_boot
 from px4fuse.recording import ClockMap, Sender
 
 # Senders beyond the busiest ones are not described, and their positions are not read
@@ -29,10 +29,8 @@ def _vehicles(frames: Frames) -> dict[Address, tuple[int, int]]:
     rows = frames.rows("HEARTBEAT")
     beats = frames.table("HEARTBEAT", rows)
     given = zip(beats["type"].tolist(), beats["autopilot"].tolist(), strict=True)
-    found: dict[Address, tuple[int, int]] = {}
-    for address, said in zip(_addresses(frames, rows), given, strict=True):
-        found.setdefault(address, said)
-    return found
+    said = [*zip(_addresses(frames, rows), given, strict=True)]
+    return dict(said[::-1])
 
 
 def _addresses(frames: Frames, rows: IntArray | slice) -> Iterator[Address]:
@@ -137,10 +135,8 @@ def _questions_of_others(recording: Recording, sender: Address) -> NDArray[np.in
     """``ts1`` of the TIMESYNC questions of everybody but one sender."""
     frames = recording.frames
     rows = frames.rows("TIMESYNC")
-    rows = rows[(frames.system[rows] != sender[0]) | (frames.component[rows] != sender[1])]
-    sync = frames.table("TIMESYNC", rows)
-    asked: NDArray[np.int64] = sync["ts1"][sync["tc1"] == 0]
-    return asked
+    sync = frames.table("TIMESYNC", rows[~frames.sent_by(sender, rows)])
+    return np.asarray(sync["ts1"][sync["tc1"] == 0])
 
 
 def clock_maps(recording: Recording, mapped: dict[Address, Mapped]) -> tuple[ClockMap, ...]:
@@ -186,8 +182,8 @@ def _lost_share(frames: Frames, address: Address) -> float | None:
     A message that came again, or a little late, is not lost. None where the sender does not count
     its messages, or counts them apart on each of two links.
     """
-    own = (frames.system == address[0]) & (frames.component == address[1])
-    step = (np.diff(frames.sequence[own].astype(np.int64)) + MOST_LATE) % 256 - MOST_LATE
+    number = frames.sequence[frames.sent_by(address)].astype(np.int64)
+    step = np.mod(np.diff(number) + MOST_LATE, 256) - MOST_LATE
     place = np.append(0, np.cumsum(step))
     share = float(1.0 - len(np.unique(place)) / (np.ptp(place) + 1))
     counts = len(place) == 1 or bool(place.any())

@@ -29,10 +29,13 @@ def missing_parts(
 
 
 def stretches(steps: pd.Series, end_s: float) -> list[tuple[float, float, Any]]:
-    """Stretches in which a step function of time keeps its value: start and end (s), value."""
+    """Stretches in which a step function of time keeps its value: start and end (s), value.
+
+    None where it has no value.
+    """
     changes = steps[steps.ne(steps.shift())]
     starts = np.maximum.accumulate(np.maximum(changes.index.to_numpy(), 0.0)).tolist()
-    every = zip(starts, [*starts[1:], end_s], changes, strict=True)
+    every = zip(starts, [*starts[1:], end_s], changes, strict=False)
     return [(start, end, value) for start, end, value in every if end > start]
 
 

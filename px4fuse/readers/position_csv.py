@@ -209,10 +209,9 @@ def read_position_csv(
             "--position-time-unit"
         )
     scales, length_words = _length_units(numbers, axes, meanings, length_unit)
-    samples = pd.DataFrame(np.nan, index=numbers.index, columns=SAMPLE_COLUMNS)
-    for column, index in zip(SAMPLE_COLUMNS, (*position, *sigma), strict=True):
-        if index is not None:
-            samples[column] = numbers[index] * scales[index]
+    chosen = zip(SAMPLE_COLUMNS, (*position, *sigma), strict=True)
+    lengths = {name: np.nan if at is None else numbers[at] * scales[at] for name, at in chosen}
+    samples = pd.DataFrame(lengths, index=numbers.index)
     samples = samples.where(np.isfinite(samples))
     wrong = samples[SIGMA_COLUMNS] <= 0.0
     if rows := int(wrong.any(axis=1).sum()):

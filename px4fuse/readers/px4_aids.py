@@ -16,7 +16,7 @@ from px4fuse.ekf2_parameters import AIDS
 from px4fuse.flight import AidLog, at_times
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.layouts import Layout
-from px4fuse.readers.px4_topics import STATUS, STATUS_FLAGS, AidSource
+from px4fuse.readers.px4_topics import STATUS_FLAGS, AidSource
 from px4fuse.readers.ulog_topics import Topics
 
 # innovations and variances are logged by separate rate limiters, up to one interval of the default
@@ -59,9 +59,8 @@ def intentions(topics: Topics) -> dict[str, pd.Series[float]]:
             group = next((group for group in source.flags if {*group} <= {*known}), None)
             if group is not None:
                 meant[name] = flags[list(group)].max(axis=1)
-    layout = Layout(STATUS, {"bits": "control_mode_flags"})
-    if not known and topics.find((layout,)) is not None:
-        bits = topics.of_primary(layout, step=True)["bits"].dropna()
+    if not known and topics.find(px4.CONTROL_BITS) is not None:
+        bits = topics.of_primary(px4.CONTROL_BITS, step=True)["bits"].dropna()
         for name, source in px4.SOURCES.items():
             if source.bit is not None:
                 on = bits.to_numpy().astype(np.int64) >> source.bit & 1
@@ -87,7 +86,7 @@ def _own_topic(
     layout = Layout(
         f"estimator_aid_src_{name}", columns | {"fused": "fused", "rejected": "innovation_rejected"}
     )
-    if topics.find((layout,)) is None:
+    if topics.find(layout) is None:  # most aids of most logs: an empty table takes its time
         return None
     frame = topics.of_primary(layout).dropna()
     if meant is not None and name in px4.FLAG_ALWAYS_SET:
@@ -112,8 +111,6 @@ def _snapshots(
         both |= _columns("variance", source, squares)
         layouts.append((Layout(px4.OLD_INNOVATIONS, both),) * 2)
     for values, variances in layouts:
-        if topics.find((values,)) is None or topics.find((variances,)) is None:
-            continue
         frame = topics.of_primary(values, select=_fresh)
         if variances is not values:
             # each topic is thinned by itself; S changes slowly

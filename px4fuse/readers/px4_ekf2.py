@@ -72,14 +72,14 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
             "Set SYS_MC_EST_GROUP to 2.",
         )
     local = topics.read(px4.LOCAL_POSITION)
-    if local is None:
+    if topics.find(px4.LOCAL_POSITION) is None:
         return Unavailable("EKF2", "no topic vehicle_local_position", px4.DEFAULT_PROFILE)
     state = local[Columns.STATE].dropna()
     if state.empty:
         return Unavailable(
             "EKF2", "vehicle_local_position holds no finite sample", "Wait until EKF2 has started."
         )
-    topics.came_from("ekf2_state", px4.LOCAL_POSITION[0].topic)
+    topics.came_from("ekf2_state", px4.LOCAL_POSITION.topic)
     meant = intentions(topics)
     fusing = _fusing(topics, meant)
     gate = settings_in_force(parameters)[EV_POS.gate]
@@ -183,15 +183,14 @@ def _step_s(topics: Topics) -> float:
     """Time between two predictions: EKF2 gathers whole IMU samples (ImuDownSampler.cpp)."""
     target = target_step_s(topics)
     imu = topics.read(px4.IMU)
-    if imu is None or len(imu) < 2:
+    if len(imu) < 2:
         return target
     time = imu.index.to_numpy()
     interval = float(np.median(np.diff(time)))
     if interval >= target:
         return target
-    known = pd.Index([])
-    if topic := _state_vector(topics)[0]:
-        known = topics.of_primary(Layout(topic, {"states[0]": "states[0]"})).index
+    layout = Layout(_state_vector(topics)[0], {"states[0]": "states[0]"})
+    known = topics.of_primary(layout).index
     return samples_per_step(target, interval, same_stamps(time, known)) * interval
 
 
@@ -226,8 +225,7 @@ def _accelerometer_bias(
     topics: Topics, delayed: pd.DataFrame | Unavailable
 ) -> pd.DataFrame | Unavailable:
     """Accelerometer bias from its own topic, or else from the state vector."""
-    layout = topics.find(px4.SENSOR_BIAS)
-    if layout is not None and len(own := topics.of_primary(layout).dropna()):
+    if len(own := topics.of_primary(px4.SENSOR_BIAS).dropna()):
         return own
     if isinstance(delayed, Unavailable) or delayed.empty:
         return BIAS_NOT_LOGGED
@@ -329,7 +327,7 @@ def _read_record(
         height_bias={
             name: topics.of_primary(layout).dropna()
             for name, layout in px4.HEIGHT_BIAS.items()
-            if topics.find((layout,)) is not None
+            if topics.find(layout) is not None
         },
     )
 
@@ -338,25 +336,20 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
     """What the magnetometer measured, of the two topics that have it the one with more rows."""
     found = []
     for topic, name in px4.MAGNETOMETER:
-        layout = Layout(topic, elements(list(FIELD_COLUMNS), name))
-        if topics.find((layout,)) is not None:
-            frame = topics.of_primary(layout).dropna()
-            if name == "observation":  # by the time that EKF2 takes it to be of
-                delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3
-                frame = frame.set_axis(frame.index + delay_s + 0.5 * step_s)
-            found.append(frame)
-    bits = topics.read((Layout(STATUS, {"bits": "control_mode_flags"}),), step=True)
-    if not found or bits is None:
+        frame = topics.of_primary(Layout(topic, elements(list(FIELD_COLUMNS), name))).dropna()
+        if name == "observation":  # by the time that EKF2 takes it to be of
+            delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3
+            frame = frame.set_axis(frame.index + delay_s + 0.5 * step_s)
+        found.append(frame)
+    used, bits = max(found, key=len), topics.read(px4.CONTROL_BITS, step=True)["bits"].dropna()
+    if used.empty or bits.empty:
         return pd.DataFrame()
-    used = max(found, key=len)
-    flags = at_times(bits["bits"].dropna(), used.index).astype(np.int64)
+    flags = at_times(bits, used.index).astype(np.int64)
     return used.assign(fused_3d=(flags >> MAG_3D_BIT & 1).astype(float))
 
 
 def _read_flow(topics: Topics, meant: Mapping[str, pd.Series[float]]) -> pd.DataFrame:
     """What optical flow measured: of the samples between two rows the mean, by the low pass."""
-    if any(topics.find((layout,)) is None for layout in px4.FLOW):
-        return pd.DataFrame()
     speed, interval, noise = (topics.of_primary(layout).dropna() for layout in px4.FLOW)
     interval_s = float(interval["interval_us"].median()) * 1e-6
     if not interval_s > 0.0 or noise.empty:
@@ -388,5 +381,4 @@ def _attitude_variance(quaternion: Array, variance: Array) -> Array:
     """
     w, x, y, z = quaternion.T
     turns = np.array([[-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]])
-    squared: Array = 4.0 * np.einsum("ijn,nj->ni", turns**2, variance)
-    return squared
+    return np.asarray(4.0 * np.einsum("ijn,nj->ni", turns**2, variance))

@@ -29,8 +29,7 @@ def left_out_fixes(topics: Topics, gps: pd.DataFrame, ekf2: Ekf2 | Unavailable) 
 
     The logger keeps every fix only where it comes slower than its limit of 10 a second.
     """
-    rows = [topics.find((layout,)) for layout in px4.FUSED_FIXES]
-    if isinstance(ekf2, Unavailable) or None in rows:
+    if isinstance(ekf2, Unavailable) or not all(map(topics.find, px4.FUSED_FIXES)):
         return pd.DataFrame()
     position, velocity = (topics.of_primary(layout) for layout in px4.FUSED_FIXES)
     # what a receiver sends without a fix has a row too
@@ -39,7 +38,7 @@ def left_out_fixes(topics: Topics, gps: pd.DataFrame, ekf2: Ekf2 | Unavailable) 
     # rows are of half a prediction step before (estimator_interface.cpp)
     fixes = position.join(velocity, how="inner").dropna()
     # of the reference; else it has EKF2's bias in it
-    if topics.find((px4.FUSED_HEIGHT,)) and topics.ekf2_parameters.get("EKF2_HGT_REF", 1.0) == 1.0:
+    if topics.find(px4.FUSED_HEIGHT) and topics.ekf2_parameters.get("EKF2_HGT_REF", 1.0) == 1.0:
         fixes = fixes.join(topics.of_primary(px4.FUSED_HEIGHT))
     fixes = fixes.set_axis(fixes.index + 0.5 * ekf2.step_s)
     at = np.clip(np.searchsorted(gps.index, fixes.index), 1, len(gps) - 1)

@@ -103,22 +103,20 @@ def innovations_of(
         frame = None if log is None else along(log, axis, gate)
         if isinstance(fusing, pd.DataFrame) and not fusing[group].any():
             quantity = "height" if axis == "down" else "horizontal position"
-            found[axis] = Unavailable(
-                f"EKF2 innovations, {axis}",
-                f"EKF2 never fused {sensor} for {quantity} in this log",
-                source.remedies[group],
-            )
+            reason = f"EKF2 never fused {sensor} for {quantity} in this log"
+            remedy = source.remedies[group]
         elif log is None or frame is None or frame.empty:
-            found[axis] = Unavailable(
-                f"EKF2 innovations, {axis}",
+            reason = (
                 f"no usable estimator_aid_src_{source.horizontal}, "
                 f"estimator_aid_src_{source.vertical}, estimator_innovations or ekf2_innovations "
-                f"sample while {sensor} was fused",
-                source.to_log,
+                f"sample while {sensor} was fused"
             )
+            remedy = source.to_log
         else:
             found[axis] = frame
             used |= dict.fromkeys(log.topics)
+            continue
+        found[axis] = Unavailable(f"EKF2 innovations, {axis}", reason, remedy)
     return found, tuple(used)
 
 

@@ -10,7 +10,7 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.arrays import Array
-from px4fuse.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, Aid, settings_in_force
+from px4fuse.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, settings_in_force
 from px4fuse.flight import (
     AXIS_NAMES,
     Columns,
@@ -21,7 +21,7 @@ from px4fuse.flight import (
     best_first,
     sample_rate,
 )
-from px4fuse.origin import with_orientation
+from px4fuse.origin import Origin, with_orientation
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.layouts import GLOBAL_COLUMNS
 from px4fuse.readers.parts import attitude_of, finite_rows, orientation_of
@@ -61,18 +61,40 @@ def read_positions(
     return best_first(track for track in found if isinstance(track, PositionTrack)), missing
 
 
-def _unavailable(name: str, reason: str) -> Unavailable:
-    return Unavailable(f"position source {name}", reason, px4.TRACKS[name].remedy, source=name)
+def unavailable(name: str, reason: str, remedy: str = "") -> Unavailable:
+    """Why there is no position source of this name; of a ULog's, what would have logged it."""
+    remedy = remedy or px4.TRACKS[name].remedy
+    return Unavailable(f"position source {name}", reason, remedy, source=name)
 
 
-def clean_positions(samples: pd.DataFrame, axes: list[str]) -> pd.DataFrame:
-    """Positions and variances, without the rows that lack one of ``axes``.
+def make_track(
+    name: str,
+    samples: pd.DataFrame,
+    origin: Origin,
+    *,
+    needed: list[str] = Columns.POSITION,
+    remedy: str = "",
+    **more: Any,
+) -> PositionTrack | Unavailable:
+    """A track of the samples that have a position; unavailable where they are too few.
 
-    A variance of 0 becomes NaN: PX4 reads it as not given (``EKF2.cpp``).
+    Parameters
+    ----------
+    samples : DataFrame
+        With the columns of a track's, as far as there are such. A variance of 0 becomes NaN: PX4
+        reads it as not given (``EKF2.cpp``).
+    needed : list of str
+        What a sample must have.
+    more
+        Of :class:`~px4fuse.flight.PositionTrack`.
     """
-    found = finite_rows(samples.reindex(columns=Columns.POSITION + Columns.POSITION_VARIANCE), axes)
-    given = found[Columns.POSITION_VARIANCE]
-    return found.assign(**given.where(given > 0))
+    samples = samples.reindex(columns=Columns.POSITION + Columns.POSITION_VARIANCE)
+    samples = finite_rows(samples, needed)
+    if len(samples) < MIN_TRACK_SAMPLES:
+        return unavailable(name, f"{len(samples)} finite samples are too few", remedy)
+    given = samples[Columns.POSITION_VARIANCE]
+    samples = samples.assign(**given.where(given > 0))
+    return PositionTrack(name=name, samples=samples, origin=origin, **more)
 
 
 def _track(
@@ -82,36 +104,27 @@ def _track(
     used: tuple[str, ...],
     *,
     turns: bool = False,
-    needed: list[str] = Columns.POSITION,
-    frame: str = "NED",
-    clock: str = AUTOPILOT_CLOCK,
     **more: Any,
 ) -> PositionTrack | Unavailable:
-    """A track of the samples that have a position; unavailable where they are too few.
-
-    ``turns`` says whether it has an orientation that turns, ``needed`` what a sample must have.
-    """
-    samples = clean_positions(samples, needed)
-    if len(samples) < MIN_TRACK_SAMPLES:
-        return _unavailable(name, f"{len(samples)} finite samples are too few")
+    """A track of a ULog; ``turns`` says whether it has an orientation that turns."""
     source = px4.TRACKS[name]
     origin = with_orientation(source.origin, turns=turns)
-    more = {"place_m": _place_m(topics, origin.aid)} | more
-    log = topics.log.name
-    return PositionTrack(name, origin, source.description, samples, frame, clock, used, log, **more)
-
-
-def _place_m(topics: Topics, aid: Aid | None) -> tuple[float, float, float]:
-    """Where EKF2 takes a sensor to be; nowhere else than the vehicle where it is not asked."""
-    names = ("", "", "") if aid is None else aid.place
-    forward, right, down = (float(topics.ekf2_parameters.get(name, 0.0)) for name in names)
-    return forward, right, down
+    places = ("", "", "") if origin.aid is None else origin.aid.place
+    known = {
+        "description": source.description,
+        "topics": used,
+        "log": topics.log.name,
+        "frame": "NED",
+        "clock": AUTOPILOT_CLOCK,
+        "place_m": tuple(float(topics.ekf2_parameters.get(place, 0.0)) for place in places),
+    }
+    return make_track(name, samples, origin, **(known | more))
 
 
 def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
-    layout = topics.find(px4.TRACKS[name].layouts)
+    layout = topics.find(*px4.TRACKS[name].layouts)
     if layout is None:
-        return _unavailable(name, f"no topic {name} in the log")
+        return unavailable(name, f"no topic {name} in the log")
     is_ekf2 = layout.topic.startswith("estimator_")  # only EKF2's own topics have its instances
     samples = topics.of_primary(layout) if is_ekf2 else topics.frame(layout)
     frame = "unknown"
@@ -147,7 +160,7 @@ def _arrival(topics: Topics, topic: str) -> ClockMap | None:
 def _read_kept(topics: Topics, turns: bool) -> PositionTrack | Unavailable:
     layout = topics.find(px4.AID_OBSERVATION_HORIZONTAL)
     if layout is None:
-        return _unavailable(px4.KEPT_OBSERVATION, f"no topic {px4.KEPT_OBSERVATION} in the log")
+        return unavailable(px4.KEPT_OBSERVATION, f"no topic {px4.KEPT_OBSERVATION} in the log")
     samples, used = topics.of_primary(layout), [layout.topic]
     notes: tuple[str, ...] = ()
     vertical = topics.find(px4.AID_OBSERVATION_VERTICAL)
@@ -198,7 +211,7 @@ def _rebuild(topics: Topics, ekf2: Ekf2 | Unavailable, turns: bool) -> PositionT
     that; without the source's own stamps nothing better is known.
     """
     if isinstance(ekf2, Unavailable):
-        return _unavailable(px4.RECONSTRUCTION, "no EKF2 output")
+        return unavailable(px4.RECONSTRUCTION, "no EKF2 output")
     tracks = {}
     for axis, column in zip(AXIS_NAMES, Columns.POSITION, strict=True):
         innovations = ekf2.innovations[axis]
@@ -207,7 +220,7 @@ def _rebuild(topics: Topics, ekf2: Ekf2 | Unavailable, turns: bool) -> PositionT
                 innovations.index, ekf2.state.index, ekf2.state[column], left=np.nan, right=np.nan
             )
     if not {"north_m", "east_m"} <= tracks.keys():
-        return _unavailable(px4.RECONSTRUCTION, "EKF2 fused no horizontal external vision position")
+        return unavailable(px4.RECONSTRUCTION, "EKF2 fused no horizontal external vision position")
     samples = pd.DataFrame({name: tracks[name] for name in Columns.POSITION[:2]})
     notes: tuple[str, ...] = ()
     if "down_m" in tracks:
@@ -264,7 +277,7 @@ def _local_origin(topics: Topics) -> tuple[float, float, float] | None:
     """EKF2's geographic origin (degrees, degrees, m), where it had one."""
     local = topics.read(px4.LOCAL_POSITION)
     columns = ["ref_lat", "ref_lon", "ref_alt"]
-    if local is None or not set(columns) <= set(local.columns):
+    if not {*columns} <= {*local}:
         return None
     origin = finite_rows(local[columns], columns)
     origin = origin[origin["ref_lat"] != 0]
@@ -293,14 +306,14 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     Those are the stamps less EKF2_GPS_DELAY, and since main of 2026 the driver's own times of
     measurement where those differ (EKF2.cpp UpdateGpsSample, estimator_interface.cpp).
     """
-    layout = topics.find(px4.GPS)
+    layout = topics.find(*px4.GPS)
     if layout is None:
-        return _unavailable(px4.GPS_POSITION, f"no topic {px4.GPS_POSITION} in the log")
+        return unavailable(px4.GPS_POSITION, f"no topic {px4.GPS_POSITION} in the log")
     gps = topics.frame(layout)
     if "fix_type" in gps:
         gps = gps[gps["fix_type"] >= GPS_3D_FIX]
     if gps.empty:
-        return _unavailable(px4.GPS_POSITION, "the receiver never had a 3D fix")
+        return unavailable(px4.GPS_POSITION, "the receiver never had a 3D fix")
     parameters = topics.ekf2_parameters
     published_s = (gps["published_us"].to_numpy() - topics.zero_us) * 1e-6
     own = GNSS_MODE in parameters and bool(np.any(published_s - gps.index > SAME_TIME_US * 1e-6))
@@ -351,10 +364,10 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     return replace(found, origin=structs.replace(found.origin, automatic=fuses(ekf2)))
 
 
-def barometer(altitude_m: pd.Series[float] | None, delay_s: float = 0.0) -> pd.DataFrame | None:
+def barometer(altitude_m: pd.Series[float], delay_s: float = 0.0) -> pd.DataFrame | None:
     """Height by the pressure, ``down_m``, None where there is none."""
-    heights = None if altitude_m is None else altitude_m[np.isfinite(altitude_m)]
-    if heights is None or len(heights) < MIN_TRACK_SAMPLES:
+    heights = altitude_m[np.isfinite(altitude_m)]
+    if len(heights) < MIN_TRACK_SAMPLES:
         return None
     return _later(-heights.to_frame("down_m"), -delay_s)
 
@@ -376,17 +389,16 @@ def read_truth(
     is not: the truth is moved there.
     """
     attitude = attitude_of(topics.read(px4.TRUTH_ATTITUDE))
-    local = topics.read(px4.TRUTH_LOCAL)
-    geo = topics.read(px4.TRUTH_GLOBAL)
-    geo = None if geo is None else finite_rows(geo, GLOBAL_COLUMNS[:2])
-    if local is not None and len(local := local.dropna()):
-        if geo is not None and len(geo) and fuses(ekf2):
+    local = topics.read(px4.TRUTH_LOCAL).dropna()
+    geo = finite_rows(topics.read(px4.TRUTH_GLOBAL), GLOBAL_COLUMNS[:2])
+    if len(local):
+        if len(geo) and fuses(ekf2):
             local = _about_origin(local, projected(geo, _local_origin(topics)))
-        return Truth(px4.TRUTH_LOCAL[0].topic, local, attitude)
-    if geo is not None and len(geo):
+        return Truth(px4.TRUTH_LOCAL.topic, local, attitude)
+    if len(geo):
         velocity = geo.reindex(columns=Columns.VELOCITY)
         samples = projected(geo, _local_origin(topics)).join(velocity)
-        return Truth(px4.TRUTH_GLOBAL[0].topic, samples, attitude)
+        return Truth(px4.TRUTH_GLOBAL.topic, samples, attitude)
     captured = motion_capture(positions, "vehicle_mocap_odometry")
     if captured is None:
         return Unavailable(

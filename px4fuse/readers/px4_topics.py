@@ -1,8 +1,8 @@
 """The table of PX4 topic and field names by generation: data, no ifs elsewhere.
 
-Each quantity lists the layouts in which PX4 has logged it, best first. A reader takes the first
-whose topic holds all its ``columns``; ``optional`` columns are read where they exist. Names are
-from PX4-Autopilot's ``msg/*.msg`` at the release tags that its comments name.
+Each quantity is a layout, or lists those in which PX4 has logged it, best first. A reader takes
+the first whose topic holds all its ``columns``; ``optional`` columns are read where they exist.
+Names are from PX4-Autopilot's ``msg/*.msg`` at the release tags that its comments name.
 """
 
 from collections.abc import Mapping
@@ -24,30 +24,26 @@ from px4fuse.readers.layouts import (
     fields,
 )
 
-IMU = (
-    Layout(
-        "sensor_combined",
-        elements(Columns.SPECIFIC_FORCE, "accelerometer_m_s2")
-        | elements(Columns.ANGULAR_RATE, "gyro_rad"),
-        {
-            "accelerometer_offset_us": "accelerometer_timestamp_relative",
-            "clipped": "accelerometer_clipping",  # v1.10
-        },
-    ),
+IMU = Layout(
+    "sensor_combined",
+    elements(Columns.SPECIFIC_FORCE, "accelerometer_m_s2")
+    | elements(Columns.ANGULAR_RATE, "gyro_rad"),
+    {
+        "accelerometer_offset_us": "accelerometer_timestamp_relative",
+        "clipped": "accelerometer_clipping",  # v1.10
+    },
 )
 
-ATTITUDE = (Layout("vehicle_attitude", elements(Columns.QUATERNION, "q")),)
+ATTITUDE = Layout("vehicle_attitude", elements(Columns.QUATERNION, "q"))
 
 _RESETS = ("xy_reset_counter", "z_reset_counter", "vxy_reset_counter", "vz_reset_counter")
-LOCAL_POSITION = (
-    Layout(
-        "vehicle_local_position",
-        POSITION_AND_VELOCITY,
-        {name: name for name in (*_RESETS, "ref_lat", "ref_lon", "ref_alt")}
-        | {"delta_down_m": "delta_z", "delta_down_m_s": "delta_vz"}
-        | elements(["delta_north_m", "delta_east_m"], "delta_xy")
-        | elements(["delta_north_m_s", "delta_east_m_s"], "delta_vxy"),
-    ),
+LOCAL_POSITION = Layout(
+    "vehicle_local_position",
+    POSITION_AND_VELOCITY,
+    {name: name for name in (*_RESETS, "ref_lat", "ref_lon", "ref_alt")}
+    | {"delta_down_m": "delta_z", "delta_down_m_s": "delta_vz"}
+    | elements(["delta_north_m", "delta_east_m"], "delta_xy")
+    | elements(["delta_north_m_s", "delta_east_m_s"], "delta_vxy"),
 )
 
 # What records all that EKF2 and the loggers publish by default
@@ -71,14 +67,14 @@ ATTITUDE_VARIANCES: Mapping[tuple[int, int], int] = {
 QUATERNION_FILTER = 4
 
 # EKF2's accelerometer bias in m/s², whatever the generation of the state vector
-SENSOR_BIAS = (Layout("estimator_sensor_bias", elements(Columns.SPECIFIC_FORCE, "accel_bias")),)
+SENSOR_BIAS = Layout("estimator_sensor_bias", elements(Columns.SPECIFIC_FORCE, "accel_bias"))
 
-SELECTOR = (Layout("estimator_selector_status", {"instance": "primary_instance"}),)  # v1.12
+SELECTOR = Layout("estimator_selector_status", {"instance": "primary_instance"})  # v1.12
 
-LAND_DETECTED = (Layout("vehicle_land_detected", {"landed": "landed"}),)
+LAND_DETECTED = Layout("vehicle_land_detected", {"landed": "landed"})
 
-FLIGHT_MODE = (Layout("vehicle_status", {"nav_state": "nav_state"}),)
-FAILURE = (Layout("failure_detector_status", {"roll": "fd_roll", "pitch": "fd_pitch"}),)  # v1.13
+FLIGHT_MODE = Layout("vehicle_status", {"nav_state": "nav_state"})
+FAILURE = Layout("failure_detector_status", {"roll": "fd_roll", "pitch": "fd_pitch"})  # v1.13
 # vehicle_status.nav_state as QGroundControl names it, msg/VehicleStatus.msg; the numbers that are
 # missing here were never flown in v1.12 to v1.16
 NAV_STATES: Mapping[int, str] = {
@@ -89,17 +85,15 @@ NAV_STATES: Mapping[int, str] = {
     **{22 + number: f"External {number}" for number in range(1, 9)},
 }  # fmt: skip
 
-TRUTH_LOCAL = (Layout("vehicle_local_position_groundtruth", POSITION_AND_VELOCITY),)
-TRUTH_GLOBAL = (
-    Layout(
-        "vehicle_global_position_groundtruth",
-        GLOBAL,
-        fields(Columns.VELOCITY, "vel_n vel_e vel_d"),
-    ),
+TRUTH_LOCAL = Layout("vehicle_local_position_groundtruth", POSITION_AND_VELOCITY)
+TRUTH_GLOBAL = Layout(
+    "vehicle_global_position_groundtruth",
+    GLOBAL,
+    fields(Columns.VELOCITY, "vel_n vel_e vel_d"),
 )
-TRUTH_ATTITUDE = (Layout("vehicle_attitude_groundtruth", elements(Columns.QUATERNION, "q")),)
+TRUTH_ATTITUDE = Layout("vehicle_attitude_groundtruth", elements(Columns.QUATERNION, "q"))
 
-BAROMETER = (Layout("vehicle_air_data", {"altitude_m": "baro_alt_meter"}),)
+BAROMETER = Layout("vehicle_air_data", {"altitude_m": "baro_alt_meter"})
 _BIAS = {"bias_m": "bias", "bias_m2": "bias_var"}
 HEIGHT_BIAS = {
     "baro_hgt": Layout("estimator_baro_bias", _BIAS),
@@ -253,21 +247,17 @@ HOW_TO_FUSE: Mapping[str, str] = {
     "the source's height.",
 }
 
-AID_OBSERVATION_HORIZONTAL = (
-    Layout(
-        KEPT_OBSERVATION,
-        elements(Columns.POSITION[:2], "observation"),
-        # v1.14
-        elements(Columns.POSITION_VARIANCE[:2], "observation_variance"),
-    ),
+AID_OBSERVATION_HORIZONTAL = Layout(
+    KEPT_OBSERVATION,
+    elements(Columns.POSITION[:2], "observation"),
+    # v1.14
+    elements(Columns.POSITION_VARIANCE[:2], "observation_variance"),
 )
-AID_OBSERVATION_VERTICAL = (
-    Layout(
-        "estimator_aid_src_ev_hgt",
-        {"down_m": "observation"},
-        # v1.14
-        {"down_m2": "observation_variance"},
-    ),
+AID_OBSERVATION_VERTICAL = Layout(
+    "estimator_aid_src_ev_hgt",
+    {"down_m": "observation"},
+    # v1.14
+    {"down_m2": "observation_variance"},
 )
 
 # What EKF2 fuses: msg/EstimatorAidSource{1,2,3}d.msg, EstimatorInnovations.msg,
@@ -362,6 +352,7 @@ FLAG_ALWAYS_SET = ("gravity", "drag")
 # Their observation is a position in EKF2's frame (that of GNSS is latitude and longitude)
 WITH_OBSERVATION = ("ev_pos", "ev_hgt")
 STATUS_FLAGS, STATUS = "estimator_status_flags", "estimator_status"
+CONTROL_BITS = Layout(STATUS, {"bits": "control_mode_flags"})
 # Every aid in one topic: innovations and variances, before v1.12 both
 INNOVATIONS = "estimator_innovations", "estimator_innovation_variances"
 OLD_INNOVATIONS = "ekf2_innovations"
@@ -377,12 +368,13 @@ UNUSED: Mapping[str, str] = {
 
 def topics() -> list[str]:
     """Every topic named in this table, sorted: all that a reader needs to decode."""
-    groups = (
+    layouts = (
         IMU, ATTITUDE, LOCAL_POSITION, SENSOR_BIAS, SELECTOR, LAND_DETECTED, FLIGHT_MODE, FAILURE,
         BAROMETER, TRUTH_LOCAL, TRUTH_GLOBAL, TRUTH_ATTITUDE, AID_OBSERVATION_HORIZONTAL,
-        AID_OBSERVATION_VERTICAL, HEIGHT_BIAS.values(), FLOW, *(track.layouts for track in _TRACKS),
+        AID_OBSERVATION_VERTICAL, *HEIGHT_BIAS.values(), *FLOW,
+        *(layout for track in _TRACKS for layout in track.layouts),
     )  # fmt: skip
-    named = {layout.topic for group in groups for layout in group}
+    named = {layout.topic for layout in layouts}
     named |= {f"estimator_aid_src_{name}" for name in SOURCES}
     of_aids = {STATUS_FLAGS, STATUS, *INNOVATIONS, OLD_INNOVATIONS}
     return sorted(named | UNUSED.keys() | of_aids | {*ESTIMATOR_STATES, MAGNETOMETER[0][0]})

@@ -52,8 +52,7 @@ def seconds_of(ticks: Any, per_second: int) -> Array:
 
     In two parts, as float64 does not hold the digits of UNIX time in ns.
     """
-    seconds: Array = ticks // per_second + ticks % per_second / per_second
-    return seconds
+    return np.asarray(ticks // per_second + ticks % per_second / per_second)
 
 
 def quote(text: str) -> str:

@@ -155,21 +155,18 @@ def _rows(name: str, content: bytes) -> tuple[Rows, str, str]:
         what = "a PX4 log" if is_ulog else "a binary file"
         remedy = f"Name a part of the log: {name}:vio or {name}:ekf2." if is_ulog else _REMEDY
         raise TrajectoryError(f"{name}: {what}, not a trajectory file", remedy)
-    lines = text.split("\n")
-    comments = [line for line in lines if line.lstrip().startswith("#")]
-    data = [
-        (number, line)
-        for number, line in enumerate(lines, 1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
+    lines = [(number, line) for number, line in enumerate(text.split("\n"), 1) if line.strip()]
+    comments = [line for _, line in lines if line.lstrip().startswith("#")]
+    data = [row for row in lines if not row[1].lstrip().startswith("#")]
     if len(data) > 1 and not _numeric(data[0][1]) and _numeric(data[1][1]):
         comments.append(data.pop(0)[1])  # a header that is no comment
     if data and not _numeric(data[0][1]):
         what = f"not a trajectory file: its first line is {quote(data[0][1])}"
         raise TrajectoryError(f"{name}: {what}", _REMEDY)
     cut = ""
-    if lines[-1] and len(data) > 1 and len(_fields(data[-1][1])) < len(_fields(data[0][1])):
-        cut = f"Line {len(lines)}, the last one, was dropped: it is cut."
+    short = len(data) > 1 and len(_fields(data[-1][1])) < len(_fields(data[0][1]))
+    if short and not text.endswith("\n"):
+        cut = f"Line {data[-1][0]}, the last one, was dropped: it is cut."
         data.pop()
     if len(data) < MIN_POSES:
         raise TrajectoryError(

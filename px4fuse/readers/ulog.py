@@ -1,7 +1,5 @@
 """PX4 ULog to :class:`~px4fuse.flight.Flight`, for PX4 v1.9 to today."""
 
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 from msgspec import structs
@@ -10,6 +8,7 @@ from px4fuse.ekf2_parameters import BAROMETER
 from px4fuse.flight import MODES_NOT_LOGGED, Columns, Flight, FlightMode, Truth, Unavailable
 from px4fuse.readers import parts
 from px4fuse.readers import px4_topics as px4
+from px4fuse.readers.layouts import Layout
 from px4fuse.readers.px4_ekf2 import read_ekf2
 from px4fuse.readers.px4_positions import GPS_3D_FIX, barometer, read_positions, read_truth
 from px4fuse.readers.ulog_topics import Topics, dropped_note, increasing, read_topics
@@ -22,36 +21,28 @@ LEAST_LOST, LOST_FROM_S = 65_538, 0.2
 UTC_RANGE_S = (1_234_567_890.0, 4_102_444_800.0)
 
 
-def read_ulog(path: Path) -> Flight:
-    """Read a PX4 ULog.
+def read_ulog(name: str, content: bytes) -> Flight:
+    """Read a PX4 ULog of this name.
 
     Raises
     ------
     LogError
-        The file cannot be read, is no ULog, or holds no usable data.
+        It is no ULog, or holds no usable data.
     """
-    return to_flight(read_topics(path))
-
-
-def to_flight(topics: Topics) -> Flight:
-    """Make a flight of the topics of a log."""
+    topics = read_topics(name, content)
     running = "Check that the logger ran while the sensors did."
-    imu = _enough(topics, _read_imu(topics), "IMU", px4.IMU[0].topic, running)
-    logged = topics.read(px4.ATTITUDE)
-    attitude = _enough(
-        topics,
-        None if logged is None else parts.with_attitude(logged),
-        "attitude",
-        px4.ATTITUDE[0].topic,
-        "Check that the estimator ran while the logger did.",
-    )
+    imu = _enough(topics, _read_imu(topics), "IMU", px4.IMU, running)
+    logged = parts.with_attitude(topics.read(px4.ATTITUDE))
+    running = "Check that the estimator ran while the logger did."
+    attitude = _enough(topics, logged, "attitude", px4.ATTITUDE, running)
     ekf2 = read_ekf2(topics)
     positions, missing_positions = read_positions(topics, ekf2)
     truth = read_truth(topics, positions, ekf2)
     if isinstance(truth, Truth):
         topics.came_from("truth", truth.name)
     airborne = _read_airborne(topics)
-    air = topics.read(px4.BAROMETER)
+    altitude_m = topics.read(px4.BAROMETER)["altitude_m"]
+    delay_s = topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3
     in_flight = parts.ends_in_flight(airborne, topics.log.duration_s)
     dropped = tuple(
         dropped_note(count, topic, "zero or go back")
@@ -74,9 +65,7 @@ def to_flight(topics: Topics) -> Flight:
         airborne=airborne,
         modes=_read_modes(topics),
         tumbled=_read_tumbled(topics),
-        barometer=None
-        if air is None
-        else barometer(air["altitude_m"], topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3),
+        barometer=barometer(altitude_m, delay_s),
         missing=(*parts.missing_parts(imu, attitude, ekf2, truth), *missing_positions),
         streams=topics.streams,
         unused=tuple(
@@ -107,8 +96,8 @@ def _lost(topics: Topics, imu: pd.DataFrame | Unavailable, in_flight: bool) -> t
 
 def _start_unix(topics: Topics) -> float | None:
     """UNIX time (s) of time zero by the GPS receiver, the median over its fixes."""
-    gps = topics.read(px4.GPS)
-    if gps is None or "utc_us" not in gps:
+    gps = topics.read(*px4.GPS)
+    if "utc_us" not in gps:
         return None
     utc_s = gps["utc_us"] * 1e-6
     known = utc_s.between(*UTC_RANGE_S)
@@ -118,10 +107,11 @@ def _start_unix(topics: Topics) -> float | None:
 
 
 def _enough(
-    topics: Topics, samples: pd.DataFrame | None, what: str, topic: str, remedy: str
+    topics: Topics, samples: pd.DataFrame, what: str, layout: Layout, remedy: str
 ) -> pd.DataFrame | Unavailable:
     """The usable samples of a topic, or why there are none."""
-    if samples is None:
+    topic = layout.topic
+    if topics.find(layout) is None:
         return Unavailable(what, f"no topic {topic}", px4.DEFAULT_PROFILE)
     if len(samples) < 2:
         return Unavailable(what, f"{topic} holds {len(samples)} usable samples", remedy)
@@ -129,10 +119,8 @@ def _enough(
     return samples
 
 
-def _read_imu(topics: Topics) -> pd.DataFrame | None:
+def _read_imu(topics: Topics) -> pd.DataFrame:
     imu = topics.read(px4.IMU)
-    if imu is None:
-        return None
     if "accelerometer_offset_us" in imu:
         offset_us = imu.pop("accelerometer_offset_us")
         imu = imu[offset_us != ACCELEROMETER_OFFSET_INVALID_US]
@@ -146,29 +134,25 @@ def _read_imu(topics: Topics) -> pd.DataFrame | None:
 def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavailable:
     """Stretches of flight by the land detector, each from take-off to touch-down."""
     detected = topics.read(px4.LAND_DETECTED, step=True)
-    if detected is None or detected.empty:
+    if detected.empty:
         return Unavailable(
             "land detector",
             "no usable topic vehicle_land_detected",
             "Record with SDLOG_PROFILE bit 0 (default), or give --start and --end.",
         )
-    topics.came_from("airborne", px4.LAND_DETECTED[0].topic)
+    topics.came_from("airborne", px4.LAND_DETECTED.topic)
     return parts.stretches_of_flight(detected["landed"], topics.log.duration_s)
 
 
 def _read_tumbled(topics: Topics) -> tuple[tuple[float, float], ...]:
     """Stretches in which PX4's failure detector finds roll or pitch beyond their limits."""
-    status = topics.read(px4.FAILURE, step=True)
-    if status is None:
-        return ()
-    upright = status[["roll", "pitch"]].max(axis=1) == 0.0
+    upright = topics.read(px4.FAILURE, step=True)[["roll", "pitch"]].max(axis=1) == 0.0
     return parts.stretches_of_flight(upright, topics.log.duration_s)
 
 
 def _read_modes(topics: Topics) -> tuple[FlightMode, ...] | Unavailable:
-    status = topics.read(px4.FLIGHT_MODE, step=True)
-    if status is None or status["nav_state"].isna().all():
+    states = topics.read(px4.FLIGHT_MODE, step=True)["nav_state"].dropna()
+    if states.empty:
         return MODES_NOT_LOGGED
-    states = status["nav_state"].dropna()
     names = states.map(lambda state: px4.NAV_STATES.get(int(state), f"mode {state:.0f}"))
     return parts.stretches_of_modes(names, topics.log.duration_s)

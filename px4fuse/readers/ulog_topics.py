@@ -12,7 +12,6 @@ from bisect import bisect_left
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -29,7 +28,6 @@ from px4fuse.plain import few_words
 from px4fuse.readers.layouts import Layout
 from px4fuse.readers.px4_topics import IMU, SELECTOR, topics
 from px4fuse.readers.ulog_framing import Framing, whole_messages
-from px4fuse.reading import read_log_bytes, shown
 from px4fuse.recording import Dropout, LogInfo, Stream
 
 _MICROSECOND = 1e-6
@@ -82,8 +80,8 @@ class Topics:
     tables: dict[tuple[str, int], dict[str, NDArray[Any]]]
     zero_us: int
     dropped: dict[tuple[str, int], int]
-    ekf2_parameters: Mapping[str, float] = field(default_factory=dict)
-    framing: Framing = field(default_factory=lambda: Framing(b""))
+    ekf2_parameters: Mapping[str, float]
+    framing: Framing
     streams: dict[str, Stream] = field(default_factory=dict)
 
     def instances(self, topic: str) -> list[int]:
@@ -97,8 +95,7 @@ class Topics:
     @cached_property
     def primary(self) -> Instances:
         """Primary EKF2 instance from each time on (``EKF2Selector.cpp``)."""
-        status = self.read(SELECTOR, step=True)
-        selected = pd.Series(dtype=float) if status is None else status["instance"]
+        selected = self.read(SELECTOR, step=True)["instance"]
         selected = selected[selected < 255]  # 255: none selected yet
         if selected.empty:
             return NO_SELECTOR
@@ -106,15 +103,12 @@ class Topics:
         times = [-np.inf, *changes.index[1:]]
         return tuple((float(at), int(number)) for at, number in zip(times, changes, strict=True))
 
-    def find(self, layouts: tuple[Layout, ...]) -> Layout | None:
+    def find(self, *layouts: Layout) -> Layout | None:
         """First layout that this log holds, or None."""
-        held = (
-            layout
-            for layout in layouts
-            for table in self.of(layout.topic)
-            if all(column in table for column in layout.columns.values())
-        )
-        return next(held, None)
+        for layout in layouts:
+            if any({*layout.columns.values()} <= table.keys() for table in self.of(layout.topic)):
+                return layout
+        return None
 
     def frame(self, layout: Layout, instance: int = 0, *, step: bool = False) -> pd.DataFrame:
         """Read one layout as a frame of float64 columns, indexed by measurement time in s.
@@ -150,12 +144,14 @@ class Topics:
                 index=pd.Index((time_us[keep] - self.zero_us) * _MICROSECOND, name="time_s"),
             )
         frame = frame.where(np.isfinite(frame))  # an infinite value is as unusable as NaN
-        return frame if step else self.window(frame)
+        # what lies outside the span of the data by more than the margin is dropped
+        end = self.log.duration_s + WINDOW_MARGIN_S
+        return frame if step else frame[(frame.index >= -WINDOW_MARGIN_S) & (frame.index <= end)]
 
-    def read(self, layouts: tuple[Layout, ...], *, step: bool = False) -> pd.DataFrame | None:
-        """:meth:`frame` of the first layout that this log holds; None where it holds none."""
-        layout = self.find(layouts)
-        return None if layout is None else self.frame(layout, step=step)
+    def read(self, *layouts: Layout, step: bool = False) -> pd.DataFrame:
+        """:meth:`frame` of the first layout that this log holds; empty where it holds none."""
+        layout = self.find(*layouts)
+        return _nothing(layouts[0]) if layout is None else self.frame(layout, step=step)
 
     def of_primary(
         self,
@@ -166,6 +162,8 @@ class Topics:
     ) -> pd.DataFrame:
         """Rows of each instance of a topic of EKF2 from when that instance was the primary one.
 
+        Empty where the log does not hold the layout.
+
         Parameters
         ----------
         layout, step
@@ -173,6 +171,8 @@ class Topics:
         select : callable, optional
             Which rows of an instance count; all by default.
         """
+        if self.find(layout) is None:
+            return _nothing(layout)
         available = self.instances(layout.topic)
         alone = self.primary == NO_SELECTOR
         starts, numbers = (np.array(part) for part in zip(*self.primary, strict=True))
@@ -195,11 +195,11 @@ class Topics:
         clock = f"autopilot boot clock, at {'measurement' if measured else 'publication'}"
         self.streams[part] = Stream(topics, clock, self.log.name)
 
-    def window(self, frame: pd.DataFrame) -> pd.DataFrame:
-        """Drop what lies outside the span of the data by more than the margin."""
-        end = self.log.duration_s + WINDOW_MARGIN_S
-        inside = (frame.index >= -WINDOW_MARGIN_S) & (frame.index <= end)
-        return frame[inside]
+
+def _nothing(layout: Layout) -> pd.DataFrame:
+    """What a log without a topic has of it."""
+    times = pd.Index([], dtype=np.float64, name="time_s")
+    return pd.DataFrame(columns=list(layout.columns), index=times, dtype=np.float64)
 
 
 def measurement_time_us(table: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
@@ -258,25 +258,22 @@ def dropped_note(count: int, name: str, why: str) -> str:
     return f"{count} samples of {name} were dropped: their time stamps are {why}"
 
 
-def read_topics(path: Path) -> Topics:
-    """Decode the topics that px4fuse uses.
+def read_topics(name: str, content: bytes) -> Topics:
+    """Decode the topics that px4fuse uses, of a log of this name.
 
     Raises
     ------
     LogError
-        The file cannot be read, is no ULog, or holds no data with usable time stamps.
+        It is no ULog, or holds no data with usable time stamps.
     """
-    name, content = shown(path), read_log_bytes(path)
     chatter = io.StringIO()
-    wanted = topics()
     framing = whole_messages(content)
-    whole = framing.content
     try:
         with contextlib.redirect_stdout(chatter):  # pyulog prints its warnings
-            ulog = ULog(io.BytesIO(whole), message_name_filter_list=wanted)
+            ulog = ULog(io.BytesIO(framing.content), message_name_filter_list=topics())
             tables = _tables(ulog)
             # a log of other topics can still be placed in time, by all that it holds
-            placed = tables or _tables(ULog(io.BytesIO(whole)))
+            placed = tables or _tables(ULog(io.BytesIO(framing.content)))
     except _PARSE_ERRORS as error:
         raise LogError(
             f"{name}: not a readable ULog ({str(error) or type(error).__name__})",
@@ -348,7 +345,7 @@ def _data_span(
 ) -> tuple[int, int]:
     """First and last time (µs) of the IMU, or else of the topic with most samples."""
     candidates = sorted(
-        tables, key=lambda key: (key[0] != IMU[0].topic, -len(tables[key]["timestamp"]))
+        tables, key=lambda key: (key[0] != IMU.topic, -len(tables[key]["timestamp"]))
     )
     for key in candidates:
         time_us = tables[key]["timestamp"].astype(np.int64)

@@ -56,6 +56,13 @@ class TopicTrack:
     resets: tuple[tuple[int, Array], ...]
     aided: BoolArray
 
+    def stamps(self, rows: IntArray, taken_s: Array | None = None) -> dict[str, NDArray[Any]]:
+        """The stamps of what the filter did in some steps, with samples that were taken then."""
+        sampled_us = self.time_us[rows]
+        if taken_s is not None:
+            sampled_us = np.rint(taken_s * 1e6).astype(np.int64)
+        return sensors.stamps(sampled_us, self.time_us[rows + self.lag] - sampled_us)
+
 
 def ekf2_topics(
     inputs: Inputs,
@@ -130,7 +137,7 @@ def _states(done: Run, track: TopicTrack, *, gnss: bool) -> Topic:
     return Topic(
         "estimator_states",
         {
-            **sensors.stamps(track.time_us[rows], _horizon_us(track, rows)),
+            **track.stamps(rows),
             "states": states,
             "covariances": covariances,
             "n_states": np.full(len(rows), 24, np.uint8),
@@ -144,9 +151,7 @@ def _aid_sources(inputs: Inputs, done: Run, track: TopicTrack, rate_hz: float) -
     seen = np.flatnonzero(events.usable & (events.end < len(track.time_us) - track.lag))
     seen = seen[sensors.thinned(sensors.seconds(track.time_us[events.end[seen]]), rate_hz)]
     rows, sample, received = events.end[seen], events.sample[seen], inputs.received
-    taken_us = np.rint(events.time_s[seen] * 1e6).astype(np.int64)
-    later_us = track.time_us[rows] + _horizon_us(track, rows) - taken_us
-    shown = sensors.stamps(taken_us, later_us)
+    shown = track.stamps(rows, events.time_s[seen])
     measured = received.position_m[sample, :2]
     north, east = measured.T
     told = (run.innovation, run.innovation_variance, run.noise)
@@ -192,13 +197,11 @@ def _barometer(inputs: Inputs, done: Run, track: TopicTrack) -> list[Topic]:
     told = told[sensors.thinned(told.index.to_numpy(), OTHER_AIDS_HZ)]
     innovation, variance, rejected, fused, rows = told.to_numpy().T
     taken_s, step = told.index.to_numpy(), rows.astype(np.intp)
-    taken_us = np.rint(taken_s * 1e6).astype(np.int64)
-    later_us = track.time_us[step] + _horizon_us(track, step) - taken_us
     measured = heights.down_m[np.searchsorted(heights.taken_s, taken_s)] - sensors.HOME[2]
     noise = np.full(len(step), inputs.settings[BAROMETER.noise] ** 2)
     return [
         _aid_source(
-            BAROMETER, inputs.settings, sensors.stamps(taken_us, later_us),
+            BAROMETER, inputs.settings, track.stamps(step, taken_s),
             measured.astype(np.float32), (innovation, variance, noise), (rejected > 0, fused > 0),
         )
     ]  # fmt: skip
@@ -214,7 +217,6 @@ def _of_field(inputs: Inputs, done: Run, track: TopicTrack, attitude_hz: float) 
     seen = seen[sensors.thinned(sensors.seconds(track.time_us[end[seen]]), OTHER_AIDS_HZ)]
     rows, (innovation, variance, fused) = end[seen], np.moveaxis(done.field[seen, :, 0], 1, 0)
     last = field.gauss[np.searchsorted(field.step, rows, side="right") - 1]
-    stamps = sensors.stamps(track.time_us[rows], _horizon_us(track, rows))
     noise = np.full(innovation.shape, settings[MAG.noise] ** 2)
     taken = fused[:, 0] > 0.0
     published = np.flatnonzero(sensors.thinned(sensors.seconds(track.time_us), attitude_hz))
@@ -225,13 +227,13 @@ def _of_field(inputs: Inputs, done: Run, track: TopicTrack, attitude_hz: float) 
             track.attitude[published],
         ),
         _aid_source(
-            MAG, settings, stamps, last.astype(np.float32), (innovation, variance, noise),
-            (~taken, taken),
+            MAG, settings, track.stamps(rows), last.astype(np.float32),
+            (innovation, variance, noise), (~taken, taken),
         ),
         Topic(
             "estimator_status",
             {
-                **sensors.stamps(track.time_us[told], _horizon_us(track, told)),
+                **track.stamps(told),
                 "control_mode_flags": np.full(len(told), 1 << MAG_3D_BIT, np.uint64),
             },
         ),
@@ -281,7 +283,7 @@ def _flags(inputs: Inputs, done: Run, track: TopicTrack) -> Topic:
     return Topic(
         "estimator_status_flags",
         {
-            **sensors.stamps(track.time_us[rows], _horizon_us(track, rows)),
+            **track.stamps(rows),
             "control_status_changes": np.cumsum(changed)[rows].astype(np.uint32),
             "cs_tilt_align": always,
             "cs_yaw_align": always,
@@ -296,9 +298,3 @@ def _flags(inputs: Inputs, done: Run, track: TopicTrack) -> Topic:
             **({"cs_gnss_vel": on[rows]} if gnss else {}),
         },
     )
-
-
-def _horizon_us(track: TopicTrack, rows: IntArray) -> NDArray[np.int64]:
-    """How much later what the filter did in a step is published."""
-    later: NDArray[np.int64] = track.time_us[rows + track.lag] - track.time_us[rows]
-    return later

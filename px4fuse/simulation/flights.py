@@ -1,6 +1,5 @@
-"""Scenario and mistakes to a flight: in memory, as ULog, and the answer for the instructor."""
+"""Scenario and mistakes to a flight, as ULog, and the answer for the instructor."""
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -8,14 +7,12 @@ from typing import Any
 import numpy as np
 
 from px4fuse.ekf2.model import MODEL_NOTE
-from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, REPORTED
+from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Flight
 from px4fuse.plain import plain
-from px4fuse.readers import ulog
-from px4fuse.readers.px4_topics import IMU
-from px4fuse.readers.ulog_topics import NOTE_KEY, Topics
-from px4fuse.recording import LogInfo
+from px4fuse.readers.ulog import read_ulog
+from px4fuse.readers.ulog_topics import NOTE_KEY
 from px4fuse.simulation import ekf2, sensors
 from px4fuse.simulation.ekf2_topics import MAGNETOMETER_HZ
 from px4fuse.simulation.mistakes import MISTAKES, Mistakes, as_typed, made
@@ -45,7 +42,7 @@ class Simulation:
     positions : Positions
         The position source with its outliers and errors.
     topics : tuple of Topic
-        All that a reader looks at.
+        All that is logged.
     parameters : mapping
     """
 
@@ -102,14 +99,13 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
         own = ekf2.fly(scenario, mistakes, motion, imu, positions, others, parameters)
         names = {topic.name for topic in own}
         topics = [*(topic for topic in topics if topic.name not in names), *own]
+    if scenario.truth:
+        topics.append(sensors.true_attitude(scenario, motion))
     return Simulation(scenario, mistakes, motion, positions, tuple(topics), parameters)
 
 
 def simulate_flight(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Flight:
-    """Fly a scenario and give what :func:`px4fuse.read_log` would read from its ULog.
-
-    Its ``log.sha256`` is of scenario and mistakes, since there is no file, and ``bytes`` 0.
-    """
+    """Fly a scenario and give what :func:`px4fuse.read_log` reads from its ULog."""
     return to_flight(simulate(scenario, mistakes))
 
 
@@ -121,39 +117,12 @@ def to_ulog(simulation: Simulation) -> bytes:
         "ver_sw_release": RELEASE,
         **({NOTE_KEY: MODEL_NOTE} if simulation.scenario.ekf2 else {}),
     }
-    topics = simulation.topics
-    if simulation.scenario.truth:
-        # left out of the fast path: no reader looks at it
-        topics += (sensors.true_attitude(simulation.scenario, simulation.motion),)
-    return encode(topics, simulation.parameters, info, sensors.START_US)
+    return encode(simulation.topics, simulation.parameters, info, sensors.START_US)
 
 
 def to_flight(simulation: Simulation, name: str = "simulation.ulg") -> Flight:
-    """The flight as the reader gives it, by the reader's own functions, without the file."""
-    tables = {(topic.name, 0): topic.columns() for topic in simulation.topics}
-    stamps = tables[IMU[0].topic, 0]["timestamp"].astype(np.int64)
-    logged = {key: float(np.float32(value)) for key, value in simulation.parameters.items()}
-    identity = repr((simulation.scenario, simulation.mistakes)).encode()
-    topics = Topics(
-        log=LogInfo(
-            name=name,
-            sha256=hashlib.sha256(identity).hexdigest(),
-            bytes=0,
-            format="ULog",
-            firmware="PX4 v1.16.0",
-            firmware_hash="unknown",
-            hardware=HARDWARE,
-            boot_time_s=int(stamps[0]) * 1e-6,
-            duration_s=int(stamps[-1] - stamps[0]) * 1e-6,
-            parameters={key: logged[key] for key in REPORTED if key in logged},
-            notes=(MODEL_NOTE,) if simulation.scenario.ekf2 else (),
-        ),
-        tables=tables,
-        zero_us=int(stamps[0]),
-        dropped={},
-        ekf2_parameters={k: value for k, value in logged.items() if k.startswith("EKF2_")},
-    )
-    return ulog.to_flight(topics)
+    """The flight as :func:`px4fuse.read_log` reads it from its ULog."""
+    return read_ulog(name, to_ulog(simulation))
 
 
 def _parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]:

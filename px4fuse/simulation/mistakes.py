@@ -295,12 +295,7 @@ def parse(texts: Iterable[str]) -> Mistakes:
             if size is None:
                 wanted = f"{NAMES[taken.unit]}, as in {name}{mistake.usage}"
                 raise SettingsError(f"--mistake {text}: {value!r}: give {wanted}.")
-            if not taken.low <= size <= taken.high:
-                raise SettingsError(
-                    f"--mistake {text}: {taken.typed} {size:g} is out of range: give "
-                    f"{taken.low:g} to {taken.high:g} {taken.unit}".rstrip()
-                    + "."
-                )
+            taken.check(size, f"--mistake {text}: {taken.typed}")
             changed[field] = size
     return Mistakes(**changed)  # type: ignore[arg-type]
 
@@ -321,11 +316,6 @@ def as_typed(name: str, mistakes: Mistakes) -> str:
     >>> as_typed("nlos", parse(["nlos=5"]))
     'nlos=5%,2m'
     """
-    given = {field: getattr(mistakes, field) for field in MISTAKES[name].sizes}
-    units = {field: QUANTITIES[field].unit for field in given}
-    values = [
-        f"{value:g}{_ASCII.get(units[field], units[field])}"
-        for field, value in given.items()
-        if value is not None
-    ]
+    given = ((getattr(mistakes, one), QUANTITIES[one].unit) for one in MISTAKES[name].sizes)
+    values = [f"{value:g}{_ASCII.get(unit, unit)}" for value, unit in given if value is not None]
     return f"{name}={','.join(values)}" if values else name

@@ -33,10 +33,11 @@ WANDER_PERIODS_S = (3.0, 20.0)
 WANDER_SINES = 4
 
 
-def _quintic(x: Array) -> Array:
-    """S(x), from 0 to 1 with two zero derivatives at either end."""
-    square = x * x
-    return np.asarray(square * x * (6.0 * square - 15.0 * x + 10.0))
+def _quintic(x: Array) -> tuple[Array, Array, Array, Array]:
+    """S(x), from 0 to 1 with two zero derivatives at either end, and its three derivatives."""
+    square, slope, rest = x * x, x * (1.0 - x), 1.0 - x
+    value = square * x * (6.0 * square - 15.0 * x + 10.0)
+    return value, 30.0 * slope**2, 60.0 * x * rest * (rest - x), 60.0 * (1.0 - 6.0 * x * rest)
 
 
 @dataclass(frozen=True)
@@ -72,17 +73,16 @@ class Ramps:
         length = self.length_s[at]
         since = time_s - self.start_s[at]
         x = np.clip(since / length, 0.0, 1.0)
-        rest = 1.0 - x
         integral = length * (x * x) ** 2 * (x * x - 3.0 * x + 2.5)
         integral += np.maximum(since - length, 0.0)
-        step = _quintic(x)
+        step, first, second, _ = _quintic(x)
         # take is several times faster than indexing
         change, before = self.change.take(at, axis=0), velocity_before.take(at, axis=0)
         return (
             position_before.take(at, axis=0) + before * since[:, None] + change * integral[:, None],
             before + change * step[:, None],
-            change * (30.0 * (x * rest) ** 2 / length)[:, None],
-            change * (60.0 * x * rest * (rest - x) / length**2)[:, None],
+            change * (first / length)[:, None],
+            change * (second / length**2)[:, None],
         )
 
 
@@ -189,16 +189,12 @@ class Motion:
         inside = np.flatnonzero((rise * (1.0 - rise) > 0.0) | (fall * (1.0 - fall) > 0.0))
         # at most one of the two is under way, the other's derivatives are 0 or cancel in x(1 - x)
         down = fall[inside] > 0.0
-        x = np.where(down, fall[inside], rise[inside])
         sign = np.where(down, -1.0, 1.0)
-        rest = 1.0 - x
-        derivatives = (
-            sign * 30.0 * (x * rest) ** 2 / FADE_S,
-            sign * 60.0 * x * rest * (rest - x) / FADE_S**2,
-            sign * 60.0 * (1.0 - 6.0 * x * rest) / FADE_S**3,
+        _, *derivatives = _quintic(np.where(down, fall[inside], rise[inside]))
+        first, second, third = (
+            (sign * part / FADE_S**order)[:, None] for order, part in enumerate(derivatives, 1)
         )
-        size = _quintic(rise) - _quintic(fall)
-        first, second, third = (part[:, None] for part in derivatives)
+        size = _quintic(rise)[0] - _quintic(fall)[0]
         return (size[:, None], first, second, third), inside
 
 

@@ -47,6 +47,17 @@ class Bounds:
     typed: str = ""
     meaning: str = ""
 
+    def check(self, value: float, name: str) -> None:
+        """Refuse a value of this name that is out of range.
+
+        Raises
+        ------
+        SettingsError
+        """
+        if not self.low <= value <= self.high:  # false for NaN too
+            allowed = f"give {self.low:g} to {self.high:g} {self.unit}".rstrip()
+            raise SettingsError(f"{name} {value:g} is out of range: {allowed}.")
+
 
 def number(usual: Any, *about: Any) -> Any:
     """A field of a record that is a number, its default, and what it may be."""
@@ -169,13 +180,7 @@ class Scenario:
         if self.yaw is not None and self.yaw not in YAWS:
             raise SettingsError(f"--yaw {self.yaw}: give {' or '.join(YAWS)}.")
         for name, taken in quantities(Scenario).items():
-            value = getattr(self, name)
-            if not taken.low <= value <= taken.high:  # false for NaN too
-                raise SettingsError(
-                    f"{taken.typed or name} {value:g} is out of range: give {taken.low:g} to "
-                    f"{taken.high:g} {taken.unit}".rstrip()
-                    + "."
-                )
+            taken.check(getattr(self, name), taken.typed or name)
         needed = self.speed_m_s * (START_STOP_S if self.kind == "aisle" else CORNER_S)
         if self.length_m < needed:
             raise SettingsError(

@@ -39,16 +39,6 @@ class Topic:
     fields: Mapping[str, NDArray[Any]]
     instance: int = 0
 
-    def columns(self) -> dict[str, NDArray[Any]]:
-        """Fields as pyulog names them, one of each element: ``q[0]``, ``q[1]``."""
-        found: dict[str, NDArray[Any]] = {}
-        for name, values in self.fields.items():
-            if values.ndim == 1:
-                found[name] = values
-            else:
-                found |= {f"{name}[{i}]": values[:, i] for i in range(values.shape[1])}
-        return found
-
 
 def encode(
     topics: Sequence[Topic],

@@ -132,8 +132,7 @@ def _transform(
 def _spread(position_m: Array) -> Array:
     """RMS about the mean along the principal directions, descending (m)."""
     centred = position_m - position_m.mean(axis=0)
-    rms: Array = np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(centred))
-    return rms
+    return np.asarray(np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(centred)))
 
 
 def rms_m(difference_m: Array) -> float:

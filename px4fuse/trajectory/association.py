@@ -128,7 +128,8 @@ def _at(trajectory: Trajectory, time_s: Array) -> Trajectory:
     rotation = trajectory.rotation
     if rotation is not None and len(time_s):
         rotation = Slerp(trajectory.time_s, rotation)(time_s)
-    return replace(trajectory.moved(positions_at(trajectory, time_s), rotation), time_s=time_s)
+    made = trajectory.moved(positions_at(trajectory, time_s))
+    return replace(made, rotation=rotation, time_s=time_s)
 
 
 def positions_at(trajectory: Trajectory, time_s: Array) -> Array:

@@ -154,8 +154,7 @@ def evaluate(
     if alignment is None:
         alignment, reason = choose_alignment(x, y)
     transform = fit(x.position_m, y.position_m, alignment)
-    turned = None if x.rotation is None else transform.rotation * x.rotation
-    aligned = replace(x, position_m=transform.apply(x.position_m), rotation=turned)
+    aligned = x.moved(transform.apply(x.position_m), transform.rotation)
     body, notes = _body_rotation(aligned, y)
     if body is not None and aligned.rotation is not None:
         aligned = replace(aligned, rotation=aligned.rotation * body)

@@ -135,12 +135,16 @@ class Trajectory(Shown):
         some = {name: values[chosen] for name, values in known.items() if values is not None}
         return replace(self, **some)
 
-    def moved(self, position_m: Array, rotation: Rotation | None) -> Trajectory:
-        """The same poses elsewhere, of which no reported variance holds any longer."""
+    def moved(self, position_m: Array, turn: Rotation | None = None) -> Trajectory:
+        """The same poses elsewhere, of which no reported variance holds any longer.
+
+        ``turn`` is of their world: one, or one for each pose.
+        """
+        turned = self.rotation if self.rotation is None or turn is None else turn * self.rotation
         return replace(
             self,
             position_m=position_m,
-            rotation=rotation,
+            rotation=turned,
             position_variance_m2=None,
             rotation_variance_rad2=None,
         )

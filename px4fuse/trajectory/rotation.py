@@ -22,8 +22,7 @@ def multiply(a: Array, b: Array) -> Array:
 
 def conjugate(q: Array) -> Array:
     """The inverse of a unit quaternion."""
-    inverse: Array = q * np.array([1.0, -1.0, -1.0, -1.0])
-    return inverse
+    return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]))
 
 
 def from_vector(rotation: Array) -> Array:
@@ -84,8 +83,7 @@ def running_product(turns: Array) -> Array:
     for row in range(1, rows):
         before[row] = multiply(before[row - 1], blocks[row - 1, -1])
     product = multiply(before[:, None, :], blocks).reshape(-1, 4)[:n]
-    unit: Array = product / np.linalg.norm(product, axis=1, keepdims=True)
-    return unit
+    return np.asarray(product / np.linalg.norm(product, axis=1, keepdims=True))
 
 
 def interpolate(times: Array, known_times: Array, known: Array) -> Array:
@@ -94,5 +92,4 @@ def interpolate(times: Array, known_times: Array, known: Array) -> Array:
     signs = np.concatenate([[1.0], np.cumprod(np.where(flips == 0.0, 1.0, flips))])
     steady = known * signs[:, None]
     q = np.stack([np.interp(times, known_times, part) for part in steady.T], axis=-1)
-    unit: Array = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    return unit
+    return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))

@@ -110,5 +110,4 @@ def _nearest_rotations(matrices: Array) -> Array:
     """
     left, _, right = np.linalg.svd(matrices)
     left[:, :, -1] *= np.sign(np.linalg.det(left @ right))[:, None]
-    made: Array = left @ right
-    return made
+    return np.asarray(left @ right)

@@ -73,8 +73,7 @@ class PoseGraph:
     @property
     def successive(self) -> BoolArray:
         """Which edges join two successive poses: odometry, unless the caller knows better."""
-        made: BoolArray = np.abs(self.first - self.second) == 1
-        return made
+        return np.asarray(np.abs(self.first - self.second) == 1)
 
 
 @dataclass(frozen=True)
