@@ -15,6 +15,7 @@ import io
 import os
 import signal
 from collections.abc import Callable, Iterator
+from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
 
@@ -27,8 +28,9 @@ from pypdf import PdfWriter
 
 import px4fuse
 from px4fuse import analysis
+from px4fuse.ekf2.model import Model, open_model
 from px4fuse.fleet import inputs
-from px4fuse.flight import Flight
+from px4fuse.flight import Flight, Unavailable
 from px4fuse.notebook import commands
 from px4fuse.readers import read_log
 from px4fuse.report import pdf
@@ -112,6 +114,12 @@ def shared_logs() -> Path:
     if not SHARED_LOGS.is_dir():
         pytest.skip("the further flight logs (../shared/logs) are not beside the repository")
     return SHARED_LOGS
+
+
+@pytest.fixture(scope="session")
+def model_of() -> Callable[[Path], Model | Unavailable]:
+    """EKF2's model of a log; the last ones of a process are kept."""
+    return lru_cache(8)(lambda path: open_model(read_log(path)))
 
 
 def page_of(_: object, text: str) -> bytes:

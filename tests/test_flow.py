@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -213,8 +214,10 @@ def test_fixes_that_come_while_ekf2_does_without_gnss_are_not_fused() -> None:
 @pytest.mark.parametrize(
     ("name", "least"), [("v1.16.1_gps_stock_flow", 0.996), ("main202603_gps_outage_flow", 0.998)]
 )
-def test_flights_with_flow_are_replayed(name: str, least: float, shared_logs: Path) -> None:
-    found = open_model(read_log(shared_logs / "gps" / f"{name}.ulg"))
+def test_flights_with_flow_are_replayed(
+    name: str, least: float, shared_logs: Path, model_of: Any
+) -> None:
+    found = model_of(shared_logs / "gps" / f"{name}.ulg")
     assert isinstance(found, Model)
     agreement = found.agreement
     assert agreement.good

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from class_tools import in_this_process
 from cli_tools import run
 from conftest import REPOSITORY, page_of
 from golden_tools import agrees, numbers, of_blocks, of_values, rounded, written
@@ -121,9 +122,13 @@ def shifted(path: Path) -> str:
 
 
 @pytest.fixture
-def kept_pages(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+def kept_pages(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """The blocks of what is reported, instead of a PDF."""
     blocks: list[Any] = []
+    if "verify" in request.node.name:  # which compares the PDF
+        in_this_process(monkeypatch)
+        request.getfixturevalue("drawn_once")
+        return blocks
 
     def keep(made: list[Any]) -> list[Any]:
         blocks[:] = made

@@ -356,10 +356,8 @@ FLOWN = {
 
 
 @pytest.fixture(scope="module")
-def models(shared_logs: Path) -> dict[str, Model]:
-    return {
-        name: opened(read_log(shared_logs / "gps" / f"v1.16.1_gps_{name}.ulg")) for name in FLOWN
-    }
+def models(shared_logs: Path, model_of: Any) -> dict[str, Model]:
+    return {name: model_of(shared_logs / "gps" / f"v1.16.1_gps_{name}.ulg") for name in FLOWN}
 
 
 @pytest.mark.reallogs
