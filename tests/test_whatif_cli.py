@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ from pypdf import PdfReader
 
 from px4fuse.analysis import Counterfactual, run_what_if
 from px4fuse.cli import cli
-from px4fuse.ekf2.whatif import Summary
+from px4fuse.ekf2.model import open_model
+from px4fuse.ekf2.whatif import Summary, what_if
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.errors import MissingDataError, Px4FuseError, SettingsError
 from px4fuse.flight import Flight
@@ -81,15 +83,15 @@ def error_of(summary: dict[str, Any]) -> float:
 
 
 def test_an_aid_that_the_model_lacks_and_a_time_after_the_flight_are_refused(
-    sample_log: Path,
+    asked: Counterfactual,
 ) -> None:
-    for words, said in (
-        (["--without", "baro_hgt"], "baro_hgt: of this log the model fuses ev_pos."),
-        (["--without", "ev_pos", "--from", "500"], "500 s: less than 5 s of the flight"),
+    model = open_model(asked.flight)
+    for without, said in (
+        ({"baro_hgt": 60.0}, "baro_hgt: of this log the model fuses ev_pos."),
+        ({"ev_pos": 500.0}, "500 s: less than 5 s of the flight"),
     ):
-        refused = run(sample_log, *words)
-        assert isinstance(refused.exception, SettingsError)
-        assert said in str(refused.exception)
+        with pytest.raises(SettingsError, match=said):
+            what_if(model, [], without)
 
 
 def test_without_set_it_is_what_the_data_ask_for(asked: Counterfactual) -> None:
@@ -164,9 +166,11 @@ def test_a_log_without_ekf2s_inside_says_why(sample_log: Path) -> None:
 
 @pytest.mark.reallogs
 class TestFlownFlights:
-    def of(self, shared_logs: Path, name: str, **request: object) -> Counterfactual:
+    @staticmethod
+    @cache
+    def of(shared_logs: Path, name: str) -> Counterfactual:
         log = shared_logs / "simulated" / f"{name}.ulg"
-        return run_what_if(WhatIfRequest(log=str(log), **request))
+        return run_what_if(WhatIfRequest(log=str(log)))
 
     def test_the_noise_that_the_data_ask_for_ends_the_rejections(self, shared_logs: Path) -> None:
         found = self.of(shared_logs, "v1.16.1_aisle_overconfident")
@@ -194,7 +198,7 @@ class TestFlownFlights:
         (cured,) = found.whatif.whatif
         assert error(cured) < 0.7 * error(found.whatif.logged)
         with pytest.raises(SettingsError, match="the longest delay makes the horizon"):
-            self.of(shared_logs, "v1.13.3_aisle_evdelay175", changes={"EKF2_DELAY_MAX": 300.0})
+            what_if(open_model(found.flight), [{"EKF2_DELAY_MAX": 300.0}])
 
     @pytest.mark.parametrize(
         ("log", "said"),
