@@ -18,9 +18,11 @@ from collections.abc import Callable, Iterator
 from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import pytest
 from browser import browser  # noqa: F401 - a fixture
+from ekf2_tools import opened
 from exchange import replace
 from explore_tools import explored, page  # noqa: F401 - fixtures
 from hypothesis import HealthCheck, settings
@@ -29,7 +31,6 @@ from pypdf import PdfWriter
 import px4fuse
 from px4fuse import analysis
 from px4fuse.ekf2.model import Model, open_model
-from px4fuse.fleet import inputs
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.notebook import commands
 from px4fuse.readers import read_log
@@ -109,6 +110,18 @@ def sample_flight(sample_log: Path) -> Flight:
 
 
 @pytest.fixture(scope="session")
+def model(sample_flight: Flight) -> Model:
+    """The sample's model of EKF2; what it has replayed it keeps."""
+    return opened(sample_flight)
+
+
+@pytest.fixture(scope="session")
+def sample(sample_log: Path) -> analysis.Analysis:
+    """The sample flight, analysed once; tests must not change it."""
+    return _run_once(ComparisonRequest(log=str(sample_log)))
+
+
+@pytest.fixture(scope="session")
 def shared_logs() -> Path:
     """The folder of further flight logs, which are not part of the project."""
     if not SHARED_LOGS.is_dir():
@@ -158,47 +171,68 @@ def drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pdf, "render", from_memory)
 
 
-# Of the unchanged program: it is there before any test patches it
-_run = px4fuse.run
-_analyses: dict[tuple[str | bytes, ...], analysis.Analysis] = {}
+# Of the unchanged program: they are there before any test patches them
+_run, _read = px4fuse.run, analysis.read_flight
+_kept: dict[tuple[str | bytes, ...] | None, Any] = {}
 
 
-def _remembered(
-    request: ComparisonRequest,
-    progress: Callable[[str], None] = lambda _: None,
-    flight: Flight | None = None,
-) -> analysis.Analysis:
+def _known(request: ComparisonRequest, what: str) -> tuple[str | bytes, ...] | None:
+    """What it is kept under: where the files lie is no part of it, verification has links."""
     position = request.position
     paths = [request.log, request.mavlink, None if position is None else position.path]
     files = [Path(path) for path in paths if path is not None]
-    if flight is not None or any(not file.is_file() for file in files):
-        return _run(request, progress, flight)
-    # where they lie is not part of an analysis: verification reads them by links
+    if any(not file.is_file() for file in files):
+        return None
     named = replace(
         request,
         log=Path(request.log).name,
         mavlink=request.mavlink and Path(request.mavlink).name,
         position=position and replace(position, path=Path(position.path).name),
     )
-    known = (repr(named), *(sha256(file.read_bytes()).digest() for file in files))
+    return (what, repr(named), *(sha256(file.read_bytes()).digest() for file in files))
+
+
+def _known_flight(request: ComparisonRequest) -> tuple[str | bytes, ...] | None:
+    names = ("log", "mavlink", "system", "position", "clock_offset_s")
+    return _known(ComparisonRequest(**{name: getattr(request, name) for name in names}), "flight")
+
+
+def _once(known: tuple[str | bytes, ...] | None, make: Callable[[], Any]) -> Any:
+    if known is None:
+        return make()
     # the last one used stands last
-    _analyses[known] = _analyses.pop(known) if known in _analyses else _run(request, progress)
-    if len(_analyses) > MOST_ANALYSES:
-        del _analyses[next(iter(_analyses))]
-    return _analyses[known]
+    _kept[known] = _kept.pop(known) if known in _kept else make()
+    if len(_kept) > 2 * MOST_ANALYSES:
+        del _kept[next(iter(_kept))]
+    return _kept[known]
+
+
+def _read_once(request: ComparisonRequest, progress: analysis.Progress = analysis.silent) -> Flight:
+    return _once(_known_flight(request), lambda: _read(request, progress))
+
+
+def _run_once(
+    request: ComparisonRequest,
+    progress: analysis.Progress = analysis.silent,
+    flight: Flight | None = None,
+) -> analysis.Analysis:
+    if flight is not None and flight is not _kept.get(_known_flight(request)):
+        return _run(request, progress, flight)
+    return _once(_known(request, "analysis"), lambda: _run(request, progress, flight))
 
 
 @pytest.fixture(scope="module")
 def analysed_once() -> Iterator[None]:
-    """The same request on the same files is analysed once; for tests that patch nothing of it."""
+    """The same request on the same files is read and analysed once; where nothing is patched."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(analysis, "read_flight", _read_once)
         for place in (analysis, commands):
-            patch.setattr(place, "run", _remembered)
-        patch.setattr(inputs, "run_or_judge_aids", _remembered)
+            patch.setattr(place, "run", _run_once)
         yield
 
 
 @pytest.fixture
 def analysed_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     """For tests of the analysis among others of what follows it."""
+    monkeypatch.setattr(analysis, "read_flight", _read)
     monkeypatch.setattr(analysis, "run", _run)

@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 from browser import Browser
 
-from px4fuse.analysis import Analysis, run
+import px4fuse.analysis
+from px4fuse.analysis import Analysis
 from px4fuse.findings import find
 from px4fuse.request import ComparisonRequest
 
@@ -23,7 +24,7 @@ def explored(sample_log: Path, tmp_path_factory: pytest.TempPathFactory) -> tupl
     from px4fuse.explore.page import html_text  # Bokeh takes long, and few tests need it
 
     request = ComparisonRequest(log=str(sample_log))
-    analysis = run(request)
+    analysis = px4fuse.analysis.run(request)  # as it is then
     file = tmp_path_factory.mktemp("explore") / "sample.html"
     file.write_bytes(html_text([(analysis, find(analysis), request)]).encode())
     return file, analysis

@@ -11,12 +11,13 @@ import jsonschema
 import numpy as np
 import pandas as pd
 import pytest
+from ekf2_tools import opened
 from exchange import replace
 from findings_tools import made
 
 from px4fuse.analysis import run_what_if
 from px4fuse.ekf2.heights import HeightFilter, barometer_samples, with_heights
-from px4fuse.ekf2.model import Model, open_model, run_variants
+from px4fuse.ekf2.model import Model, run_variants
 from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.stretches import Heights, Stretch
 from px4fuse.ekf2.whatif import HEIGHT_FOLLOWS, HEIGHT_STAYS, WhatIf, what_if
@@ -195,12 +196,6 @@ def outdoors(baro_noise_m: float = 0.4) -> Flight:
             simulated, "parameters", lambda *of: usual(*of) | {"EKF2_BARO_NOISE": baro_noise_m}
         )
         return simulate_flight(scenario_of("outdoor", seed=3, passes=3), parse(()))
-
-
-def opened(flight: Flight) -> Model:
-    model = open_model(flight)
-    assert isinstance(model, Model)
-    return model
 
 
 def test_what_if_predicts_the_height_of_the_flight_with_the_other_noise() -> None:

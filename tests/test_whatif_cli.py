@@ -25,6 +25,8 @@ from px4fuse.request import Sweep, WhatIfRequest, command_line
 from px4fuse.results.contract import WhatIfResults, schema
 from px4fuse.results.reading import read_results
 
+pytestmark = pytest.mark.usefixtures("analysed_once")
+
 
 @pytest.fixture(scope="module")
 def asked(sample_log: Path) -> Counterfactual:
