@@ -355,26 +355,7 @@ def test_junk_in_hundreds_costs_a_line_each(tmp_path):
     assert table["reason"].str.len().between(10, 300).all()
 
 
-def test_bad_input_is_one_line(tmp_path, flights):
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "file").touch()
-    for arguments, said in (
-        ([tmp_path / "empty", "-o", tmp_path / "o"], "no logs there"),
-        ([tmp_path / "none.ulg", "-o", tmp_path / "o"], "no logs there"),
-        ([tmp_path / "*.ulg", "-o", tmp_path / "o"], "no logs there"),
-        (["-o", tmp_path / "o"], "no logs"),
-        ([flights], "-o"),
-        ([flights, "-o", tmp_path / "file"], "is not a folder"),
-        ([flights, "-o", tmp_path / "o", "--sigma-z", "0"], "sigma"),
-        ([flights, "-o", tmp_path / "o", "--scheduler", "tcp://h:1", "--workers", 2], "--workers"),
-        ([flights, "-o", tmp_path / "o", "--memory", "lots"], "--memory"),
-        (["s3://bucket/logs", "-o", tmp_path / "o"], 'pip install "s3fs"'),
-        (["nonsense://x", "-o", tmp_path / "o"], "nonsense"),
-    ):
-        result = command(*arguments)
-        assert result.exit_code != 0, arguments
-        assert said in str(result.exception or result.output) + result.output
-    assert not (tmp_path / "o").exists()
+def test_settings_that_a_batch_cannot_have_are_refused(flights):
     for settings in ({"mavlink": "a.tlog"}, {"sigma": 1.0}, {"sigma_z_m": 0.0}):
         with pytest.raises(SettingsError):
             px4fuse.batch(flights, **settings)

@@ -234,37 +234,6 @@ def test_names_of_files_are_safe_and_unique() -> None:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["grade"], "nothing to grade"),
-        (["grade", "in"], "say with -o"),
-        (["grade", "missing", "-o", "out"], "no regular file, and no folder"),
-        (["grade", "in", "-o", "in/out"], "lies inside"),
-        (["grade", "in", "-o", "in/a.pdf"], "is not a folder"),
-        (["grade", "in", "-o", "out", "--rubric", "missing.toml"], "missing.toml"),
-        (["grade", "in", "-o", "out", "--key", "missing.json"], "missing.json"),
-        (["grade", "in", "-o", "out", "--logs", "missing"], "missing: cannot be read"),
-        (["grade", "in", "-o", "out", "--roster", "missing"], "cannot be read"),
-        (["grade", "in", "-o", "out", "--worksheet", "missing"], "cannot be read"),
-        (["grade", "in", "-o", "out", "--late", "10%/day"], "--due"),
-        (["grade", "in", "-o", "out", "--due", "soon"], "--due"),
-        (["grade", "in", "-o", "out", "--due", "2026-11-20", "--late", "10"], "--late"),
-        (["grade", "--gradescope", "missing"], "missing"),
-        (["grade", "--write-autograder", "a.zip"], "--logs"),
-    ],
-)
-def test_bad_input_is_one_line(tmp_path, monkeypatch, arguments, says) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("in").mkdir()
-    shutil.copy(REPORT, "in/a.pdf")
-    result = CliRunner().invoke(cli, arguments)
-    assert result.exit_code != 0
-    assert says in str(result.exception)
-    assert "\n" not in str(result.exception)
-    assert not Path("out").exists()
-
-
 def test_the_options_of_a_term_reach_it(tmp_path, monkeypatch) -> None:
     import px4fuse.grading.grade as module
 

@@ -326,18 +326,3 @@ def test_the_command_writes_one_page(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("px4fuse.practice.practice_text", lambda *_: "made")
     practice("--seed", "3", "--flights", "1", "--open", "-o", "a.html")
     assert opened == [str(tmp_path / "a.html")]
-
-
-@pytest.mark.parametrize(
-    ("words", "wanted"),
-    [(["--level", "4"], "4 is not in the range"), (["-o", "a.pdf"], "ends in .html"),
-     (["--flights", "0"], "0 is not in the range"), (["--seed", "-1"], "-1 is not in the range")],
-)  # fmt: skip
-def test_bad_input_leaves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], wanted: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    done = practice(*words)
-    assert done.exit_code != 0
-    assert wanted in f"{done.output}{done.exception}"
-    assert list(tmp_path.iterdir()) == []

@@ -17,8 +17,7 @@ from px4fuse.analysis import Counterfactual, run_what_if
 from px4fuse.cli import cli
 from px4fuse.ekf2.model import open_model
 from px4fuse.ekf2.whatif import Summary, what_if
-from px4fuse.ekf2_parameters import PARAMETERS
-from px4fuse.errors import MissingDataError, Px4FuseError, SettingsError
+from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import Flight
 from px4fuse.report.whatif import heads, reading, rows, sweep_heads, sweep_rows
 from px4fuse.request import Sweep, WhatIfRequest, command_line
@@ -132,33 +131,6 @@ def test_the_request_is_written_as_it_was_typed() -> None:
         "px4fuse whatif log.ulg --mavlink x.tlog --set EKF2_EVP_NOISE=0.1 "
         "--sweep EKF2_EV_DELAY=0:200:5"
     )
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--set", "EKF2_BARO_DELAY=1"], ", ".join(PARAMETERS)),
-        (["--set", "EKF2_EVP_NOISE"], "give NAME=VALUE"),
-        (["--set", "EKF2_EVP_NOISE=much"], "'much' is not a number"),
-        (["--set", "EKF2_EVP_NOISE=nan"], "outside PX4's range"),
-        (["--set", "EKF2_EVP_GATE=3", "--set", "EKF2_EVP_GATE=4"], "given twice"),
-        (["--sweep", "EKF2_EVP_NOISE=0.1"], "give NAME=LOW:HIGH"),
-        (["--sweep", "EKF2_EVP_NOISE=0.2:0.1"], "the first value must be the smaller one"),
-        (["--sweep", "EKF2_EVP_NOISE=0.1:0.2:1"], "not between 2 and 200"),
-        (
-            ["--set", "EKF2_EVP_NOISE=0.1", "--sweep", "EKF2_EVP_NOISE=0.1:0.2"],
-            "set and swept",
-        ),
-        (["--from", "60"], "--from says when --without begins"),
-        (["-o", "page.txt"], "ends in .pdf"),
-    ],
-)
-def test_what_cannot_be_asked_is_one_clear_line(words: list[str], said: str) -> None:
-    """Before the log is read: there is none."""
-    done = run("no_such_log.ulg", *words)
-    assert isinstance(done.exception, Px4FuseError)
-    assert said in str(done.exception)
-    assert "\n" not in str(done.exception)
 
 
 def test_a_log_without_ekf2s_inside_says_why(sample_log: Path) -> None:
