@@ -20,7 +20,7 @@ from px4fuse.assignment.assignment import assign, fly, key_path
 from px4fuse.assignment.drawing import CHOICES, COUNTS, EASIEST, HARDEST, LOOPS, draw
 from px4fuse.assignment.key import AnswerKey, key_text, read_key
 from px4fuse.assignment.roster import Person, read_roster
-from px4fuse.cli import cli, main
+from px4fuse.cli import cli
 from px4fuse.comparison.comparison import compare
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.findings import find, find_loop
@@ -374,28 +374,11 @@ class TestKey:
 # ------------------------------------------------------------------ command
 
 
-BAD_COMMANDS = {
-    "short secret": ("--assignment roster.csv -o f --secret-file abc.txt", "can be guessed"),
-    "no secret file": ("--assignment roster.csv -o f --secret-file none", "cannot be read"),
-    "seed": ("--assignment roster.csv -o f --seed 3", "--seed is for a single flight"),
-    "too many for a loop": ("--assignment roster.csv -o f --kind mixed --mistakes 2", "0 to 1"),
-    "mistakes alone": ("-o f.ulg --mistakes 1", "requires --assignment"),
-    "preview without a secret": (
-        "--assignment roster.csv -o f --preview",
-        "requires --secret-file",
-    ),
-    "no roster": ("--assignment none.csv -o f", "cannot be read"),
-    "key inside": ("--assignment roster.csv -o f --answer f/k.json", "students' folder"),
-    "key is the roster": ("--assignment roster.csv -o f --answer roster.csv", "is the roster"),
-}
-
-
 class TestCommand:
     @pytest.fixture
     def at(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         roster(tmp_path, "id,name\ns01,=cmd|x\ns02,<b>\n")
-        (tmp_path / "abc.txt").write_text("abc")
         (tmp_path / "secret.txt").write_text("\ufeffour secret 2026\r\n", encoding="utf-8")
         return tmp_path
 
@@ -429,15 +412,3 @@ class TestCommand:
         again = self.run("--assignment", "roster.csv", "-o", "g", "--kind", "loop", "--preview")
         for answer in read_key(at / "g_answers.json").answers:
             assert " ".join(answer.mistakes) in again.output
-
-    @pytest.mark.parametrize(("words", "said"), BAD_COMMANDS.values(), ids=BAD_COMMANDS.keys())
-    def test_bad_ones_write_nothing(self, at, words, said, capsys, monkeypatch):
-        before = files(at)
-        monkeypatch.setattr("sys.argv", ["px4fuse", "simulate", *words.split()])
-        with pytest.raises(SystemExit) as end:
-            main()
-        assert end.value.code == 2
-        message = capsys.readouterr().err
-        assert said in message
-        assert message.count("\n") == 1
-        assert files(at) == before

@@ -58,6 +58,8 @@ def desk(tmp_path_factory):
         ],
         "bad.g2o": ["VERTEX_SE2 0 0 0 0", "EDGE_SE2 0 7 1 0 0 1 0 0 1 0 1"],
         "n.md": ["my own words"],
+        "abc.txt": ["abc"],
+        "roster.csv": ["id,name", "s01,Ada"],
     }.items():
         (folder / name).write_bytes("".join(row + "\n" for row in rows).encode())
     (folder / "hard.json").hardlink_to(folder / "a.ulg")
@@ -171,6 +173,21 @@ REFUSED = {
     "late by what": ("grade in -o out --due 2026-11-20 --late 10", "--late"),
     "no submission": ("grade --gradescope missing", "missing"),
     "autograder of no logs": ("grade --write-autograder a.zip", "--logs"),
+    # assignments
+    **{
+        name: (f"simulate -o f --assignment roster.csv {typed}", said)
+        for name, typed, said in (
+            ("short secret", "--secret-file abc.txt", "can be guessed"),
+            ("no secret file", "--secret-file none", "cannot be read"),
+            ("seed of a class", "--seed 3", "--seed is for a single flight"),
+            ("too many for a loop", "--kind mixed --mistakes 2", "0 to 1"),
+            ("preview without a secret", "--preview", "requires --secret-file"),
+            ("key inside", "--answer f/k.json", "students' folder"),
+            ("key is the roster", "--answer roster.csv", "is the roster"),
+        )
+    },
+    "mistakes alone": ("simulate -o f.ulg --mistakes 1", "requires --assignment"),
+    "no roster of a class": ("simulate -o f --assignment none.csv", "cannot be read"),
     # trajectories and pose graphs
     "missing": ("loop absent.ulg", "absent.ulg: cannot be read (No such file or directory)"),
     "empty trajectory": ("loop empty.tum", "empty.tum: the file is empty"),
