@@ -9,7 +9,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from cli_tools import run
 from detector_rates import rates
 
 import px4fuse
@@ -20,7 +20,6 @@ from px4fuse.assignment.assignment import assign, fly, key_path
 from px4fuse.assignment.drawing import CHOICES, COUNTS, EASIEST, HARDEST, LOOPS, draw
 from px4fuse.assignment.key import AnswerKey, key_text, read_key
 from px4fuse.assignment.roster import Person, read_roster
-from px4fuse.cli import cli
 from px4fuse.comparison.comparison import compare
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.findings import find, find_loop
@@ -382,19 +381,16 @@ class TestCommand:
         (tmp_path / "secret.txt").write_text("\ufeffour secret 2026\r\n", encoding="utf-8")
         return tmp_path
 
-    def run(self, *words):
-        return CliRunner().invoke(cli, ["simulate", *words])
-
     def test_preview_prints_what_is_then_drawn_and_writes_nothing(self, at):
         given = ("--assignment", "roster.csv", "-o", "f", "--kind", "mixed", "--mistakes", "1",
                  "--secret-file", "secret.txt")  # fmt: skip
         before = files(at)
-        shown = self.run(*given, "--preview")
+        shown = run("simulate", *given, "--preview")
         assert shown.exit_code == 0, shown.output
         assert files(at) == before
         assert "Nothing was written" in shown.output
-        assert self.run(*given).exit_code == 0
-        by_file = self.run(*given)
+        assert run("simulate", *given).exit_code == 0
+        by_file = run("simulate", *given)
         assert "0 written, 2 were there already" in by_file.output
         assert "our secret" not in (at / "f_answers.json").read_text(encoding="utf-8")
         key = read_key(at / "f_answers.json")
@@ -405,10 +401,12 @@ class TestCommand:
                 assert part in line
             assert line.strip().endswith(f"{answer.difficulty:.2f}")
         # the key's secret serves where none is given
-        kept = self.run("--assignment", "roster.csv", "-o", "g", "--kind", "loop")
+        kept = run("simulate", "--assignment", "roster.csv", "-o", "g", "--kind", "loop")
         assert kept.exit_code == 0
         assert "kept in the answers" in kept.output
         assert read_key(at / "g_answers.json").secret not in kept.output
-        again = self.run("--assignment", "roster.csv", "-o", "g", "--kind", "loop", "--preview")
+        again = run(
+            "simulate", "--assignment", "roster.csv", "-o", "g", "--kind", "loop", "--preview"
+        )
         for answer in read_key(at / "g_answers.json").answers:
             assert " ".join(answer.mistakes) in again.output

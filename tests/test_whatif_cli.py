@@ -10,11 +10,10 @@ from typing import Any
 import jsonschema
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from cli_tools import run
 from pypdf import PdfReader
 
 from px4fuse.analysis import Counterfactual, run_what_if
-from px4fuse.cli import cli
 from px4fuse.ekf2.model import open_model
 from px4fuse.ekf2.whatif import Summary, what_if
 from px4fuse.errors import MissingDataError, SettingsError
@@ -41,12 +40,10 @@ def swept(sample_log: Path) -> Counterfactual:
     return run_what_if(request)
 
 
-def run(*words: str | Path) -> Result:
-    return CliRunner().invoke(cli, ["whatif", *map(str, words)])
-
-
 def test_results_have_the_three_side_by_side(sample_log: Path, tmp_path: Path) -> None:
-    done = run(sample_log, "--set", "EKF2_EVP_NOISE=0.3", "-o", tmp_path / "w.pdf", "--json", "-")
+    done = run(
+        "whatif", sample_log, "--set", "EKF2_EVP_NOISE=0.3", "-o", tmp_path / "w.pdf", "--json", "-"
+    )
     assert done.exit_code == 0, done.output
     said = json.loads(done.output)
     jsonschema.validate(said, schema())
@@ -60,7 +57,7 @@ def test_results_have_the_three_side_by_side(sample_log: Path, tmp_path: Path) -
 
 
 def test_without_an_aid_from_a_time_on(sample_log: Path) -> None:
-    done = run(sample_log, "--without", "ev_pos", "--from", "100", "--json", "-")
+    done = run("whatif", sample_log, "--without", "ev_pos", "--from", "100", "--json", "-")
     assert done.exit_code == 0, done.output
     said = json.loads(done.output)
     jsonschema.validate(said, schema())
