@@ -20,6 +20,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+import one_thread  # noqa: F401 - first
 import pytest
 from browser import browser  # noqa: F401 - a fixture
 from ekf2_tools import opened
@@ -36,7 +37,6 @@ from px4fuse.notebook import commands
 from px4fuse.readers import read_log
 from px4fuse.report import pdf
 from px4fuse.request import ComparisonRequest
-from px4fuse.threads import ONE_THREAD
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SHARED_LOGS = REPOSITORY.parent / "shared" / "logs"
@@ -67,11 +67,10 @@ MANY_OBJECTS = 500_000
 def pytest_configure(config: pytest.Config) -> None:
     """Look for garbage between tests only, as collecting them makes none.
 
-    The processes of the tests, which are begun after this, do linear algebra as commands do, and
-    keep what they compile, as there are a hundred; not those of a study, which changes the code.
+    The processes of the tests, which are begun after this, keep what they compile, as there are a
+    hundred; not those of a study, which changes the code.
     """
     gc.disable()
-    os.environ.update(ONE_THREAD)
     if config.getoption("numprocesses", None):
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
