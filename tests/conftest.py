@@ -39,7 +39,7 @@ from px4fuse.report import pdf
 from px4fuse.request import ComparisonRequest
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-SHARED_LOGS = REPOSITORY.parent / "shared" / "logs"
+SHARED = REPOSITORY.parent / "shared"
 
 # A shell's background jobs ignore Ctrl-C, and so would all that the tests start
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -120,12 +120,18 @@ def sample(sample_log: Path) -> analysis.Analysis:
     return _run_once(ComparisonRequest(log=str(sample_log)))
 
 
+def shared(name: str) -> Path:
+    """A folder of what is not part of the project."""
+    folder = SHARED / name
+    if not folder.is_dir():
+        pytest.skip(f"the further files ../shared/{name} are not beside the repository")
+    return folder
+
+
 @pytest.fixture(scope="session")
 def shared_logs() -> Path:
-    """The folder of further flight logs, which are not part of the project."""
-    if not SHARED_LOGS.is_dir():
-        pytest.skip("the further flight logs (../shared/logs) are not beside the repository")
-    return SHARED_LOGS
+    """Further flight logs."""
+    return shared("logs")
 
 
 @pytest.fixture(scope="session")
