@@ -38,6 +38,12 @@ class Elements(HTMLParser):
         self.found.append((tag, dict(attributes)))
 
 
+def content(text: str) -> Any:
+    """What the script of a page with a table reads."""
+    (found,) = re.findall(r'<script type="application/json" id="content">(.*?)</script>', text)
+    return json.loads(found)
+
+
 class Browser:
     """Chromium without a window, driven by its DevTools protocol over a pair of pipes."""
 

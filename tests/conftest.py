@@ -15,12 +15,15 @@ import io
 import os
 import signal
 from collections.abc import Callable, Iterator
+from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+import one_thread  # noqa: F401 - first
 import pytest
 from browser import browser  # noqa: F401 - a fixture
+from ekf2_tools import opened
 from exchange import replace
 from explore_tools import explored, page  # noqa: F401 - fixtures
 from hypothesis import HealthCheck, settings
@@ -28,16 +31,15 @@ from pypdf import PdfWriter
 
 import px4fuse
 from px4fuse import analysis
-from px4fuse.fleet import inputs
-from px4fuse.flight import Flight
+from px4fuse.ekf2.model import Model, open_model
+from px4fuse.flight import Flight, Unavailable
 from px4fuse.notebook import commands
 from px4fuse.readers import read_log
 from px4fuse.report import pdf
 from px4fuse.request import ComparisonRequest
-from px4fuse.threads import ONE_THREAD
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-SHARED_LOGS = REPOSITORY.parent / "shared" / "logs"
+SHARED = REPOSITORY.parent / "shared"
 
 # A shell's background jobs ignore Ctrl-C, and so would all that the tests start
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -65,11 +67,10 @@ MANY_OBJECTS = 500_000
 def pytest_configure(config: pytest.Config) -> None:
     """Look for garbage between tests only, as collecting them makes none.
 
-    The processes of the tests, which are begun after this, do linear algebra as commands do, and
-    keep what they compile, as there are a hundred; not those of a study, which changes the code.
+    The processes of the tests, which are begun after this, keep what they compile, as there are a
+    hundred; not those of a study, which changes the code.
     """
     gc.disable()
-    os.environ.update(ONE_THREAD)
     if config.getoption("numprocesses", None):
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
@@ -108,11 +109,35 @@ def sample_flight(sample_log: Path) -> Flight:
 
 
 @pytest.fixture(scope="session")
+def model(sample_flight: Flight) -> Model:
+    """The sample's model of EKF2; what it has replayed it keeps."""
+    return opened(sample_flight)
+
+
+@pytest.fixture(scope="session")
+def sample(sample_log: Path) -> analysis.Analysis:
+    """The sample flight, analysed once; tests must not change it."""
+    return _run_once(ComparisonRequest(log=str(sample_log)))
+
+
+def shared(name: str) -> Path:
+    """A folder of what is not part of the project."""
+    folder = SHARED / name
+    if not folder.is_dir():
+        pytest.skip(f"the further files ../shared/{name} are not beside the repository")
+    return folder
+
+
+@pytest.fixture(scope="session")
 def shared_logs() -> Path:
-    """The folder of further flight logs, which are not part of the project."""
-    if not SHARED_LOGS.is_dir():
-        pytest.skip("the further flight logs (../shared/logs) are not beside the repository")
-    return SHARED_LOGS
+    """Further flight logs."""
+    return shared("logs")
+
+
+@pytest.fixture(scope="session")
+def model_of() -> Callable[[Path], Model | Unavailable]:
+    """EKF2's model of a log; the last ones of a process are kept."""
+    return lru_cache(8)(lambda path: open_model(read_log(path)))
 
 
 def page_of(*drawn: Any) -> bytes:
@@ -151,47 +176,68 @@ def drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pdf, "render", from_memory)
 
 
-# Of the unchanged program: it is there before any test patches it
-_run = px4fuse.run
-_analyses: dict[tuple[str | bytes, ...], analysis.Analysis] = {}
+# Of the unchanged program: they are there before any test patches them
+_run, _read = px4fuse.run, analysis.read_flight
+_kept: dict[tuple[str | bytes, ...] | None, Any] = {}
 
 
-def _remembered(
-    request: ComparisonRequest,
-    progress: Callable[[str], None] = lambda _: None,
-    flight: Flight | None = None,
-) -> analysis.Analysis:
+def _known(request: ComparisonRequest, what: str) -> tuple[str | bytes, ...] | None:
+    """What it is kept under: where the files lie is no part of it, verification has links."""
     position = request.position
     paths = [request.log, request.mavlink, None if position is None else position.path]
     files = [Path(path) for path in paths if path is not None]
-    if flight is not None or any(not file.is_file() for file in files):
-        return _run(request, progress, flight)
-    # where they lie is not part of an analysis: verification reads them by links
+    if any(not file.is_file() for file in files):
+        return None
     named = replace(
         request,
         log=Path(request.log).name,
         mavlink=request.mavlink and Path(request.mavlink).name,
         position=position and replace(position, path=Path(position.path).name),
     )
-    known = (repr(named), *(sha256(file.read_bytes()).digest() for file in files))
+    return (what, repr(named), *(sha256(file.read_bytes()).digest() for file in files))
+
+
+def _known_flight(request: ComparisonRequest) -> tuple[str | bytes, ...] | None:
+    names = ("log", "mavlink", "system", "position", "clock_offset_s")
+    return _known(ComparisonRequest(**{name: getattr(request, name) for name in names}), "flight")
+
+
+def _once(known: tuple[str | bytes, ...] | None, make: Callable[[], Any]) -> Any:
+    if known is None:
+        return make()
     # the last one used stands last
-    _analyses[known] = _analyses.pop(known) if known in _analyses else _run(request, progress)
-    if len(_analyses) > MOST_ANALYSES:
-        del _analyses[next(iter(_analyses))]
-    return _analyses[known]
+    _kept[known] = _kept.pop(known) if known in _kept else make()
+    if len(_kept) > 2 * MOST_ANALYSES:
+        del _kept[next(iter(_kept))]
+    return _kept[known]
+
+
+def _read_once(request: ComparisonRequest, progress: analysis.Progress = analysis.silent) -> Flight:
+    return _once(_known_flight(request), lambda: _read(request, progress))
+
+
+def _run_once(
+    request: ComparisonRequest,
+    progress: analysis.Progress = analysis.silent,
+    flight: Flight | None = None,
+) -> analysis.Analysis:
+    if flight is not None and flight is not _kept.get(_known_flight(request)):
+        return _run(request, progress, flight)
+    return _once(_known(request, "analysis"), lambda: _run(request, progress, flight))
 
 
 @pytest.fixture(scope="module")
 def analysed_once() -> Iterator[None]:
-    """The same request on the same files is analysed once; for tests that patch nothing of it."""
+    """The same request on the same files is read and analysed once; where nothing is patched."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(analysis, "read_flight", _read_once)
         for place in (analysis, commands):
-            patch.setattr(place, "run", _remembered)
-        patch.setattr(inputs, "run_or_judge_aids", _remembered)
+            patch.setattr(place, "run", _run_once)
         yield
 
 
 @pytest.fixture
 def analysed_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     """For tests of the analysis among others of what follows it."""
+    monkeypatch.setattr(analysis, "read_flight", _read)
     monkeypatch.setattr(analysis, "run", _run)

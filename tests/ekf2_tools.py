@@ -6,12 +6,20 @@ import numpy as np
 
 from px4fuse.ekf2.inputs import Inputs, Rules
 from px4fuse.ekf2.intervals import Events
+from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.stretches import GRAVITY_M_S2, Stretch
+from px4fuse.flight import Flight
 from px4fuse.trajectory.rotation import skew
 
 EYE = np.eye(15)
 # Of v1.16
 RULES = Rules(0.2, 0.4, 1.0, 5, None, False)
+
+
+def opened(flight: Flight) -> Model:
+    found = open_model(flight)
+    assert isinstance(found, Model), found
+    return found
 
 
 def step_matrix(stretch: Stretch, k: int, *, trapezoid: bool = True) -> np.ndarray:

@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 from browser import Browser
 
-from px4fuse.analysis import Analysis, run
+import px4fuse.analysis
+from px4fuse.analysis import Analysis
 from px4fuse.request import ComparisonRequest
 
 
@@ -21,7 +22,8 @@ def explored(sample_log: Path, tmp_path_factory: pytest.TempPathFactory) -> tupl
     """The page of the sample flight."""
     from px4fuse.explore.page import html_text  # Bokeh takes long, and few tests need it
 
-    analysis = run(ComparisonRequest(log=str(sample_log)))
+    request = ComparisonRequest(log=str(sample_log))
+    analysis = px4fuse.analysis.run(request)  # as it is then
     file = tmp_path_factory.mktemp("explore") / "sample.html"
     file.write_bytes(html_text([analysis]).encode())
     return file, analysis

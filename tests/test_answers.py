@@ -121,7 +121,7 @@ def test_silence_is_predicted_step_by_step() -> None:
     assert quantity_truth(main, quantity) == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.usefixtures("drawn_once")
+@pytest.mark.usefixtures("analysed_once", "drawn_once")
 def test_the_way_of_a_form(tmp_path: Path, sample_log: Path) -> None:
     """``answers`` writes it, ``compare`` reads it into page and results."""
     form, report = tmp_path / "f.toml", tmp_path / "r.pdf"

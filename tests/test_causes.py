@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import pytest
 from exchange import replace
 
-from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.model import Comparison
-from px4fuse.filter.settings import Settings
+from px4fuse.analysis import Analysis
 from px4fuse.findings import NAMES, Finding
 from px4fuse.findings.causes import CONSEQUENCES, NOISES, RECORDING, by_cause
-from px4fuse.flight import Flight
 from px4fuse.report.words import verdict_notes
 
 
@@ -90,24 +86,19 @@ def test_what_the_recording_lacks_comes_before_noises() -> None:
     ]  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def comparison(sample_flight: Flight) -> Comparison:
-    return compare(sample_flight, Settings())
-
-
-def test_verdicts_that_could_be_misread_have_a_sentence(comparison: Comparison) -> None:
-    small, white = verdict_notes(comparison)
+def test_verdicts_that_could_be_misread_have_a_sentence(sample: Analysis) -> None:
+    small, white = verdict_notes(sample)
     assert "ours aisle overstated 1.09× in σ" in small
     assert "ours down p < 0.001" in white
 
 
-def test_what_is_consistent_and_white_needs_no_words(comparison: Comparison) -> None:
-    east = comparison.axes["east"]
+def test_what_is_consistent_and_white_needs_no_words(sample: Analysis) -> None:
+    east = sample.axes["east"]
     fine = replace(east.filters["kf"], ljung_box_p=0.5)
     white = replace(east, filters={**east.filters, "kf": fine})
-    assert verdict_notes(replace(comparison, axes={"east": white})) == []
+    assert verdict_notes(replace(sample, axes={"east": white})) == []
 
 
-def test_a_source_that_may_drift_is_said_to(comparison: Comparison) -> None:
-    turning = replace(comparison.source, origin=replace(comparison.source.origin, kind="vio"))
-    assert "is not correct" in verdict_notes(replace(comparison, source=turning))[0]
+def test_a_source_that_may_drift_is_said_to(sample: Analysis) -> None:
+    turning = replace(sample.source, origin=replace(sample.source.origin, kind="vio"))
+    assert "is not correct" in verdict_notes(replace(sample, source=turning))[0]

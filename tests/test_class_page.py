@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import Browser, Elements
+from browser import Browser, Elements, content
 from golden_tools import agrees, of_values
 from hypothesis import given
 from hypothesis import strategies as st
@@ -103,12 +103,6 @@ CLASS = (
 
 def shape(text: str) -> list[tuple[str, list[str]]]:
     return [(tag, sorted(attributes)) for tag, attributes in Elements(text).found]
-
-
-def content(text: str) -> Any:
-    """What the page's script reads."""
-    (found,) = re.findall(r'<script type="application/json" id="content">(.*?)</script>', text)
-    return json.loads(found)
 
 
 def test_the_page_holds_what_it_held() -> None:

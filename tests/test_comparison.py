@@ -30,11 +30,6 @@ from px4fuse.flight import Flight, Reset, Truth, Unavailable
 
 
 @pytest.fixture(scope="module")
-def sample(sample_flight: Flight) -> Comparison:
-    return compare(sample_flight)
-
-
-@pytest.fixture(scope="module")
 def made() -> Comparison:
     return compare(aisle_flight())
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -25,7 +26,10 @@ NOT_CARRIED = {
 GNSS_NOT_CARRIED = ("v1.13.3_gps_profile1", "v1.14.4_gps_magdist")
 
 
-def test_the_figures_of_the_benchmark_hold_on_every_simulated_flight(shared_logs: Path) -> None:
+def test_the_figures_of_the_benchmark_hold_on_every_simulated_flight(
+    shared_logs: Path, model_of: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench_ekf2, "opened", model_of)
     paths = bench_ekf2.flights([shared_logs / "simulated", shared_logs / "gps"])
     models = bench_ekf2.agreement_table(paths)
     assert {path.stem for path in paths} - models.keys() == {*NOT_CARRIED, *GNSS_NOT_CARRIED}

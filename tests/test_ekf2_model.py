@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from ekf2_tools import plain_replay, step_matrix, step_noise, step_state
+from ekf2_tools import opened, plain_replay, step_matrix, step_noise, step_state
 from exchange import replace
 
 from px4fuse.alignment.joining import join
@@ -31,13 +31,6 @@ from px4fuse.origin import RECEIVED
 from px4fuse.readers import read_log
 
 
-@pytest.fixture(scope="module")
-def model(sample_flight: Flight) -> Model:
-    made = open_model(sample_flight)
-    assert isinstance(made, Model)
-    return made
-
-
 def of(flight: Flight) -> tuple[Ekf2, FusionRecord]:
     assert isinstance(flight.ekf2.record, FusionRecord)
     return flight.ekf2, flight.ekf2.record
@@ -56,12 +49,6 @@ def with_vision(flight: Flight, samples: pd.DataFrame, **changes: object) -> Fli
 
 def vision_of(flight: Flight) -> pd.DataFrame:
     return next(t for t in flight.positions if t.name == "vehicle_visual_odometry").samples
-
-
-def opened(flight: Flight) -> Model:
-    made = open_model(flight)
-    assert isinstance(made, Model), made
-    return made
 
 
 def test_an_interval_is_the_product_of_its_steps(model: Model) -> None:

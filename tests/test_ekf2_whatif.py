@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from ekf2_tools import RULES
+from ekf2_tools import RULES, opened
 from exchange import replace
 from findings_tools import NONE, made
 from msgspec import structs
 
 from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.inputs import Inputs, Received
-from px4fuse.ekf2.model import Model, open_model
+from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.replay import Ekf2Replay, along, rms_to_truth
 from px4fuse.ekf2.stretches import Flow, Stretch
 from px4fuse.ekf2.walk import (
@@ -50,13 +50,6 @@ from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate, to_ulog
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
-
-
-@pytest.fixture(scope="module")
-def model(sample_flight: Flight) -> Model:
-    made = open_model(sample_flight)
-    assert isinstance(made, Model)
-    return made
 
 
 def found(result: WhatIf | Unavailable) -> WhatIf:
@@ -243,9 +236,7 @@ def flown(tmp_path: Path, mistake: str, seed: int) -> Model:
     """A flight with one of EKF2's parameters wrong, as its log is read."""
     log = tmp_path / f"{seed}{mistake.partition('=')[2]}.ulg"
     log.write_bytes(to_ulog(simulate(Scenario(seed=seed), parse([mistake] if mistake else []))))
-    opened = open_model(read_log(log))
-    assert isinstance(opened, Model)
-    return opened
+    return opened(read_log(log))
 
 
 @pytest.mark.parametrize(

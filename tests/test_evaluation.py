@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import REPOSITORY
+from conftest import REPOSITORY, shared
 from exchange import replace
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 from trajectory_tools import (
     NAMES,
     PUBLISHED,
-    SHARED,
     SHIFT,
     TURN,
     flight,
@@ -55,8 +54,8 @@ def evo_matched(estimate: str, reference: str) -> tuple[Any, Any]:
     from evo.core import sync
     from evo.tools import file_interface
 
-    published(estimate)
-    both = (file_interface.read_tum_trajectory_file(SHARED / n) for n in (reference, estimate))
+    paths = (shared("trajectories") / name for name in (reference, estimate))
+    both = map(file_interface.read_tum_trajectory_file, paths)
     matched: tuple[Any, Any] = sync.associate_trajectories(*both)
     return matched
 

@@ -15,13 +15,12 @@ import click
 import numpy as np
 import pytest
 from browser import Browser, Elements
-from click.testing import CliRunner, Result
+from cli_tools import run
 from exchange import replace
 from explore_tools import ask, box, mouse, open_view, settle, show
 from flights import Imu, aisle_flight, unexplained
 
 from px4fuse.analysis import Analysis, run_comparison
-from px4fuse.cli import cli
 from px4fuse.cli.compare import compare as compare_command
 from px4fuse.cli.inputs import comparison_request, read_person
 from px4fuse.comparison.comparison import compare
@@ -412,23 +411,19 @@ def test_without_ekf2_truth_and_imu(browser: Browser, tmp_path: Path) -> None:
 # ------------------------------------------------------------------ the command
 
 
-def explore(*words: str | Path) -> Result:
-    return CliRunner().invoke(cli, ["explore", *map(str, words)])
-
-
 @pytest.mark.usefixtures("analysed_once")
 def test_without_a_log_it_is_the_sample_flight(
     sample_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "px4fuse_samples", None)
-    done = explore()
+    done = run("explore")
     assert "no log was given" in f"{done.output}{done.exception}"
     assert list(tmp_path.iterdir()) == []
     here = tmp_path / "sample_logs"
     here.mkdir()
     (here / sample_log.name).write_bytes(sample_log.read_bytes())
-    done = explore("--start", "20", "--end", "40")
+    done = run("explore", "--start", "20", "--end", "40")
     assert done.exit_code == 0, done.output
     assert "No log was given: this is the sample flight, aisle_uwb.ulg." in done.stderr
     assert (tmp_path / "reports" / "aisle_uwb_start-20_end-40.html").is_file()
@@ -448,7 +443,7 @@ def test_open_opens_what_is_looked_at(
         (["evaluate", f"{log}:ekf2", f"{log}:truth", "-o", "a.pdf", "--open"], "a.pdf"),
         (["compare", log, *part, "--json", "only.json", "-o", "other.pdf"], None),
     ):
-        done = CliRunner().invoke(cli, words)
+        done = run(*words)
         assert done.exit_code == 0, done.output
         assert opened == ([] if name is None else [str(tmp_path / name)])
         opened.clear()

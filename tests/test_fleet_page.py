@@ -11,7 +11,7 @@ from unittest import mock
 import numpy as np
 import pandas as pd
 import pytest
-from browser import Browser, Elements
+from browser import Browser, Elements, content
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_fleet import DAMAGED, NOT_LOGGED, STORY, VEHICLES, made_up
@@ -28,11 +28,6 @@ TEXTS = (
     "firmware_hash", "airframe", "hardware", "source", "kf_verdict", "story", "results", "report",
     "change",
 )  # fmt: skip
-
-
-def content(text: str) -> Any:
-    (found,) = re.findall(r'<script type="application/json" id="content">(.*?)</script>', text)
-    return json.loads(found)
 
 
 def parts(row: list[Any]) -> dict[str, Any]:

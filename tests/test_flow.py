@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from ekf2_tools import opened
 from exchange import replace
 from ulog_tools import gnss_log, seconds_of, stamps, topic
 
 from px4fuse.ekf2.flow import FlowSamples, fuse_flow, gather_flow, with_flow
 from px4fuse.ekf2.inputs import read_gnss
-from px4fuse.ekf2.model import Model, open_model, replay_settings
+from px4fuse.ekf2.model import Model, replay_settings
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.flight import Columns, Ekf2, Flight, FusionRecord, Reset, Truth
 from px4fuse.readers import read_log
@@ -35,9 +37,7 @@ def low_passed(raw: np.ndarray) -> np.ndarray:
 
 @cache
 def model() -> Model:
-    found = open_model(simulate_flight(scenario_of("outdoor", seed=3, passes=3), parse(())))
-    assert isinstance(found, Model)
-    return found
+    return opened(simulate_flight(scenario_of("outdoor", seed=3, passes=3), parse(())))
 
 
 def true_velocity(times: np.ndarray) -> np.ndarray:
@@ -159,9 +159,8 @@ def test_flow_carries_the_filter_without_gnss() -> None:
 
 
 def stretches_s(flight: Flight) -> list[tuple[float, float]]:
-    found = open_model(flight)
-    assert isinstance(found, Model)
-    return [(float(one.time_s[0]), float(one.time_s[-1])) for one in found.inputs.stretches]
+    stretches = opened(flight).inputs.stretches
+    return [(float(one.time_s[0]), float(one.time_s[-1])) for one in stretches]
 
 
 def test_the_model_begins_again_after_resets_of_height_and_where_much_is_clipped() -> None:
@@ -213,8 +212,10 @@ def test_fixes_that_come_while_ekf2_does_without_gnss_are_not_fused() -> None:
 @pytest.mark.parametrize(
     ("name", "least"), [("v1.16.1_gps_stock_flow", 0.996), ("main202603_gps_outage_flow", 0.998)]
 )
-def test_flights_with_flow_are_replayed(name: str, least: float, shared_logs: Path) -> None:
-    found = open_model(read_log(shared_logs / "gps" / f"{name}.ulg"))
+def test_flights_with_flow_are_replayed(
+    name: str, least: float, shared_logs: Path, model_of: Any
+) -> None:
+    found = model_of(shared_logs / "gps" / f"{name}.ulg")
     assert isinstance(found, Model)
     agreement = found.agreement
     assert agreement.good
@@ -241,8 +242,7 @@ def test_flights_with_flow_are_replayed(name: str, least: float, shared_logs: Pa
 @pytest.mark.reallogs
 def test_a_flight_that_crashes_is_followed_up_to_its_tumble(shared_logs: Path) -> None:
     """Vertical velocity was reset at 47 s, and much of the IMU clipped at 26 and at 46 s."""
-    found = open_model(read_log(shared_logs / "real" / "PX4_flight-review-rs_ekf_failure.ulg"))
-    assert isinstance(found, Model)
+    found = opened(read_log(shared_logs / "real" / "PX4_flight-review-rs_ekf_failure.ulg"))
     ends = [(one.time_s[0], one.time_s[-1]) for one in found.inputs.stretches]
     assert np.array(ends) == pytest.approx(np.array([(6.7, 24.7), (30.7, 44.2), (49.7, 67.4)]),
                                            abs=0.1)  # fmt: skip

@@ -439,10 +439,10 @@ REPLAYED = ("delay0", "fullrate", "nominal", "overconfident")
 
 
 @pytest.fixture(scope="module")
-def models(shared_logs: Path) -> dict[str, Model]:
+def models(shared_logs: Path, model_of: Any) -> dict[str, Model]:
     found = {}
     for name in REPLAYED:
-        model = px4fuse.open_model(read_log(shared_logs / "gps" / f"v1.16.1_gps_{name}.ulg"))
+        model = model_of(shared_logs / "gps" / f"v1.16.1_gps_{name}.ulg")
         assert isinstance(model, Model)
         assert model.inputs.step_s == pytest.approx(0.008, abs=1e-6)
         found[name] = model

@@ -11,12 +11,13 @@ import jsonschema
 import numpy as np
 import pandas as pd
 import pytest
+from ekf2_tools import opened
 from exchange import replace
 from findings_tools import made
 
 from px4fuse.analysis import run_what_if
 from px4fuse.ekf2.heights import HeightFilter, barometer_samples, with_heights
-from px4fuse.ekf2.model import Model, open_model, run_variants
+from px4fuse.ekf2.model import Model, run_variants
 from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.stretches import Heights, Stretch
 from px4fuse.ekf2.whatif import HEIGHT_FOLLOWS, HEIGHT_STAYS, WhatIf, what_if
@@ -197,12 +198,6 @@ def outdoors(baro_noise_m: float = 0.4) -> Flight:
         return simulate_flight(scenario_of("outdoor", seed=3, passes=3), parse(()))
 
 
-def opened(flight: Flight) -> Model:
-    model = open_model(flight)
-    assert isinstance(model, Model)
-    return model
-
-
 def test_what_if_predicts_the_height_of_the_flight_with_the_other_noise() -> None:
     model = opened(outdoors())
     assert model.agreement.baro_hgt["down"].innovation_correlation > 0.999
@@ -356,10 +351,8 @@ FLOWN = {
 
 
 @pytest.fixture(scope="module")
-def models(shared_logs: Path) -> dict[str, Model]:
-    return {
-        name: opened(read_log(shared_logs / "gps" / f"v1.16.1_gps_{name}.ulg")) for name in FLOWN
-    }
+def models(shared_logs: Path, model_of: Any) -> dict[str, Model]:
+    return {name: model_of(shared_logs / "gps" / f"v1.16.1_gps_{name}.ulg") for name in FLOWN}
 
 
 @pytest.mark.reallogs

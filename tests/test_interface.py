@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 import pytest
+from class_tools import in_this_process
 from click.testing import CliRunner
 from exchange import replace
 from matplotlib.axes import Axes
@@ -360,10 +361,13 @@ def test_a_noise_that_is_not_known_says_so(
     assert said in repr(tuned)
 
 
+@pytest.mark.usefixtures("drawn_once")
 def test_report_and_page_are_written_as_by_the_commands(
-    analysis: px4fuse.Analysis, tmp_path: Path
+    analysis: px4fuse.Analysis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import px4fuse.report.pdf  # a room of the same name as the function
+
+    in_this_process(monkeypatch)
 
     report = px4fuse.report(analysis, tmp_path / "x.pdf")
     page = px4fuse.explore(analysis, str(tmp_path / "x.html"))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import SHARED_LOGS
+from conftest import SHARED
 from fastcrc.crc16 import mcrf4xx
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -39,7 +39,7 @@ BEYOND_PYMAVLINK = {
 }
 PARSABLE = [
     path
-    for path in sorted((SHARED_LOGS / "mavlink").glob("*"))
+    for path in sorted((SHARED / "logs" / "mavlink").glob("*"))
     if path.suffix in (".tlog", ".rlog", ".raw")
 ]
 LONG_BYTES = 500_000

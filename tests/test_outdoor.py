@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from ekf2_tools import opened
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
@@ -20,7 +21,7 @@ from px4fuse.cli import cli
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.interventions import TURN, cause_of
 from px4fuse.comparison.remedy import aid_of
-from px4fuse.ekf2.model import Model, open_model
+from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.whatif import HEADING_STAYS, WhatIf, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
@@ -197,8 +198,7 @@ def test_without_a_magnetometer_the_heading_is_as_flown_and_that_is_told(tmp_pat
     log = tmp_path / "a.ulg"  # which holds the true attitude, as a flight in memory does not
     # a heading that is wrong is one that EKF2 takes from the field alone
     log.write_bytes(to_ulog(simulate(OUTDOOR, parse(["ekf2-delay=0", "heading=3"]))))
-    model = open_model(read_log(log))
-    assert isinstance(model, Model)
+    model = opened(read_log(log))
     asked = what_if(model, [{"EKF2_GPS_DELAY": 110.0}])
     assert isinstance(asked, WhatIf)
     assert asked.notes[0] == HEADING_STAYS

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from conftest import shared
 from exchange import replace
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -29,7 +29,6 @@ from px4fuse.trajectory.graph.model import (
 )
 from px4fuse.trajectory.graph.solver import solve
 
-SHARED = Path(__file__).resolve().parents[2] / "shared" / "pose_graphs"
 TANGENT = {2: 3, 3: 6}
 SEEDS = 2
 # Seconds each on one core; torus3D from its own vertices does not converge in 100 steps
@@ -135,18 +134,11 @@ def test_cost_is_gtsams(dimension: int, seed: int) -> None:
     assert cost(graph) == pytest.approx(factors.error(values), rel=1e-9)
 
 
-@pytest.fixture(scope="module")
-def shared() -> Path:
-    if not SHARED.is_dir():
-        pytest.skip("the public pose graphs (../shared/pose_graphs) are not beside the repository")
-    return SHARED
-
-
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", FILES)
-def test_minimum_is_gtsams(name: str, shared: Path) -> None:
+def test_minimum_is_gtsams(name: str) -> None:
     gtsam = pytest.importorskip("gtsam")
-    graph = read_g2o(shared / f"{name}.g2o")
+    graph = read_g2o(shared("pose_graphs") / f"{name}.g2o")
     solution = solve(graph)
     assert solution.converged
     # Of toyExample nothing but rounding is left, 1e-11
@@ -157,8 +149,8 @@ def test_minimum_is_gtsams(name: str, shared: Path) -> None:
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", ["SE-Sync_manhattan", "SE-Sync_CSAIL", "SE-Sync_kitti_00"])
-def test_start_of_graphs_without_vertices(name: str, shared: Path) -> None:
-    graph = read_g2o(shared / f"{name}.g2o")
+def test_start_of_graphs_without_vertices(name: str) -> None:
+    graph = read_g2o(shared("pose_graphs") / f"{name}.g2o")
     assert graph.initialised == FROM_CHORDAL
     assert cost(graph) < 1e-3 * cost(composed(graph))
     assert solve(graph).cost < 0.9 * cost(graph) or name == "SE-Sync_CSAIL"

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from conftest import REPOSITORY
+from conftest import REPOSITORY, shared
 from patience import patience
 
 from px4fuse.errors import LogError, Px4FuseError, SettingsError
@@ -25,7 +25,6 @@ from px4fuse.readers.position_csv import (
 )
 
 EXTERNAL = REPOSITORY / "sample_logs" / "aisle_uwb_external.csv"
-SHARED_UWB = REPOSITORY.parent / "shared" / "uwb"
 AXES = ["x_m", "y_m", "z_m"]
 
 # The one track that every dialect below is written from: 5 Hz with jitter, 0.1 mm, 1 µs
@@ -572,21 +571,13 @@ def test_sample_of_the_project():
     assert (file.clock, file.frame, file.notes) == ("UNIX", None, ())
 
 
-@pytest.fixture(scope="session")
-def shared_uwb() -> Path:
-    """The folder of UWB recordings, which are not part of the project."""
-    if not SHARED_UWB.is_dir():
-        pytest.skip("the UWB recordings (../shared/uwb) are not beside the repository")
-    return SHARED_UWB
-
-
 @pytest.mark.reallogs
 @pytest.mark.parametrize(
     ("pattern", "time", "count"),
     [("dwm1001__tag__*position.csv", "bag_time", 3), ("vrpn*.csv", "header_stamp", 2)],
 )
-def test_recordings_of_uwb(shared_uwb, pattern, time, count):
-    paths = sorted(shared_uwb.glob(f"*/{pattern}"))
+def test_recordings_of_uwb(pattern, time, count):
+    paths = sorted(shared("uwb").glob(f"*/{pattern}"))
     assert len(paths) == count
     for path in paths:
         file = read_position_csv(path)

@@ -10,9 +10,12 @@ import pytest
 from cli_tools import contents, run_main
 from conftest import REPOSITORY
 
+from px4fuse.ekf2_parameters import PARAMETERS
+
 pytestmark = pytest.mark.usefixtures("analysed_once")
 
 SAMPLES = REPOSITORY / "sample_logs"
+REPORT = REPOSITORY / "reports" / "aisle_uwb.pdf"
 ROWS = [
     line
     for line in (SAMPLES / "loop_slam.tum").read_text().splitlines()
@@ -55,11 +58,15 @@ def desk(tmp_path_factory):
         ],
         "bad.g2o": ["VERTEX_SE2 0 0 0 0", "EDGE_SE2 0 7 1 0 0 1 0 0 1 0 1"],
         "n.md": ["my own words"],
+        "abc.txt": ["abc"],
+        "roster.csv": ["id,name", "s01,Ada"],
     }.items():
         (folder / name).write_bytes("".join(row + "\n" for row in rows).encode())
     (folder / "hard.json").hardlink_to(folder / "a.ulg")
     (folder / "soft.json").symlink_to(folder / "l.ulg")
-    (folder / "reports").mkdir()
+    for name in ("empty", "in", "reports"):
+        (folder / name).mkdir()
+    (folder / "in" / "a.pdf").write_bytes(REPORT.read_bytes())
     (folder / "reports" / "bad.pdf").write_text("an older report")
     return folder
 
@@ -115,6 +122,72 @@ REFUSED = {
         for name in ("missing", "empty", "bad")
         for command in ("compare", "info", "extract -o tables", "tune", "sync")
     },
+    # practice, verify and whatif
+    "no such level": ("practice --level 4", "4 is not in the range"),
+    "practice as PDF": ("practice -o a.pdf", "ends in .html"),
+    "practice of nothing": ("practice --flights 0", "0 is not in the range"),
+    "practice by no seed": ("practice --seed -1", "-1 is not in the range"),
+    "verify nothing": ("verify none.pdf", "none.pdf"),
+    "verify a log": ("verify a.ulg", "a.ulg"),
+    "verify by nothing": (f"verify {REPORT} none.ulg", "none.ulg"),
+    **{
+        f"what if {typed}": (f"whatif missing.ulg {typed}", said)  # before the log is read
+        for typed, said in (
+            ("--set EKF2_BARO_DELAY=1", ", ".join(PARAMETERS)),
+            ("--set EKF2_EVP_NOISE", "give NAME=VALUE"),
+            ("--set EKF2_EVP_NOISE=much", "'much' is not a number"),
+            ("--set EKF2_EVP_NOISE=nan", "outside PX4's range"),
+            ("--set EKF2_EVP_GATE=3 --set EKF2_EVP_GATE=4", "given twice"),
+            ("--sweep EKF2_EVP_NOISE=0.1", "give NAME=LOW:HIGH"),
+            ("--sweep EKF2_EVP_NOISE=0.2:0.1", "the first value must be the smaller one"),
+            ("--sweep EKF2_EVP_NOISE=0.1:0.2:1", "not between 2 and 200"),
+            ("--set EKF2_EVP_NOISE=0.1 --sweep EKF2_EVP_NOISE=0.1:0.2", "set and swept"),
+            ("--from 60", "--from says when --without begins"),
+            ("-o page.txt", "ends in .pdf"),
+        )
+    },
+    # batch and grade
+    "batch of nothing": ("batch empty -o o", "no logs there"),
+    "batch of what is missing": ("batch none.ulg -o o", "no logs there"),
+    "batch of a pattern": ("batch x*.ulg -o o", "no logs there"),
+    "batch without logs": ("batch -o o", "no logs"),
+    "batch to nowhere": ("batch a.ulg", "-o"),
+    "batch into a file": ("batch a.ulg -o n.md", "is not a folder"),
+    "batch of no noise": ("batch a.ulg -o o --sigma-z 0", "--sigma-z 0 is out of range"),
+    "two kinds of workers": ("batch a.ulg -o o --scheduler tcp://h:1 --workers 2", "--workers"),
+    "memory of words": ("batch a.ulg -o o --memory lots", "--memory"),
+    "batch from a bucket": ("batch s3://bucket/logs -o o", 'pip install "s3fs"'),
+    "batch from nonsense": ("batch nonsense://x -o o", "nonsense"),
+    "nothing to grade": ("grade", "nothing to grade"),
+    "grade to nowhere": ("grade in", "say with -o"),
+    "grade what is missing": ("grade missing -o out", "no regular file, and no folder"),
+    "grade into what is graded": ("grade in -o in/out", "lies inside"),
+    "grade into a report": ("grade in -o in/a.pdf", "is not a folder"),
+    "no rubric": ("grade in -o out --rubric missing.toml", "missing.toml"),
+    "no key": ("grade in -o out --key missing.json", "missing.json"),
+    "no logs": ("grade in -o out --logs missing", "missing: cannot be read"),
+    "no roster": ("grade in -o out --roster missing", "cannot be read"),
+    "no worksheet": ("grade in -o out --worksheet missing", "cannot be read"),
+    "late from when": ("grade in -o out --late 10%/day", "--due"),
+    "due in words": ("grade in -o out --due soon", "--due"),
+    "late by what": ("grade in -o out --due 2026-11-20 --late 10", "--late"),
+    "no submission": ("grade --gradescope missing", "missing"),
+    "autograder of no logs": ("grade --write-autograder a.zip", "--logs"),
+    # assignments
+    **{
+        name: (f"simulate -o f --assignment roster.csv {typed}", said)
+        for name, typed, said in (
+            ("short secret", "--secret-file abc.txt", "can be guessed"),
+            ("no secret file", "--secret-file none", "cannot be read"),
+            ("seed of a class", "--seed 3", "--seed is for a single flight"),
+            ("too many for a loop", "--kind mixed --mistakes 2", "0 to 1"),
+            ("preview without a secret", "--preview", "requires --secret-file"),
+            ("key inside", "--answer f/k.json", "students' folder"),
+            ("key is the roster", "--answer roster.csv", "is the roster"),
+        )
+    },
+    "mistakes alone": ("simulate -o f.ulg --mistakes 1", "requires --assignment"),
+    "no roster of a class": ("simulate -o f --assignment none.csv", "cannot be read"),
     # trajectories and pose graphs
     "missing": ("loop absent.ulg", "absent.ulg: cannot be read (No such file or directory)"),
     "empty trajectory": ("loop empty.tum", "empty.tum: the file is empty"),

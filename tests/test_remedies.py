@@ -27,7 +27,7 @@ from px4fuse.ekf2.whatif import AxisSummary, Summary, what_if
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding, ekf2_rejecting, find, source_clock
-from px4fuse.flight import Flight, Unavailable
+from px4fuse.flight import Unavailable
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
@@ -156,11 +156,6 @@ def test_a_remedy_of_our_filter_that_the_truth_contradicts_is_not_given() -> Non
 # ---------------------------------------------------------------- of EKF2
 
 NO_TRUTH = Unavailable("truth", "none", "None.")
-
-
-@pytest.fixture(scope="module")
-def sample(sample_flight: Flight) -> Analysis:
-    return explain(compare(sample_flight))
 
 
 def model_of(analysis: Analysis) -> Model:

@@ -106,7 +106,7 @@ def test_shipped_pdf_carries_the_shipped_results():
     ids=lambda options: next(iter(options)),
 )
 def test_results_of_every_kind_validate_and_render(sample_flight, options):
-    made = document(sample_flight, **options)
+    made = document(sample_flight, **({"start_s": 40.0, "end_s": 70.0} | options))
     text = to_json(results(made))
     assert_valid(text)
     assert render(*made, text).startswith(b"%PDF-")

@@ -5,14 +5,13 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
-from click.testing import CliRunner
+from cli_tools import run
 from exchange import replace
 from flights import unexplained
 from scipy.integrate import cumulative_simpson
 from scipy.spatial.transform import Rotation
 
 import px4fuse
-from px4fuse.cli import cli
 from px4fuse.comparison.comparison import compare
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
@@ -416,21 +415,17 @@ def test_clean_flight_has_no_mistake(scenario):
 # --- the command
 
 
-def run(*arguments):
-    return CliRunner().invoke(cli, ["simulate", *map(str, arguments)])
-
-
 def test_command_writes_log_and_answer_the_same_again(tmp_path):
     log, told, again = (tmp_path / name for name in ("s07.ulg", "s07.json", "again.ulg"))
     options = ("--seed", 7, "--passes", 1, "--mistake", "nlos=5%", "--mistake", "clock-offset=80ms")
-    result = run("-o", log, *options, "--answer", told)
+    result = run("simulate", "-o", log, *options, "--answer", told)
     assert result.exit_code == 0, result.output
     assert "nlos=5%,2m" in result.output
     content = json.loads(told.read_text(encoding="utf-8"))
     assert set(content["mistakes"]) == {"nlos", "clock-offset"}
     assert content["scenario"]["seed"] == 7
-    assert run("-o", again, *options).exit_code == 0
+    assert run("simulate", "-o", again, *options).exit_code == 0
     assert again.read_bytes() == log.read_bytes()
-    assert run("-o", again, "--seed", 8, *options[2:], "--no-truth").exit_code == 0
+    assert run("simulate", "-o", again, "--seed", 8, *options[2:], "--no-truth").exit_code == 0
     assert again.read_bytes() != log.read_bytes()
     assert b"groundtruth" not in again.read_bytes()

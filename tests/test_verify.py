@@ -598,10 +598,3 @@ def test_the_command_verifies(tmp_path: Path) -> None:
     (folder / "renamed.bin").write_bytes(LOOP_LOG.read_bytes())
     code, output = run(str(target), str(folder))
     assert (code, "verified" in output) == (0, True), output
-
-
-@pytest.mark.parametrize("words", [["none.pdf"], [str(LOG)], [str(SHIPPED), "none.ulg"]])
-def test_bad_input_is_one_line(words: list[str]) -> None:
-    outcome = CliRunner().invoke(cli, ["verify", *words], standalone_mode=False)
-    assert outcome.exception is not None
-    assert "\n" not in str(outcome.exception)

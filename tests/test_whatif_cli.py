@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import jsonschema
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from cli_tools import run
 from pypdf import PdfReader
 
 from px4fuse.analysis import Counterfactual, run_what_if
-from px4fuse.cli import cli
-from px4fuse.ekf2.whatif import Summary
-from px4fuse.ekf2_parameters import PARAMETERS
-from px4fuse.errors import MissingDataError, Px4FuseError, SettingsError
+from px4fuse.ekf2.model import open_model
+from px4fuse.ekf2.whatif import Summary, what_if
+from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import Flight
 from px4fuse.report.whatif import heads, reading, rows, sweep_table
 from px4fuse.request import Sweep, WhatIfRequest, command_line
 from px4fuse.results.contract import WhatIfResults, schema
 from px4fuse.results.reading import read_results
+
+pytestmark = pytest.mark.usefixtures("analysed_once")
 
 
 @pytest.fixture(scope="module")
@@ -38,12 +40,10 @@ def swept(sample_log: Path) -> Counterfactual:
     return run_what_if(request)
 
 
-def run(*words: str | Path) -> Result:
-    return CliRunner().invoke(cli, ["whatif", *map(str, words)])
-
-
 def test_results_have_the_three_side_by_side(sample_log: Path, tmp_path: Path) -> None:
-    done = run(sample_log, "--set", "EKF2_EVP_NOISE=0.3", "-o", tmp_path / "w.pdf", "--json", "-")
+    done = run(
+        "whatif", sample_log, "--set", "EKF2_EVP_NOISE=0.3", "-o", tmp_path / "w.pdf", "--json", "-"
+    )
     assert done.exit_code == 0, done.output
     said = json.loads(done.output)
     jsonschema.validate(said, schema())
@@ -57,7 +57,7 @@ def test_results_have_the_three_side_by_side(sample_log: Path, tmp_path: Path) -
 
 
 def test_without_an_aid_from_a_time_on(sample_log: Path) -> None:
-    done = run(sample_log, "--without", "ev_pos", "--from", "100", "--json", "-")
+    done = run("whatif", sample_log, "--without", "ev_pos", "--from", "100", "--json", "-")
     assert done.exit_code == 0, done.output
     said = json.loads(done.output)
     jsonschema.validate(said, schema())
@@ -81,15 +81,15 @@ def error_of(summary: dict[str, Any]) -> float:
 
 
 def test_an_aid_that_the_model_lacks_and_a_time_after_the_flight_are_refused(
-    sample_log: Path,
+    asked: Counterfactual,
 ) -> None:
-    for words, said in (
-        (["--without", "baro_hgt"], "baro_hgt: of this log the model fuses ev_pos."),
-        (["--without", "ev_pos", "--from", "500"], "500 s: less than 5 s of the flight"),
+    model = open_model(asked.flight)
+    for without, said in (
+        ({"baro_hgt": 60.0}, "baro_hgt: of this log the model fuses ev_pos."),
+        ({"ev_pos": 500.0}, "500 s: less than 5 s of the flight"),
     ):
-        refused = run(sample_log, *words)
-        assert isinstance(refused.exception, SettingsError)
-        assert said in str(refused.exception)
+        with pytest.raises(SettingsError, match=said):
+            what_if(model, [], without)
 
 
 def test_without_set_it_is_what_the_data_ask_for(asked: Counterfactual) -> None:
@@ -130,33 +130,6 @@ def test_the_request_is_written_as_it_was_typed() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--set", "EKF2_BARO_DELAY=1"], ", ".join(PARAMETERS)),
-        (["--set", "EKF2_EVP_NOISE"], "give NAME=VALUE"),
-        (["--set", "EKF2_EVP_NOISE=much"], "'much' is not a number"),
-        (["--set", "EKF2_EVP_NOISE=nan"], "outside PX4's range"),
-        (["--set", "EKF2_EVP_GATE=3", "--set", "EKF2_EVP_GATE=4"], "given twice"),
-        (["--sweep", "EKF2_EVP_NOISE=0.1"], "give NAME=LOW:HIGH"),
-        (["--sweep", "EKF2_EVP_NOISE=0.2:0.1"], "the first value must be the smaller one"),
-        (["--sweep", "EKF2_EVP_NOISE=0.1:0.2:1"], "not between 2 and 200"),
-        (
-            ["--set", "EKF2_EVP_NOISE=0.1", "--sweep", "EKF2_EVP_NOISE=0.1:0.2"],
-            "set and swept",
-        ),
-        (["--from", "60"], "--from says when --without begins"),
-        (["-o", "page.txt"], "ends in .pdf"),
-    ],
-)
-def test_what_cannot_be_asked_is_one_clear_line(words: list[str], said: str) -> None:
-    """Before the log is read: there is none."""
-    done = run("no_such_log.ulg", *words)
-    assert isinstance(done.exception, Px4FuseError)
-    assert said in str(done.exception)
-    assert "\n" not in str(done.exception)
-
-
 def test_a_log_without_ekf2s_inside_says_why(sample_log: Path) -> None:
     with pytest.raises(MissingDataError, match="EKF2 replay: no estimator_states"):
         run_what_if(WhatIfRequest(log=str(sample_log.with_suffix(".tlog"))))
@@ -164,9 +137,11 @@ def test_a_log_without_ekf2s_inside_says_why(sample_log: Path) -> None:
 
 @pytest.mark.reallogs
 class TestFlownFlights:
-    def of(self, shared_logs: Path, name: str, **request: object) -> Counterfactual:
+    @staticmethod
+    @cache
+    def of(shared_logs: Path, name: str) -> Counterfactual:
         log = shared_logs / "simulated" / f"{name}.ulg"
-        return run_what_if(WhatIfRequest(log=str(log), **request))
+        return run_what_if(WhatIfRequest(log=str(log)))
 
     def test_the_noise_that_the_data_ask_for_ends_the_rejections(self, shared_logs: Path) -> None:
         found = self.of(shared_logs, "v1.16.1_aisle_overconfident")
@@ -194,7 +169,7 @@ class TestFlownFlights:
         (cured,) = found.whatif.whatif
         assert error(cured) < 0.7 * error(found.whatif.logged)
         with pytest.raises(SettingsError, match="the longest delay makes the horizon"):
-            self.of(shared_logs, "v1.13.3_aisle_evdelay175", changes={"EKF2_DELAY_MAX": 300.0})
+            what_if(open_model(found.flight), [{"EKF2_DELAY_MAX": 300.0}])
 
     @pytest.mark.parametrize(
         ("log", "said"),

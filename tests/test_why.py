@@ -10,21 +10,16 @@ import pytest
 from exchange import replace
 from flights import unexplained
 
-from px4fuse.analysis import Analysis, explain
+from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.why import why_ekf2_differs, with_words
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.walk import SAMPLES, Why
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings
-from px4fuse.flight import Flight, Unavailable
+from px4fuse.flight import Unavailable
 from px4fuse.report.style import report_style
 from px4fuse.report.why import draw, nothing_concluded
-
-
-@pytest.fixture(scope="module")
-def sample(sample_flight: Flight) -> Analysis:
-    return explain(compare(sample_flight))
 
 
 def model_of(analysis: Analysis) -> Model:

@@ -6,8 +6,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import pytest
-from conftest import REPOSITORY
+from conftest import shared
 from exchange import replace
 from scipy.spatial.transform import Rotation
 
@@ -16,7 +15,6 @@ from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.model import Frame, Kind, Trajectory
 
-SHARED = REPOSITORY.parent / "shared" / "trajectories"
 PUBLISHED = [
     ("evo_fr2_desk_ORB.txt", "evo_fr2_desk_groundtruth.txt"),
     ("evo_freiburg1_xyz-ORB_kf_mono.txt", "evo_freiburg1_xyz-groundtruth.txt"),
@@ -78,9 +76,7 @@ TURN = Rotation.from_euler("ZYX", [2.0, 0.4, -0.7])
 
 @cache
 def published(name: str) -> Trajectory:
-    if not SHARED.is_dir():
-        pytest.skip("the published trajectories (../shared/trajectories) are not here")
-    return read_trajectory(SHARED / name)
+    return read_trajectory(shared("trajectories") / name)
 
 
 # GTSAM has rotation before translation

@@ -143,8 +143,9 @@ def _strip(
         value = samples[f"innovation_{axis}"] / np.sqrt(samples[f"variance_{axis}"])
         size = value.clip(-WIDEST, WIDEST).to_numpy()
         for which, look in ((fused, EKF2_DOTS), (~fused, EKF2_REJECTED)):
-            dots = thin(samples.index.to_numpy()[which], size[which], DOTS)
-            axes.plot(*dots, **look | {"ms": 1.4})
+            if which.any():
+                dots = thin(samples.index.to_numpy()[which], size[which], DOTS)
+                axes.plot(*dots, **look | {"ms": 1.4})
     for level in (-2.0, 2.0):
         axes.axhline(level, color="black", lw=0.4, ls=(0, (1, 1.5)))
     if log.meant is not None:
