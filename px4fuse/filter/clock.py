@@ -171,14 +171,17 @@ def estimate_clock_offset(
     -------
     ClockOffset, or Unavailable where there is no IMU, no attitude or too few measurements.
     """
-    samples = within(track.samples, segment)[Columns.POSITION].dropna(subset=Columns.POSITION[:2])
+    # GNSS is noisier along the vertical, and one SIGMA_Z is fitted
+    axes = 2 if track.origin.is_gnss else 3
+    samples = within(track.samples, segment)[Columns.POSITION[:axes]]
+    samples = samples.dropna(subset=Columns.POSITION[:2])
     if outlier_time_s is not None:
         samples = samples[~np.isin(samples.index.to_numpy(), outlier_time_s)]
     moved = motion(
         flight,
         samples.index.to_numpy(),
         samples.to_numpy(),
-        directions=np.eye(3),
+        directions=np.eye(3)[:axes],
         dt_s=settings.dt_s,
         signals=signals,
         heading_sigma_rad=WRONG_HEADING_RAD if track.origin.is_gnss else HEADING_RAD,
