@@ -319,6 +319,7 @@ def stretches(monkeypatch: pytest.MonkeyPatch, **parts: Any) -> list[tuple[float
     usual = {
         "imu": np.arange(0.0, 60.0, 0.01), "vision": np.arange(0.0, 60.0, 0.1),
         "fused": np.arange(0.0, 60.0, 0.1), "airborne": NONE, "delayed": np.arange(0.0, 60.0, 0.5),
+        "instances": ((-np.inf, 0),),
     }  # fmt: skip
     given = {**usual, **parts}
 
@@ -330,7 +331,11 @@ def stretches(monkeypatch: pytest.MonkeyPatch, **parts: Any) -> list[tuple[float
         made(Flight, airborne=given["airborne"]),
         pd.DataFrame(index=given["imu"]),
         pd.DataFrame(index=given["imu"]),
-        made(Ekf2, innovations={"north": pd.DataFrame(index=given["fused"])}),
+        made(
+            Ekf2,
+            innovations={"north": pd.DataFrame(index=given["fused"])},
+            instances=given["instances"],
+        ),
         made(FusionRecord, delayed=pd.DataFrame(index=given["delayed"])),
         given["vision"],
     )
@@ -358,6 +363,9 @@ def test_where_a_stretch_begins_and_ends(monkeypatch: pytest.MonkeyPatch) -> Non
     assert len(stretches(monkeypatch, imu=without(imu, 30.0, 30.04))) == 1
     parted = stretches(monkeypatch, imu=without(imu, 30.0, 30.07))
     assert [start for start, _ in parted] == [1.0, 31.5]
+    # so does a change to another instance of EKF2, which has states of its own
+    parted = stretches(monkeypatch, instances=((-np.inf, 0), (30.2, 1)))
+    assert parted == [(1.0, 30.2), (31.5, 59.99)]
     # ten seconds at least, and a second after the last sample of vision
     assert stretches(monkeypatch, fused=np.arange(48.0, 60.0, 0.1))[0][0] == 49.0
     assert stretches(monkeypatch, fused=np.arange(49.3, 60.0, 0.1)) == []
