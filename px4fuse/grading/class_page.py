@@ -80,20 +80,15 @@ def _above(entries: Sequence[Entry], counts: Mapping[str, int]) -> str:
     """What stands above the table: counts, the points of all, and those of each item."""
     totals = [entry.total for entry in entries if entry.total is not None]
     most = max((entry.of for entry in entries if entry.of > 0.0), default=1.0)
-    named = (("Missing", MISSING), ("Flagged", "flagged"), ("Late", "late"))
-    cells = [("Students", f"{len(entries)}"), ("Verified", f"{counts['verified']}")]
-    cells += [(name, f"{counts[tag]}") for name, tag in named if counts[tag]]
-    for name, of_all in (("Mean points", statistics.fmean), ("Median", statistics.median)):
-        of = f" <small>of {number(most)}</small>"
-        cells.append((name, f"{of_all(totals):.1f}{of}" if totals else "–"))
     graded = [one for entry in entries if (one := entry.counting)]
-    if pending := [one.points for one in graded if one.pending]:
-        said = f"{number(sum(pending))} points, not counted"
-        cells.append(("Pending", f"{len(pending)} <small>{said}</small>"))
     return template("grading/above.html").render(
-        entries=cells,
+        students=len(entries),
+        counts=counts,
+        averages=(statistics.fmean(totals), statistics.median(totals)) if totals else (),
         totals=tenths(totals, most) if totals else (),
-        most=number_words(most),
+        most=(number(most), number_words(most)),
+        pending=[one.points for one in graded if one.pending],
+        number=number,
         items=list(_items(graded)),
     )
 
@@ -133,7 +128,7 @@ def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str]) -> Row:
     few = f"{count} flag{'s' if count > 1 else ''}" if count else ""
     file = one.submission if one else ""
     late_s = entry.late_s or 0.0
-    minutes = f"{math.ceil(late_s / 60.0)} min late" if late_s else ""
+    minutes = f"{math.ceil(late_s / 60.0)} min late" * bool(late_s)
     late = f"{late_s / 3600.0:.1f} h late" if late_s >= 3600.0 else minutes
     points = {item.title: item.points for item in one.items} if one else {}
     held = one.numbers if one else {}

@@ -305,6 +305,7 @@ def filled(
     place, comments = grade_column(sheet, column), sheet.column(COMMENTS)
     as_read = neutral if sheet.column(HTML_COMMENTS) is None else as_html
     cells = [list(row) for row in sheet.rows]
+    names = [one_line(entry.student or entry.student_id, 40) for entry in entries]
     comma = any(re.fullmatch(r"\d+,\d+", cell.strip()) for row in cells for cell in row)
     notes, seen = [], set()
     for row in cells:
@@ -319,13 +320,13 @@ def filled(
         most = _most(sheet, row, place)
         if most is not None and total > most:
             notes.append(
-                f"{sheet.path.name}: {number(total)} points of {_who(entries[at])} are more than "
+                f"{sheet.path.name}: {number(total)} points of {names[at]} are more than "
                 f"the platform's {number(most)}, and will not be taken: change its maximum."
             )
         row[place] = number(total).replace(".", "," if comma else ".")
         if comments is not None and comments != place:
             row[comments] = as_read(feedback[at])
-    left = [_who(entries[at]) for at in range(len(register.people))
+    left = [names[at] for at in range(len(register.people))
             if at not in seen and entries[at].total is not None]  # fmt: skip
     if left:
         notes.append(f"{sheet.path.name}: it has no row for {few_words(left, 4)}.")
@@ -336,10 +337,6 @@ def _most(sheet: Sheet, row: Sequence[str], place: int) -> float | None:
     """The most points that the platform takes, where the table says it."""
     possible = (one[place] for one in sheet.rows[:3] if "points possible" in one[0].casefold())
     return decimal(next(possible, sheet.cell(row, MAX_GRADE)))
-
-
-def _who(entry: Entry) -> str:
-    return one_line(entry.student or entry.student_id, 40)
 
 
 def as_html(text: str) -> str:

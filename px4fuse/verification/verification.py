@@ -17,7 +17,6 @@ import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
 from pathlib import Path
@@ -30,7 +29,7 @@ from px4fuse.flight import Unavailable
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json, to_plain
 from px4fuse.results.model import LIBRARIES, Provenance
 from px4fuse.results.reading import cleaned, one_line
-from px4fuse.verification.model import Mismatch, PageStatus, Refused, Report, Status, Verdict
+from px4fuse.verification.model import Mismatch, PageStatus, Refused, Status, Verdict
 from px4fuse.verification.pages import NumbersAlike, compare_pages
 
 ADD = "Add {} to --logs."
@@ -63,23 +62,10 @@ PRINTED_SCALES = (1.0, 100.0, 1000.0)
 MAX_NOTES_LINES = 5_000
 _NUMBER = re.compile(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)")
 
+# What the analysis gives now: results as a report attaches them, and what draws the report, with
+# the student and the versions that were recorded
+Recomputed = tuple[Reported, Callable[[], bytes]]
 _Place = Callable[[str, str | None, str], str]
-
-
-@dataclass(frozen=True)
-class Recomputed:
-    """What the analysis gives now.
-
-    Attributes
-    ----------
-    results : ComparisonResults or LoopResults
-        As a report attaches them.
-    draw : callable
-        Draws the report: with the student, and with the versions, that were recorded.
-    """
-
-    results: Reported
-    draw: Callable[[], bytes]
 
 
 class _RefusedError(Exception):
@@ -121,7 +107,7 @@ def recompute(results: Reported, logs: Mapping[str, Path]) -> Recomputed | Refus
                 found, made = _looped(results, place)
             else:
                 found, made = _compared(results, place)
-        return Recomputed(made, partial(_drawn, found, made, results.provenance))
+        return made, partial(_drawn, found, made, results.provenance)
     except SettingsError as error:  # no run with these settings can have made a report
         return Refused(f"{NOT_OURS}: {error}", ASK)
     except _RefusedError as error:
@@ -207,7 +193,8 @@ def _drawn(found: object, results: Reported, versions: Provenance) -> bytes:
 
 
 def verify(
-    report: Report,
+    results: Reported,
+    pdf: bytes,
     logs: Mapping[str, Path],
     *,
     recompute: Callable[[Reported, Mapping[str, Path]], Recomputed | Refused] = recompute,
@@ -228,25 +215,25 @@ def verify(
         numbers belong to the log, not who wrote them. ``redrawn`` is the report to read, and
         ``pages`` names those of the PDF that look otherwise.
     """
-    theirs, ours = report.results.provenance.px4fuse, metadata.version("px4fuse")
+    theirs, ours = results.provenance.px4fuse, metadata.version("px4fuse")
     if theirs != ours:
         named = one_line(theirs, 40)
         why = f"made with px4fuse {named}, this is {ours}"
         return _unknown(Refused(why, f"Run it with px4fuse {named}."))
-    name = one_line(log_name(report.results), 80) or "its log"
+    name = one_line(log_name(results), 80) or "its log"
     if not logs:
         return _unknown(Refused(NO_LOG, ADD.format(name), name))
-    sha256 = log_sha256(report.results)
+    sha256 = log_sha256(results)
     if sha256 not in logs:
         asked = one_line(sha256, 64) or "none"
         reason = f"none of the {len(logs)} files given is the log, whose SHA-256 is {asked}"
         remedy = f"If it is a log of yours, a{ADD.format(name)[1:]}"
         return Verdict("other log", (reason,), False, remedy=remedy, missing=name)
-    if report.results.student.notes.count("\n") > MAX_NOTES_LINES:
+    if results.student.notes.count("\n") > MAX_NOTES_LINES:
         reason = f"its notes have more than {MAX_NOTES_LINES} lines, which is no report"
         return _unknown(Refused(reason, ASK))
-    again = recompute(report.results, logs)
-    return _unknown(again) if isinstance(again, Refused) else _with_log(report, again)
+    again = recompute(results, logs)
+    return _unknown(again) if isinstance(again, Refused) else _with_log(results, pdf, *again)
 
 
 def _unknown(why: Refused) -> Verdict:
@@ -254,12 +241,12 @@ def _unknown(why: Refused) -> Verdict:
     return Verdict("cannot verify", reasons, False, remedy=why.remedy, missing=why.missing)
 
 
-def _with_log(report: Report, again: Recomputed) -> Verdict:
-    redrawn = again.draw()
-    if redrawn == report.pdf:
+def _with_log(theirs: Reported, pdf: bytes, ours: Reported, draw: Callable[[], bytes]) -> Verdict:
+    redrawn = draw()
+    if redrawn == pdf:
         reason = "the log gives the same file again, byte for byte"
         return Verdict("verified", (reason, LIMIT), True, page_status="same", redrawn=redrawn)
-    wrong, alike, compared = compare_results(to_plain(report.results), to_plain(again.results))
+    wrong, alike, compared = compare_results(to_plain(theirs), to_plain(ours))
     first = ", ".join(one.path for one in wrong[:3]) + ", …" * (len(wrong) > 3)
     reasons = [
         f"{len(wrong)} of {compared} values are not what the log gives: {first}"
@@ -268,7 +255,7 @@ def _with_log(report: Report, again: Recomputed) -> Verdict:
         f"within {ESTIMATE_RELATIVE:g})"
     ]
     page_status: PageStatus = "not compared"
-    pages = compare_pages(report.pdf, redrawn, partial(same_words, alike=alike))
+    pages = compare_pages(pdf, redrawn, partial(same_words, alike=alike))
     if isinstance(pages, Unavailable):
         reasons.append(f"the pages were not compared: {pages.reason}. {pages.remedy}")
         pages = ()
@@ -276,7 +263,7 @@ def _with_log(report: Report, again: Recomputed) -> Verdict:
         page_status = "differ" if pages else "same"
     reasons += [f"page {one.page} differs: {one.what}" for one in pages]
     if pages:
-        reasons += _other_machine(report.results.provenance, again.results.provenance)
+        reasons += _other_machine(theirs.provenance, ours.provenance)
     status: Status = "numbers differ" if wrong else "verified"
     said = (*reasons, *([] if wrong else [LIMIT]))
     return Verdict(status, said, True, wrong[:SHOWN], page_status, pages, redrawn)
