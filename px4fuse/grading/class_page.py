@@ -106,13 +106,10 @@ def _items(graded: Sequence[Graded]) -> Iterator[tuple[Any, ...]]:
         yield title, tenths(shares, 1.0), mean, number(most), none, full
 
 
-def _status(entry: Entry) -> str:
-    return entry.counting.status if entry.counting else MISSING
-
-
 def _tags(entry: Entry) -> list[str]:
     one = entry.counting
-    tags = [_status(entry), *["flagged"] * bool(entry.flags), *["late"] * bool(entry.late_s)]
+    tags = [one.status if one else MISSING]
+    tags += ["flagged"] * bool(entry.flags) + ["late"] * bool(entry.late_s)
     if one:
         tags += ["pending"] * bool(one.pending) + ["to read"] * one.waits
         tags += [f"missed: {mistake}" for mistake, named in one.mistakes.items() if not named]
@@ -122,7 +119,7 @@ def _tags(entry: Entry) -> list[str]:
 def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str]) -> Row:
     """One student."""
     one = entry.counting
-    status = _status(entry)
+    status = one.status if one else MISSING
     look, sign = LOOKS[status]
     count = len(entry.flags)
     few = f"{count} flag{'s' if count > 1 else ''}" if count else ""

@@ -33,7 +33,7 @@ from px4fuse.grading.checks import text_of
 from px4fuse.grading.class_page import html_text
 from px4fuse.grading.entries import NAME, TEMPLATE, Course
 from px4fuse.grading.model import TOTAL, Entry, Graded, columns
-from px4fuse.grading.records import HANDED_IN, PAGE, RECORDS, REDRAWN, file_of
+from px4fuse.grading.records import HANDED_IN, PAGE, RECORDS, REDRAWN
 from px4fuse.plain import few_words
 from px4fuse.results.reading import one_line
 from px4fuse.spreadsheet import neutral, neutral_id
@@ -128,8 +128,8 @@ def _with_files(entry: Entry, stem: str, output: Path) -> Entry:
         return entry
 
     def there(end: str) -> str:
-        path = file_of(output / RECORDS, one.sha256, end)
-        return f"{RECORDS}/{path.name}" if path.exists() else ""
+        name = f"{RECORDS}/{one.sha256}{end}"
+        return name if (output / name).exists() else ""
 
     name = f"{REPORTS}/{stem}.pdf" if (redrawn := there(REDRAWN)) else ""
     if name:

@@ -27,8 +27,8 @@ from px4fuse.writing import write_all
 
 # In the folder of a class
 RECORDS = "records"
-# Pictures stand in files that the class page loads when a row is unfolded: three hundred reports
-# have a hundred megabytes of them
+# Behind the SHA-256 of a PDF, whose record is ".json". Pictures stand in files that the class page
+# loads when a row is unfolded: three hundred reports have a hundred megabytes of them
 HANDED_IN, REDRAWN, PAGE = ".handed-in.png", ".pdf", ".page-{:03}.png"
 
 
@@ -48,11 +48,6 @@ class VerificationRecord:
     refused: Refused | None = None
     results: str = ""
     verdict: Verdict | None = None
-
-
-def file_of(records: Path, sha256: str, end: str = ".json") -> Path:
-    """Where a part of the record of a PDF stands."""
-    return records / f"{sha256}{end}"
 
 
 def verified(
@@ -126,8 +121,8 @@ def _keep(records: Path, sha256: str, kept: VerificationRecord, parts: Mapping[s
         # another process may be reading what an identical file left
         if earlier.suffix != ".json":
             earlier.unlink(missing_ok=True)
-    files = {file_of(records, sha256, end): content for end, content in parts.items()}
-    write_all({**files, file_of(records, sha256): msgspec.json.encode(kept)})
+    whole = {**parts, ".json": msgspec.json.encode(kept)}
+    write_all({records / f"{sha256}{end}": content for end, content in whole.items()})
 
 
 def _recalled(
@@ -135,7 +130,8 @@ def _recalled(
 ) -> tuple[Reported, Verdict] | Refused | None:
     """What an earlier run found, if nothing that it rests on has changed."""
     try:
-        kept = msgspec.json.decode(file_of(records, sha256).read_bytes(), type=VerificationRecord)
+        content = (records / f"{sha256}.json").read_bytes()
+        kept = msgspec.json.decode(content, type=VerificationRecord)
         if kept.rests_on != _rests_on(kept.results, logs, handed_out):
             return None
         if kept.verdict is None:
