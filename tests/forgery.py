@@ -16,10 +16,10 @@ from pypdf.generic import DecodedStreamObject, DictionaryObject, NameObject, Num
 
 from px4fuse.errors import ResultsError
 from px4fuse.reading import files_by_sha256
-from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json
+from px4fuse.results.contract import Reported, to_json
 from px4fuse.results.reading import read_results
 from px4fuse.verification import verification
-from px4fuse.verification.model import Refused, Report, Verdict
+from px4fuse.verification.model import Refused, Verdict
 from px4fuse.verification.verification import Recomputed, verify
 
 Forge = Callable[[PdfWriter], Any]
@@ -136,23 +136,23 @@ def put(value: Any, *path: Any) -> Change:
     return change
 
 
-def report_of(pdf: bytes) -> Report:
+def report_of(pdf: bytes) -> Reported:
     """A report, read without care: tests of reading are elsewhere."""
     results = read_results(PdfReader(io.BytesIO(pdf)).attachments["results.json"][0])
-    assert isinstance(results, ComparisonResults | LoopResults)
-    return Report(results, pdf)
+    assert isinstance(results, Reported)
+    return results
 
 
-def plain(report: Report) -> dict[str, Any]:
+def plain(report: Reported) -> dict[str, Any]:
     """The results of a report, to be changed."""
-    made: dict[str, Any] = json.loads(to_json(report.results))
+    made: dict[str, Any] = json.loads(to_json(report))
     return made
 
 
 def read_again(results: dict[str, Any]) -> Reported:
     """Changed results, as they are read from a report."""
     made = read_results(to_json(results).encode())
-    assert isinstance(made, ComparisonResults | LoopResults)
+    assert isinstance(made, Reported)
     return made
 
 
@@ -171,7 +171,7 @@ class Base:
             # the recorded command is made anew from the request
             (held.request, held.student, verification.log_sha256(held),
              msgspec.structs.replace(held.provenance, command=""))
-            for held in (self.again.results, results)
+            for held in (self.again[0], results)
         )  # fmt: skip
         return self.again if ours == theirs else verification.recompute(results, logs)
 
@@ -181,7 +181,7 @@ class Base:
             report = report_of(pdf)
         except ResultsError as error:  # refused before there is anything to verify
             return Verdict("cannot verify", (str(error),), with_log=False)
-        return verify(report, self.files, recompute=self.recompute)
+        return verify(report, pdf, self.files, recompute=self.recompute)
 
     def with_results(self, results: dict[str, Any]) -> bytes:
         """The report with other results attached."""
@@ -190,9 +190,7 @@ class Base:
 
 def base(pdf: bytes, log: Path) -> Base:
     files = files_by_sha256([log])
-    report = report_of(pdf)
-    again = verification.recompute(report.results, files)
-    assert isinstance(again, Recomputed), again
-    drawn = again.draw()
-    kept = Recomputed(again.results, lambda: drawn)
-    return Base(drawn, plain(report_of(drawn)), kept, files)
+    again = verification.recompute(report_of(pdf), files)
+    assert not isinstance(again, Refused), again
+    drawn = again[1]()
+    return Base(drawn, plain(report_of(drawn)), (again[0], lambda: drawn), files)

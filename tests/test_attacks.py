@@ -27,12 +27,13 @@ from px4fuse.cli import cli
 from px4fuse.grading.model import Graded
 from px4fuse.grading.rubric import Rubric, assess, read_rubric, refused
 from px4fuse.report import pdf as pdf_module
+from px4fuse.results.contract import Reported
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.verification import pages
 from px4fuse.verification.intake import read_report
-from px4fuse.verification.model import Refused, Report, Verdict
+from px4fuse.verification.model import Refused, Verdict
 
 pytestmark = pytest.mark.usefixtures("analysed_once", "_pages_here")
 
@@ -63,19 +64,20 @@ class Flight:
     honest: Base
     key: AnswerKey
 
-    def graded(self, report: Report | Refused, verdict: Verdict, rubric: Rubric) -> Graded:
+    def graded(self, report: Reported | Refused, verdict: Verdict, rubric: Rubric) -> Graded:
         if isinstance(report, Refused):
             made = refused(rubric, self.key, report)
             return Graded("a.pdf", "", "", verdict, made.items, pending=made.pending)
-        made = assess(report.results, verdict, rubric, self.key)
+        made = assess(report, verdict, rubric, self.key)
         return Graded("a.pdf", "", "", verdict, made.items, made.flags, made.pending)
 
     def with_notes(self, text: str, rubric: Rubric) -> Graded:
         """As if the report had been made with these notes, which verifies."""
         results = copy.deepcopy(self.honest.results)
         results["student"]["notes"] = text
-        report = replace(report_of(self.honest.pdf), results=read_again(results))
-        return self.graded(report, Verdict("verified", (), True, page_status="same"), rubric)
+        return self.graded(
+            read_again(results), Verdict("verified", (), True, page_status="same"), rubric
+        )
 
 
 @pytest.fixture

@@ -167,7 +167,7 @@ def test_only_what_changed_is_done_again(handed_in, tmp_path) -> None:
     (handed_in / "essay.pdf").write_bytes(b"%PDF-1.7\nanother one")
     assert reused() == 5
     for record in (output / "records").glob("*.json"):
-        record.write_text('{"made_with": {"verdict": 3}}')
+        record.write_text('{"rests_on": {"verdict": 3}}')
     assert reused() == 2
     (output / "overrides (1).csv").write_text("id,item,points,comment\n")
     again = grade([handed_in, tmp_path / "more.zip"], Course(read_rubric(None)), output)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from px4fuse.assignment.roster import Person, Register, read_people
+from px4fuse.assignment.roster import Person, Register, people_of_sheet
+from px4fuse.assignment.sheet import read_sheet
 from px4fuse.grading.model import ExportOrigin
 
 MOODLE = (
@@ -35,7 +36,7 @@ def test_columns_are_found_by_the_titles_that_platforms_write(tmp_path, text, is
     for encoding in ("utf-8", "utf-8-sig", "utf-16"):
         path = tmp_path / "roster.csv"
         path.write_text(text, encoding)
-        assert read_people(path) == (is_,)
+        assert people_of_sheet(read_sheet(path)) == (is_,)
 
 
 CLASS = Register(
@@ -93,8 +94,10 @@ def test_of_two_ids_that_differ_by_zeros_the_exact_one_is_meant() -> None:
 
 
 def test_a_worksheet_adds_what_it_knows() -> None:
-    register = Register([Person("0042", "Jane Doe"), Person("43", "Max Roe")])
-    register.add([Person("42", "Doe J", "j@x.edu", "jdoe", {"moodle": "7"}), Person("9", "No One")])
+    register = Register(
+        [Person("0042", "Jane Doe"), Person("43", "Max Roe")],
+        [Person("42", "Doe J", "j@x.edu", "jdoe", {"moodle": "7"}), Person("9", "No One")],
+    )
     assert register.people == [
         Person("0042", "Jane Doe", "j@x.edu", "jdoe", {"moodle": "7"}), Person("43", "Max Roe"),
     ]  # fmt: skip

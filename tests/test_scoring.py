@@ -61,7 +61,8 @@ def filled(kinds, results=EXAMPLE, **values):
 
 
 def test_a_file_that_is_not_at_hand():
-    verdict = verify(read_report((ROOT / "reports" / "aisle_uwb.pdf").read_bytes(), "a.pdf"), {})
+    pdf = (ROOT / "reports" / "aisle_uwb.pdf").read_bytes()
+    verdict = verify(read_report(pdf, "a.pdf"), pdf, {})
     assert checked("verified", verdict=verdict)[0] == 0.0
     assert "Hand in aisle_uwb.ulg" in fed_back(graded(verdict=verdict))
     other = replace(verdict, reasons=("made with another version",), missing="")

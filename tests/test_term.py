@@ -14,7 +14,7 @@ from class_tools import Reports, at_once, zipped
 from golden_tools import agrees
 
 from px4fuse.assignment.key import Answer, AnswerKey
-from px4fuse.assignment.roster import read_people
+from px4fuse.assignment.roster import people_of_sheet
 from px4fuse.assignment.sheet import read_sheet
 from px4fuse.grading.entries import Course, due_time, late_rule
 from px4fuse.grading.grade import GradeOutcome, grade
@@ -88,7 +88,7 @@ class Lab:
         rows = [[student_id(n), first(n), last(n), f"s{n}@x.edu"] for n in STUDENTS]
         roster = table(folder / "roster.csv", ["id", "first name", "last name", "email"], rows)
         self.sheets = [self.worksheet(), self.gradebook(), self.grades()]
-        self.roster = read_people(roster)
+        self.roster = people_of_sheet(read_sheet(roster))
 
     def moodle(self) -> Path:
         files = {f"{name(n)}_{9000 + n}_assignsubmission_file_/report.pdf": self.pdf[n]

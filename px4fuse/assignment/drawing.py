@@ -26,19 +26,14 @@ MIN_SECRET = 8
 # Named in every draw: another text gives other flights, and keys of another text cannot be extended
 DRAWN = "px4fuse assignment 2"
 # What is drawn, and from where to where, with the decimals that are kept
+EITHER = {"sigma_a_m_s2": (0.15, 0.30, 3), "heading_deg": (-180.0, 180.0, 1)}
 NOISES: dict[Kind, dict[str, tuple[float, float, int]]] = {
-    "aisle": {
-        "sigma_uwb_m": (0.07, 0.12, 3),
-        "sigma_a_m_s2": (0.15, 0.30, 3),
-        "speed_m_s": (0.9, 1.3, 2),
-        "heading_deg": (-180.0, 180.0, 1),
-    },
+    "aisle": {"sigma_uwb_m": (0.07, 0.12, 3), "speed_m_s": (0.9, 1.3, 2), **EITHER},
     "loop": {
         "vio_drift": (0.008, 0.02, 4),
         "sigma_vio_m": (0.008, 0.015, 4),
-        "sigma_a_m_s2": (0.15, 0.30, 3),
         "speed_m_s": (0.8, 1.2, 2),
-        "heading_deg": (-180.0, 180.0, 1),
+        **EITHER,
     },
 }
 # Shares of flights with so many mistakes, where the number is not given. The loop has one mistake
@@ -181,24 +176,22 @@ def draw(
     one = partial(uniform, secret, student_id, kind)
     if count is None:
         count = bisect(list(accumulate(COUNTS[kind][:-1])), one("count"))
-    chosen: list[AssignableMistake] = []
-    typed: list[str] = []
-    hard: list[float] = []
+    made: list[tuple[AssignableMistake, float, str]] = []
     for choice in sorted(CHOICES[kind], key=lambda c: one(f"order {c.mistake}")):
-        if len(chosen) < count and all(map(choice.goes_with, chosen)):
+        if len(made) < count and all(choice.goes_with(other) for other, *_ in made):
             name = choice.mistake
             share = 0.0 if choice.limit is None else one(f"size {name}")
             sign = -1.0 if choice.either_sign and one(f"sign {name}") < 0.5 else 1.0
-            chosen.append(choice)
-            hard.append(EASIEST + (HARDEST - EASIEST) * share)
-            typed.append(choice.typed(hard[-1], sign, one(f"at {name}")))
+            hard = EASIEST + (HARDEST - EASIEST) * share
+            made.append((choice, hard, choice.typed(hard, sign, one(f"at {name}"))))
     numbers: dict[str, Any] = {
         name: round(low + (high - low) * one(name), decimals)
         for name, (low, high, decimals) in NOISES[kind].items()
     }
     told, seed = truth and kind == "aisle", int(one("seed") * 2**32)
     scenario = scenario_of(kind, truth=told, seed=seed, **numbers)
-    return Drawn(scenario, tuple(typed), round(max(hard, default=HARDEST), 2))
+    hardest = max((hard for _, hard, _ in made), default=HARDEST)
+    return Drawn(scenario, tuple(typed for *_, typed in made), round(hardest, 2))
 
 
 def secret_of(text: str, where: str) -> bytes:

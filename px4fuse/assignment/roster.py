@@ -5,6 +5,7 @@ import unicodedata
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from operator import attrgetter
 from pathlib import Path
 
@@ -66,19 +67,8 @@ class Person:
         return f"{file_stem(self.student_id)}.ulg"
 
 
-def read_people(path: Path) -> tuple[Person, ...]:
-    """The class list that a learning platform exports, or any table with a column of ids or names.
-
-    Raises
-    ------
-    SettingsError
-        It cannot be read, no column tells who somebody is, or two rows have the same id.
-    """
-    return people_of_sheet(read_sheet(path))
-
-
 def people_of_sheet(sheet: Sheet) -> tuple[Person, ...]:
-    """The people of a table, as :func:`read_people` does it.
+    """The class list that a learning platform exports, or any table with a column of ids or names.
 
     Columns are found by their titles: id (Student ID, ID number, Matrikelnummer, SIS User ID),
     login (Username, SIS Login ID), email, name (or first and last name). Worksheets of Moodle and
@@ -117,9 +107,10 @@ def read_roster(path: Path) -> tuple[Person, ...]:
     Raises
     ------
     SettingsError
-        From :func:`read_people`, or no file can be named after an id.
+        From :func:`~px4fuse.assignment.sheet.read_sheet` and :func:`people_of_sheet`, or no file
+        can be named after an id.
     """
-    people = read_people(path)
+    people = people_of_sheet(read_sheet(path))
     if not people or len(people) > MAX_STUDENTS:
         raise SettingsError(f"{path}: {len(people)} students", f"Give 1 to {MAX_STUDENTS}.")
     stems: dict[str, Person] = {}
@@ -155,14 +146,11 @@ def person_of_row(sheet: Sheet, row: Sequence[str]) -> Person | None:
 class Register:
     """The class, to be asked who somebody is; without people where nothing says who is in it."""
 
-    def __init__(self, people: Iterable[Person] = ()) -> None:
+    def __init__(self, people: Iterable[Person] = (), *lists: Iterable[Person]) -> None:
         self.people = list(people)
-
-    def add(self, others: Iterable[Person]) -> None:
-        """What another list knows of the same people; who is not among them is left out."""
-        for other in others:
-            place = self.place(other)
-            if place is not None:
+        # what other lists know of the same people; who is not among them is left out
+        for other in chain.from_iterable(lists):
+            if (place := self.place(other)) is not None:
                 known = self.people[place]
                 whole = {name: getattr(known, name) or getattr(other, name) for name in ADDED}
                 numbers = {**other.numbers, **known.numbers}

@@ -19,9 +19,6 @@ from px4fuse.reading import read_whole
 
 MAX_BYTES = 20_000_000
 SEPARATORS = ",;\t|"
-# By byte order mark
-_ENCODINGS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
-              (codecs.BOM_UTF16_BE, "utf-16"))  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -89,7 +86,9 @@ def read_sheet(path: Path) -> Sheet:
     )
     if content.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")):
         raise SettingsError(f"{path}: a spreadsheet", "Save it as CSV.")
-    encoding = next((name for mark, name in _ENCODINGS if content.startswith(mark)), "utf-8")
+    encoding = "utf-8-sig" if content.startswith(codecs.BOM_UTF8) else "utf-8"
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        encoding = "utf-16"
     try:
         text = content.decode(encoding)
     except UnicodeDecodeError:  # as spreadsheets on Windows save it

@@ -11,7 +11,6 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import noises_and_clock
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
 from px4fuse.filter.clock import ClockOffset
-from px4fuse.filter.consistency import SIGMA_OFF
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.model import COVARIANCES, matrix, noise, transition
 from px4fuse.filter.settings import Settings
@@ -32,20 +31,20 @@ REJECTED = 0.005
 # A reset of position that is seen, after EKF2 has found its first position
 RESET_M, SETTLED_S = 0.2, 5.0
 # What EKF2 does in flights that have one of these, and what may be said as well
-DOES: Mapping[str, frozenset[str]] = {
-    "followed the wrong positions": frozenset(
-        ("clock-offset", "clock-drift", "yaw", "scale", "smoothed", "slow-error")
-    ),
-    "fused at the wrong time": frozenset(("ekf2-delay",)),
-    "never fused": frozenset(("ekf2-off",)),
-}
-MAY_DO: Mapping[str, frozenset[str]] = {
-    "fused at the wrong time": frozenset(("clock-offset", "clock-drift", "clock-jump", "smoothed")),
-    "followed the wrong positions": frozenset(("clock-jump", "nlos", "jump")),
-    "coasted, then reset": frozenset(("dropout",)),
-    "never fused": frozenset(("decimate",)),
-    "followed the positions": frozenset(("heading", "mag")),
-    "rejected the bad samples": frozenset(("mag",)),
+DOES: Mapping[str, set[str]] = {
+    "followed the wrong positions": {
+        "clock-offset", "clock-drift", "yaw", "scale", "smoothed", "slow-error",
+    },
+    "fused at the wrong time": {"ekf2-delay"},
+    "never fused": {"ekf2-off"},
+}  # fmt: skip
+MAY_DO: Mapping[str, set[str]] = {
+    "fused at the wrong time": {"clock-offset", "clock-drift", "clock-jump", "smoothed"},
+    "followed the wrong positions": {"clock-jump", "nlos", "jump"},
+    "coasted, then reset": {"dropout"},
+    "never fused": {"decimate"},
+    "followed the positions": {"heading", "mag"},
+    "rejected the bad samples": {"mag"},
 }
 
 
@@ -73,11 +72,6 @@ class VerdictTruth(Record, frozen=True):
 
     verdict: str
     factor: float | None = None
-
-    @property
-    def clear(self) -> bool:
-        """Whether nobody can take it for another."""
-        return self.factor is None or self.factor >= SIGMA_OFF
 
 
 class FormTruth(Record, frozen=True):

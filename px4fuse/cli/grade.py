@@ -86,7 +86,7 @@ def grade(
     nothing in it is executed.
     """
     from px4fuse.assignment.key import read_key
-    from px4fuse.assignment.roster import read_people
+    from px4fuse.assignment.roster import people_of_sheet
     from px4fuse.assignment.sheet import read_sheet
     from px4fuse.grading.entries import Course, due_time, late_rule
     from px4fuse.grading.grade import grade as grade_all
@@ -116,7 +116,7 @@ def grade(
         answers,
         logs,
         title or "",
-        roster=None if roster is None else read_people(roster),
+        roster=None if roster is None else people_of_sheet(read_sheet(roster)),
         worksheets=tuple(map(read_sheet, worksheet)),
         column=column or "",
         attempt=attempt,

@@ -18,7 +18,7 @@ from px4fuse.reading import files_by_sha256, read_whole, shown
 
 if TYPE_CHECKING:
     from px4fuse.report.page import Page
-    from px4fuse.verification.model import Report, Verdict
+    from px4fuse.verification.model import Verdict
 
 SCHEMA = {"name": "px4fuse-verification", "version": "2.0"}
 # A flight of ten minutes takes about one; what takes longer than this was made to
@@ -62,16 +62,16 @@ def verify(
         if logs and not files:
             raise LogError("there is no file in what was given as LOG.")
         step("running the analysis again")
-        verdict = bounded(partial(verify_report, logs=files), read, TIMEOUT_S)
+        verdict = bounded(partial(verify_report, pdf=content, logs=files), read, TIMEOUT_S)
     if isinstance(verdict, Failed):
         raise LogError(f"{shown(report)}: cannot be verified: {verdict.reason}")
     redrawn = {} if output is None or not verdict.redrawn else {output: verdict.redrawn}
-    contents = redrawn | result_files(_plain(read, verdict), json_path)
+    contents = redrawn | result_files(_plain(content, verdict), json_path)
     finish(contents, _page(shown(report), verdict, output))
     sys.exit(0 if verdict.outcome == "verified" else 1)
 
 
-def _plain(report: Report, verdict: Verdict) -> dict[str, object]:
+def _plain(pdf: bytes, verdict: Verdict) -> dict[str, object]:
     from px4fuse.verification.verification import LIMIT
 
     values = asdict(verdict)
@@ -79,7 +79,7 @@ def _plain(report: Report, verdict: Verdict) -> dict[str, object]:
         del values[name]
     return {
         "schema": SCHEMA,
-        "report_sha256": hashlib.sha256(report.pdf).hexdigest(),
+        "report_sha256": hashlib.sha256(pdf).hexdigest(),
         "outcome": verdict.outcome,
         **values,
         "limit": LIMIT,

@@ -27,7 +27,7 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.grading.form_points import FormPoints, form_points
 from px4fuse.loop.model import Closure, Correction, LoopPart, Way
 from px4fuse.plain import capital, factor_words, length_words, p_words
-from px4fuse.record import Maybe, Share, Unavailable
+from px4fuse.record import Maybe, Share
 from px4fuse.results.contract import ASKED, ComparisonResults, LoopResults, Reported, to_plain
 from px4fuse.results.reading import one_line
 from px4fuse.trajectory.evaluation import Score
@@ -197,11 +197,6 @@ def bracketed(reason: str) -> str:
     return f" ({said})" if said else ""
 
 
-def absence(part: object) -> str:
-    """Why a part is not there, in brackets; "" where it is, or nobody says."""
-    return bracketed(part.reason) if isinstance(part, Unavailable) else ""
-
-
 # ------------------------------------------------------------------ the report
 
 
@@ -318,8 +313,7 @@ class TuningItem(RubricItem, frozen=True, kw_only=True, tag="tuning"):
         """1 in the interval, falling to 0 at ``factor`` from its end."""
         if evidence.comparison is None:
             return NO_COMPARISON
-        share, said = _tuned(evidence, evidence.comparison, self.setting, self.factor)
-        return share, f"{capital(said)}."
+        return _tuned(evidence, evidence.comparison, self.setting, self.factor)
 
 
 def _tuned(
@@ -331,21 +325,17 @@ def _tuned(
     interval = getattr(tuned, f"{ASKED[name]}_interval", None)
     if interval is None or interval[1] is None:
         why = evidence.why_absent(f"tuning.{HORIZONTAL}")
-        return 0.0, f"your report has no interval for {label}{why}"
+        return 0.0, f"Your report has no interval for {label}{why}."
     low, high = interval
     if name == "sigma_z_m" and evidence.has("source_may_drift"):
         # small innovations do not make a drifting source trustworthy: up to its error is right
         high = max(high, _error_m(comparison))
     off = max(chosen / high if high > 0.0 else math.inf, low / chosen, 1.0)
-    said = f"your {label} {chosen:.3g} {unit} is"
-    wanted = f"what the data ask for ({low:.3g} to {high:.3g} {unit})"
-    if off == 1.0:
-        return 1.0, f"{said} within {wanted}"
-    side = "above" if chosen > high else "below"
-    return falling(off, factor), (
-        f"{said} {side} {wanted}, by a factor of {factor_words(off)}: try a value between with "
-        f"{option}"
-    )
+    side = "within" if off == 1.0 else "above" if chosen > high else "below"
+    said = f"Your {label} {chosen:.3g} {unit} is {side} what the data ask for"
+    advice = f", by a factor of {factor_words(off)}: try a value between with {option}"
+    wanted = f"({low:.3g} to {high:.3g} {unit})"
+    return falling(off, factor), f"{said} {wanted}{advice * (off != 1.0)}."
 
 
 def _error_m(comparison: ComparisonResults) -> float:
@@ -496,7 +486,8 @@ class LoopItem(RubricItem, frozen=True, kw_only=True, tag="loop"):
         results, loop = evidence.results, evidence.results.loop
         opened = isinstance(results, LoopResults) and not results.request.came_back
         if not isinstance(loop, LoopPart) or (loop.closure_error_m is None and not opened):
-            why = absence(loop.known_end if isinstance(loop, LoopPart) else loop)
+            missing = loop.known_end if isinstance(loop, LoopPart) else loop
+            why = bracketed(getattr(missing, "reason", ""))
             return 0.0, f"Your report measures no loop{why}."
         if loop.absolute:
             return 0.0, "Your loop is on a track that does not drift; measure it on odometry."

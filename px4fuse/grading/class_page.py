@@ -80,20 +80,15 @@ def _above(entries: Sequence[Entry], counts: Mapping[str, int]) -> str:
     """What stands above the table: counts, the points of all, and those of each item."""
     totals = [entry.total for entry in entries if entry.total is not None]
     most = max((entry.of for entry in entries if entry.of > 0.0), default=1.0)
-    named = (("Missing", MISSING), ("Flagged", "flagged"), ("Late", "late"))
-    cells = [("Students", f"{len(entries)}"), ("Verified", f"{counts['verified']}")]
-    cells += [(name, f"{counts[tag]}") for name, tag in named if counts[tag]]
-    for name, of_all in (("Mean points", statistics.fmean), ("Median", statistics.median)):
-        of = f" <small>of {number(most)}</small>"
-        cells.append((name, f"{of_all(totals):.1f}{of}" if totals else "–"))
     graded = [one for entry in entries if (one := entry.counting)]
-    if pending := [one.points for one in graded if one.pending]:
-        said = f"{number(sum(pending))} points, not counted"
-        cells.append(("Pending", f"{len(pending)} <small>{said}</small>"))
     return template("grading/above.html").render(
-        entries=cells,
+        students=len(entries),
+        counts=counts,
+        averages=(statistics.fmean(totals), statistics.median(totals)) if totals else (),
         totals=tenths(totals, most) if totals else (),
-        most=number_words(most),
+        most=(number(most), number_words(most)),
+        pending=[one.points for one in graded if one.pending],
+        number=number,
         items=list(_items(graded)),
     )
 
@@ -111,13 +106,10 @@ def _items(graded: Sequence[Graded]) -> Iterator[tuple[Any, ...]]:
         yield title, tenths(shares, 1.0), mean, number(most), none, full
 
 
-def _status(entry: Entry) -> str:
-    return entry.counting.status if entry.counting else MISSING
-
-
 def _tags(entry: Entry) -> list[str]:
     one = entry.counting
-    tags = [_status(entry), *["flagged"] * bool(entry.flags), *["late"] * bool(entry.late_s)]
+    tags = [one.status if one else MISSING]
+    tags += ["flagged"] * bool(entry.flags) + ["late"] * bool(entry.late_s)
     if one:
         tags += ["pending"] * bool(one.pending) + ["to read"] * one.waits
         tags += [f"missed: {mistake}" for mistake, named in one.mistakes.items() if not named]
@@ -127,13 +119,13 @@ def _tags(entry: Entry) -> list[str]:
 def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str]) -> Row:
     """One student."""
     one = entry.counting
-    status = _status(entry)
+    status = one.status if one else MISSING
     look, sign = LOOKS[status]
     count = len(entry.flags)
     few = f"{count} flag{'s' if count > 1 else ''}" if count else ""
     file = one.submission if one else ""
     late_s = entry.late_s or 0.0
-    minutes = f"{math.ceil(late_s / 60.0)} min late" if late_s else ""
+    minutes = f"{math.ceil(late_s / 60.0)} min late" * bool(late_s)
     late = f"{late_s / 3600.0:.1f} h late" if late_s >= 3600.0 else minutes
     points = {item.title: item.points for item in one.items} if one else {}
     held = one.numbers if one else {}

@@ -126,10 +126,7 @@ class Course:
         listed = [people_of_sheet(sheet) for sheet in self.worksheets]
         given = self.key.answers if self.key else ()
         handed_out = tuple(Person(one.student_id, one.name) for one in given)
-        found = Register(self.roster or handed_out or next(iter(listed), ()))
-        for others in listed:
-            found.add(others)
-        return found
+        return Register(self.roster or handed_out or next(iter(listed), ()), *listed)
 
 
 # When it came and when it was packed, by which attempts are ordered; the file; and the row that it

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 from px4fuse.answers import MISTAKES, Answers, Claim, Quantified
 from px4fuse.assignment.truth import FormTruth, Wrong
+from px4fuse.filter.consistency import SIGMA_OFF
 
 PARTS = ("kinds", "sizes", "when", "cure", "verdicts", "quantities")
 WEIGHTS = dict(zip(PARTS, (30.0, 15.0, 10.0, 15.0, 15.0, 15.0), strict=True))
@@ -248,10 +249,8 @@ def cures(wrong: Wrong, truth: FormTruth) -> tuple[Cure, ...]:
         ("EKF2_EV_DELAY", (1e3 * low, 1e3 * high), {"clock-offset": float(size > 0.0)}),
         ("EKF2_EV_DELAY", (0.0, 20.0), {"ekf2-delay": 1.0}),
         ("send positions more often", (5.0, 1e3), {"decimate": 1.0}),
-        (
-            "line of sight and link", ANY,
-            {"nlos": 1.0, "dropout": 1.0, "slow-error": 1.0, "decimate": 0.5},
-        ),
+        ("line of sight and link", ANY, dict.fromkeys(("nlos", "dropout", "slow-error"), 1.0)),
+        ("line of sight and link", ANY, {"decimate": 0.5}),
         ("one set of anchors", ANY, {"jump": 1.0}),
         ("--start", after, dict.fromkeys(("clock-jump", "dropout", "imu-dropout", "jump"), 1.0)),
         ("--end", before, dict.fromkeys(("dropout", "imu-dropout", "jump"), 1.0)),
@@ -285,8 +284,9 @@ def _verdicts(answers: Answers, truth: FormTruth) -> float:
     """Mean share of the verdicts on both filters and of what EKF2 did."""
     shares = [_did(answers, truth)]
     for given, known in ((answers.verdict_ours, truth.ours), (answers.verdict_ekf2, truth.ekf2)):
-        nearly = given == "consistent" and known.verdict and not known.clear
         right = given and given == known.verdict
+        # a factor so small can be taken for none
+        nearly = known.factor is not None and known.factor < SIGMA_OFF and given == "consistent"
         shares.append(1.0 if right else 0.5 if nearly else 0.0)
     return sum(shares) / len(shares)
 

@@ -33,11 +33,11 @@ from px4fuse.grading.checks import text_of
 from px4fuse.grading.class_page import html_text
 from px4fuse.grading.entries import NAME, TEMPLATE, Course
 from px4fuse.grading.model import TOTAL, Entry, Graded, columns
-from px4fuse.grading.records import HANDED_IN, PAGE, RECORDS, REDRAWN, file_of
+from px4fuse.grading.records import HANDED_IN, PAGE, RECORDS, REDRAWN
 from px4fuse.plain import few_words
 from px4fuse.results.reading import one_line
 from px4fuse.spreadsheet import neutral, neutral_id
-from px4fuse.verification.model import Verdict
+from px4fuse.webpage.safe import template
 from px4fuse.writing import write_all
 
 # Reports drawn again from their logs: what to read instead of what was handed in
@@ -55,20 +55,6 @@ LAST = (
 BETWEEN = " | "
 # A list of reasons is cut where it would become longer than a sentence
 NAMED = 4
-NEXT = (
-    "Your instructor has these points as a proposal and decides; ask if you think that something "
-    "was overlooked."
-)
-AGAIN = (
-    "Make it again with px4fuse, of the log that you were given, and hand in the PDF as it was "
-    "written."
-)
-FOUND = {
-    "verified": "Your report was verified: its numbers are what px4fuse computes from your log",
-    "numbers differ": "Your report's numbers are not those that px4fuse computes from its log",
-    "other log": "The log of your report is not one of those that your instructor has",
-    "cannot verify": "Your report could not be verified",
-}
 # Titles of columns of platforms' tables
 GRADE = ("grade", "bewertung", "points", "punkte", "mark", "note", "score")
 MAX_GRADE = ("maximumgrade", "hoechstebewertung", "höchstebewertung")
@@ -142,8 +128,8 @@ def _with_files(entry: Entry, stem: str, output: Path) -> Entry:
         return entry
 
     def there(end: str) -> str:
-        path = file_of(output / RECORDS, one.sha256, end)
-        return f"{RECORDS}/{path.name}" if path.exists() else ""
+        name = f"{RECORDS}/{one.sha256}{end}"
+        return name if (output / name).exists() else ""
 
     name = f"{REPORTS}/{stem}.pdf" if (redrawn := there(REDRAWN)) else ""
     if name:
@@ -239,53 +225,25 @@ def returned_text(entry: Entry, class_name: str = "") -> str:
     Flags and remarks are for the instructor and are not in it.
     """
     graded = entry.counting
-    lines = [class_name] if class_name else []
-    if graded is None:
-        lines += ["Nothing was handed in.", ""]
-    else:
-        # a total that the instructor has said leaves no proposal beside it
-        lines += _feedback(graded, final=TOTAL in entry.overrides and entry.total is not None)
-    if entry.deduction:
-        hours = (entry.late_s or 0.0) / 3600.0
-        off = number(entry.deduction)
-        lines.append(f"Handed in {hours:.1f} hours late: {off} points taken off.")
-    if entry.total is not None and (entry.deduction or TOTAL in entry.overrides):
-        lines.append(f"Total    {number(entry.total)} of {number(entry.of)}")
-    if entry.comment:
-        lines += ["", "From your instructor:", "", entry.comment]
-    return "\n".join(lines).rstrip("\n") + "\n"
+    reasons = (text_of(one).rstrip(".") for one in graded.verdict.reasons[:NAMED]) if graded else ()
+    made = template("grading/feedback.txt").render(
+        entry=entry,
+        graded=graded,
+        class_name=class_name,
+        reasons="; ".join(filter(None, reasons)),
+        final=TOTAL in entry.overrides,
+        line=text_of,
+        number=number,
+        wrapped=_wrapped,
+    )
+    return made.rstrip("\n") + "\n"
 
 
-def _feedback(graded: Graded, final: bool) -> list[str]:
-    """The points, and why."""
-    who = ", ".join(filter(None, map(text_of, (graded.student, graded.student_id))))
-    lines = [f"Report   {text_of(graded.submission)}", *([f"Student  {who}"] if who else [])]
-    points = f"{number(graded.points)} of {number(graded.of)}"
-    if graded.counted is None:
-        points = f"pending: they do not count yet (as it is: {points})"
-    proposed = bool(graded.items) and not final
-    lines += [f"Points   {points}"] if proposed else []
-    lines += ["", *_wrapped(verdict_text(graded.verdict)), ""]
-    for item in graded.items:
-        lines.append(f"{number(item.points)} of {number(item.of)}  {text_of(item.title)}")
-        lines += [f"    {line}" for line in _wrapped(item.comment, 84)]
-    return [*lines, *(["", *_wrapped(NEXT)] if proposed else []), ""]
-
-
-def verdict_text(verdict: Verdict) -> str:
-    """What verification found, and what to do about it, for the student."""
-    said = FOUND[verdict.status]
-    if verdict.status == "verified":
-        return f"{said}."
-    reasons = (text_of(one).rstrip(".") for one in verdict.reasons[:NAMED])
-    said = f"{said}: {'; '.join(filter(None, reasons))}"
-    if verdict.missing:
-        return f"{said}. Hand in {text_of(verdict.missing)}, if your instructor does not have it."
-    return f"{said}. {AGAIN}"
-
-
-def _wrapped(text: str, width: int = 88) -> list[str]:
-    return textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False)
+def _wrapped(text: str, indent: str = "") -> str:
+    return textwrap.fill(
+        text, 88, initial_indent=indent, subsequent_indent=indent, break_long_words=False,
+        break_on_hyphens=False,
+    )  # fmt: skip
 
 
 # ------------------------------------------------------------------ platforms' tables
@@ -347,6 +305,7 @@ def filled(
     place, comments = grade_column(sheet, column), sheet.column(COMMENTS)
     as_read = neutral if sheet.column(HTML_COMMENTS) is None else as_html
     cells = [list(row) for row in sheet.rows]
+    names = [one_line(entry.student or entry.student_id, 40) for entry in entries]
     comma = any(re.fullmatch(r"\d+,\d+", cell.strip()) for row in cells for cell in row)
     notes, seen = [], set()
     for row in cells:
@@ -361,13 +320,13 @@ def filled(
         most = _most(sheet, row, place)
         if most is not None and total > most:
             notes.append(
-                f"{sheet.path.name}: {number(total)} points of {_who(entries[at])} are more than "
+                f"{sheet.path.name}: {number(total)} points of {names[at]} are more than "
                 f"the platform's {number(most)}, and will not be taken: change its maximum."
             )
         row[place] = number(total).replace(".", "," if comma else ".")
         if comments is not None and comments != place:
             row[comments] = as_read(feedback[at])
-    left = [_who(entries[at]) for at in range(len(register.people))
+    left = [names[at] for at in range(len(register.people))
             if at not in seen and entries[at].total is not None]  # fmt: skip
     if left:
         notes.append(f"{sheet.path.name}: it has no row for {few_words(left, 4)}.")
@@ -378,10 +337,6 @@ def _most(sheet: Sheet, row: Sequence[str], place: int) -> float | None:
     """The most points that the platform takes, where the table says it."""
     possible = (one[place] for one in sheet.rows[:3] if "points possible" in one[0].casefold())
     return decimal(next(possible, sheet.cell(row, MAX_GRADE)))
-
-
-def _who(entry: Entry) -> str:
-    return one_line(entry.student or entry.student_id, 40)
 
 
 def as_html(text: str) -> str:

@@ -7,7 +7,7 @@ request. Rubric, answer key, roster and overrides are not in it.
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,7 +15,7 @@ from pathlib import Path
 import msgspec
 
 from px4fuse.errors import ResultsError
-from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, files_named, to_json
+from px4fuse.results.contract import Reported, files_named, to_json
 from px4fuse.results.model import provenance
 from px4fuse.results.reading import read_results
 from px4fuse.verification.intake import read_report
@@ -27,8 +27,8 @@ from px4fuse.writing import write_all
 
 # In the folder of a class
 RECORDS = "records"
-# Pictures stand in files that the class page loads when a row is unfolded: three hundred reports
-# have a hundred megabytes of them
+# Behind the SHA-256 of a PDF, whose record is ".json". Pictures stand in files that the class page
+# loads when a row is unfolded: three hundred reports have a hundred megabytes of them
 HANDED_IN, REDRAWN, PAGE = ".handed-in.png", ".pdf", ".page-{:03}.png"
 
 
@@ -38,25 +38,16 @@ class VerificationRecord:
 
     Attributes
     ----------
-    made_with : dict
-        Versions that it holds for.
+    rests_on : dict
+        What it holds for: see :func:`_rests_on`.
     results : str
         As they were attached.
-    files : dict
-        SHA-256 of every file that the report rests on, and whether it was "here", "handed out" by
-        the answer key and not at hand, which is the instructor's gap, or "away".
     """
 
-    made_with: dict[str, str]
+    rests_on: dict[str, str]
     refused: Refused | None = None
     results: str = ""
-    files: dict[str, str] = field(default_factory=dict)
     verdict: Verdict | None = None
-
-
-def file_of(records: Path, sha256: str, end: str = ".json") -> Path:
-    """Where a part of the record of a PDF stands."""
-    return records / f"{sha256}{end}"
 
 
 def verified(
@@ -83,14 +74,14 @@ def verified(
     found = _recalled(records, sha256, logs, handed_out)
     if found is not None:
         return found, True
-    report = read_report(pdf, "The file")
-    if isinstance(report, Refused):
-        _keep(records, sha256, VerificationRecord(_versions(), report), {})
-        return report, False
-    results = to_json(report.results)
-    rests_on = _files(results, logs, handed_out)
-    gap = rests_on.get(log_sha256(report.results)) == "handed out"
-    verdict = verify(report, {} if gap else logs)
+    results = read_report(pdf, "The file")
+    if isinstance(results, Refused):
+        _keep(records, sha256, VerificationRecord(_versions(), results), {})
+        return results, False
+    attached = to_json(results)
+    rests_on = _rests_on(attached, logs, handed_out)
+    gap = rests_on.get(log_sha256(results)) == "handed out"
+    verdict = verify(results, pdf, {} if gap else logs)
     parts: dict[str, bytes] = {}
     if verdict.pages or not verdict.redrawn:
         handed_in = bounded(partial(pictures, page=verdict.page - 1), pdf, TIMEOUT_S, MEMORY_BYTES)
@@ -102,14 +93,17 @@ def verified(
         parts |= {PAGE.format(at): made for at, made in enumerate(shown, start=1)}
         parts[REDRAWN] = verdict.redrawn
     unread = replace(verdict, redrawn=b"")
-    kept = VerificationRecord(_versions(), None, results, rests_on, unread)
-    _keep(records, sha256, kept, parts)
-    return (report.results, unread), False
+    _keep(records, sha256, VerificationRecord(rests_on, None, attached, unread), parts)
+    return (results, unread), False
 
 
-def _files(results: str, logs: Mapping[str, Path], handed_out: frozenset[str]) -> dict[str, str]:
-    """Where every file is that a report rests on."""
-    return {
+def _rests_on(results: str, logs: Mapping[str, Path], handed_out: frozenset[str]) -> dict[str, str]:
+    """The versions, and of every file that a report rests on, by SHA-256, where it is.
+
+    "here", "handed out" by the answer key and not at hand, which is the instructor's gap, or
+    "away".
+    """
+    return _versions() | {
         name: "here" if name in logs else "handed out" if name in handed_out else "away"
         for name in sorted(set(files_named(results)))
     }
@@ -127,8 +121,8 @@ def _keep(records: Path, sha256: str, kept: VerificationRecord, parts: Mapping[s
         # another process may be reading what an identical file left
         if earlier.suffix != ".json":
             earlier.unlink(missing_ok=True)
-    files = {file_of(records, sha256, end): content for end, content in parts.items()}
-    write_all({**files, file_of(records, sha256): msgspec.json.encode(kept)})
+    whole = {**parts, ".json": msgspec.json.encode(kept)}
+    write_all({records / f"{sha256}{end}": content for end, content in whole.items()})
 
 
 def _recalled(
@@ -136,14 +130,14 @@ def _recalled(
 ) -> tuple[Reported, Verdict] | Refused | None:
     """What an earlier run found, if nothing that it rests on has changed."""
     try:
-        kept = msgspec.json.decode(file_of(records, sha256).read_bytes(), type=VerificationRecord)
-        if kept.made_with != _versions() or kept.verdict is None:
-            return kept.refused if kept.made_with == _versions() else None
+        content = (records / f"{sha256}.json").read_bytes()
+        kept = msgspec.json.decode(content, type=VerificationRecord)
+        if kept.rests_on != _rests_on(kept.results, logs, handed_out):
+            return None
+        if kept.verdict is None:
+            return kept.refused
         results = read_results(kept.results.encode())
     # none, or not one of ours: done again
     except (OSError, msgspec.MsgspecError, ResultsError):
         return None
-    same = kept.files == _files(kept.results, logs, handed_out)
-    if not same or not isinstance(results, ComparisonResults | LoopResults):
-        return None
-    return results, kept.verdict
+    return (results, kept.verdict) if isinstance(results, Reported) else None

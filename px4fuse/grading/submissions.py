@@ -39,7 +39,7 @@ from px4fuse.grading.model import NOBODY, ExportOrigin, Submission
 from px4fuse.reading import files_below
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification.intake import MAX_BYTES
-from px4fuse.verification.model import Refused
+from px4fuse.verification.model import BAD_VALUES, Refused
 
 MAX_ENTRIES = 10_000
 # Of the table of contents, which zipfile reads in one piece before it can be counted
@@ -85,11 +85,9 @@ class _EntryError(Exception):
     """Why an entry of a zip file is not read."""
 
 
-# RuntimeError: also NotImplementedError, for what zipfile does not know
-_UNREADABLE = (
-    _EntryError, zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, ValueError,
-    RuntimeError, LookupError, OverflowError, MemoryError,
-)  # fmt: skip
+_BROKEN_ZIP = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, MemoryError)
+# with RuntimeError also NotImplementedError, for what zipfile does not know
+_UNREADABLE = (_EntryError, *_BROKEN_ZIP, *BAD_VALUES)
 
 
 def _why(error: Exception) -> str:

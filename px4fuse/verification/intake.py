@@ -22,10 +22,10 @@ from pypdf.generic import ArrayObject, DictionaryObject, IndirectObject, StreamO
 
 from px4fuse.errors import ResultsError
 from px4fuse.report.pdf import RESULTS_NAME
-from px4fuse.results.contract import AidsResults, ComparisonResults, LoopResults, Results
+from px4fuse.results.contract import AidsResults, Reported, Results
 from px4fuse.results.reading import MAX_BYTES as MAX_ATTACHMENT_BYTES
 from px4fuse.results.reading import one_line, read_results
-from px4fuse.verification.model import Refused, Report
+from px4fuse.verification.model import BAD_VALUES, Refused
 
 MAX_BYTES = 25_000_000
 MAX_PAGES = 100
@@ -41,13 +41,9 @@ _DAMAGED = "damaged: it cannot be read as a PDF. Hand in the file that px4fuse w
 _LOCKED = "encrypted, or damaged. Hand in the file px4fuse wrote."
 _COSTLY = "it takes more memory or work to open than a report can need."
 
-# Beside its own errors pypdf raises Python's where a value in a broken file is of another type, out
-# of range or not there: 900 files with a few bytes changed gave AttributeError. What is none of
-# these is a mistake of ours, and stands as such in the row of that file
-BROKEN = (
-    PyPdfError, ArithmeticError, AssertionError, AttributeError, LookupError, OSError, RuntimeError,
-    TypeError, ValueError, zlib.error,
-)  # fmt: skip
+# 900 files with a few bytes changed gave AttributeError too. What is none of these is a mistake of
+# ours, and stands as such in the row of that file
+BROKEN = (*BAD_VALUES, PyPdfError, AttributeError, zlib.error)
 
 # What acts: keys of a dictionary ... Links, comments, forms without scripts and the view to open
 # with are what programs add that save a report again
@@ -86,7 +82,7 @@ _STREAM = re.compile(rb"(?<!end)stream *\r?\n?")
 logging.getLogger("pypdf").setLevel(logging.CRITICAL + 1)
 
 
-def read_report(pdf: bytes, name: str) -> Report | Refused:
+def read_report(pdf: bytes, name: str) -> Reported | Refused:
     """Read a report that was handed in.
 
     Parameters
@@ -98,19 +94,19 @@ def read_report(pdf: bytes, name: str) -> Report | Refused:
 
     Returns
     -------
-    Report or Refused
-        Refused too where it is of what cannot be verified: the aids of EKF2 alone.
+    ComparisonResults, LoopResults or Refused
+        What is attached; Refused too where that cannot be verified: the aids of EKF2 alone.
     """
     try:
         results = attached_results(pdf, name)
     except ResultsError as refusal:
         return Refused(f"{refusal.reason}.", refusal.remedy)
-    if not isinstance(results, ComparisonResults | LoopResults):
+    if not isinstance(results, Reported):
         held = "no results of a report"
         if isinstance(results, AidsResults):
             held = "the aids of EKF2 alone, nothing of our filter"
         return Refused(f"{one_line(name, 200)}: {RESULTS_NAME} in it holds {held}.")
-    return Report(results, pdf)
+    return results
 
 
 def attached_results(pdf: bytes, name: str) -> Results:

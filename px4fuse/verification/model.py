@@ -3,27 +3,13 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from px4fuse.results.contract import Reported
-
+# What Python raises where a value in a broken file is of another type, out of range or not there
+BAD_VALUES = (
+    ArithmeticError, AssertionError, LookupError, OSError, RuntimeError, TypeError, ValueError,
+)  # fmt: skip
 # Of the numbers; how the pages look is a result of its own
 Status = Literal["verified", "numbers differ", "other log", "cannot verify"]
 PageStatus = Literal["same", "differ", "not compared"]
-
-
-@dataclass(frozen=True)
-class Report:
-    """A report as it was handed in.
-
-    Attributes
-    ----------
-    results : ComparisonResults or LoopResults
-        The attached results.
-    pdf : bytes
-        The file itself.
-    """
-
-    results: Reported
-    pdf: bytes = field(repr=False)
 
 
 @dataclass(frozen=True)

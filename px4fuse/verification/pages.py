@@ -42,7 +42,7 @@ from scipy.ndimage import uniform_filter
 
 from px4fuse.flight import Unavailable
 from px4fuse.results.reading import cleaned, one_line
-from px4fuse.verification.model import PageDifference
+from px4fuse.verification.model import BAD_VALUES, PageDifference
 from px4fuse.verification.workers import Failed, bounded
 
 # Side of the square over which differences are averaged: about two digits, at a pixel per point
@@ -67,10 +67,7 @@ MAX_DRAWN_COLOURS = 20_000
 MAX_POINTS = 14_400.0
 WHAT = "picture of the page"
 # PDFium's own errors are RuntimeErrors; the others come from ctypes and Pillow
-FAILURES = (
-    RuntimeError, ValueError, TypeError, ArithmeticError, LookupError, AssertionError, OSError,
-    MemoryError, ImportError,
-)  # fmt: skip
+FAILURES = (*BAD_VALUES, MemoryError, ImportError)
 
 NumbersAlike = Callable[[str, str], bool]
 Made = TypeVar("Made")

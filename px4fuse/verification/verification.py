@@ -17,7 +17,6 @@ import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
 from pathlib import Path
@@ -25,18 +24,12 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from px4fuse.errors import Px4FuseError, ResultsError, SettingsError
+from px4fuse.errors import Px4FuseError, SettingsError
 from px4fuse.flight import Unavailable
-from px4fuse.results.contract import (
-    ComparisonResults,
-    LoopResults,
-    Reported,
-    to_json,
-    to_plain,
-)
+from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json, to_plain
 from px4fuse.results.model import LIBRARIES, Provenance
 from px4fuse.results.reading import cleaned, one_line
-from px4fuse.verification.model import Mismatch, PageStatus, Refused, Report, Status, Verdict
+from px4fuse.verification.model import Mismatch, PageStatus, Refused, Status, Verdict
 from px4fuse.verification.pages import NumbersAlike, compare_pages
 
 ADD = "Add {} to --logs."
@@ -69,50 +62,14 @@ PRINTED_SCALES = (1.0, 100.0, 1000.0)
 MAX_NOTES_LINES = 5_000
 _NUMBER = re.compile(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)")
 
-_Place = Callable[[str, str | None, str], Path]
+# What the analysis gives now: results as a report attaches them, and what draws the report, with
+# the student and the versions that were recorded
+Recomputed = tuple[Reported, Callable[[], bytes]]
+_Place = Callable[[str, str | None, str], str]
 
 
-@dataclass(frozen=True)
-class Recomputed:
-    """What the analysis gives now.
-
-    Attributes
-    ----------
-    results : ComparisonResults or LoopResults
-        As a report attaches them.
-    draw : callable
-        Draws the report: with the student, and with the versions, that were recorded.
-    """
-
-    results: Reported
-    draw: Callable[[], bytes]
-
-
-@dataclass(frozen=True)
-class Numbers:
-    """What comparing two results found.
-
-    Attributes
-    ----------
-    differences : tuple of Mismatch
-        What is beyond the tolerances.
-    alike : callable
-        Whether two printed numbers are a recorded number and its recomputed twin, each rounded.
-    compared : int
-        How many values.
-    """
-
-    differences: tuple[Mismatch, ...]
-    alike: NumbersAlike
-    compared: int
-
-
-class FileMissingError(ResultsError):
-    """A file that a report rests on is not among those given; ``missing`` is what it is called."""
-
-    def __init__(self, text: str, missing: str) -> None:
-        super().__init__(text, ADD.format(missing))
-        self.missing = missing
+class _RefusedError(Exception):
+    """Why an analysis is not run again, with the arguments of :class:`Refused`."""
 
 
 def log_sha256(results: Reported) -> str:
@@ -143,25 +100,25 @@ def recompute(results: Reported, logs: Mapping[str, Path]) -> Recomputed | Refus
     """
     try:
         if tuple(results.provenance.libraries) != LIBRARIES:
-            raise ResultsError("the results do not say which libraries they were made with", ASK)
+            raise _RefusedError("the results do not say which libraries they were made with", ASK)
         with tempfile.TemporaryDirectory(prefix="px4fuse-") as folder:
             place = partial(_place, logs, Path(folder))
             if isinstance(results, LoopResults):
-                return _looped(results, place)
-            return _compared(results, place)
+                found, made = _looped(results, place)
+            else:
+                found, made = _compared(results, place)
+        return made, partial(_drawn, found, made, results.provenance)
     except SettingsError as error:  # no run with these settings can have made a report
         return Refused(f"{NOT_OURS}: {error}", ASK)
-    except ResultsError as error:
-        return Refused(error.reason, error.remedy, getattr(error, "missing", ""))
+    except _RefusedError as error:
+        return Refused(*error.args)
     except Px4FuseError as error:
         return Refused(str(error), ASK)
     except Exception as error:  # noqa: BLE001 - settings made to fail may fail anywhere
         return Refused(f"the analysis cannot be repeated ({type(error).__name__})", ASK)
 
 
-def _place(
-    logs: Mapping[str, Path], within: Path, recorded: str, sha256: str | None, what: str
-) -> Path:
+def _place(logs: Mapping[str, Path], within: Path, name: str, sha256: str | None, what: str) -> str:
     """A file with this content where the analysis finds it, under the recorded name.
 
     Names are printed in the report. They are those of links in a folder of this run alone, and
@@ -169,20 +126,18 @@ def _place(
     """
     path = None if sha256 is None else logs.get(sha256)
     if path is None:
+        missing = one_line(name, 80) or "its file"
         asked = f"none of the files given has the SHA-256 of {what}"
-        raise FileMissingError(asked, one_line(recorded, 80) or "its file")
-    name = recorded
-    plain = name == Path(name).name != ".." and "\\" not in name and name.isprintable()
-    if not plain:
-        raise ResultsError(f"{NOT_OURS}: a file name in it is not a plain name", ASK)
+        raise _RefusedError(asked, ADD.format(missing), missing)
+    if name != Path(name).name or name == ".." or "\\" in name or not name.isprintable():
+        raise _RefusedError(f"{NOT_OURS}: a file name in it is not a plain name", ASK)
     # each in a folder of its own: two may have one name
-    folder = Path(tempfile.mkdtemp(dir=within))
-    target = folder / name
+    target = Path(tempfile.mkdtemp(dir=within), name)
     try:
         target.symlink_to(path.resolve())
     except OSError:  # on Windows for administrators only
         shutil.copyfile(path, target)
-    return target
+    return str(target)
 
 
 def split_part(source: str) -> tuple[str, str]:
@@ -193,42 +148,37 @@ def split_part(source: str) -> tuple[str, str]:
     return (name, f":{tail}") if colon and tail in PARTS else (source, "")
 
 
-def _compared(handed_in: ComparisonResults, place: _Place) -> Recomputed:
+def _compared(handed_in: ComparisonResults, place: _Place) -> tuple[object, Reported]:
     from px4fuse.analysis import run  # noqa: PLC0415
     from px4fuse.results.build import results  # noqa: PLC0415
 
     recorded = handed_in.request
     if recorded.dt_s < MIN_DT_S:
-        raise ResultsError(f"DT is below {MIN_DT_S:g} s, which takes too long to repeat", ASK)
+        raise _RefusedError(f"DT is below {MIN_DT_S:g} s, which takes too long to repeat", ASK)
     joined = {file.role: file.sha256 for file in handed_in.log.joined}
-    request = replace(recorded, log=str(place(recorded.log, handed_in.log.sha256, "the log")))
+    request = replace(recorded, log=place(recorded.log, handed_in.log.sha256, "the log"))
     if (mavlink := recorded.mavlink) is not None:
-        placed = place(mavlink, joined.get("mavlink"), "--mavlink")
-        request = replace(request, mavlink=str(placed))
+        request = replace(request, mavlink=place(mavlink, joined.get("mavlink"), "--mavlink"))
     if (position := recorded.position) is not None:
         placed = place(position.path, joined.get("position"), "--position")
-        request = replace(request, position=replace(position, path=str(placed)))
-    analysis = run(request)
-    made = results(recorded, analysis, handed_in.student)
-    return Recomputed(made, partial(_drawn, analysis, made, handed_in.provenance))
+        request = replace(request, position=replace(position, path=placed))
+    found = run(request)
+    return found, results(recorded, found, handed_in.student)
 
 
-def _looped(handed_in: LoopResults, place: _Place) -> Recomputed:
+def _looped(handed_in: LoopResults, place: _Place) -> tuple[object, Reported]:
     from px4fuse.analysis import run_loop  # noqa: PLC0415
     from px4fuse.results.build import loop_results  # noqa: PLC0415
 
     recorded = handed_in.request
     path, part = split_part(recorded.source)
-    placed = place(path, handed_in.track.sha256, "the log")
-    request = replace(recorded, source=f"{placed}{part}")
+    request = replace(recorded, source=place(path, handed_in.track.sha256, "the log") + part)
     if recorded.reference is not None:
         path, part = split_part(recorded.reference)
         sha256 = handed_in.references[-1].sha256 if handed_in.references else None
-        placed = place(path, sha256, "--reference")
-        request = replace(request, reference=f"{placed}{part}")
+        request = replace(request, reference=place(path, sha256, "--reference") + part)
     found = run_loop(request)
-    made = loop_results(recorded, found, handed_in.student)
-    return Recomputed(made, partial(_drawn, found, made, handed_in.provenance))
+    return found, loop_results(recorded, found, handed_in.student)
 
 
 def _drawn(found: object, results: Reported, versions: Provenance) -> bytes:
@@ -243,7 +193,8 @@ def _drawn(found: object, results: Reported, versions: Provenance) -> bytes:
 
 
 def verify(
-    report: Report,
+    results: Reported,
+    pdf: bytes,
     logs: Mapping[str, Path],
     *,
     recompute: Callable[[Reported, Mapping[str, Path]], Recomputed | Refused] = recompute,
@@ -264,25 +215,25 @@ def verify(
         numbers belong to the log, not who wrote them. ``redrawn`` is the report to read, and
         ``pages`` names those of the PDF that look otherwise.
     """
-    theirs, ours = report.results.provenance.px4fuse, metadata.version("px4fuse")
+    theirs, ours = results.provenance.px4fuse, metadata.version("px4fuse")
     if theirs != ours:
         named = one_line(theirs, 40)
         why = f"made with px4fuse {named}, this is {ours}"
         return _unknown(Refused(why, f"Run it with px4fuse {named}."))
-    name = one_line(log_name(report.results), 80) or "its log"
+    name = one_line(log_name(results), 80) or "its log"
     if not logs:
         return _unknown(Refused(NO_LOG, ADD.format(name), name))
-    sha256 = log_sha256(report.results)
+    sha256 = log_sha256(results)
     if sha256 not in logs:
         asked = one_line(sha256, 64) or "none"
         reason = f"none of the {len(logs)} files given is the log, whose SHA-256 is {asked}"
         remedy = f"If it is a log of yours, a{ADD.format(name)[1:]}"
         return Verdict("other log", (reason,), False, remedy=remedy, missing=name)
-    if report.results.student.notes.count("\n") > MAX_NOTES_LINES:
+    if results.student.notes.count("\n") > MAX_NOTES_LINES:
         reason = f"its notes have more than {MAX_NOTES_LINES} lines, which is no report"
         return _unknown(Refused(reason, ASK))
-    again = recompute(report.results, logs)
-    return _unknown(again) if isinstance(again, Refused) else _with_log(report, again)
+    again = recompute(results, logs)
+    return _unknown(again) if isinstance(again, Refused) else _with_log(results, pdf, *again)
 
 
 def _unknown(why: Refused) -> Verdict:
@@ -290,22 +241,21 @@ def _unknown(why: Refused) -> Verdict:
     return Verdict("cannot verify", reasons, False, remedy=why.remedy, missing=why.missing)
 
 
-def _with_log(report: Report, again: Recomputed) -> Verdict:
-    redrawn = again.draw()
-    if redrawn == report.pdf:
+def _with_log(theirs: Reported, pdf: bytes, ours: Reported, draw: Callable[[], bytes]) -> Verdict:
+    redrawn = draw()
+    if redrawn == pdf:
         reason = "the log gives the same file again, byte for byte"
         return Verdict("verified", (reason, LIMIT), True, page_status="same", redrawn=redrawn)
-    numbers = compare_results(to_plain(report.results), to_plain(again.results))
-    wrong, alike = numbers.differences, partial(same_words, alike=numbers.alike)
+    wrong, alike, compared = compare_results(to_plain(theirs), to_plain(ours))
     first = ", ".join(one.path for one in wrong[:3]) + ", …" * (len(wrong) > 3)
     reasons = [
-        f"{len(wrong)} of {numbers.compared} values are not what the log gives: {first}"
+        f"{len(wrong)} of {compared} values are not what the log gives: {first}"
         if wrong
-        else f"the log gives all {numbers.compared} values again (within {RELATIVE:g}, estimates "
+        else f"the log gives all {compared} values again (within {RELATIVE:g}, estimates "
         f"within {ESTIMATE_RELATIVE:g})"
     ]
     page_status: PageStatus = "not compared"
-    pages = compare_pages(report.pdf, redrawn, alike)
+    pages = compare_pages(pdf, redrawn, partial(same_words, alike=alike))
     if isinstance(pages, Unavailable):
         reasons.append(f"the pages were not compared: {pages.reason}. {pages.remedy}")
         pages = ()
@@ -313,7 +263,7 @@ def _with_log(report: Report, again: Recomputed) -> Verdict:
         page_status = "differ" if pages else "same"
     reasons += [f"page {one.page} differs: {one.what}" for one in pages]
     if pages:
-        reasons += _other_machine(report.results.provenance, again.results.provenance)
+        reasons += _other_machine(theirs.provenance, ours.provenance)
     status: Status = "numbers differ" if wrong else "verified"
     said = (*reasons, *([] if wrong else [LIMIT]))
     return Verdict(status, said, True, wrong[:SHOWN], page_status, pages, redrawn)
@@ -330,8 +280,20 @@ def _other_machine(theirs: Provenance, ours: Provenance) -> tuple[str, ...]:
     return (one_line(made, 400),) if others else ()
 
 
-def compare_results(recorded: Mapping[str, Any], recomputed: Mapping[str, Any]) -> Numbers:
-    """Compare every value of two results, of which the first is a stranger's."""
+def compare_results(
+    recorded: Mapping[str, Any], recomputed: Mapping[str, Any]
+) -> tuple[tuple[Mismatch, ...], NumbersAlike, int]:
+    """Compare every value of two results, of which the first is a stranger's.
+
+    Returns
+    -------
+    differences : tuple of Mismatch
+        What is beyond the tolerances.
+    alike : callable
+        Whether two printed numbers are a recorded number and its recomputed twin, each rounded.
+    compared : int
+        How many values.
+    """
     command = str(recomputed["provenance"]["command"])
     # everything rests on an offset or placement that was estimated
     everywhere = not {"auto", "--position"}.isdisjoint(command.split())
@@ -341,23 +303,16 @@ def compare_results(recorded: Mapping[str, Any], recomputed: Mapping[str, Any]) 
         for path in {**made, **handed_in}
         if not path.startswith(MACHINE)
     }
-    numbers = {path: pair for path, pair in pairs.items() if all(map(is_number, pair))}
     near = {
-        path: pair
-        for path, pair in numbers.items()
-        if _near(path, *pair, everywhere or path.startswith(ESTIMATES))
-    }
-    alike = _rounding([(float(one), float(other)) for one, other in near.values() if one != other])
-    wrong = {path: pair for path, pair in numbers.items() if path not in near}
-    wrong |= {
-        path: pair
+        path: _near(path, *pair, everywhere or path.startswith(ESTIMATES))
         for path, pair in pairs.items()
-        if path not in numbers and not _same(*pair, alike)
+        if all(map(is_number, pair))
     }
-    found = (
-        Mismatch(one_line(path, SHOWN_TEXT), *map(_shown, pair)) for path, pair in wrong.items()
-    )
-    return Numbers(tuple(found), alike, len(pairs))
+    alike = _rounding([pairs[path] for path, is_near in near.items() if is_near])
+    wrong = [path for path, is_near in near.items() if not is_near]
+    wrong += [path for path in pairs if path not in near and not _same(*pairs[path], alike)]
+    found = (Mismatch(one_line(path, SHOWN_TEXT), *map(_shown, pairs[path])) for path in wrong)
+    return tuple(found), alike, len(pairs)
 
 
 # Stands where there is nothing
@@ -414,8 +369,9 @@ def same_words(one: str, other: str, alike: NumbersAlike) -> bool:
     return parts[::2] == others[::2] and all(a == b or alike(a, b) for a, b in numbers)
 
 
-def _rounding(pairs: Sequence[tuple[float, float]]) -> NumbersAlike:
+def _rounding(near: Sequence[tuple[float, float]]) -> NumbersAlike:
     """Whether two printed numbers are a recorded number and its recomputed twin, each rounded."""
+    pairs = [(float(one), float(other)) for one, other in near if one != other]
 
     def alike(one: str, other: str) -> bool:
         decimals, printed = _decimals(one), (float(one), float(other))

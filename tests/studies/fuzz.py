@@ -44,7 +44,8 @@ from made_up_fleet import made_up  # noqa: E402
 from px4fuse import answers  # noqa: E402
 from px4fuse.analysis import run_or_judge_aids  # noqa: E402
 from px4fuse.assignment.key import Answer, AnswerKey, key_text, read_key  # noqa: E402
-from px4fuse.assignment.roster import read_people, read_roster  # noqa: E402
+from px4fuse.assignment.roster import people_of_sheet, read_roster  # noqa: E402
+from px4fuse.assignment.sheet import read_sheet  # noqa: E402
 from px4fuse.cli import cli  # noqa: E402
 from px4fuse.errors import Px4FuseError  # noqa: E402
 from px4fuse.fleet.regressions import read_baseline  # noqa: E402
@@ -217,6 +218,10 @@ def _key() -> list[bytes]:
     return [key_text(AnswerKey("aisle", people)).encode()]
 
 
+def _class_list(path: Path) -> object:
+    return people_of_sheet(read_sheet(path))
+
+
 TARGETS = (
     Target("ULog", _ulogs, read_log, ".ulg", False, 120, 0.5),
     Target("MAVLink", _recordings, read_log, ".tlog", False, 120, 0.5),
@@ -236,7 +241,7 @@ TARGETS = (
     Target("rubric", lambda: [rubric_text().encode()], read_rubric, ".toml", True, 900, 8.0),
     Target("overrides", _text(_OVERRIDES), read_overrides, ".csv", True, 900, 6.0),
     Target("roster", _text(_ROSTER, _MOODLE), read_roster, ".csv", True, 900, 6.0),
-    Target("class list", _text(_ROSTER, _MOODLE), read_people, ".csv", True, 900, 6.0),
+    Target("class list", _text(_ROSTER, _MOODLE), _class_list, ".csv", True, 900, 6.0),
     Target("answer key", _key, read_key, ".json", True, 300, 2.0),
     Target("earlier table", _fleet, read_baseline, ".csv", True, 120, 1.0),
 )  # fmt: skip
