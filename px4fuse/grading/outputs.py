@@ -226,7 +226,7 @@ def returned_text(entry: Entry, class_name: str = "") -> str:
     """
     graded = entry.counting
     reasons = (text_of(one).rstrip(".") for one in graded.verdict.reasons[:NAMED]) if graded else ()
-    made = template("grading/feedback.txt").render(
+    made = template("grading/feedback.j2").render(
         entry=entry,
         graded=graded,
         class_name=class_name,
