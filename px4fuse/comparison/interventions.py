@@ -13,7 +13,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -32,7 +32,7 @@ from px4fuse.comparison.model import (
     UnjudgedFilter,
 )
 from px4fuse.comparison.projection import project_state, project_truth
-from px4fuse.comparison.remedy import delay_asked, noise_change, noise_used_m
+from px4fuse.comparison.remedy import delay_asked, fused, noise_change
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, moved, replay_settings
 from px4fuse.ekf2.recursion import Variant
@@ -168,12 +168,25 @@ def cause_of(
     )  # fmt: skip
 
 
-def beyond_claim(statement: FilterSummary | UnjudgedFilter) -> bool:
-    """Whether the error to the truth is larger than claimed, and no innovation says so."""
+class Hidden(NamedTuple):
+    """An error to the truth (RMS, and its NEES) beyond the standard deviation that is claimed."""
+
+    nees: float
+    rmse_m: float
+    claimed_m: float
+    nis_mean: float
+
+
+def beyond_claim(statement: FilterSummary | UnjudgedFilter) -> Hidden | None:
+    """The error to the truth where it is larger than claimed, and no innovation says so."""
     truth = statement.truth
-    if isinstance(statement, Unavailable) or not isinstance(truth, AgainstTruth):
-        return False
-    return (truth.nees_position_mean or 0.0) >= NEES_LARGE and statement.nis_mean < CONTENT_NIS
+    if isinstance(statement, Unavailable) or isinstance(truth, Unavailable):
+        return None
+    nees, rmse_m = truth.nees_position_mean or 0.0, truth.position_rmse_m
+    if nees < NEES_LARGE or statement.nis_mean >= CONTENT_NIS:
+        return None
+    claimed_m = statement.sigma_p_median_m or rmse_m / float(np.sqrt(nees))
+    return Hidden(nees, rmse_m, claimed_m, statement.nis_mean)
 
 
 def interventions(
@@ -198,10 +211,9 @@ def interventions(
         Of EKF2.
     """
     known = comparison, tuning, clock, heading
-    filters: list[_Tried] = [_Ours(*known, explained)]
-    if not isinstance(model, Unavailable) and model.agreement.good:
-        inputs, used_m = model.inputs, noise_used_m(model)
-        filters += [_Replayed(*known, inputs, used_m, model)] if _fused(comparison, inputs) else []
+    filters: list[_Changed] = [_Ours(*known, explained)]
+    if isinstance(model, Model) and model.agreement.good and fused(comparison, model.inputs):
+        filters.append(_Ekf2(*known, model.inputs, model))
     rows: list[Intervention] = []
     for changed in filters:
         for result, of in changed.asked():
@@ -223,23 +235,14 @@ def to_try(
 
     One that is not among them is replayed when it is asked for.
     """
-    if not _fused(comparison, inputs):
+    if not fused(comparison, inputs):
         return []
-    mode, flown = inputs.aid.noise_mode, inputs.settings
-    stated = inputs.received.variance_m2[:, :2] * (not mode or flown[mode] != 1.0)
-    used_m = float(np.sqrt(np.median(np.maximum(stated, flown[inputs.aid.noise] ** 2))))
-    tried = _Ekf2(comparison, tuning, clock, heading, inputs, used_m)
+    tried, flown = _Ekf2(comparison, tuning, clock, heading, inputs), inputs.settings
     changes = [change for one in tried.asked() for change in tried.candidates(*one)]
     return [Variant({**flown, **change}) for change in changes if change.keys() <= flown.keys()]
 
 
-def _fused(comparison: Comparison, inputs: Inputs) -> bool:
-    """Whether EKF2 fused what was analysed."""
-    source = comparison.source
-    return source.name == inputs.received.source and source.alignment is None
-
-
-def _apart(cause: Intervention, result: AxisComparison, changed: _Tried) -> list[Intervention]:
+def _apart(cause: Intervention, result: AxisComparison, changed: _Changed) -> list[Intervention]:
     """How far a cause keeps both filters apart."""
     before, after = (changed.number(result, "apart", change) for change in ({}, cause.change))
     if before is None or after is None:
@@ -259,7 +262,7 @@ def _discrepancies(statement: FilterSummary | UnjudgedFilter) -> list[Of]:
     return [*found, "nis"] if statement.times_off >= SIGMA_OFF else found
 
 
-def _tried(changed: _Tried, result: AxisComparison, of: Of) -> list[Intervention]:
+def _tried(changed: _Changed, result: AxisComparison, of: Of) -> list[Intervention]:
     """All candidates alone; where the best leaves the number outside its band, with the others."""
     statement, candidates = result.filters[changed.owner], changed.candidates(result, of)
     truth = statement.truth
@@ -324,7 +327,7 @@ def _turned(direction: Array, turned_deg: float) -> Array:
 
 @dataclass(frozen=True)
 class _Changed:
-    """A filter, and what the data ask to change of it."""
+    """A filter, what the data ask to change of it, and what it does with changes."""
 
     comparison: Comparison
     tuning: Tuning
@@ -349,6 +352,10 @@ class _Changed:
     @abstractmethod
     def of_filter(self, tuned: AxisTuning | None) -> list[Change]:
         """What else may be wrong; ``tuned`` where the variance is not larger than what is shown."""
+
+    @abstractmethod
+    def number(self, result: AxisComparison, of: Of, change: Change) -> tuple[float, int] | None:
+        """Mean NIS or NEES along an axis with a change, or how far apart; and of how many."""
 
     def candidates(self, result: AxisComparison, of: Of) -> list[Change]:
         """What to try along an axis."""
@@ -381,16 +388,7 @@ class _Changed:
 
 
 @dataclass(frozen=True)
-class _Tried(_Changed):
-    """A filter that is run with changes."""
-
-    @abstractmethod
-    def number(self, result: AxisComparison, of: Of, change: Change) -> tuple[float, int] | None:
-        """Mean NIS or NEES along an axis with a change, or how far apart; and of how many."""
-
-
-@dataclass(frozen=True)
-class _Ours(_Tried):
+class _Ours(_Changed):
     """Our filter with changes."""
 
     explained: Explained | Unavailable
@@ -465,12 +463,24 @@ class _Ours(_Tried):
 
 @dataclass(frozen=True)
 class _Ekf2(_Changed):
-    """What to change of EKF2, where it fused what was analysed; ``used_m`` is its √R as flown."""
+    """EKF2 with changes, where it fused what was analysed.
+
+    Without a model, which must agree with the log, it only has candidates.
+    """
 
     inputs: Inputs
-    used_m: float
+    model: Model | None = None
+    replays: dict[tuple[tuple[str, float], ...], Ekf2Replay] = field(default_factory=dict)
 
     owner = "ekf2"
+
+    @property
+    def used_m(self) -> float:
+        """Median √R (m) as flown."""
+        aid, flown = self.inputs.aid, self.inputs.settings
+        takes_stated = not aid.noise_mode or flown[aid.noise_mode] != 1.0
+        stated = self.inputs.received.variance_m2[:, :2] * takes_stated
+        return float(np.sqrt(np.median(np.maximum(stated, flown[aid.noise] ** 2))))
 
     def of_stamps(self) -> list[Change]:
         """A delay is EKF2's own to set; there is none for stamps that are early."""
@@ -517,32 +527,25 @@ class _Ekf2(_Changed):
             asked_m = float(np.hypot(statement.innovation_std_m, statement.innovation_mean_m))
         return [noise_change(self.inputs, self.used_m, asked_m)]
 
-
-@dataclass(frozen=True)
-class _Replayed(_Ekf2, _Tried):
-    """EKF2 with changes, where the model agrees with the log."""
-
-    model: Model
-    replays: dict[tuple[tuple[str, float], ...], Ekf2Replay] = field(default_factory=dict)
-
     def number(self, result: AxisComparison, of: Of, change: Change) -> tuple[float, int] | None:
         """By a replay, along a horizontal axis; unchanged how far apart by the log."""
-        made, axis, segment = self._replayed(change), result.axis, self.comparison.segment
+        assert self.model is not None
+        judged_s, axis = self.model.flown.judged_s, result.axis
+        made = self._replayed(self.model, change)
         if TURN in change and self.comparison.source.origin.is_gnss:
             # what is put right is the attitude: its frame is turned, north is where it was
             axis = replace(axis, direction=_turned(axis.direction, -change[TURN]))
         weights = axis.direction[:2]
-        updates = made.updates[settled(made.updates.index, self.model.flown.judged_s)]
+        updates = made.updates[settled(made.updates.index, judged_s)]
         if of == "nis":
             nu = along(updates, INNOVATION_COLUMNS, weights)
             s = along(updates, INNOVATION_VARIANCE_COLUMNS, weights**2)
             return (float(np.mean(nu**2 / s)), len(nu)) if len(nu) else None
-        state = project_state(made.published, axis, segment)
+        state = project_state(made.published, axis, self.comparison.segment)
         if of == "apart":
             logged = result.ekf2_state
             state = state if change or isinstance(logged, Unavailable) else logged
-            inside = settled(state.index, self.model.flown.judged_s)
-            return _rms_apart(result.replay, state[inside])
+            return _rms_apart(result.replay, state[settled(state.index, judged_s)])
         at_s, track = updates["fused_at_s"], along(made.delayed, Columns.POSITION, axis.direction)
         stated = {
             "position_m": np.interp(at_s, made.delayed.index, track),
@@ -551,14 +554,14 @@ class _Replayed(_Ekf2, _Tried):
         horizon = pd.DataFrame(stated, index=pd.Index(at_s))
         return _nees(against_truth(state, result.ekf2_variance, result.truth, horizon))
 
-    def _replayed(self, change: Change) -> Ekf2Replay:
+    def _replayed(self, model: Model, change: Change) -> Ekf2Replay:
         """EKF2 with a change, each replayed once."""
         if not change:
-            return self.model.flown
+            return model.flown
         key = tuple(sorted(change.items()))
         if key not in self.replays:
             settings = {name: value for name, value in change.items() if name in PARAMETERS}
-            model = moved(self.model, change.get(TURN, 0.0), change.get(CLOCK, 0.0))
+            model = moved(model, change.get(TURN, 0.0), change.get(CLOCK, 0.0))
             left_out_s, tuned = None, tuned_for(self.tuning, HORIZONTAL)
             if OUTLIERS in change and tuned is not None:
                 stamp = 1e-3 * self.inputs.settings[self.inputs.aid.delay]

@@ -6,6 +6,8 @@ replayed, the words say so.
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +25,7 @@ from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital
+from px4fuse.request import OPTIONS
 
 # EKF2 takes R from the sender where that is more than this many times EKF2_EVP_NOISE
 REPORTED_TIMES = 1.25
@@ -68,16 +71,20 @@ def asked_of_ekf2(
         that may drift, or of GNSS, only where EKF2 trusts it even more than its short-term noise
         allows: small innovations against such a source say nothing about its error.
     """
-    source = comparison.source
-    if source.name != model.inputs.received.source or source.alignment is not None:
+    if not fused(comparison, model.inputs):
         return {}
     changes: dict[str, float] = {}
-    noise_m = tuned_noise_m(tuning)
-    trusted = noise_m is not None and noise_m <= noise_used_m(model)
-    slow = source.origin.may_drift or source.origin.is_gnss
-    if noise_m is not None and not (trusted and slow):
-        changes |= noise_change(model.inputs, noise_used_m(model), noise_m)
+    noise_m, used_m = tuned_noise_m(tuning), noise_used_m(model)
+    slow = comparison.source.origin.may_drift or comparison.source.origin.is_gnss
+    if noise_m is not None and not (slow and noise_m <= used_m):
+        changes |= noise_change(model.inputs, used_m, noise_m)
     return changes | delay_asked(comparison, model.inputs, clock)
+
+
+def fused(comparison: Comparison, inputs: Inputs) -> bool:
+    """Whether EKF2 fused what was analysed."""
+    source = comparison.source
+    return source.name == inputs.received.source and source.alignment is None
 
 
 def delay_asked(
@@ -175,8 +182,8 @@ def remedy_words(
     *,
     why: str = "",
     otherwise: str,
-) -> tuple[str, bool]:
-    """A change of EKF2's parameters in words, and whether it is a remedy: no replay denies it.
+) -> str:
+    """A change of EKF2's parameters in words, as a remedy where no replay denies it.
 
     Parameters
     ----------
@@ -193,16 +200,16 @@ def remedy_words(
     setting = f"{why}set {settings_words(changes)}"
     found = model if isinstance(model, Unavailable) else what_if(model, [changes])
     if isinstance(found, Unavailable):
-        return f"{capital(setting)}. {not_replayed(found)}", True
+        return f"{capital(setting)}. {not_replayed(found)}"
     before, (after,) = found.replayed, found.whatif
     if not after.steady:
         said = settings_words(changes)
-        return f"{otherwise} What {said} would do is chaotic: single rejections decide.", False
+        return f"{otherwise} What {said} would do is chaotic: single rejections decide."
     effect = effect_words(before, after)
     if helps(before, after):
-        return f"{capital(setting)}: {effect}.", True
+        return f"{capital(setting)}: {effect}."
     said = ", ".join(f"{name} {value:.3g}" for name, value in changes.items())
-    return f"{otherwise} {said} is no remedy: {effect}.", False
+    return f"{otherwise} {said} is no remedy: {effect}."
 
 
 def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, float] | None:
@@ -234,19 +241,26 @@ def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, f
 
 
 def filter_words(
-    comparison: Comparison, changed: Settings, typed: str, unseen_nats: float | None = None
+    comparison: Comparison,
+    changes: Mapping[str, float],
+    more: str = "",
+    unseen_nats: float | None = None,
 ) -> str:
     """Other settings of our filter as a remedy, as far as truth or unseen data confirm it.
 
     Parameters
     ----------
     comparison : Comparison
-    changed : Settings
-    typed : str
-        The options that make them.
+    changes : mapping from field of Settings to value
+        Rounded to three digits.
+    more : str
+        Words behind the options that make them.
     unseen_nats : float or None
         What settings found on one half gain per measurement of the other; None where not known.
     """
+    rounded: dict[str, Any] = {name: float(f"{value:.3g}") for name, value in changes.items()}
+    typed = " ".join(f"{OPTIONS[name].name} {value:g}" for name, value in rounded.items()) + more
+    changed = replace(comparison.settings, **rounded)
     errors = filter_errors_m(comparison, changed)
     if errors is None:
         if unseen_nats is not None and unseen_nats <= 0.0:

@@ -6,9 +6,7 @@ fitted together, so that they are put right together: the one that is further of
 setting that nobody chose is advice, one step less severe than one that was.
 """
 
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any, NamedTuple, TypeGuard
+from typing import NamedTuple, TypeGuard
 
 import numpy as np
 from msgspec import structs
@@ -25,7 +23,7 @@ from px4fuse.comparison.interventions import (
     tried_on,
     tuned_for,
 )
-from px4fuse.comparison.model import FILTERS, AxisComparison, Comparison, FilterName
+from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.ekf2_parameters import BAROMETER, BAROMETER_NOISE_M, PARAMETERS
 from px4fuse.filter.consistency import SIGMA_OFF, Consistency
@@ -83,27 +81,6 @@ AGAINST_TRUTH = (
 Member = tuple[AxisComparison, Consistency]
 
 
-def try_out(
-    comparison: Comparison, values: Mapping[str, float], more: str = "", unseen: float | None = None
-) -> str:
-    """What to type, as far as a replay with it holds what the likelihood promises.
-
-    Parameters
-    ----------
-    comparison : Comparison
-    values : mapping from field of Settings to value
-        Rounded to three digits.
-    more : str
-        Words behind them.
-    unseen : float or None
-        What such settings gain on data that they were not found on (nats), where that is known.
-    """
-    rounded: dict[str, Any] = {name: float(f"{value:.3g}") for name, value in values.items()}
-    typed = " ".join(f"{OPTIONS[name].name} {value:g}" for name, value in rounded.items())
-    settings = replace(comparison.settings, **rounded)
-    return remedy.filter_words(comparison, settings, typed + more, unseen)
-
-
 class Off(NamedTuple):
     """How a setting is off: ``size`` times from the most likely value, or from its bound."""
 
@@ -134,7 +111,7 @@ def settings_off(analysis: Analysis) -> Found:
     # where a source may drift, or the truth shows it, innovations tell too little noise alone, and
     # a filter may follow such a source as closely as it likes
     drifts, slow = analysis.source.origin.may_drift, analysis.source.origin.is_gnss
-    if drifts or slow or any(one.owner == "kf" for one in hidden_errors(analysis)):
+    if drifts or slow or any(owner == "kf" for owner, *_ in hidden_errors(analysis)):
         off = {
             name: each
             for name, each in off.items()
@@ -147,7 +124,7 @@ def settings_off(analysis: Analysis) -> Found:
     if SIGMA_Z in values and tuned.sigma_z.value is None:
         values[SIGMA_Z] = max(values[SIGMA_Z], SMALLEST_SIGMA_Z_M)
     unseen = None if isinstance(tuned.held_out, Unavailable) else tuned.held_out.gain_nats
-    cure, first = try_out(analysis, values, unseen=unseen), None
+    cure, first = remedy.filter_words(analysis, values, unseen_nats=unseen), None
     for name in worst_first:
         (value, size, severity), noise, unit = off[name], asked[name], OPTIONS[name].unit
         label, side = name[:7], "small" if chosen[name] < value else "large"
@@ -209,7 +186,7 @@ def forgotten(analysis: Analysis) -> Found:
         growth = float(np.median((before[1:] / after[:-1] - 1.0)[len(after) // 2 :]))
         tuned = tuned_for(analysis.tuning, name)
         needed = None if tuned is None else tuned.filter_sigma_a.value
-        more = "" if needed is None else f" {try_out(analysis, {SIGMA_A: needed})}"
+        more = "" if needed is None else f" {remedy.filter_words(analysis, {SIGMA_A: needed})}"
         yield error(
             "process_noise_forgotten",
             f"With SIGMA_A {analysis.settings.sigma_a_m_s2:g} m/s² Q is forgotten",
@@ -262,7 +239,7 @@ def _of_group(analysis: Analysis, owner: FilterName, group: str, members: list[M
         cause = NOISE if cure else ELSEWHERE
         slow = AGAINST_SLOW_ERRORS.format("a barometer" if air else "GNSS")
         severity, cure = severity if cure else "info", cure or slow
-    elif over and any(hidden.owner == owner for hidden in hidden_errors(analysis)):
+    elif over and any(each == owner for each, *_ in hidden_errors(analysis)):
         cure, cause = AGAINST_TRUTH, ELSEWHERE
     else:
         found = cause_of(analysis.causes, owner, result.axis.name)
@@ -299,11 +276,10 @@ def _above_stated(analysis: Analysis) -> str:
     if not least_m > NOISE_FITS * stated_m:  # false for NaN too
         return ""
     held = f"{name} {least_m:g} m holds R above what the receiver states ({stated_m:.2g} m)"
-    words, _ = remedy.remedy_words(
+    return remedy.remedy_words(
         analysis.ekf2_model, {name: float(f"{stated_m:.2g}")}, remedy.noise_helps,
         why=f"{held}: where you trust the receiver, ", otherwise=f"{held}.",
     )  # fmt: skip
-    return words
 
 
 def _is_default(analysis: Analysis, owner: FilterName, result: AxisComparison) -> bool:
@@ -338,10 +314,10 @@ def _remedy(
         return cure_words(analysis, cause)
     bounded = tuned is not None and tuned.sigma_z.value is None and SIGMA_Z in cause.change
     if not bounded:
-        return try_out(analysis, cause.change)
+        return remedy.filter_words(analysis, cause.change)
     return (
         "The source's noise is below what this rate can show. "
-        f"{try_out(analysis, cause.change, ', and less SIGMA_A')}"
+        f"{remedy.filter_words(analysis, cause.change, ', and less SIGMA_A')}"
     )
 
 

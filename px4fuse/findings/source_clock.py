@@ -137,5 +137,4 @@ def delay_remedy(analysis: Analysis, delay_ms: float, flown_ms: float) -> str:
     changes = {"EKF2_EV_DELAY": max(float(round(delay_ms)), 0.0)}
     if not isinstance(model, Unavailable):
         changes = remedy.delay_change(model.inputs, delay_ms) or changes
-    words, _ = remedy.remedy_words(model, changes, remedy.delay_helps, otherwise=AT_THE_SENDER)
-    return words
+    return remedy.remedy_words(model, changes, remedy.delay_helps, otherwise=AT_THE_SENDER)
