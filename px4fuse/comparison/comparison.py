@@ -23,9 +23,9 @@ from px4fuse.comparison.preparation import Choices, prepare
 from px4fuse.comparison.projection import (
     MIN_COMMON_SAMPLES,
     continuous_state,
+    project,
     project_horizon,
     project_innovations,
-    project_state,
     project_truth,
     project_variance,
 )
@@ -102,7 +102,7 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, run: Replay) -
         state = variance = innovations = apart = ekf2
         times, gate = run.steps.index.to_numpy(), GATE_SIGMA
     else:
-        state = project_state(ekf2.state, axis, segment)
+        state = project(ekf2.state, axis, segment)
         variance = project_variance(ekf2, axis, segment)
         horizon = project_horizon(ekf2, axis, segment)
         innovations = project_innovations(flight, ekf2, prepared.source, axis, segment)

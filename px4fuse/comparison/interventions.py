@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import against_truth, difference, kf_against_truth
-from px4fuse.comparison.estimates import Tuning
+from px4fuse.comparison.estimates import Tuning, known_noises
 from px4fuse.comparison.model import (
     AgainstTruth,
     AxisComparison,
@@ -31,7 +31,7 @@ from px4fuse.comparison.model import (
     FilterSummary,
     UnjudgedFilter,
 )
-from px4fuse.comparison.projection import project_state, project_truth
+from px4fuse.comparison.projection import project, project_truth
 from px4fuse.comparison.remedy import delay_asked, fused, noise_change
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, moved, replay_settings
@@ -265,12 +265,10 @@ def _discrepancies(statement: FilterSummary | UnjudgedFilter) -> list[Of]:
 def _tried(changed: _Changed, result: AxisComparison, of: Of) -> list[Intervention]:
     """All candidates alone; where the best leaves the number outside its band, with the others."""
     statement, candidates = result.filters[changed.owner], changed.candidates(result, of)
+    assert isinstance(statement, FilterSummary)  # else it has no discrepancy
     truth = statement.truth
-    before = nees = None if isinstance(truth, Unavailable) else truth.nees_position_mean
-    if of == "nis" and isinstance(statement, FilterSummary):
-        before = statement.nis_mean
-    if before is None:
-        return []
+    nees = None if isinstance(truth, Unavailable) else truth.nees_position_mean
+    before = statement.nis_mean if nees is None or of == "nis" else nees
     deniable = of == "nis" and before < 1.0 and not isinstance(result.truth, Unavailable)
 
     def tried(change: Change) -> list[Intervention]:
@@ -315,9 +313,7 @@ def _nees(judged: AgainstTruth | Unavailable) -> tuple[float, int] | None:
 
 def tuned_for(tuning: Tuning, axis: str) -> AxisTuning | None:
     """What was tuned for an axis: both horizontal ones together, where there are both."""
-    names = (axis,) if axis == "down" else (HORIZONTAL, axis)
-    found = (tuning.get(name) for name in names)
-    return next((tuned for tuned in found if isinstance(tuned, AxisTuning)), None)
+    return known_noises(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
 
 
 def _turned(direction: Array, turned_deg: float) -> Array:
@@ -346,7 +342,7 @@ class _Changed:
         ]
 
     @abstractmethod
-    def of_noise(self, result: AxisComparison, tuned: AxisTuning, over: bool) -> list[Change]:
+    def of_noise(self, statement: FilterSummary, tuned: AxisTuning, over: bool) -> list[Change]:
         """The noises that the data ask for, where their interval excludes those that were taken."""
 
     @abstractmethod
@@ -360,13 +356,14 @@ class _Changed:
     def candidates(self, result: AxisComparison, of: Of) -> list[Change]:
         """What to try along an axis."""
         statement, origin = result.filters[self.owner], self.comparison.source.origin
-        over = not isinstance(statement, Unavailable) and of == "nis" and statement.nis_mean < 1.0
+        assert isinstance(statement, FilterSummary)  # else it has no discrepancy
+        over = of == "nis" and statement.nis_mean < 1.0
         tuned = tuned_for(self.tuning, result.axis.name)
         found = list[Change]()
         # small innovations against such a source say too little of its errors
         hides_noise = origin.may_drift or origin.is_gnss
         if tuned is not None and not (over and hides_noise):
-            found += self.of_noise(result, tuned, over)
+            found += self.of_noise(statement, tuned, over)
         if tuned is not None and not over and len(tuned.outlier_time_s):
             found.append({OUTLIERS: float(len(tuned.outlier_time_s))})
         found += self.of_stamps()
@@ -395,7 +392,7 @@ class _Ours(_Changed):
 
     owner = "kf"
 
-    def of_noise(self, result: AxisComparison, tuned: AxisTuning, over: bool) -> list[Change]:
+    def of_noise(self, statement: FilterSummary, tuned: AxisTuning, over: bool) -> list[Change]:
         """SIGMA_A and SIGMA_Z."""
         found = list[Change]()
         for name, noise in ((SIGMA_A, tuned.filter_sigma_a), (SIGMA_Z, tuned.sigma_z)):
@@ -514,16 +511,13 @@ class _Ekf2(_Changed):
         asked = min((tuned.filter_sigma_a.value or 0.0) * steps**0.5, most)
         return {ACC_NOISE: float(f"{asked:.2g}")} if asked > flown else {}
 
-    def of_noise(self, result: AxisComparison, tuned: AxisTuning, over: bool) -> list[Change]:
+    def of_noise(self, statement: FilterSummary, tuned: AxisTuning, over: bool) -> list[Change]:
         """The source's noise."""
-        noise, statement = tuned.sigma_z, result.filters["ekf2"]
+        noise = tuned.sigma_z
         if (noise.low or 0.0) <= self.used_m <= (noise.high or np.inf):
             return []
         asked_m = noise.value
-        if asked_m is None:
-            if isinstance(statement, Unavailable):
-                return []
-            # EKF2's own innovations bound it too, and less tightly
+        if asked_m is None:  # EKF2's own innovations bound it too, and less tightly
             asked_m = float(np.hypot(statement.innovation_std_m, statement.innovation_mean_m))
         return [noise_change(self.inputs, self.used_m, asked_m)]
 
@@ -541,7 +535,7 @@ class _Ekf2(_Changed):
             nu = along(updates, INNOVATION_COLUMNS, weights)
             s = along(updates, INNOVATION_VARIANCE_COLUMNS, weights**2)
             return (float(np.mean(nu**2 / s)), len(nu)) if len(nu) else None
-        state = project_state(made.published, axis, self.comparison.segment)
+        state = project(made.published, axis, self.comparison.segment)
         if of == "apart":
             logged = result.ekf2_state
             state = state if change or isinstance(logged, Unavailable) else logged

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from px4fuse.comparison.comparison import compare_prepared
+from px4fuse.comparison.estimates import Tuning, known_noises
 from px4fuse.comparison.model import AgainstTruth, Comparison
 from px4fuse.comparison.preparation import prepare
 from px4fuse.ekf2.inputs import Inputs
@@ -22,7 +23,7 @@ from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.quick import quick_replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital
 from px4fuse.request import OPTIONS
@@ -50,7 +51,7 @@ REJECTED_SHOWN = 0.005
 def asked_of_ekf2(
     comparison: Comparison,
     model: Model,
-    tuning: Mapping[str, AxisTuning | Unavailable],
+    tuning: Tuning,
     clock: ClockOffset | Unavailable,
 ) -> dict[str, float]:
     """EKF2's parameters as the data ask for them, by PX4 name and in PX4's units.
@@ -74,7 +75,8 @@ def asked_of_ekf2(
     if not fused(comparison, model.inputs):
         return {}
     changes: dict[str, float] = {}
-    noise_m, used_m = tuned_noise_m(tuning), noise_used_m(model)
+    tuned, used_m = known_noises(tuning, HORIZONTAL, AISLE, "north", "east"), noise_used_m(model)
+    noise_m = None if tuned is None else tuned.sigma_z.value
     slow = comparison.source.origin.may_drift or comparison.source.origin.is_gnss
     if noise_m is not None and not (slow and noise_m <= used_m):
         changes |= noise_change(model.inputs, used_m, noise_m)
@@ -115,12 +117,6 @@ def delay_ms(comparison: Comparison) -> float | None:
         return None
     found = comparison.flight.log.parameters.get(source.origin.aid.delay)
     return None if source.origin.by_gnss and source.age_s == 0.0 != found else found
-
-
-def tuned_noise_m(tuning: Mapping[str, AxisTuning | Unavailable]) -> float | None:
-    """Horizontal measurement noise (m) that the data ask for; None where they do not tell."""
-    known = (tuning.get(name) for name in (HORIZONTAL, AISLE, "north", "east"))
-    return next((tuned.sigma_z.value for tuned in known if isinstance(tuned, AxisTuning)), None)
 
 
 def noise_change(inputs: Inputs, used_m: float, noise_m: float) -> dict[str, float]:
@@ -283,12 +279,8 @@ def not_replayed(why: Unavailable) -> str:
 
 def settings_words(changes: Mapping[str, float]) -> str:
     """Parameters and the values to set."""
-    parts = []
-    for name, value in changes.items():
-        unit = PARAMETERS[name].unit
-        unit = f" {unit}" if unit else ""
-        parts.append(f"{name} to {value:.3g}{unit}")
-    return " and ".join(parts)
+    said = (f"{name} to {value:.3g} {PARAMETERS[name].unit}" for name, value in changes.items())
+    return " and ".join(map(str.rstrip, said))
 
 
 def noise_helps(before: Summary, after: Summary) -> bool:

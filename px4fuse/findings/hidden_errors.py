@@ -20,7 +20,6 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.causes import CAUSE
 from px4fuse.findings.model import Finding, Found, finding, info
 from px4fuse.findings.since import cure_words, kind_of, since_words
-from px4fuse.flight import Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.plain import factor_words, number_words
 from px4fuse.trajectory.alignment import fit
@@ -125,7 +124,10 @@ def _after_turning(comparison: Comparison, owner: str) -> tuple[float, float] | 
     if len(truths) < 2:
         return None
     times = truths[0].index.to_numpy()
-    tracks = [_track(result, owner, times) for result in axes]
+    tracks = [
+        state_at(result.replay, times)[0] if owner == "kf" else _published(result, times)
+        for result in axes
+    ]
     level = np.zeros(len(times))
     estimate = np.column_stack([*tracks, level])
     true = np.column_stack([*(truth["position_m"] for truth in truths), level])
@@ -140,15 +142,11 @@ def _after_turning(comparison: Comparison, owner: str) -> tuple[float, float] | 
     return before, left
 
 
-def _track(result: AxisComparison, owner: str, times: Array) -> Array:
-    """Position (m) of a filter along one axis; NaN where it is not known."""
-    if owner == "kf":
-        return state_at(result.replay, times)[0]
-    if isinstance(result.ekf2_state, Unavailable):
-        return np.full(len(times), np.nan)
+def _published(result: AxisComparison, times: Array) -> Array:
+    """Position (m) of EKF2 along one axis; NaN where it is not known."""
+    assert isinstance(result.ekf2_state, pd.DataFrame)  # else no error of EKF2 is hidden
     state = result.ekf2_state["position_m"]
-    track: Array = np.interp(times, state.index, state, left=np.nan, right=np.nan)
-    return track
+    return np.asarray(np.interp(times, state.index, state, left=np.nan, right=np.nan))
 
 
 def drift(analysis: Analysis) -> Finding:

@@ -13,6 +13,7 @@ from msgspec import structs
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
+from px4fuse.comparison.estimates import known_noises
 from px4fuse.comparison.interventions import (
     OF_SETTINGS,
     SIGMA_A,
@@ -24,6 +25,7 @@ from px4fuse.comparison.interventions import (
     tuned_for,
 )
 from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName
+from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.ekf2_parameters import BAROMETER, BAROMETER_NOISE_M, PARAMETERS
 from px4fuse.filter.consistency import SIGMA_OFF, Consistency
@@ -54,7 +56,6 @@ READINGS = {
     "every measurement.",
 }
 SIGMA_OFF_ERROR = 2.0  # times, in standard deviation
-EKF2_NOISE_FLOOR_M = 0.01  # EKF2 never trusts external vision better, EKF2.cpp
 NOISE_FITS = 1.25  # times: the median's own scatter below n = 100 (1.17/√n, two σ)
 NOT_EXPLAINED = (
     "No change of a noise, the clock, the frame or the outliers explains half of it: look at the "
@@ -98,8 +99,7 @@ def detect(analysis: Analysis) -> Found:
 
 def settings_off(analysis: Analysis) -> Found:
     """What is off beyond its interval, the worse one first."""
-    tunings = map(analysis.tuning.get, (HORIZONTAL, "aisle", "down"))
-    tuned = next((tuned for tuned in tunings if isinstance(tuned, AxisTuning)), None)
+    tuned = known_noises(analysis.tuning, HORIZONTAL, "aisle", "down")
     if tuned is None:
         return
     chosen = {SIGMA_Z: analysis.settings.sigma_z_m, SIGMA_A: analysis.settings.sigma_a_m_s2}
@@ -347,7 +347,7 @@ def _not_replayed(analysis: Analysis, result: AxisComparison, tuned: AxisTuning 
     asked_m = None if tuned is None else _asked(tuned.sigma_z)
     if asked_m is None or why is None:
         return UNKNOWN_NOISE if tuned is None else NOT_EXPLAINED
-    noise_m, used_m = max(asked_m, EKF2_NOISE_FLOOR_M), ekf2_noise_m(result)
+    noise_m, used_m = max(asked_m, EKF2_MIN_NOISE_M), ekf2_noise_m(result)
     said = f"The source's noise is {noise_m:.2g} m, EKF2 takes it to be {used_m:.2g} m"
     statement = result.filters["ekf2"]
     assert not isinstance(statement, Unavailable)
