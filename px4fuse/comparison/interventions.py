@@ -455,7 +455,7 @@ class _Ours(_Changed):
         if of == "apart":
             state = result.ekf2_state
             return None if compass or isinstance(state, Unavailable) else _rms_apart(run, state)
-        return _nees(kf_against_truth(run, truth, run.steps.index.to_numpy()))
+        return _nees(kf_against_truth(run, truth, run.steps))
 
 
 @dataclass(frozen=True)

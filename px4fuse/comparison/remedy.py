@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from px4fuse.comparison.comparison import compare_prepared
+from px4fuse.comparison.comparison import kf_against_truth
 from px4fuse.comparison.estimates import Tuning, known_noises
-from px4fuse.comparison.model import AgainstTruth, Comparison
-from px4fuse.comparison.preparation import prepare
+from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.preparation import shift_clock
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.whatif import Summary, what_if
@@ -22,7 +22,7 @@ from px4fuse.ekf2_parameters import EV_POS, PARAMETERS, Aid
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.quick import quick_replay
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import AISLE
+from px4fuse.filter.signals import AISLE, make_axes
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital
@@ -214,26 +214,22 @@ def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, f
     Root of the sum of the mean squares of all axes but the aisle, which is made of the others.
     None without a truth.
     """
-    names = [name for name in comparison.axes if name != AISLE] or [AISLE]
-
-    def errors_m(of: Comparison) -> list[float]:
-        truths = (of.axes[name].filters["kf"].truth for name in names)
-        return [truth.position_rmse_m for truth in truths if isinstance(truth, AgainstTruth)]
-
-    segment, before = comparison.segment, errors_m(comparison)
-    if len(before) < len(names):
-        return None
-    prepared = prepare(
-        comparison.flight,
-        changed,
-        axes=tuple(names),
-        heading_deg=comparison.axes[names[0]].heading_deg,
-        position_source=comparison.source.name,
-        start_s=segment.start_s,
-        end_s=segment.end_s,
-    )
-    after = errors_m(compare_prepared(prepared, replayed=quick_replay))
-    return (math.hypot(*before), math.hypot(*after)) if len(after) == len(names) else None
+    names = tuple(name for name in comparison.axes if name != AISLE) or (AISLE,)
+    results = [comparison.axes[name] for name in names]
+    later_s = changed.clock_offset_s - comparison.settings.clock_offset_s
+    lines = make_axes(
+        comparison.flight, shift_clock(comparison.source, later_s), comparison.segment, names=names,
+        heading_deg=results[0].heading_deg,
+    )  # fmt: skip
+    errors_m: list[tuple[float, float]] = []
+    for result, line in zip(results, lines, strict=True):
+        run, before = quick_replay(line, changed), result.filters["kf"].truth
+        after = kf_against_truth(run, result.truth, result.ekf2_state)
+        if isinstance(before, Unavailable) or isinstance(after, Unavailable):
+            return None
+        errors_m.append((before.position_rmse_m, after.position_rmse_m))
+    before_m, after_m = zip(*errors_m, strict=True)
+    return math.hypot(*before_m), math.hypot(*after_m)
 
 
 def filter_words(
