@@ -271,10 +271,11 @@ def test_what_the_data_ask_for(sample: Analysis) -> None:
 def test_a_noise_that_the_sender_reports_is_overruled(sample: Analysis) -> None:
     model = model_of(sample)
     assert noise_used_m(model) == pytest.approx(0.1)
-    assert noise_change(model.inputs, noise_used_m(model), 0.0012345) == {"EKF2_EVP_NOISE": 0.01}
+    flown = model.inputs.aid, model.inputs.settings, noise_used_m(model)
+    assert noise_change(*flown, 0.0012345) == {"EKF2_EVP_NOISE": 0.01}
     settings = {**model.inputs.settings, "EKF2_EVP_NOISE": 0.02, "EKF2_EV_NOISE_MD": 0.0}
     reported = replace(model, inputs=replace(model.inputs, settings=settings))
-    used = reported.inputs, noise_used_m(reported)
+    used = reported.inputs.aid, settings, noise_used_m(reported)
     assert noise_change(*used, 0.05) == {
         "EKF2_EVP_NOISE": 0.05,
         "EKF2_EV_NOISE_MD": 1.0,

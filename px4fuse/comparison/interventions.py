@@ -519,7 +519,7 @@ class _Ekf2(_Changed):
         asked_m = noise.value
         if asked_m is None:  # EKF2's own innovations bound it too, and less tightly
             asked_m = float(np.hypot(statement.innovation_std_m, statement.innovation_mean_m))
-        return [noise_change(self.inputs, self.used_m, asked_m)]
+        return [noise_change(self.inputs.aid, self.inputs.settings, self.used_m, asked_m)]
 
     def number(self, result: AxisComparison, of: Of, change: Change) -> tuple[float, int] | None:
         """By a replay, along a horizontal axis; unchanged how far apart by the log."""

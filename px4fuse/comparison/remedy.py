@@ -79,7 +79,7 @@ def asked_of_ekf2(
     noise_m = None if tuned is None else tuned.sigma_z.value
     slow = comparison.source.origin.may_drift or comparison.source.origin.is_gnss
     if noise_m is not None and not (slow and noise_m <= used_m):
-        changes |= noise_change(model.inputs, used_m, noise_m)
+        changes |= noise_change(model.inputs.aid, model.inputs.settings, used_m, noise_m)
     return changes | delay_asked(comparison, model.inputs, clock)
 
 
@@ -119,16 +119,16 @@ def delay_ms(comparison: Comparison) -> float | None:
     return None if source.origin.by_gnss and source.age_s == 0.0 != found else found
 
 
-def noise_change(inputs: Inputs, used_m: float, noise_m: float) -> dict[str, float]:
+def noise_change(
+    aid: Aid, settings: Mapping[str, float], used_m: float, noise_m: float
+) -> dict[str, float]:
     """What to set so that EKF2 takes a position's standard deviation (m) to be this.
 
-    Two digits, within PX4's range; ``used_m`` is what it took.
+    Two digits, within PX4's range; ``settings`` and ``used_m`` are what it took.
     """
-    settings, aid = inputs.settings, inputs.aid
-    least = PARAMETERS[aid.noise].minimum
-    changes = {aid.noise: max(float(f"{noise_m:.2g}"), least)}
-    reported = used_m > REPORTED_TIMES * settings[aid.noise]
-    may_differ = aid.noise_mode and settings[aid.noise_mode] == 0.0
+    changes = {aid.noise: max(float(f"{noise_m:.2g}"), PARAMETERS[aid.noise].minimum)}
+    reported = used_m > REPORTED_TIMES * settings.get(aid.noise, math.inf)
+    may_differ = aid.noise_mode and settings.get(aid.noise_mode, 0.0) == 0.0
     if may_differ and reported and noise_m < used_m:
         changes[aid.noise_mode] = 1.0
     return changes
@@ -214,6 +214,8 @@ def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, f
     Root of the sum of the mean squares of all axes but the aisle, which is made of the others.
     None without a truth.
     """
+    if isinstance(comparison.flight.truth, Unavailable):
+        return None
     names = tuple(name for name in comparison.axes if name != AISLE) or (AISLE,)
     results = [comparison.axes[name] for name in names]
     later_s = changed.clock_offset_s - comparison.settings.clock_offset_s

@@ -27,7 +27,7 @@ from px4fuse.comparison.interventions import (
 from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
 from px4fuse.comparison.remedy import aid_of
-from px4fuse.ekf2_parameters import BAROMETER, BAROMETER_NOISE_M, PARAMETERS
+from px4fuse.ekf2_parameters import BAROMETER, PARAMETERS
 from px4fuse.filter.consistency import SIGMA_OFF, Consistency
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import within
@@ -287,10 +287,8 @@ def _is_default(analysis: Analysis, owner: FilterName, result: AxisComparison) -
     if owner == "kf":
         chosen, own = analysis.settings, Settings()
         return (chosen.sigma_z_m, chosen.sigma_a_m_s2) == (own.sigma_z_m, own.sigma_a_m_s2)
-    aid = aid_of(analysis, result.axis.name)
-    name, default = aid.noise, BAROMETER_NOISE_M
-    if aid != BAROMETER:
-        default = PARAMETERS[name].default
+    name = aid_of(analysis, result.axis.name).noise
+    default = PARAMETERS[name].default
     untouched = analysis.flight.log.parameters.get(name, default) == default
     # a sender that reports a larger variance has chosen it
     return untouched and not abs(np.log(ekf2_noise_m(result) / default)) > np.log(NOISE_FITS)
@@ -357,10 +355,7 @@ def _not_replayed(analysis: Analysis, result: AxisComparison, tuned: AxisTuning 
             f"{said}: that is not it. Look at the clock ({aid.delay}) and at EKF2's process noise "
             f"(EKF2_ACC_NOISE). {remedy.not_replayed(why)}"
         )
-    changes = {aid.noise: float(f"{noise_m:.2g}")}
-    set_m = analysis.flight.log.parameters.get(aid.noise, np.inf)
-    if aid.noise_mode and used_m > NOISE_FITS * set_m:
-        changes[aid.noise_mode] = 1.0
+    changes = remedy.noise_change(aid, analysis.flight.log.parameters, used_m, noise_m)
     return f"{said}: set {remedy.settings_words(changes)}. {remedy.not_replayed(why)}"
 
 
