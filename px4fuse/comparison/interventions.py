@@ -13,7 +13,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, TypeGuard
 
 import numpy as np
 import pandas as pd
@@ -254,12 +254,17 @@ def _apart(cause: Intervention, result: AxisComparison, changed: _Changed) -> li
     ]  # fmt: skip
 
 
+def is_off(statement: FilterSummary | UnjudgedFilter) -> TypeGuard[FilterSummary]:
+    """Whether a variance is not what innovations show, by more than chance and enough to matter."""
+    if isinstance(statement, Unavailable):
+        return False
+    return statement.verdict != "consistent" and statement.times_off >= SIGMA_OFF
+
+
 def _discrepancies(statement: FilterSummary | UnjudgedFilter) -> list[Of]:
-    """What of a filter is not as it should be, by more than chance and by enough to matter."""
+    """What of a filter is not as it should be."""
     found: list[Of] = ["nees"] if beyond_claim(statement) else []
-    if isinstance(statement, Unavailable) or statement.verdict == "consistent":
-        return found
-    return [*found, "nis"] if statement.times_off >= SIGMA_OFF else found
+    return [*found, "nis"] if is_off(statement) else found
 
 
 def _tried(changed: _Changed, result: AxisComparison, of: Of) -> list[Intervention]:

@@ -6,7 +6,7 @@ fitted together, so that they are put right together: the one that is further of
 setting that nobody chose is advice, one step less severe than one that was.
 """
 
-from typing import NamedTuple, TypeGuard
+from typing import NamedTuple
 
 import numpy as np
 from msgspec import structs
@@ -21,14 +21,14 @@ from px4fuse.comparison.interventions import (
     SMALLEST_SIGMA_Z_M,
     Intervention,
     cause_of,
+    is_off,
     tried_on,
     tuned_for,
 )
-from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName
+from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName, FilterSummary
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.ekf2_parameters import BAROMETER, PARAMETERS
-from px4fuse.filter.consistency import SIGMA_OFF, Consistency
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
@@ -79,7 +79,7 @@ AGAINST_TRUTH = (
     "truth."
 )
 
-Member = tuple[AxisComparison, Consistency]
+Member = tuple[AxisComparison, FilterSummary]
 
 
 class Off(NamedTuple):
@@ -206,19 +206,12 @@ def variances(analysis: Analysis) -> Found:
             for group, axes in GROUPS.items():
                 results = [analysis.axes[name] for name in axes if name in analysis.axes]
                 pairs = [(result, result.filters[owner]) for result in results]
-                members = [(result, each) for result, each in pairs if _is_off(each, over=over)]
+                off = [(result, each) for result, each in pairs if is_off(each)]
+                members = [pair for pair in off if (pair[1].sigma_factor > 1.0) == over]
                 if members:
                     found = _of_group(analysis, owner, group, members)
                     yield structs.replace(found, caused_by=first)
                     first = found.id
-
-
-def _is_off(statement: Consistency | Unavailable, *, over: bool) -> TypeGuard[Consistency]:
-    """Whether a variance is over-, or else understated."""
-    if isinstance(statement, Unavailable):
-        return False
-    right = (statement.sigma_factor > 1.0) == over
-    return right and statement.verdict != "consistent" and statement.times_off >= SIGMA_OFF
 
 
 def _of_group(analysis: Analysis, owner: FilterName, group: str, members: list[Member]) -> Finding:
