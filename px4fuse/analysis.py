@@ -130,11 +130,11 @@ class Analysis(Comparison):
         )
 
     @cached_property
-    def hanging_together(self) -> tuple[Smoothing, Coloured | Unavailable] | Unavailable:
+    def hanging_together(self) -> tuple[Smoothing | Unavailable, Coloured | Unavailable]:
         """A low pass and a slow error of the source, jumps taken out."""
         found = self._horizontally()
         if isinstance(found, Unavailable):
-            return found
+            return found, found
         axes, tuned, offset_s = found
         jumps = self.explained.jumps if isinstance(self.explained, Explained) else ()
         # when exactly a jump was is not known
@@ -146,24 +146,24 @@ class Analysis(Comparison):
             self.flight, axes, self.settings, tuned.noises, outlier_time_s=left_out,
             clock_offset_s=offset_s, jumps=jumps,
         )  # fmt: skip
+        if isinstance(together, Unavailable):
+            return together, together
+        smooth, slow = together
         truths = [self.axes[axis.name].truth for axis in axes]
         known = [truth for truth in truths if not isinstance(truth, Unavailable)]
-        if isinstance(together, Unavailable) or len(known) < len(axes):
-            return together
-        smooth, slow = together
-        return smooth, against_truth(axes, known, left_out, offset_s, jumps, slow)
+        if len(known) == len(axes):
+            slow = against_truth(axes, known, left_out, offset_s, jumps, slow)
+        return smooth, slow
 
     @property
     def smoothing(self) -> Smoothing | Unavailable:
         """A low pass in the source."""
-        found = self.hanging_together
-        return found if isinstance(found, Unavailable) else found[0]
+        return self.hanging_together[0]
 
     @property
     def coloured(self) -> Coloured | Unavailable:
         """A slow error of the source, where something makes successive errors hang together."""
-        found = self.hanging_together
-        return found if isinstance(found, Unavailable) else found[1]
+        return self.hanging_together[1]
 
     @cached_property
     def aids(self) -> Mapping[str, AidResult] | Unavailable:

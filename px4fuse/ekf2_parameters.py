@@ -93,7 +93,6 @@ BAROMETER = Aid(
     "baro_hgt", "EKF2_BARO_CTRL", "EKF2_BARO_NOISE", "EKF2_BARO_GATE", "EKF2_BARO_DELAY",
     label="barometer", reported="EKF2_BARO_NOISE and the variance of its bias",
 )  # fmt: skip
-BAROMETER_NOISE_M = 3.5  # PX4's default of EKF2_BARO_NOISE
 GNSS_HGT = _gnss("gnss_hgt", "GNSS height", GNSS_POS.noise, GNSS_POS.gate, "m")
 GNSS_VEL = _gnss("gnss_vel", "GNSS velocity", "EKF2_GPS_V_NOISE", "EKF2_GPS_V_GATE", "m/s")
 FLOW = Aid(
@@ -176,7 +175,7 @@ PARAMETERS: Mapping[str, Parameter] = {
     MAG.noise: Parameter("gauss", 0.05, 0.001, 1.0),
     MAG.gate: Parameter("SD", 3.0, 1.0, 1e3),
     **FIELD_NOISES,
-    BAROMETER.noise: Parameter("m", BAROMETER_NOISE_M, 0.01, 15.0),
+    BAROMETER.noise: Parameter("m", 3.5, 0.01, 15.0),
     BAROMETER.gate: Parameter("SD", BAROMETER.default_gate, 1.0, 1e3),
     "EKF2_DELAY_MAX": Parameter("ms", 200.0, 0.0, 1e3),
     **dict.fromkeys((*EV_POS.place, *GNSS_POS.place), Parameter("m", 0.0, -math.inf, math.inf)),

@@ -13,13 +13,13 @@ from browser import Browser
 from explore_tools import ask, axe, open_view, serious, settle, show
 
 from px4fuse.analysis import Analysis, run
+from px4fuse.comparison.interventions import beyond_claim
 from px4fuse.ekf2.model import replay_settings
 from px4fuse.explore.page import html_text
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import within
 from px4fuse.findings import find
-from px4fuse.findings.hidden_errors import hidden_errors
 from px4fuse.flight import Unavailable
 from px4fuse.plain import length_words, number_words
 from px4fuse.request import ComparisonRequest
@@ -143,7 +143,8 @@ def test_an_error_that_innovations_hide_is_told_by_what_the_filter_claims(
 ) -> None:
     put(page, offset=0.3)
     shifted = _shifted(explored[1], 0.3)
-    hidden = next(one for one in hidden_errors(shifted) if (one.owner, one.axis) == ("kf", "aisle"))
+    hidden = beyond_claim(shifted.axes["aisle"].filters["kf"])
+    assert hidden is not None
     error, claimed = length_words(hidden.rmse_m), length_words(hidden.claimed_m)
     assert f"our filter is {error} from the truth (RMS) and claims {claimed};" in text(page, "live")
 

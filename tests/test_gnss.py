@@ -22,12 +22,14 @@ import px4fuse
 from px4fuse.analysis import run_preparation
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.preparation import choose_source, prepare
+from px4fuse.comparison.remedy import filter_errors_m
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.inputs import _rules, read_gnss
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.replay import rms, settled
 from px4fuse.ekf2.whatif import Summary, WhatIf, what_if
 from px4fuse.errors import MissingDataError, SettingsError
+from px4fuse.filter.settings import Settings
 from px4fuse.findings import find, noises
 from px4fuse.flight import Columns, Ekf2, Flight, FusionRecord, PositionTrack, Unavailable
 from px4fuse.origin import GNSS
@@ -274,6 +276,19 @@ def test_down_is_by_gnss_unless_ekf2_fused_the_barometer_alone_or_it_is_asked_fo
     vision = simulate_flight(scenario_of("aisle", seed=1))
     with pytest.raises(SettingsError, match="`height` is for GNSS"):
         prepare(vision, height="gnss")
+
+
+@pytest.mark.reallogs
+def test_a_remedy_is_judged_by_the_height_that_was_asked_for(shared_logs: Path) -> None:
+    """Settings that change nothing leave the error as it is, of either height."""
+    flight = read_log(shared_logs / "gps" / "v1.16.1_gps_nominal.ulg")
+    errors_m = []
+    for height in ("gnss", "barometer"):
+        compared = compare(flight, Settings(), axes=("down",), height=height)
+        before_m, after_m = filter_errors_m(compared, compared.settings)  # type: ignore[misc]
+        assert after_m == pytest.approx(before_m, rel=1e-9)
+        errors_m.append(before_m)
+    assert errors_m[0] != pytest.approx(errors_m[1], rel=0.01)
 
 
 @pytest.mark.reallogs

@@ -53,10 +53,15 @@ RIGHT = Noise(1.0, 0.9, 1.1)
 def no_replay(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a replay would be made with stands in its place."""
 
-    def words(_: Any, changed: Settings, typed: str, unseen_nats: float | None = None) -> str:
+    said, tried_out = noises.remedy.filter_words, list[Settings]()
+
+    def words(of: Any, changes: Any, more: str = "", unseen_nats: float | None = None) -> str:
+        typed = said(of, changes, more).removeprefix("px4fuse compare LOG ").removesuffix(".")
+        changed = tried_out[-1]
         return f"[{typed}|{changed.sigma_z_m:g}|{changed.sigma_a_m_s2:g}|{unseen_nats}]."
 
     monkeypatch.setattr(noises.remedy, "filter_words", words)
+    monkeypatch.setattr(noises.remedy, "filter_errors_m", lambda _, new: tried_out.append(new))
 
 
 # ---------------------------------------------------------------- SIGMA_Z and SIGMA_A
@@ -276,9 +281,9 @@ def test_ekf2s_noise_is_the_programs_unless_the_sender_chose_another(
 def test_what_a_cause_asks_for(
     owner: Any, change: dict[str, float], kind: str, says: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def words(_: Any, changes: Any, helps: Any, *, otherwise: str) -> tuple[str, bool]:
+    def words(_: Any, changes: Any, helps: Any, *, otherwise: str) -> str:
         ((name, value),) = changes.items()
-        return f"{{{name}: {value:g} {PARAMETERS[name].unit}|{helps.__name__}}}", True
+        return f"{{{name}: {value:g} {PARAMETERS[name].unit}|{helps.__name__}}}"
 
     monkeypatch.setattr(since.remedy, "remedy_words", words)
     model = SimpleNamespace(inputs=SimpleNamespace(settings=dict.fromkeys(PARAMETERS, 1.0)))

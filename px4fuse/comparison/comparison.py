@@ -23,16 +23,15 @@ from px4fuse.comparison.preparation import Choices, prepare
 from px4fuse.comparison.projection import (
     MIN_COMMON_SAMPLES,
     continuous_state,
+    project,
     project_horizon,
     project_innovations,
-    project_state,
     project_truth,
     project_variance,
 )
 from px4fuse.filter.consistency import GATE_SIGMA, HorizontalNis, assess, assess_horizontal
 from px4fuse.filter.kalman import Replay, replay, state_at, variance_at
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis
 from px4fuse.flight import RECORD_NOT_LOGGED, Ekf2, Flight, Unavailable, sample_rate
 
 STATE = ("position_m", "velocity_m_s")
@@ -63,11 +62,9 @@ def compare(
 
 
 def compare_prepared(
-    prepared: Comparison,
-    progress: Callable[[str], None] = lambda _: None,
-    replayed: Callable[[Axis, Settings], Replay] = replay,
+    prepared: Comparison, progress: Callable[[str], None] = lambda _: None
 ) -> Comparison:
-    """:func:`compare`, with what it begins with made; ``replayed`` runs the filter."""
+    """:func:`compare`, with what it begins with made."""
     notes, ekf2 = list(prepared.notes), prepared.flight.ekf2
     if isinstance(ekf2, Ekf2):
         state, statement = continuous_state(ekf2, prepared.source, prepared.segment)
@@ -78,7 +75,7 @@ def compare_prepared(
         ekf2 = ekf2 if same else replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
     progress(", ".join(line.name for line in prepared.lines))
     axes = {
-        line.name: _compare_axis(prepared, ekf2, replayed(line, prepared.settings))
+        line.name: _compare_axis(prepared, ekf2, replay(line, prepared.settings))
         for line in prepared.lines
     }
     both: dict[FilterName, HorizontalNis | None] = {
@@ -97,17 +94,15 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, run: Replay) -
     variance: Frame
     innovations: Frame
     apart: Difference | Unavailable
-    horizon = None
+    horizon, gate = None, GATE_SIGMA if isinstance(ekf2, Unavailable) else ekf2.gate
     if isinstance(ekf2, Unavailable):
         state = variance = innovations = apart = ekf2
-        times, gate = run.steps.index.to_numpy(), GATE_SIGMA
     else:
-        state = project_state(ekf2.state, axis, segment)
+        state = project(ekf2.state, axis, segment)
         variance = project_variance(ekf2, axis, segment)
         horizon = project_horizon(ekf2, axis, segment)
         innovations = project_innovations(flight, ekf2, prepared.source, axis, segment)
         apart = difference(run, state)
-        times, gate = state.index.to_numpy(), ekf2.gate
     updates = run.updates.assign(
         prior_variance_m2=run.updates["prior_position_variance_m2"],
         posterior_variance_m2=run.steps["position_variance_m2"].reindex(run.updates.index),
@@ -125,7 +120,7 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, run: Replay) -
             input_gap_s=run.input_gap_s,
         ),
         filters={
-            "kf": _summary(updates, run.steps, kf_against_truth(run, truth, times), GATE_SIGMA),
+            "kf": _summary(updates, run.steps, kf_against_truth(run, truth, state), GATE_SIGMA),
             "ekf2": _summary(
                 innovations, variance, against_truth(state, variance, truth, horizon), gate
             ),
@@ -193,8 +188,9 @@ def _rmse(error: Array) -> float:
     return float(np.sqrt(np.mean(error**2)))
 
 
-def kf_against_truth(run: Replay, truth: Frame, times: Array) -> AgainstTruth | Unavailable:
-    """Our filter against the truth along one axis, at some times."""
+def kf_against_truth(run: Replay, truth: Frame, beside: Frame) -> AgainstTruth | Unavailable:
+    """Our filter against the truth along one axis, when EKF2 is known beside it or at its steps."""
+    times = (run.steps if isinstance(beside, Unavailable) else beside).index.to_numpy()
     state, variance = (
         pd.DataFrame(dict(zip(columns, of(run, times), strict=True)), index=times)
         for columns, of in ((STATE, state_at), (VARIANCES, variance_at))

@@ -42,6 +42,12 @@ def silent(_: str) -> None:
     """Progress that is shown to nobody."""
 
 
+def known_noises(tuning: Tuning, *names: str) -> AxisTuning | None:
+    """Of the first of these names of which noises are known."""
+    found = map(tuning.get, names)
+    return next((tuned for tuned in found if isinstance(tuned, AxisTuning)), None)
+
+
 def size(noise: Noise, otherwise: float) -> float:
     """Most likely value of a noise, or its bound, or what was set."""
     return noise.value or noise.high or otherwise
@@ -86,16 +92,11 @@ def noises_and_clock(
     tuning = tuned(comparison, names, progress, cache)
     if slow := imu_too_slow_for_clocks(comparison.flight):
         return tuning, slow
-    settings = comparison.settings
-    known = [
-        found
-        for found in (tuning.get(HORIZONTAL), *tuning.values())
-        if isinstance(found, AxisTuning)
-    ]
+    settings, known = comparison.settings, known_noises(tuning, HORIZONTAL, *tuning)
     clock = estimate_clock_offset(
         comparison.flight, comparison.source, comparison.segment, settings,
-        known[0].noises if known else Noises(settings.sigma_a_m_s2, settings.sigma_z_m),
-        known[0].outlier_time_s if known else None, progress, cache,
+        known.noises if known else Noises(settings.sigma_a_m_s2, settings.sigma_z_m),
+        known.outlier_time_s if known else None, progress, cache,
     )  # fmt: skip
     drifts = comparison.source.origin.may_drift
     return tuning, with_drift(clock) if drifts and isinstance(clock, ClockOffset) else clock
@@ -109,8 +110,8 @@ def turned_frame(
 ) -> HeadingError | Unavailable:
     """Turn of the source's frame, with the noise and the clock offset that were found."""
     progress("heading")
-    tuned, sigma_z_m = tuning.get(HORIZONTAL), comparison.settings.sigma_z_m
-    if isinstance(tuned, AxisTuning):
+    tuned, sigma_z_m = known_noises(tuning, HORIZONTAL), comparison.settings.sigma_z_m
+    if tuned is not None:
         sigma_z_m = size(tuned.sigma_z, sigma_z_m)
     offset_s = 0.0
     if isinstance(clock, ClockOffset) and clock.determinable:

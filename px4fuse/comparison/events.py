@@ -9,13 +9,12 @@ import pandas as pd
 from px4fuse.arrays import Array
 from px4fuse.comparison.model import Comparison
 from px4fuse.flight import Ekf2, FlightMode, Unavailable
+from px4fuse.record import Span
 
 # A source is silent where it leaves out this long, and so many of its intervals: jitter and single
 # losses pass
 GAP_S = 1.0
 GAP_INTERVALS = 5.0
-
-Span = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -49,6 +48,11 @@ class Events:
     rejected_s: Mapping[str, Array]
 
 
+def longest_s(interval_s: float) -> float:
+    """Interval beyond which a source with this usual one is silent."""
+    return max(GAP_S, GAP_INTERVALS * interval_s)
+
+
 def source_gaps(time_s: Array, rate_hz: float) -> tuple[Span, ...]:
     """Stretches (s) between measurements in which the source was silent.
 
@@ -59,7 +63,7 @@ def source_gaps(time_s: Array, rate_hz: float) -> tuple[Span, ...]:
     rate_hz : float
         Of the source between gaps.
     """
-    long = np.diff(time_s) > max(GAP_S, GAP_INTERVALS / rate_hz)
+    long = np.diff(time_s) > longest_s(1.0 / rate_hz)
     return tuple(zip(time_s[:-1][long].tolist(), time_s[1:][long].tolist(), strict=True))
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple, TypeGuard
 
 import numpy as np
 import pandas as pd
@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import against_truth, difference, kf_against_truth
-from px4fuse.comparison.estimates import Tuning
+from px4fuse.comparison.estimates import Tuning, known_noises
 from px4fuse.comparison.model import (
     AgainstTruth,
     AxisComparison,
@@ -31,8 +31,8 @@ from px4fuse.comparison.model import (
     FilterSummary,
     UnjudgedFilter,
 )
-from px4fuse.comparison.projection import project_state, project_truth
-from px4fuse.comparison.remedy import delay_asked, noise_change, noise_used_m
+from px4fuse.comparison.projection import project, project_truth
+from px4fuse.comparison.remedy import delay_asked, fused, noise_change
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, moved, replay_settings
 from px4fuse.ekf2.recursion import Variant
@@ -168,12 +168,25 @@ def cause_of(
     )  # fmt: skip
 
 
-def beyond_claim(statement: FilterSummary | UnjudgedFilter) -> bool:
-    """Whether the error to the truth is larger than claimed, and no innovation says so."""
+class Hidden(NamedTuple):
+    """An error to the truth (RMS, and its NEES) beyond the standard deviation that is claimed."""
+
+    nees: float
+    rmse_m: float
+    claimed_m: float
+    nis_mean: float
+
+
+def beyond_claim(statement: FilterSummary | UnjudgedFilter) -> Hidden | None:
+    """The error to the truth where it is larger than claimed, and no innovation says so."""
     truth = statement.truth
-    if isinstance(statement, Unavailable) or not isinstance(truth, AgainstTruth):
-        return False
-    return (truth.nees_position_mean or 0.0) >= NEES_LARGE and statement.nis_mean < CONTENT_NIS
+    if isinstance(statement, Unavailable) or isinstance(truth, Unavailable):
+        return None
+    nees, rmse_m = truth.nees_position_mean or 0.0, truth.position_rmse_m
+    if nees < NEES_LARGE or statement.nis_mean >= CONTENT_NIS:
+        return None
+    claimed_m = statement.sigma_p_median_m or rmse_m / float(np.sqrt(nees))
+    return Hidden(nees, rmse_m, claimed_m, statement.nis_mean)
 
 
 def interventions(
@@ -198,10 +211,9 @@ def interventions(
         Of EKF2.
     """
     known = comparison, tuning, clock, heading
-    filters: list[_Tried] = [_Ours(*known, explained)]
-    if not isinstance(model, Unavailable) and model.agreement.good:
-        inputs, used_m = model.inputs, noise_used_m(model)
-        filters += [_Replayed(*known, inputs, used_m, model)] if _fused(comparison, inputs) else []
+    filters: list[_Changed] = [_Ours(*known, explained)]
+    if isinstance(model, Model) and model.agreement.good and fused(comparison, model.inputs):
+        filters.append(_Ekf2(*known, model.inputs, model))
     rows: list[Intervention] = []
     for changed in filters:
         for result, of in changed.asked():
@@ -223,23 +235,14 @@ def to_try(
 
     One that is not among them is replayed when it is asked for.
     """
-    if not _fused(comparison, inputs):
+    if not fused(comparison, inputs):
         return []
-    mode, flown = inputs.aid.noise_mode, inputs.settings
-    stated = inputs.received.variance_m2[:, :2] * (not mode or flown[mode] != 1.0)
-    used_m = float(np.sqrt(np.median(np.maximum(stated, flown[inputs.aid.noise] ** 2))))
-    tried = _Ekf2(comparison, tuning, clock, heading, inputs, used_m)
+    tried, flown = _Ekf2(comparison, tuning, clock, heading, inputs), inputs.settings
     changes = [change for one in tried.asked() for change in tried.candidates(*one)]
     return [Variant({**flown, **change}) for change in changes if change.keys() <= flown.keys()]
 
 
-def _fused(comparison: Comparison, inputs: Inputs) -> bool:
-    """Whether EKF2 fused what was analysed."""
-    source = comparison.source
-    return source.name == inputs.received.source and source.alignment is None
-
-
-def _apart(cause: Intervention, result: AxisComparison, changed: _Tried) -> list[Intervention]:
+def _apart(cause: Intervention, result: AxisComparison, changed: _Changed) -> list[Intervention]:
     """How far a cause keeps both filters apart."""
     before, after = (changed.number(result, "apart", change) for change in ({}, cause.change))
     if before is None or after is None:
@@ -251,23 +254,26 @@ def _apart(cause: Intervention, result: AxisComparison, changed: _Tried) -> list
     ]  # fmt: skip
 
 
+def is_off(statement: FilterSummary | UnjudgedFilter) -> TypeGuard[FilterSummary]:
+    """Whether a variance is not what innovations show, by more than chance and enough to matter."""
+    if isinstance(statement, Unavailable):
+        return False
+    return statement.verdict != "consistent" and statement.times_off >= SIGMA_OFF
+
+
 def _discrepancies(statement: FilterSummary | UnjudgedFilter) -> list[Of]:
-    """What of a filter is not as it should be, by more than chance and by enough to matter."""
+    """What of a filter is not as it should be."""
     found: list[Of] = ["nees"] if beyond_claim(statement) else []
-    if isinstance(statement, Unavailable) or statement.verdict == "consistent":
-        return found
-    return [*found, "nis"] if statement.times_off >= SIGMA_OFF else found
+    return [*found, "nis"] if is_off(statement) else found
 
 
-def _tried(changed: _Tried, result: AxisComparison, of: Of) -> list[Intervention]:
+def _tried(changed: _Changed, result: AxisComparison, of: Of) -> list[Intervention]:
     """All candidates alone; where the best leaves the number outside its band, with the others."""
     statement, candidates = result.filters[changed.owner], changed.candidates(result, of)
+    assert isinstance(statement, FilterSummary)  # else it has no discrepancy
     truth = statement.truth
-    before = nees = None if isinstance(truth, Unavailable) else truth.nees_position_mean
-    if of == "nis" and isinstance(statement, FilterSummary):
-        before = statement.nis_mean
-    if before is None:
-        return []
+    nees = None if isinstance(truth, Unavailable) else truth.nees_position_mean
+    before = statement.nis_mean if nees is None or of == "nis" else nees
     deniable = of == "nis" and before < 1.0 and not isinstance(result.truth, Unavailable)
 
     def tried(change: Change) -> list[Intervention]:
@@ -312,9 +318,7 @@ def _nees(judged: AgainstTruth | Unavailable) -> tuple[float, int] | None:
 
 def tuned_for(tuning: Tuning, axis: str) -> AxisTuning | None:
     """What was tuned for an axis: both horizontal ones together, where there are both."""
-    names = (axis,) if axis == "down" else (HORIZONTAL, axis)
-    found = (tuning.get(name) for name in names)
-    return next((tuned for tuned in found if isinstance(tuned, AxisTuning)), None)
+    return known_noises(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
 
 
 def _turned(direction: Array, turned_deg: float) -> Array:
@@ -324,7 +328,7 @@ def _turned(direction: Array, turned_deg: float) -> Array:
 
 @dataclass(frozen=True)
 class _Changed:
-    """A filter, and what the data ask to change of it."""
+    """A filter, what the data ask to change of it, and what it does with changes."""
 
     comparison: Comparison
     tuning: Tuning
@@ -343,23 +347,28 @@ class _Changed:
         ]
 
     @abstractmethod
-    def of_noise(self, result: AxisComparison, tuned: AxisTuning, over: bool) -> list[Change]:
+    def of_noise(self, statement: FilterSummary, tuned: AxisTuning, over: bool) -> list[Change]:
         """The noises that the data ask for, where their interval excludes those that were taken."""
 
     @abstractmethod
     def of_filter(self, tuned: AxisTuning | None) -> list[Change]:
         """What else may be wrong; ``tuned`` where the variance is not larger than what is shown."""
 
+    @abstractmethod
+    def number(self, result: AxisComparison, of: Of, change: Change) -> tuple[float, int] | None:
+        """Mean NIS or NEES along an axis with a change, or how far apart; and of how many."""
+
     def candidates(self, result: AxisComparison, of: Of) -> list[Change]:
         """What to try along an axis."""
         statement, origin = result.filters[self.owner], self.comparison.source.origin
-        over = not isinstance(statement, Unavailable) and of == "nis" and statement.nis_mean < 1.0
+        assert isinstance(statement, FilterSummary)  # else it has no discrepancy
+        over = of == "nis" and statement.nis_mean < 1.0
         tuned = tuned_for(self.tuning, result.axis.name)
         found = list[Change]()
         # small innovations against such a source say too little of its errors
         hides_noise = origin.may_drift or origin.is_gnss
         if tuned is not None and not (over and hides_noise):
-            found += self.of_noise(result, tuned, over)
+            found += self.of_noise(statement, tuned, over)
         if tuned is not None and not over and len(tuned.outlier_time_s):
             found.append({OUTLIERS: float(len(tuned.outlier_time_s))})
         found += self.of_stamps()
@@ -381,23 +390,14 @@ class _Changed:
 
 
 @dataclass(frozen=True)
-class _Tried(_Changed):
-    """A filter that is run with changes."""
-
-    @abstractmethod
-    def number(self, result: AxisComparison, of: Of, change: Change) -> tuple[float, int] | None:
-        """Mean NIS or NEES along an axis with a change, or how far apart; and of how many."""
-
-
-@dataclass(frozen=True)
-class _Ours(_Tried):
+class _Ours(_Changed):
     """Our filter with changes."""
 
     explained: Explained | Unavailable
 
     owner = "kf"
 
-    def of_noise(self, result: AxisComparison, tuned: AxisTuning, over: bool) -> list[Change]:
+    def of_noise(self, statement: FilterSummary, tuned: AxisTuning, over: bool) -> list[Change]:
         """SIGMA_A and SIGMA_Z."""
         found = list[Change]()
         for name, noise in ((SIGMA_A, tuned.filter_sigma_a), (SIGMA_Z, tuned.sigma_z)):
@@ -460,17 +460,29 @@ class _Ours(_Tried):
         if of == "apart":
             state = result.ekf2_state
             return None if compass or isinstance(state, Unavailable) else _rms_apart(run, state)
-        return _nees(kf_against_truth(run, truth, run.steps.index.to_numpy()))
+        return _nees(kf_against_truth(run, truth, run.steps))
 
 
 @dataclass(frozen=True)
 class _Ekf2(_Changed):
-    """What to change of EKF2, where it fused what was analysed; ``used_m`` is its √R as flown."""
+    """EKF2 with changes, where it fused what was analysed.
+
+    Without a model, which must agree with the log, it only has candidates.
+    """
 
     inputs: Inputs
-    used_m: float
+    model: Model | None = None
+    replays: dict[tuple[tuple[str, float], ...], Ekf2Replay] = field(default_factory=dict)
 
     owner = "ekf2"
+
+    @property
+    def used_m(self) -> float:
+        """Median √R (m) as flown."""
+        aid, flown = self.inputs.aid, self.inputs.settings
+        takes_stated = not aid.noise_mode or flown[aid.noise_mode] != 1.0
+        stated = self.inputs.received.variance_m2[:, :2] * takes_stated
+        return float(np.sqrt(np.median(np.maximum(stated, flown[aid.noise] ** 2))))
 
     def of_stamps(self) -> list[Change]:
         """A delay is EKF2's own to set; there is none for stamps that are early."""
@@ -504,45 +516,35 @@ class _Ekf2(_Changed):
         asked = min((tuned.filter_sigma_a.value or 0.0) * steps**0.5, most)
         return {ACC_NOISE: float(f"{asked:.2g}")} if asked > flown else {}
 
-    def of_noise(self, result: AxisComparison, tuned: AxisTuning, over: bool) -> list[Change]:
+    def of_noise(self, statement: FilterSummary, tuned: AxisTuning, over: bool) -> list[Change]:
         """The source's noise."""
-        noise, statement = tuned.sigma_z, result.filters["ekf2"]
+        noise = tuned.sigma_z
         if (noise.low or 0.0) <= self.used_m <= (noise.high or np.inf):
             return []
         asked_m = noise.value
-        if asked_m is None:
-            if isinstance(statement, Unavailable):
-                return []
-            # EKF2's own innovations bound it too, and less tightly
+        if asked_m is None:  # EKF2's own innovations bound it too, and less tightly
             asked_m = float(np.hypot(statement.innovation_std_m, statement.innovation_mean_m))
-        return [noise_change(self.inputs, self.used_m, asked_m)]
-
-
-@dataclass(frozen=True)
-class _Replayed(_Ekf2, _Tried):
-    """EKF2 with changes, where the model agrees with the log."""
-
-    model: Model
-    replays: dict[tuple[tuple[str, float], ...], Ekf2Replay] = field(default_factory=dict)
+        return [noise_change(self.inputs.aid, self.inputs.settings, self.used_m, asked_m)]
 
     def number(self, result: AxisComparison, of: Of, change: Change) -> tuple[float, int] | None:
         """By a replay, along a horizontal axis; unchanged how far apart by the log."""
-        made, axis, segment = self._replayed(change), result.axis, self.comparison.segment
+        assert self.model is not None
+        judged_s, axis = self.model.flown.judged_s, result.axis
+        made = self._replayed(self.model, change)
         if TURN in change and self.comparison.source.origin.is_gnss:
             # what is put right is the attitude: its frame is turned, north is where it was
             axis = replace(axis, direction=_turned(axis.direction, -change[TURN]))
         weights = axis.direction[:2]
-        updates = made.updates[settled(made.updates.index, self.model.flown.judged_s)]
+        updates = made.updates[settled(made.updates.index, judged_s)]
         if of == "nis":
             nu = along(updates, INNOVATION_COLUMNS, weights)
             s = along(updates, INNOVATION_VARIANCE_COLUMNS, weights**2)
             return (float(np.mean(nu**2 / s)), len(nu)) if len(nu) else None
-        state = project_state(made.published, axis, segment)
+        state = project(made.published, axis, self.comparison.segment)
         if of == "apart":
             logged = result.ekf2_state
             state = state if change or isinstance(logged, Unavailable) else logged
-            inside = settled(state.index, self.model.flown.judged_s)
-            return _rms_apart(result.replay, state[inside])
+            return _rms_apart(result.replay, state[settled(state.index, judged_s)])
         at_s, track = updates["fused_at_s"], along(made.delayed, Columns.POSITION, axis.direction)
         stated = {
             "position_m": np.interp(at_s, made.delayed.index, track),
@@ -551,14 +553,14 @@ class _Replayed(_Ekf2, _Tried):
         horizon = pd.DataFrame(stated, index=pd.Index(at_s))
         return _nees(against_truth(state, result.ekf2_variance, result.truth, horizon))
 
-    def _replayed(self, change: Change) -> Ekf2Replay:
+    def _replayed(self, model: Model, change: Change) -> Ekf2Replay:
         """EKF2 with a change, each replayed once."""
         if not change:
-            return self.model.flown
+            return model.flown
         key = tuple(sorted(change.items()))
         if key not in self.replays:
             settings = {name: value for name, value in change.items() if name in PARAMETERS}
-            model = moved(self.model, change.get(TURN, 0.0), change.get(CLOCK, 0.0))
+            model = moved(model, change.get(TURN, 0.0), change.get(CLOCK, 0.0))
             left_out_s, tuned = None, tuned_for(self.tuning, HORIZONTAL)
             if OUTLIERS in change and tuned is not None:
                 stamp = 1e-3 * self.inputs.settings[self.inputs.aid.delay]

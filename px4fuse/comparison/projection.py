@@ -26,6 +26,13 @@ EKF2_MIN_NOISE_M = 0.01
 # EKF2 takes a height of GNSS for less exact than its position (gnss_height_control.cpp)
 GNSS_HEIGHT_SCALE = 1.5
 MIN_COMMON_SAMPLES = 3
+# What is projected along an axis, from which columns, and by which power of its direction
+PROJECTED: Mapping[str, tuple[list[str], int]] = {
+    "position_m": (Columns.POSITION, 1),
+    "velocity_m_s": (Columns.VELOCITY, 1),
+    "position_variance_m2": (Columns.POSITION_VARIANCE, 2),
+    "velocity_variance_m2_s2": (Columns.VELOCITY_VARIANCE, 2),
+}
 # Undoing resets must bring EKF2 this much closer to the measurements (median squared distance);
 # below that the published output, which the vehicle flew on, stands.
 CLEARLY_CLOSER = 0.95
@@ -98,26 +105,19 @@ def _distance(samples: pd.DataFrame, state: pd.DataFrame) -> float:
     return float(np.median(squared)) if len(squared) else float("inf")
 
 
-def project_state(state: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
-    """Position (m) and velocity (m/s) along the axis, within the segment."""
-    columns = {"position_m": Columns.POSITION, "velocity_m_s": Columns.VELOCITY}
-    return _project(within(state, segment), columns, axis.direction)
-
-
-def _project(frame: pd.DataFrame, columns: Mapping[str, list[str]], weights: Array) -> pd.DataFrame:
-    made = {name: along(frame, parts, weights) for name, parts in columns.items()}
-    return pd.DataFrame(made, index=frame.index)
+def project(frame: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
+    """What a frame holds of :data:`PROJECTED` along the axis, within the segment."""
+    cut = within(frame, segment)
+    known = {name: part for name, part in PROJECTED.items() if part[0][0] in frame}
+    made = {name: along(cut, of, axis.direction**power) for name, (of, power) in known.items()}
+    return pd.DataFrame(made, index=cut.index)
 
 
 def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | Unavailable:
     """Variances along the axis; EKF2 logs no covariance between axes, so none is added."""
     if isinstance(ekf2.variance, Unavailable):
         return ekf2.variance
-    columns = {
-        "position_variance_m2": Columns.POSITION_VARIANCE,
-        "velocity_variance_m2_s2": Columns.VELOCITY_VARIANCE,
-    }
-    projected = _project(within(ekf2.variance, segment), columns, axis.direction**2)
+    projected = project(ekf2.variance, axis, segment)
     if projected.empty:
         return Unavailable("EKF2 variances", "no sample in the segment", "Analyse more of the log.")
     return projected
@@ -144,12 +144,8 @@ def project_horizon(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | 
         return found[found["position_variance_m2"] > 0.0]
     if isinstance(ekf2.record, Unavailable):
         return None
-    delayed = within(ekf2.record.delayed, segment)
-    found = pd.DataFrame(
-        {"position_m": along(delayed, Columns.POSITION, axis.direction),
-         "position_variance_m2": along(delayed, Columns.POSITION_VARIANCE, axis.direction**2)},
-        index=delayed.index,
-    ).dropna()  # fmt: skip
+    projected = project(ekf2.record.delayed, axis, segment)
+    found = projected[["position_m", "position_variance_m2"]].dropna()
     return found if len(found) else None
 
 
@@ -239,10 +235,10 @@ def observation_variance(
 def project_truth(
     truth: Truth | Unavailable, axis: Axis, segment: Segment
 ) -> pd.DataFrame | Unavailable:
-    """Ground truth along the axis, as :func:`project_state`."""
+    """Position and velocity of the ground truth along the axis."""
     if isinstance(truth, Unavailable):
         return truth
-    projected = project_state(truth.samples, axis, segment)
+    projected = project(truth.samples, axis, segment)
     if len(projected) < MIN_COMMON_SAMPLES:
         return Unavailable(
             "ground truth",

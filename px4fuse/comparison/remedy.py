@@ -6,12 +6,15 @@ replayed, the words say so.
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from px4fuse.comparison.comparison import compare_prepared
-from px4fuse.comparison.model import AgainstTruth, Comparison
-from px4fuse.comparison.preparation import prepare
+from px4fuse.comparison.comparison import kf_against_truth
+from px4fuse.comparison.estimates import Tuning, known_noises
+from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.preparation import shift_clock
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.whatif import Summary, what_if
@@ -19,10 +22,11 @@ from px4fuse.ekf2_parameters import EV_POS, PARAMETERS, Aid
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.quick import quick_replay
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import AISLE
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.filter.signals import AISLE, make_axes
+from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital
+from px4fuse.request import OPTIONS
 
 # EKF2 takes R from the sender where that is more than this many times EKF2_EVP_NOISE
 REPORTED_TIMES = 1.25
@@ -47,7 +51,7 @@ REJECTED_SHOWN = 0.005
 def asked_of_ekf2(
     comparison: Comparison,
     model: Model,
-    tuning: Mapping[str, AxisTuning | Unavailable],
+    tuning: Tuning,
     clock: ClockOffset | Unavailable,
 ) -> dict[str, float]:
     """EKF2's parameters as the data ask for them, by PX4 name and in PX4's units.
@@ -68,16 +72,21 @@ def asked_of_ekf2(
         that may drift, or of GNSS, only where EKF2 trusts it even more than its short-term noise
         allows: small innovations against such a source say nothing about its error.
     """
-    source = comparison.source
-    if source.name != model.inputs.received.source or source.alignment is not None:
+    if not fused(comparison, model.inputs):
         return {}
     changes: dict[str, float] = {}
-    noise_m = tuned_noise_m(tuning)
-    trusted = noise_m is not None and noise_m <= noise_used_m(model)
-    slow = source.origin.may_drift or source.origin.is_gnss
-    if noise_m is not None and not (trusted and slow):
-        changes |= noise_change(model.inputs, noise_used_m(model), noise_m)
+    tuned, used_m = known_noises(tuning, HORIZONTAL, AISLE, "north", "east"), noise_used_m(model)
+    noise_m = None if tuned is None else tuned.sigma_z.value
+    slow = comparison.source.origin.may_drift or comparison.source.origin.is_gnss
+    if noise_m is not None and not (slow and noise_m <= used_m):
+        changes |= noise_change(model.inputs.aid, model.inputs.settings, used_m, noise_m)
     return changes | delay_asked(comparison, model.inputs, clock)
+
+
+def fused(comparison: Comparison, inputs: Inputs) -> bool:
+    """Whether EKF2 fused what was analysed."""
+    source = comparison.source
+    return source.name == inputs.received.source and source.alignment is None
 
 
 def delay_asked(
@@ -110,22 +119,16 @@ def delay_ms(comparison: Comparison) -> float | None:
     return None if source.origin.by_gnss and source.age_s == 0.0 != found else found
 
 
-def tuned_noise_m(tuning: Mapping[str, AxisTuning | Unavailable]) -> float | None:
-    """Horizontal measurement noise (m) that the data ask for; None where they do not tell."""
-    known = (tuning.get(name) for name in (HORIZONTAL, AISLE, "north", "east"))
-    return next((tuned.sigma_z.value for tuned in known if isinstance(tuned, AxisTuning)), None)
-
-
-def noise_change(inputs: Inputs, used_m: float, noise_m: float) -> dict[str, float]:
+def noise_change(
+    aid: Aid, settings: Mapping[str, float], used_m: float, noise_m: float
+) -> dict[str, float]:
     """What to set so that EKF2 takes a position's standard deviation (m) to be this.
 
-    Two digits, within PX4's range; ``used_m`` is what it took.
+    Two digits, within PX4's range; ``settings`` and ``used_m`` are what it took.
     """
-    settings, aid = inputs.settings, inputs.aid
-    least = PARAMETERS[aid.noise].minimum
-    changes = {aid.noise: max(float(f"{noise_m:.2g}"), least)}
-    reported = used_m > REPORTED_TIMES * settings[aid.noise]
-    may_differ = aid.noise_mode and settings[aid.noise_mode] == 0.0
+    changes = {aid.noise: max(float(f"{noise_m:.2g}"), PARAMETERS[aid.noise].minimum)}
+    reported = used_m > REPORTED_TIMES * settings.get(aid.noise, math.inf)
+    may_differ = aid.noise_mode and settings.get(aid.noise_mode, 0.0) == 0.0
     if may_differ and reported and noise_m < used_m:
         changes[aid.noise_mode] = 1.0
     return changes
@@ -175,8 +178,8 @@ def remedy_words(
     *,
     why: str = "",
     otherwise: str,
-) -> tuple[str, bool]:
-    """A change of EKF2's parameters in words, and whether it is a remedy: no replay denies it.
+) -> str:
+    """A change of EKF2's parameters in words, as a remedy where no replay denies it.
 
     Parameters
     ----------
@@ -193,16 +196,16 @@ def remedy_words(
     setting = f"{why}set {settings_words(changes)}"
     found = model if isinstance(model, Unavailable) else what_if(model, [changes])
     if isinstance(found, Unavailable):
-        return f"{capital(setting)}. {not_replayed(found)}", True
+        return f"{capital(setting)}. {not_replayed(found)}"
     before, (after,) = found.replayed, found.whatif
     if not after.steady:
         said = settings_words(changes)
-        return f"{otherwise} What {said} would do is chaotic: single rejections decide.", False
+        return f"{otherwise} What {said} would do is chaotic: single rejections decide."
     effect = effect_words(before, after)
     if helps(before, after):
-        return f"{capital(setting)}: {effect}.", True
+        return f"{capital(setting)}: {effect}."
     said = ", ".join(f"{name} {value:.3g}" for name, value in changes.items())
-    return f"{otherwise} {said} is no remedy: {effect}.", False
+    return f"{otherwise} {said} is no remedy: {effect}."
 
 
 def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, float] | None:
@@ -211,42 +214,47 @@ def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, f
     Root of the sum of the mean squares of all axes but the aisle, which is made of the others.
     None without a truth.
     """
-    names = [name for name in comparison.axes if name != AISLE] or [AISLE]
-
-    def errors_m(of: Comparison) -> list[float]:
-        truths = (of.axes[name].filters["kf"].truth for name in names)
-        return [truth.position_rmse_m for truth in truths if isinstance(truth, AgainstTruth)]
-
-    segment, before = comparison.segment, errors_m(comparison)
-    if len(before) < len(names):
+    if isinstance(comparison.flight.truth, Unavailable):
         return None
-    prepared = prepare(
-        comparison.flight,
-        changed,
-        axes=tuple(names),
-        heading_deg=comparison.axes[names[0]].heading_deg,
-        position_source=comparison.source.name,
-        start_s=segment.start_s,
-        end_s=segment.end_s,
-    )
-    after = errors_m(compare_prepared(prepared, replayed=quick_replay))
-    return (math.hypot(*before), math.hypot(*after)) if len(after) == len(names) else None
+    names = tuple(name for name in comparison.axes if name != AISLE) or (AISLE,)
+    results = [comparison.axes[name] for name in names]
+    later_s = changed.clock_offset_s - comparison.settings.clock_offset_s
+    lines = make_axes(
+        comparison.flight, shift_clock(comparison.source, later_s), comparison.segment, names=names,
+        heading_deg=results[0].heading_deg,
+    )  # fmt: skip
+    errors_m: list[tuple[float, float]] = []
+    for result, line in zip(results, lines, strict=True):
+        run, before = quick_replay(line, changed), result.filters["kf"].truth
+        after = kf_against_truth(run, result.truth, result.ekf2_state)
+        if isinstance(before, Unavailable) or isinstance(after, Unavailable):
+            return None
+        errors_m.append((before.position_rmse_m, after.position_rmse_m))
+    before_m, after_m = zip(*errors_m, strict=True)
+    return math.hypot(*before_m), math.hypot(*after_m)
 
 
 def filter_words(
-    comparison: Comparison, changed: Settings, typed: str, unseen_nats: float | None = None
+    comparison: Comparison,
+    changes: Mapping[str, float],
+    more: str = "",
+    unseen_nats: float | None = None,
 ) -> str:
     """Other settings of our filter as a remedy, as far as truth or unseen data confirm it.
 
     Parameters
     ----------
     comparison : Comparison
-    changed : Settings
-    typed : str
-        The options that make them.
+    changes : mapping from field of Settings to value
+        Rounded to three digits.
+    more : str
+        Words behind the options that make them.
     unseen_nats : float or None
         What settings found on one half gain per measurement of the other; None where not known.
     """
+    rounded: dict[str, Any] = {name: float(f"{value:.3g}") for name, value in changes.items()}
+    typed = " ".join(f"{OPTIONS[name].name} {value:g}" for name, value in rounded.items()) + more
+    changed = replace(comparison.settings, **rounded)
     errors = filter_errors_m(comparison, changed)
     if errors is None:
         if unseen_nats is not None and unseen_nats <= 0.0:
@@ -269,12 +277,8 @@ def not_replayed(why: Unavailable) -> str:
 
 def settings_words(changes: Mapping[str, float]) -> str:
     """Parameters and the values to set."""
-    parts = []
-    for name, value in changes.items():
-        unit = PARAMETERS[name].unit
-        unit = f" {unit}" if unit else ""
-        parts.append(f"{name} to {value:.3g}{unit}")
-    return " and ".join(parts)
+    said = (f"{name} to {value:.3g} {PARAMETERS[name].unit}" for name, value in changes.items())
+    return " and ".join(map(str.rstrip, said))
 
 
 def noise_helps(before: Summary, after: Summary) -> bool:

@@ -11,7 +11,7 @@ import pandas as pd
 from scipy import stats
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.interventions import CONTENT_NIS, NEES_LARGE
+from px4fuse.comparison.interventions import CONTENT_NIS, NEES_LARGE, beyond_claim
 from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.explore.ekf2_grid import grid_data, judged_numbers
@@ -25,7 +25,6 @@ from px4fuse.filter.signals import AISLE, Acceleration, Axis, along, imu_gaps, w
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings import Finding, by_root, find
 from px4fuse.findings.causes import NOISES
-from px4fuse.findings.hidden_errors import hidden_error
 from px4fuse.findings.story import story
 from px4fuse.flight import Columns, PositionTrack, Unavailable
 from px4fuse.request import ComparisonRequest, command_line
@@ -240,7 +239,7 @@ def _ekf2(analysis: Analysis, result: AxisComparison, packer: Packer) -> dict[st
             "truthP": judged.truth.position_rmse_m,
             "truthV": judged.truth.velocity_rmse_m_s,
         }
-    if hidden := hidden_error(analysis, result, "ekf2"):
+    if hidden := beyond_claim(judged):
         made["summary"]["claimed"] = hidden.claimed_m
     if isinstance(result.ekf2_variance, pd.DataFrame):
         sigma = result.ekf2_variance.dropna().pow(0.5)

@@ -6,28 +6,20 @@ is the NEES (1 is consistent).
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.interventions import Intervention, beyond_claim, cause_of
-from px4fuse.comparison.model import (
-    AgainstTruth,
-    AxisComparison,
-    Comparison,
-    FilterName,
-    FilterSummary,
-)
+from px4fuse.comparison.interventions import Hidden, Intervention, beyond_claim, cause_of
+from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison, FilterName
 from px4fuse.errors import TrajectoryError
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.causes import CAUSE
 from px4fuse.findings.model import Finding, Found, finding, info
 from px4fuse.findings.since import cure_words, kind_of, since_words
-from px4fuse.flight import Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.plain import factor_words, number_words
 from px4fuse.trajectory.alignment import fit
@@ -52,42 +44,18 @@ REMEDIES = {
 }
 
 
-@dataclass(frozen=True)
-class Hidden:
-    """One filter on one axis whose innovations hide its error."""
+def hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, Hidden]]:
+    """Where the error is larger than claimed and no innovation says so, by filter and axis.
 
-    owner: FilterName
-    axis: str
-    statement: FilterSummary
-    rmse_m: float
-    nees: float
-
-    @property
-    def claimed_m(self) -> float:
-        """Standard deviation that the filter states."""
-        return self.statement.sigma_p_median_m or self.rmse_m / float(np.sqrt(self.nees))
-
-
-def hidden_errors(comparison: Comparison) -> list[Hidden]:
-    """Where the error is larger than claimed and no innovation says so, the worst first."""
-    found = []
-    for name, result in comparison.axes.items():
-        for owner, statement in result.filters.items():
-            truth = statement.truth
-            if not beyond_claim(statement) or not isinstance(truth, AgainstTruth):
-                continue
-            assert isinstance(statement, FilterSummary)
-            nees = truth.nees_position_mean or 0.0
-            found.append(Hidden(owner, name, statement, truth.position_rmse_m, nees))
-    return sorted(found, key=lambda hidden: -hidden.nees)
-
-
-def hidden_error(
-    comparison: Comparison, result: AxisComparison, owner: FilterName
-) -> Hidden | None:
-    """That of one filter along one axis, where there is one."""
-    found = hidden_errors(comparison)
-    return next((h for h in found if (h.owner, h.axis) == (owner, result.axis.name)), None)
+    The worst comes first.
+    """
+    found = [
+        (owner, name, hidden)
+        for name, result in comparison.axes.items()
+        for owner, statement in result.filters.items()
+        if (hidden := beyond_claim(statement))
+    ]
+    return sorted(found, key=lambda each: -each[2].nees)
 
 
 def detect(analysis: Analysis) -> Found:
@@ -98,40 +66,39 @@ def detect(analysis: Analysis) -> Found:
         yield drift(analysis)
 
 
-def larger(analysis: Analysis, hidden: list[Hidden]) -> Finding:
+def larger(analysis: Analysis, hidden: list[tuple[FilterName, str, Hidden]]) -> Finding:
     """Told of each filter's worst axis."""
-    worst, drifts = hidden[0], analysis.source.origin.may_drift
-    evidence: dict[str, float | str] = {"axis": worst.axis, "filter": worst.owner}
+    (erring, main, worst), drifts = hidden[0], analysis.source.origin.may_drift
+    evidence: dict[str, float | str] = {"axis": main, "filter": erring}
     said, causes = [], dict[FilterName, Intervention | None]()
     for owner, name in FILTERS.items():
-        for one in [each for each in hidden if each.owner == owner][:1]:
-            nis = one.statement.nis_mean
+        for _, axis, one in [each for each in hidden if each[0] == owner][:1]:
             evidence |= {
-                f"{owner}_nis_mean": nis,
+                f"{owner}_nis_mean": one.nis_mean,
                 f"{owner}_nees_position_mean": one.nees,
                 f"{owner}_position_rmse_m": one.rmse_m,
                 f"{owner}_sigma_p_m": one.claimed_m,
             }
+            causes[owner] = cause_of(analysis.causes, owner, axis, "nees")
             said.append(
-                f"{name} claims σ {one.claimed_m:.2g} m along {one.axis} and errs by "
+                f"{name} claims σ {one.claimed_m:.2g} m along {axis} and errs by "
                 f"{one.rmse_m:.2f} m RMS (mean NEES {factor_words(one.nees)}, mean NIS "
-                f"{number_words(nis, 2)}; 1 is consistent)"
-                f"{since_words(analysis, causes.setdefault(owner, _cause(analysis, one)))}"
+                f"{number_words(one.nis_mean, 2)}; 1 is consistent)"
+                f"{since_words(analysis, causes[owner])}"
             )
-    small = worst.statement.nis_mean < SMALL_NIS
-    words = "; ".join(said) + "."
-    ours = analysis.axes[worst.axis].filters["kf"].truth
+    words, small = "; ".join(said) + ".", worst.nis_mean < SMALL_NIS
+    ours = analysis.axes[main].filters["kf"].truth
     less = isinstance(ours, AgainstTruth) and ours.position_rmse_m < OWN_ERROR * worst.rmse_m
-    alone = less and all(one.owner == "ekf2" for one in hidden)
+    alone = less and all(owner == "ekf2" for owner, *_ in hidden)
     shared = "gnss" if analysis.source.origin.is_gnss else "shared"
     remedy = REMEDIES["drift" if drifts else "ekf2" if alone else shared]
-    known = filter(None, (causes[worst.owner], *causes.values()))
+    known = filter(None, (causes[erring], *causes.values()))
     evidence |= {CAUSE: kind_of(analysis, next(known, None))}
     if cures := {
         cure_words(analysis, cause): None for cause in causes.values() if cause is not None
     }:
         remedy = " ".join(cures)
-    elif frame := _after_turning(analysis, worst.owner):
+    elif frame := _after_turning(analysis, erring):
         before, left = frame
         evidence |= {"position_rmse_horizontal_m": before, "position_rmse_aligned_m": left}
         remain = f"of {before:.2f} m horizontally {left:.2f} m remain after the best shift and turn"
@@ -150,11 +117,6 @@ def larger(analysis: Analysis, hidden: list[Hidden]) -> Finding:
     )
 
 
-def _cause(analysis: Analysis, hidden: Hidden) -> Intervention | None:
-    """What makes the error, by a replay."""
-    return cause_of(analysis.causes, hidden.owner, hidden.axis, "nees")
-
-
 def _after_turning(comparison: Comparison, owner: str) -> tuple[float, float] | None:
     """Horizontal RMSE (m) to the truth, and what of it the best shift and turn leave."""
     axes = [comparison.axes[name] for name in ("north", "east") if name in comparison.axes]
@@ -162,7 +124,10 @@ def _after_turning(comparison: Comparison, owner: str) -> tuple[float, float] | 
     if len(truths) < 2:
         return None
     times = truths[0].index.to_numpy()
-    tracks = [_track(result, owner, times) for result in axes]
+    tracks = [
+        state_at(result.replay, times)[0] if owner == "kf" else _published(result, times)
+        for result in axes
+    ]
     level = np.zeros(len(times))
     estimate = np.column_stack([*tracks, level])
     true = np.column_stack([*(truth["position_m"] for truth in truths), level])
@@ -177,15 +142,11 @@ def _after_turning(comparison: Comparison, owner: str) -> tuple[float, float] | 
     return before, left
 
 
-def _track(result: AxisComparison, owner: str, times: Array) -> Array:
-    """Position (m) of a filter along one axis; NaN where it is not known."""
-    if owner == "kf":
-        return state_at(result.replay, times)[0]
-    if isinstance(result.ekf2_state, Unavailable):
-        return np.full(len(times), np.nan)
+def _published(result: AxisComparison, times: Array) -> Array:
+    """Position (m) of EKF2 along one axis; NaN where it is not known."""
+    assert isinstance(result.ekf2_state, pd.DataFrame)  # else no error of EKF2 is hidden
     state = result.ekf2_state["position_m"]
-    track: Array = np.interp(times, state.index, state, left=np.nan, right=np.nan)
-    return track
+    return np.asarray(np.interp(times, state.index, state, left=np.nan, right=np.nan))
 
 
 def drift(analysis: Analysis) -> Finding:

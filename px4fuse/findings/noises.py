@@ -6,15 +6,14 @@ fitted together, so that they are put right together: the one that is further of
 setting that nobody chose is advice, one step less severe than one that was.
 """
 
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any, NamedTuple, TypeGuard
+from typing import NamedTuple
 
 import numpy as np
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
+from px4fuse.comparison.estimates import known_noises
 from px4fuse.comparison.interventions import (
     OF_SETTINGS,
     SIGMA_A,
@@ -22,13 +21,14 @@ from px4fuse.comparison.interventions import (
     SMALLEST_SIGMA_Z_M,
     Intervention,
     cause_of,
+    is_off,
     tried_on,
     tuned_for,
 )
-from px4fuse.comparison.model import FILTERS, AxisComparison, Comparison, FilterName
+from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName, FilterSummary
+from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
 from px4fuse.comparison.remedy import aid_of
-from px4fuse.ekf2_parameters import BAROMETER, BAROMETER_NOISE_M, PARAMETERS
-from px4fuse.filter.consistency import SIGMA_OFF, Consistency
+from px4fuse.ekf2_parameters import BAROMETER, PARAMETERS
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
@@ -56,7 +56,6 @@ READINGS = {
     "every measurement.",
 }
 SIGMA_OFF_ERROR = 2.0  # times, in standard deviation
-EKF2_NOISE_FLOOR_M = 0.01  # EKF2 never trusts external vision better, EKF2.cpp
 NOISE_FITS = 1.25  # times: the median's own scatter below n = 100 (1.17/√n, two σ)
 NOT_EXPLAINED = (
     "No change of a noise, the clock, the frame or the outliers explains half of it: look at the "
@@ -80,28 +79,7 @@ AGAINST_TRUTH = (
     "truth."
 )
 
-Member = tuple[AxisComparison, Consistency]
-
-
-def try_out(
-    comparison: Comparison, values: Mapping[str, float], more: str = "", unseen: float | None = None
-) -> str:
-    """What to type, as far as a replay with it holds what the likelihood promises.
-
-    Parameters
-    ----------
-    comparison : Comparison
-    values : mapping from field of Settings to value
-        Rounded to three digits.
-    more : str
-        Words behind them.
-    unseen : float or None
-        What such settings gain on data that they were not found on (nats), where that is known.
-    """
-    rounded: dict[str, Any] = {name: float(f"{value:.3g}") for name, value in values.items()}
-    typed = " ".join(f"{OPTIONS[name].name} {value:g}" for name, value in rounded.items())
-    settings = replace(comparison.settings, **rounded)
-    return remedy.filter_words(comparison, settings, typed + more, unseen)
+Member = tuple[AxisComparison, FilterSummary]
 
 
 class Off(NamedTuple):
@@ -121,8 +99,7 @@ def detect(analysis: Analysis) -> Found:
 
 def settings_off(analysis: Analysis) -> Found:
     """What is off beyond its interval, the worse one first."""
-    tunings = map(analysis.tuning.get, (HORIZONTAL, "aisle", "down"))
-    tuned = next((tuned for tuned in tunings if isinstance(tuned, AxisTuning)), None)
+    tuned = known_noises(analysis.tuning, HORIZONTAL, "aisle", "down")
     if tuned is None:
         return
     chosen = {SIGMA_Z: analysis.settings.sigma_z_m, SIGMA_A: analysis.settings.sigma_a_m_s2}
@@ -134,7 +111,7 @@ def settings_off(analysis: Analysis) -> Found:
     # where a source may drift, or the truth shows it, innovations tell too little noise alone, and
     # a filter may follow such a source as closely as it likes
     drifts, slow = analysis.source.origin.may_drift, analysis.source.origin.is_gnss
-    if drifts or slow or any(one.owner == "kf" for one in hidden_errors(analysis)):
+    if drifts or slow or any(owner == "kf" for owner, *_ in hidden_errors(analysis)):
         off = {
             name: each
             for name, each in off.items()
@@ -147,7 +124,7 @@ def settings_off(analysis: Analysis) -> Found:
     if SIGMA_Z in values and tuned.sigma_z.value is None:
         values[SIGMA_Z] = max(values[SIGMA_Z], SMALLEST_SIGMA_Z_M)
     unseen = None if isinstance(tuned.held_out, Unavailable) else tuned.held_out.gain_nats
-    cure, first = try_out(analysis, values, unseen=unseen), None
+    cure, first = remedy.filter_words(analysis, values, unseen_nats=unseen), None
     for name in worst_first:
         (value, size, severity), noise, unit = off[name], asked[name], OPTIONS[name].unit
         label, side = name[:7], "small" if chosen[name] < value else "large"
@@ -209,7 +186,7 @@ def forgotten(analysis: Analysis) -> Found:
         growth = float(np.median((before[1:] / after[:-1] - 1.0)[len(after) // 2 :]))
         tuned = tuned_for(analysis.tuning, name)
         needed = None if tuned is None else tuned.filter_sigma_a.value
-        more = "" if needed is None else f" {try_out(analysis, {SIGMA_A: needed})}"
+        more = "" if needed is None else f" {remedy.filter_words(analysis, {SIGMA_A: needed})}"
         yield error(
             "process_noise_forgotten",
             f"With SIGMA_A {analysis.settings.sigma_a_m_s2:g} m/s² Q is forgotten",
@@ -229,19 +206,12 @@ def variances(analysis: Analysis) -> Found:
             for group, axes in GROUPS.items():
                 results = [analysis.axes[name] for name in axes if name in analysis.axes]
                 pairs = [(result, result.filters[owner]) for result in results]
-                members = [(result, each) for result, each in pairs if _is_off(each, over=over)]
+                off = [(result, each) for result, each in pairs if is_off(each)]
+                members = [pair for pair in off if (pair[1].sigma_factor > 1.0) == over]
                 if members:
                     found = _of_group(analysis, owner, group, members)
                     yield structs.replace(found, caused_by=first)
                     first = found.id
-
-
-def _is_off(statement: Consistency | Unavailable, *, over: bool) -> TypeGuard[Consistency]:
-    """Whether a variance is over-, or else understated."""
-    if isinstance(statement, Unavailable):
-        return False
-    right = (statement.sigma_factor > 1.0) == over
-    return right and statement.verdict != "consistent" and statement.times_off >= SIGMA_OFF
 
 
 def _of_group(analysis: Analysis, owner: FilterName, group: str, members: list[Member]) -> Finding:
@@ -262,7 +232,7 @@ def _of_group(analysis: Analysis, owner: FilterName, group: str, members: list[M
         cause = NOISE if cure else ELSEWHERE
         slow = AGAINST_SLOW_ERRORS.format("a barometer" if air else "GNSS")
         severity, cure = severity if cure else "info", cure or slow
-    elif over and any(hidden.owner == owner for hidden in hidden_errors(analysis)):
+    elif over and any(each == owner for each, *_ in hidden_errors(analysis)):
         cure, cause = AGAINST_TRUTH, ELSEWHERE
     else:
         found = cause_of(analysis.causes, owner, result.axis.name)
@@ -299,11 +269,10 @@ def _above_stated(analysis: Analysis) -> str:
     if not least_m > NOISE_FITS * stated_m:  # false for NaN too
         return ""
     held = f"{name} {least_m:g} m holds R above what the receiver states ({stated_m:.2g} m)"
-    words, _ = remedy.remedy_words(
+    return remedy.remedy_words(
         analysis.ekf2_model, {name: float(f"{stated_m:.2g}")}, remedy.noise_helps,
         why=f"{held}: where you trust the receiver, ", otherwise=f"{held}.",
     )  # fmt: skip
-    return words
 
 
 def _is_default(analysis: Analysis, owner: FilterName, result: AxisComparison) -> bool:
@@ -311,10 +280,8 @@ def _is_default(analysis: Analysis, owner: FilterName, result: AxisComparison) -
     if owner == "kf":
         chosen, own = analysis.settings, Settings()
         return (chosen.sigma_z_m, chosen.sigma_a_m_s2) == (own.sigma_z_m, own.sigma_a_m_s2)
-    aid = aid_of(analysis, result.axis.name)
-    name, default = aid.noise, BAROMETER_NOISE_M
-    if aid != BAROMETER:
-        default = PARAMETERS[name].default
+    name = aid_of(analysis, result.axis.name).noise
+    default = PARAMETERS[name].default
     untouched = analysis.flight.log.parameters.get(name, default) == default
     # a sender that reports a larger variance has chosen it
     return untouched and not abs(np.log(ekf2_noise_m(result) / default)) > np.log(NOISE_FITS)
@@ -338,10 +305,10 @@ def _remedy(
         return cure_words(analysis, cause)
     bounded = tuned is not None and tuned.sigma_z.value is None and SIGMA_Z in cause.change
     if not bounded:
-        return try_out(analysis, cause.change)
+        return remedy.filter_words(analysis, cause.change)
     return (
         "The source's noise is below what this rate can show. "
-        f"{try_out(analysis, cause.change, ', and less SIGMA_A')}"
+        f"{remedy.filter_words(analysis, cause.change, ', and less SIGMA_A')}"
     )
 
 
@@ -371,7 +338,7 @@ def _not_replayed(analysis: Analysis, result: AxisComparison, tuned: AxisTuning 
     asked_m = None if tuned is None else _asked(tuned.sigma_z)
     if asked_m is None or why is None:
         return UNKNOWN_NOISE if tuned is None else NOT_EXPLAINED
-    noise_m, used_m = max(asked_m, EKF2_NOISE_FLOOR_M), ekf2_noise_m(result)
+    noise_m, used_m = max(asked_m, EKF2_MIN_NOISE_M), ekf2_noise_m(result)
     said = f"The source's noise is {noise_m:.2g} m, EKF2 takes it to be {used_m:.2g} m"
     statement = result.filters["ekf2"]
     assert not isinstance(statement, Unavailable)
@@ -381,10 +348,7 @@ def _not_replayed(analysis: Analysis, result: AxisComparison, tuned: AxisTuning 
             f"{said}: that is not it. Look at the clock ({aid.delay}) and at EKF2's process noise "
             f"(EKF2_ACC_NOISE). {remedy.not_replayed(why)}"
         )
-    changes = {aid.noise: float(f"{noise_m:.2g}")}
-    set_m = analysis.flight.log.parameters.get(aid.noise, np.inf)
-    if aid.noise_mode and used_m > NOISE_FITS * set_m:
-        changes[aid.noise_mode] = 1.0
+    changes = remedy.noise_change(aid, analysis.flight.log.parameters, used_m, noise_m)
     return f"{said}: set {remedy.settings_words(changes)}. {remedy.not_replayed(why)}"
 
 

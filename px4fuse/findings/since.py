@@ -60,9 +60,7 @@ def share_words(cause: Intervention) -> str:
         return "denied by the truth"
     if cause.brings_into_band:
         return "all"
-    if cause.of == "apart" and cause.explains > 0.0:
-        return f"{cause.explains:.0%}"
-    if cause.explains > 1.0:
+    if cause.explains > 1.0 and cause.of != "apart":
         return "too much"
     return f"{cause.explains:.0%}" if cause.explains > 0.0 else "nothing"
 
@@ -109,11 +107,10 @@ def ekf2_cure_words(analysis: Analysis, cause: Intervention) -> str:
     """What to do about a cause of EKF2's, with what a parameter would do to all of the flight."""
     if not cause.change.keys() <= PARAMETERS.keys():
         return cure_words(analysis, cause)
-    words, _ = remedy.remedy_words(
+    return remedy.remedy_words(
         analysis.ekf2_model, cause.change, HELPS.get(kind_of(analysis, cause), remedy.noise_helps),
         otherwise=f"{capital(reason_words(analysis, cause))}.",
     )  # fmt: skip
-    return words
 
 
 def _one(analysis: Analysis, cause: Intervention, name: str) -> str:

@@ -15,7 +15,6 @@ from px4fuse.flight import Unavailable
 
 OFFSET_S = 0.03  # at 1 m/s a third of a good UWB's noise
 OFFSET_ERROR_S = 0.10  # at 1 m/s a good UWB's noise
-EKF2_UPDATE_S = 0.010  # EKF2_PREDICT_US, EKF2's own step
 AT_THE_SENDER = "Correct the stamps at the sender:"
 
 
@@ -106,7 +105,7 @@ def delay(analysis: Analysis, clock: ClockOffset) -> Found:
     # of GNSS the offset itself is what EKF2's delay is wrong by
     delay_ms = remedy.delay_ms(analysis) if analysis.source.origin.is_vision else None
     asked_ms = -1e3 * clock.offset_s
-    known_ms = 1e3 * max(clock.chance_s + EKF2_UPDATE_S, OFFSET_S)
+    known_ms = max(1e3 * clock.chance_s + remedy.UPDATE_MS, 1e3 * OFFSET_S)
     if delay_ms is None or abs(delay_ms - asked_ms) < known_ms:
         return
     low_ms, high_ms = (-1e3 * end for end in reversed(clock.interval_s))
@@ -137,5 +136,4 @@ def delay_remedy(analysis: Analysis, delay_ms: float, flown_ms: float) -> str:
     changes = {"EKF2_EV_DELAY": max(float(round(delay_ms)), 0.0)}
     if not isinstance(model, Unavailable):
         changes = remedy.delay_change(model.inputs, delay_ms) or changes
-    words, _ = remedy.remedy_words(model, changes, remedy.delay_helps, otherwise=AT_THE_SENDER)
-    return words
+    return remedy.remedy_words(model, changes, remedy.delay_helps, otherwise=AT_THE_SENDER)

@@ -8,7 +8,7 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.events import GAP_INTERVALS, GAP_S, source_gaps
+from px4fuse.comparison.events import longest_s, source_gaps
 from px4fuse.filter.signals import within
 from px4fuse.findings.ekf2_not_fusing import EV_START_INTERVAL_S
 from px4fuse.findings.model import Found, finding, info, times, warning
@@ -32,11 +32,6 @@ def detect(analysis: Analysis) -> Found:
     yield from gaps(analysis)
     yield from losses(analysis)
     yield from thinning(analysis)
-
-
-def longest_s(interval_s: float) -> float:
-    """Interval beyond which a source with this usual one is silent."""
-    return max(GAP_S, GAP_INTERVALS * interval_s)
 
 
 def gaps(analysis: Analysis) -> Found:

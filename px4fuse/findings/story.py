@@ -16,7 +16,6 @@ from px4fuse.comparison.model import FILTERS, AgainstTruth, AxisComparison, Diff
 from px4fuse.ekf2.walk import Why
 from px4fuse.filter.kalman import state_at
 from px4fuse.findings.causes import CLOCK, FRAME, PROCESS, SETTINGS, VARIANCES
-from px4fuse.findings.hidden_errors import hidden_error
 from px4fuse.findings.model import Finding
 from px4fuse.findings.since import TOLD_BY, effect_words, kind_of, since_words
 from px4fuse.findings.source_positions import hardly_moved
@@ -156,7 +155,7 @@ def _judged(
     unexplained = ", which nothing that was tried explains" if tried and not told else ""
     if any(each.denied_by_truth for each in tried):
         unexplained = ", as its errors against the truth ask for"
-    if hidden := hidden_error(analysis, analysis.main, owner):
+    if hidden := interventions.beyond_claim(statement):
         return f"claimed {length_words(hidden.claimed_m)}{since or unexplained}"
     if isinstance(statement, Unavailable):
         return "cannot be judged, since the log has no innovations or too few"

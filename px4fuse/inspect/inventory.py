@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.events import longest_s
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import of_source
 from px4fuse.ekf2.aids import judge_aids
@@ -16,7 +17,6 @@ from px4fuse.ekf2.inputs import prepare
 from px4fuse.errors import MissingDataError, Px4FuseError
 from px4fuse.filter.signals import IMU_GAP_INTERVALS, IMU_GAP_S, Segment, ned_acceleration, within
 from px4fuse.findings import ekf2_not_fusing, imu, missing, named, recording
-from px4fuse.findings.source_intervals import longest_s
 from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable, sample_rate
 from px4fuse.inspect.tables import NO_POSITION, absent
 from px4fuse.plain import capital, plain

@@ -8,11 +8,11 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.model import Comparison, FilterName
+from px4fuse.comparison.interventions import beyond_claim
+from px4fuse.comparison.model import Comparison
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.signals import AISLE, Axis, within
 from px4fuse.findings import Finding, by_root
-from px4fuse.findings.hidden_errors import hidden_error
 from px4fuse.flight import Ekf2, Truth, Unavailable
 from px4fuse.plain import length_words
 from px4fuse.recording import LogInfo
@@ -84,8 +84,7 @@ def _verdict(page: Page, analysis: Analysis) -> None:
         column, _ = halves()
         owner = "our filter" if name == "ours" else name
         what, large = "variance is", verdict_words(one)
-        which: FilterName = "kf" if name == "ours" else "ekf2"
-        if hidden := hidden_error(analysis, result, which):
+        if hidden := beyond_claim(one):
             what, claimed = "error is", length_words(hidden.claimed_m)
             large = f"{length_words(hidden.rmse_m)}, claimed {claimed}"
         column.write(f"Along {along} {owner}'s {what}")

@@ -9,10 +9,10 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.events import Span
 from px4fuse.comparison.model import AxisComparison, Difference
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Unavailable
+from px4fuse.record import Span
 from px4fuse.report import marks, panels, style
 from px4fuse.report.page import WIDTH, Page
 from px4fuse.report.style import EKF2, LINES, OURS, Artist, Axes
