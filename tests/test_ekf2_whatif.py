@@ -300,7 +300,7 @@ def test_a_prediction_that_a_little_noise_changes_is_not_steady(
         monkeypatch.setattr(whatif, "disturbed", disturbed)
         monkeypatch.setattr(whatif, "replay_settings", lambda _, changes, **_more: changes)
         monkeypatch.setattr(whatif, "_of_replay", lambda *_: changed)
-        (found,) = whatif._steadied(model, [base], ((0.0, 1.0),))
+        (found,) = whatif._steadied(model, [base], ((0.0, 1.0),), {})
         return found.steady
 
     assert judged(base)
@@ -318,5 +318,5 @@ def test_a_prediction_that_a_little_noise_changes_is_not_steady(
     assert not judged(structs.replace(base, rejected_share=0.2301))
     few, many = (structs.replace(base, rejected_share=share) for share in (0.02, 0.351))
     runs.clear()
-    assert [one.steady for one in whatif._steadied(model, [few, many], ())] == [True, False]
+    assert [one.steady for one in whatif._steadied(model, [few, many], (), {})] == [True, False]
     assert runs == []  # nothing to try

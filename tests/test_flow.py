@@ -116,7 +116,7 @@ def test_flow_tells_the_velocity_at_the_event_after_it(every: int) -> None:
     (stretch,) = model().inputs.stretches
     told = with_flow(stretch, flow_of(every=every), 3.0)
     assert told.flow is not None
-    end = model().intervals[0].events.end
+    end = next(iter(model().intervals.values()))[0].events.end
     found = gather_flow(told, told.flow, end)
     seen = found.number > 0.0
     assert found.number.sum() == pytest.approx(len(flow_of(every=every)) * every, abs=12.0)

@@ -258,9 +258,6 @@ def find_stretches(
     airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
     of_field = _field_s(record) if gnss else None
     cuts += of_field[1:] if of_field else ()
-    for reset in ekf2.resets if gnss else ():
-        if reset.delta[2]:
-            cuts += [reset.time_s - 0.5, reset.time_s]
     found = []
     for low, high in pairwise(np.unique(np.clip(cuts, first, last))):
         inside = fused[(fused >= low) & (fused <= high)]

@@ -349,38 +349,6 @@ class HypothesisFit:
         return Estimate(float(self.coefficients[column]), sigma)
 
 
-def fit(data: Array, columns: Array, axis: IntArray, prior: Array, log_s: float) -> HypothesisFit:
-    """Regress whitened innovations on their columns.
-
-    Parameters
-    ----------
-    data : ndarray, shape (n,)
-    columns : ndarray, shape (n, k)
-    axis : ndarray of int, shape (n,)
-    prior : ndarray, shape (k,)
-        Standard deviation of each coefficient before the data, infinite where nothing is known.
-    log_s : float
-        Σ ln S over all.
-    """
-    information = np.diag(prior**-2.0) + columns.T @ columns
-    # a column that nothing excites (a turn in hover) must not stop the others
-    information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(len(prior))
-    moment = columns.T @ data
-    factor = cho_factor(information)
-    covariance = cho_solve(factor, np.eye(len(prior)))
-    coefficients = covariance @ moment
-    square = float(data @ data - coefficients @ moment)
-    return HypothesisFit(
-        axis,
-        data - columns @ coefficients,
-        coefficients,
-        covariance,
-        square,
-        0.5 * (square + log_s) + float(np.sum(np.log(np.diag(factor[0])))),
-        float(np.sqrt(max(square, 0.0) / max(len(data) - CONSTANTS, 1))),
-    )
-
-
 @dataclass(frozen=True)
 class Hypotheses:
     """Axes with their columns: what every hypothesis is fitted on.
@@ -440,10 +408,21 @@ class Hypotheses:
 
     def regress(self, data: Array, columns: Array, log_s: float, skip: BoolArray) -> HypothesisFit:
         """Fit what :meth:`laid_out` gave, without the measurements that are left out."""
-        axes, kept = len(data), np.count_nonzero(~skip)
-        prior = np.append(self.prior, np.full(axes * self.steps.shape[1], np.inf))
-        rows = columns[:, ~skip].reshape(axes * kept, -1)
-        return fit(data[:, ~skip].ravel(), rows, np.repeat(np.arange(axes), kept), prior, log_s)
+        axis = np.repeat(np.arange(len(data)), np.count_nonzero(~skip))
+        data, columns = data[:, ~skip].ravel(), columns[:, ~skip].reshape(len(axis), -1)
+        count = columns.shape[1]
+        prior = np.append(self.prior, np.full(count - len(self.prior), np.inf))
+        information = np.diag(prior**-2.0) + columns.T @ columns
+        # a column that nothing excites (a turn in hover) must not stop the others
+        information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(count)
+        moment, factor = columns.T @ data, cho_factor(information)
+        covariance = cho_solve(factor, np.eye(count))
+        coefficients = covariance @ moment
+        square = float(data @ data - coefficients @ moment)
+        score = 0.5 * (square + log_s) + float(np.sum(np.log(np.diag(factor[0]))))
+        spread = float(np.sqrt(max(square, 0.0) / max(len(data) - CONSTANTS, 1)))
+        rest = data - columns @ coefficients
+        return HypothesisFit(axis, rest, coefficients, covariance, square, score, spread)
 
     def squares(self, sigma_a: float, skip: BoolArray) -> Array:
         """What a fit leaves of every measurement, over its σ: squares summed over the axes."""

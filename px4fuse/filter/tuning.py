@@ -47,8 +47,6 @@ GRID = 40
 MAP_SIGMAS = 4.5
 MIN_MEASUREMENTS = 30
 MAX_OUTLIER_SHARE = 0.3
-# The clock offset is a nuisance here: a rough one is enough
-COARSE_MEASUREMENTS = 600
 SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 FIRST_WALK_M = 0.02
 # A value this near to the end of its search lies there
@@ -333,7 +331,8 @@ def _with_biases(
     if isinstance(moved, Unavailable):
         return None
     start = replace(alone.noises, walk_m=FIRST_WALK_M if drifts else 0.0)
-    offset, start = moved.search(COARSE_MEASUREMENTS, start, SIGMA_A_FACTORS, scaled=False)
+    # the clock offset is a nuisance here: a rough one is enough
+    offset, start = moved.search(start, SIGMA_A_FACTORS, scaled=False)
     return most_likely([moved.at(offset)], start, moved.weight)
 
 
