@@ -19,7 +19,7 @@ from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.inputs import Inputs, Received
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.replay import Ekf2Replay, along, rms_to_truth
-from px4fuse.ekf2.stretches import Flow, Stretch
+from px4fuse.ekf2.stretches import Sensed, Stretch
 from px4fuse.ekf2.walk import (
     ATTITUDE,
     FIELD,
@@ -158,7 +158,7 @@ def test_the_walk_changes_one_thing_after_the_other() -> None:
     # the delay was taken from the positions of GNSS that ours is given
     assert found[0].stamp_offset_s == pytest.approx(-0.16)
     assert [one.settings["EKF2_GPS_P_NOISE"] for one in found] == [0.2] * 2 + [0.5] * 6
-    flow = (made(Stretch, flow=made(Flow), heights=None),)
+    flow = (made(Stretch, flow=made(Sensed), heights=None),)
     more = {"stretches": flow, "settings": gnss.settings | {"EKF2_MAG_NOISE": 0.05}}
     variants = on_the_way(made(Inputs, **{**vars(gnss), **more}), ours)
     assert list(variants)[-5:] == [ATTITUDE, FIELD, SPEED, FLOWING, GATE]
