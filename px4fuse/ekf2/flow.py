@@ -14,8 +14,8 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array
-from px4fuse.ekf2.magnetometer import CROSS, EYE, Samples, fuse_mean
-from px4fuse.ekf2.stretches import THETA, VELOCITY, Sensed, Stretch
+from px4fuse.ekf2.magnetometer import Samples, fuse_mean
+from px4fuse.ekf2.stretches import VELOCITY, Sensed, Stretch
 from px4fuse.flight import FLOW_SHARE
 
 
@@ -47,11 +47,4 @@ def with_flow(stretch: Stretch, flow: pd.DataFrame, gate: float) -> Stretch:
 
 def fuse_flow(x: Array, P: Array, told: Samples, gate: float) -> tuple[Array, Array]:
     """State and covariance of S variants after the flow of one event."""
-    speed = x[:, VELOCITY]
-    of_speed, of_turn = ((each @ CROSS).reshape(-1, 3, 3) for each in (speed, x[:, THETA]))
-    H = np.zeros((len(x), 2, x.shape[1]))
-    H[:, :, THETA] = told.turn @ of_speed
-    H[:, :, VELOCITY] = told.turn @ (EYE - of_turn)
-    seen = (H[:, :, VELOCITY] @ speed[:, :, None])[:, :, 0]
-    gates = np.full(len(x), gate)
-    return fuse_mean(x, P, H, told.value - seen, told.noise, told.number, gates)[:2]
+    return fuse_mean(x, P, told, told.noise, np.full(len(x), gate), VELOCITY)[:2]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from px4fuse.arrays import Array, IntArray
-from px4fuse.ekf2.stretches import BODY_FIELD, EARTH_FIELD, FIELD_STATES, THETA, Sensed
+from px4fuse.ekf2.stretches import BODY_FIELD, EARTH_FIELD, THETA, Sensed
 from px4fuse.trajectory.rotation import skew
 
 MIN_SD_GAUSS = 0.01
@@ -63,43 +63,46 @@ def fuse_field(
     And innovation (gauss), its variance for a single sample and whether it was fused, of shape
     (3, S, 3); NaN where there was no sample.
     """
-    earth = x[:, EARTH_FIELD]
-    of_earth, of_turn = ((each @ CROSS).reshape(-1, 3, 3) for each in (earth, x[:, THETA]))
-    H = np.zeros((len(x), 3, FIELD_STATES))
-    H[:, :, THETA] = told.turn @ of_earth
-    H[:, :, EARTH_FIELD] = told.turn @ (EYE - of_turn)
-    H[:, :, BODY_FIELD] = EYE
-    seen = (H[:, :, EARTH_FIELD] @ earth[:, :, None])[:, :, 0] + x[:, BODY_FIELD]
     R = np.maximum(noise_gauss, MIN_SD_GAUSS) ** 2
-    return fuse_mean(x, P, H, told.value - seen, R, told.number, gate)
+    return fuse_mean(x, P, told, R, gate, EARTH_FIELD, BODY_FIELD)
 
 
 def fuse_mean(
-    x: Array, P: Array, H: Array, nu: Array, R: Array, number: Array, gate: Array
+    x: Array, P: Array, told: Samples, R: Array, gate: Array, rows: slice, own: slice | None = None
 ) -> tuple[Array, Array, Array]:
     """State and covariance of S variants after the mean of some samples, as :func:`fuse_field`.
 
     Parameters
     ----------
-    H : ndarray, shape (S, k, n)
-    nu : ndarray, shape (S, k)
-        Mean minus what is expected of it.
-    R, number : ndarray, shape (S,)
-        Variance of one sample, and how many there were.
-    gate : ndarray, shape (S,)
-        Of one sample, in standard deviations.
+    told : Samples
+        Of one event.
+    R, gate : ndarray, shape (S,)
+        Variance of one sample, and its gate in standard deviations.
+    rows : slice
+        States that are measured in the body (NED).
+    own : slice, optional
+        States that are the body's own, and are measured with them.
     """
-    HP = H @ P
+    state, number = x[:, rows], told.number
+    of_state, of_turn = ((each @ CROSS).reshape(-1, 3, 3) for each in (state, x[:, THETA]))
+    H = np.zeros((len(x), told.value.shape[-1], x.shape[1]))
+    H[:, :, THETA] = told.turn @ of_state
+    H[:, :, rows] = told.turn @ (EYE - of_turn)
+    seen = (H[:, :, rows] @ state[:, :, None])[:, :, 0]
+    if own is not None:
+        H[:, :, own] = EYE
+        seen += x[:, own]
+    nu, HP = told.value - seen, H @ P
     S = HP @ H.transpose(0, 2, 1)
-    own = S.reshape(len(S), -1)[:, :: nu.shape[1] + 1]  # its diagonal, as a view
-    told = np.empty((3, *nu.shape))
-    told[0], told[1] = nu, own + R[:, None]
-    seen = number > 0.0
-    taken = seen & (nu * nu <= gate[:, None] ** 2 * told[1]).all(axis=1)
-    told[2] = taken[:, None]
-    told[:, ~seen] = np.nan
-    own += np.where(seen, R / np.maximum(number, 1.0), 1.0)[:, None]
+    diagonal = S.reshape(len(S), -1)[:, :: nu.shape[1] + 1]  # a view
+    found = np.empty((3, *nu.shape))
+    found[0], found[1] = nu, diagonal + R[:, None]
+    there = number > 0.0
+    taken = there & (nu * nu <= gate[:, None] ** 2 * found[1]).all(axis=1)
+    found[2] = taken[:, None]
+    found[:, ~there] = np.nan
+    diagonal += np.where(there, R / np.maximum(number, 1.0), 1.0)[:, None]
     K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * taken[:, None, None]
     x = x + (K @ nu[:, :, None])[:, :, 0]
     P = P - K @ HP
-    return x, 0.5 * (P + P.transpose(0, 2, 1)), told
+    return x, 0.5 * (P + P.transpose(0, 2, 1)), found

@@ -53,7 +53,6 @@ GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])  # CONSTANTS_ONE_G
 # States, of Stretch.state
 STATES = 15
 MOVED = 9  # of them, those that the IMU moves: all but the biases
-FIELD_STATES = 21  # with the magnetic fields of earth (NED) and body (FRD), where they are fused
 THETA, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCELEROMETER_BIAS, BIASES = slice(9, 12), slice(12, 15), slice(9, 15)
 EARTH_FIELD, BODY_FIELD = slice(15, 18), slice(18, 21)

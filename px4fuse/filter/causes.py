@@ -18,7 +18,6 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -40,7 +39,7 @@ from px4fuse.filter.likelihood import (
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, ned_acceleration, too_few
 from px4fuse.filter.steps import Timeline, timeline
-from px4fuse.flight import AXIS_NAMES, Columns, Flight, Unavailable
+from px4fuse.flight import Columns, Flight, Unavailable
 
 CAUSES = "causes beyond noise"
 MIN_MEASUREMENTS = 50
@@ -502,9 +501,7 @@ def hypotheses_of(
     for axis in shifted:
         own = preintegrate(axis, settings)
         columns = [(own.delta_position_m, own.delta_velocity_m_s)]
-        columns += [
-            _added(frame.to_numpy() @ axis.direction, frame.index, line) for frame in common
-        ]
+        columns += [_added(value @ axis.direction, when, line) for when, value in common]
         dp, dv = (np.stack(part, axis=1) for part in zip(*columns, strict=True))
         measured = np.zeros_like(dp)
         # the filter starts at the first one
@@ -530,19 +527,16 @@ def _added(acceleration_m_s2: Array, time_s: ArrayLike, line: Timeline) -> tuple
     return moved(line, np.diff(velocity) / np.diff(line.time_s))
 
 
-def _common_columns(attitude: pd.DataFrame, acceleration: pd.DataFrame) -> list[pd.DataFrame]:
-    """NED acceleration that takes out a bias forward and right, and that a turn adds."""
+def _common_columns(
+    attitude: pd.DataFrame, acceleration: pd.DataFrame
+) -> list[tuple[pd.Index, Array]]:
+    """NED acceleration that takes out a bias forward and right, and that a turn adds; and when."""
     body_to_ned = Rotation.from_quat(
         attitude[Columns.QUATERNION].to_numpy(copy=True), scalar_first=True
     )
-    names: list[Any] = list(AXIS_NAMES)
-    biases = [
-        pd.DataFrame(body_to_ned.apply(np.eye(3)[axis]), index=attitude.index, columns=names)
-        for axis in (FORWARD, RIGHT)
-    ]
+    biases = [(attitude.index, body_to_ned.apply(np.eye(3)[axis])) for axis in (FORWARD, RIGHT)]
     north, east, _ = acceleration.to_numpy().T
-    turned = np.column_stack([-east, north, np.zeros(len(north))])
-    return [*biases, pd.DataFrame(turned, index=acceleration.index, columns=names)]
+    return [*biases, (acceleration.index, np.column_stack([-east, north, 0.0 * north]))]
 
 
 def _hats(start_s: float, end_s: float) -> tuple[Array, Array]:

@@ -123,8 +123,6 @@ class ClockOffset(Shown, Clock, frozen=True, kw_only=True, eq=False):
     ----------
     curve_s, curve_drop : ndarray, shape (n,)
         Offsets, and how far each lies below the greatest log-likelihood.
-    interval_drop : float
-        How far below it the interval reaches: more than chi-square says, by the IMU's noise.
     sigma_a_m_s2, sigma_z_m : float
         Noises at the maximum.
     """
@@ -132,7 +130,6 @@ class ClockOffset(Shown, Clock, frozen=True, kw_only=True, eq=False):
     written_as = Clock
     curve_s: Array
     curve_drop: Array
-    interval_drop: float
     sigma_a_m_s2: float
     sigma_z_m: float
 
@@ -231,7 +228,6 @@ def estimate_clock_offset(
         reason=reason,
         curve_s=applied + curve,
         curve_drop=profile - profile.min(),
-        interval_drop=PROFILE_DROP * factor,
         parts=tuple(structs.replace(part, offset_s=applied + part.offset_s) for part in parts),
         drift_ppm=drift,
         drift_sigma_ppm=drift_sigma,
