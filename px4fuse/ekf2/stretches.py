@@ -55,7 +55,7 @@ STATES = 15
 MOVED = 9  # of them, those that the IMU moves: all but the biases
 THETA, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCELEROMETER_BIAS, BIASES = slice(9, 12), slice(12, 15), slice(9, 15)
-EARTH_FIELD, BODY_FIELD = slice(15, 18), slice(18, 21)
+EARTH_FIELD, BODY_FIELD = slice(15, 18), slice(18, 21)  # NED and FRD, where they are fused
 
 
 @dataclass(frozen=True)

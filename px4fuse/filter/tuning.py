@@ -371,11 +371,8 @@ def _bounded(
     value = float(np.exp(best[0]))
     low, high = profile_ends(score, best, search, widening)
     inside = search[0] * AT_END < value < search[1] / AT_END
-    return Noise(
-        value if inside and low is not None and high is not None else None,
-        None if low is None else float(np.exp(low)),
-        None if high is None else float(np.exp(high)),
-    )
+    closed = low is not None and high is not None
+    return Noise(value if inside and closed else None, low, high)
 
 
 def _map(
