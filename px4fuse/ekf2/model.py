@@ -99,8 +99,7 @@ class Model:
     def obedient(self) -> Ekf2Replay:
         """As flown, rejecting and resetting where EKF2 did, as far as the log tells."""
         obeys = Variant(self.inputs.settings, as_logged=True)
-        runs = _run_model(self, [obeys])
-        return _assemble(self.inputs, runs, runs[0].variants.index(obeys), {})
+        return _assemble(self.inputs, _run_model(self, [obeys]), obeys, {})
 
 
 def open_model(flight: Flight, besides: Besides = lambda _: ()) -> Model | Unavailable:
@@ -143,13 +142,13 @@ def _open(
         variants += [] if each in variants else [each]
     known = {timing: intervals}
     runs = run_variants(inputs, variants, known)
-    replay = _assemble(inputs, runs, 0, {})
+    replay = _assemble(inputs, runs, flown, {})
     agreement = agreement_with_log(flight, replay)
     if isinstance(agreement, Unavailable):
         return agreement
     share = max(agreement.rejected_share_logged, agreement.rejected_share_replayed)
     if share > REJECTING_SHARE and np.isfinite(inputs.received.rejected).any():
-        obeyed = agreement_with_log(flight, _assemble(inputs, runs, 1, {}))
+        obeyed = agreement_with_log(flight, _assemble(inputs, runs, variants[1], {}))
         if isinstance(obeyed, Agreement):
             agreement = with_obedient(agreement, obeyed)
     told = {DOUBTED.get(name, name): name for name in doubted}
@@ -224,10 +223,7 @@ def replay_settings(
         for change in changes
     ]
     runs = _run_model(model, variants)
-    replays = [
-        _assemble(inputs, runs, runs[0].variants.index(variant), change)
-        for variant, change in zip(variants, changes, strict=True)
-    ]
+    replays = [_assemble(inputs, runs, *each) for each in zip(variants, changes, strict=True)]
     if left_out_s is not None:
         replays = [_without(inputs, each, left_out_s) for each in replays]
     return tuple(structs.replace(each, agreement=model.agreement) for each in replays)
@@ -330,12 +326,13 @@ def _track(part: Run, state: Array) -> pd.DataFrame:
 
 
 def _assemble(
-    inputs: Inputs, runs: Sequence[Run], at: int, changed: Mapping[str, float]
+    inputs: Inputs, runs: Sequence[Run], variant: Variant, changed: Mapping[str, float]
 ) -> Ekf2Replay:
+    at = runs[0].variants.index(variant)
     tracks = [_tracks(inputs, part, at) for part in runs]
     updates = [_updates(part, at) for part in runs]
     return Ekf2Replay(
-        settings=runs[0].variants[at].settings,
+        settings=variant.settings,
         changed=dict(changed),
         updates=pd.concat(updates),
         carried_s=tuple(
