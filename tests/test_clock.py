@@ -492,7 +492,7 @@ def stated(*offsets: float, sigma_s: float = 0.02, change_p: float | None = 1e-7
     curve = np.array([0.0])
     return ClockOffset(
         offset_s=middle, interval_s=(middle - 0.02, middle + 0.02), sigma_s=0.01, applied_s=0.0,
-        determinable=True, curve_s=curve, curve_drop=curve, interval_drop=1.92, parts=parts,
+        determinable=True, curve_s=curve, curve_drop=curve, parts=parts,
         drift_ppm=100.0, drift_sigma_ppm=50.0, change_p=change_p, sigma_a_m_s2=0.2,
         sigma_z_m=0.01, count=3000,
     )  # fmt: skip

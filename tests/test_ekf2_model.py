@@ -52,7 +52,7 @@ def vision_of(flight: Flight) -> pd.DataFrame:
 
 
 def test_an_interval_is_the_product_of_its_steps(model: Model) -> None:
-    stretch, made = model.inputs.stretches[0], model.intervals[0]
+    stretch, made = model.inputs.stretches[0], next(iter(model.intervals.values()))[0]
     end = made.events.end
     starts = np.concatenate([[0], end[:-1]])
     gyro, force = (model.inputs.settings[f"EKF2_{name}_NOISE"] for name in ("GYR", "ACC"))
@@ -81,8 +81,7 @@ def test_within_an_interval_a_state_follows_from_its_beginning(
 ) -> None:
     """Without attitude as a state, the nominal one is not corrected either."""
     variant = Variant(model.inputs.settings, attitude=attitude)
-    timing = variant.timing(model.inputs)
-    (part,) = run_variants(model.inputs, [variant], {timing: model.intervals})
+    (part,) = run_variants(model.inputs, [variant], model.intervals)
     kept = np.random.default_rng(4).normal(0.0, 0.05, part.state.shape)
     state, _ = delayed_states(replace(part, state=kept), 0)
     stretch, ends = part.stretch, part.events[0].end
@@ -98,7 +97,7 @@ def test_within_an_interval_a_state_follows_from_its_beginning(
 
 
 def test_the_recursion_is_the_plain_filter(model: Model) -> None:
-    events = model.intervals[0].events
+    events = next(iter(model.intervals.values()))[0].events
     nu, S = plain_replay(model.inputs, model.inputs.stretches[0], events[events.end < 3000])
     updates = model.flown.updates.iloc[: len(nu)]
     assert len(nu) > 100

@@ -4,8 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from findings_tools import made as made_of
+from scipy.spatial.transform import Rotation
 
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
+from px4fuse.ekf2.stretches import (
+    ACCELEROMETER_BIAS,
+    GRAVITY_M_S2,
+    POSITION,
+    VELOCITY,
+    Stretch,
+)
 
 STEP_S = 0.01
 
@@ -44,16 +53,20 @@ def buffered(gain, velocity, position, reset, lag, tau_v, tau_p):
 def test_the_recursive_filters_are_the_buffer(lag: int) -> None:
     rng = np.random.default_rng(lag)
     n = 400
-    gain = rng.normal(0.0, 0.02, (n, 2))
-    velocity = np.cumsum(rng.normal(0.0, 0.03, (n + 1, 2)), axis=0) + 0.3
+    turn, turned = Rotation.random(n + 1, rng).as_matrix(), rng.normal(0.0, 0.1, (n + 1, 3))
+    force, bias = rng.normal(0.0, 2.0, (n, 3)), np.full(3, 0.05)
+    felt = np.einsum("nij,nj->ni", turn[1:], force - bias)
+    gain = (felt + np.cross(turned[1:], felt) + GRAVITY_M_S2) * STEP_S
+    velocity = np.cumsum(rng.normal(0.0, 0.03, (n + 1, 3)), axis=0) + 0.3
     position = np.cumsum(velocity * STEP_S, axis=0) + 4.0
-    reset = np.zeros((n + 1, 2))
-    reset[150:] = 0.7, -0.2
+    reset = np.zeros((n + 1, 3))
+    reset[150:] = 0.7, -0.2, 0.0
     position += reset
-    made = publish(
-        gain_m_s=gain, step_s=np.full(n, STEP_S), velocity_m_s=velocity, position_m=position,
-        reset_m=reset, lag=lag, tau_velocity_s=0.25, tau_position_s=0.4,
-    )  # fmt: skip
+    stretch = made_of(Stretch, rotation=turn, force_m_s2=force, step_s=np.full(n, STEP_S))
+    state = np.zeros((n + 1, 15))
+    state[:, VELOCITY], state[:, POSITION], state[:, ACCELEROMETER_BIAS] = velocity, position, bias
+    settings = {"EKF2_TAU_VEL": 0.25, "EKF2_TAU_POS": 0.4}
+    made = publish(stretch, state, reset, turned, lag, settings)
     expected = buffered(gain, velocity, position, reset, lag, 0.25, 0.4)
     for found, known in zip(made, expected, strict=True):
         assert found == pytest.approx(known, abs=1e-9)

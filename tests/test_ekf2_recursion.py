@@ -37,7 +37,7 @@ from px4fuse.ekf2.recursion import (
     run,
 )
 from px4fuse.ekf2.recursion import _measurements as measurements
-from px4fuse.ekf2.stretches import GRAVITY_M_S2, Field, Stretch
+from px4fuse.ekf2.stretches import GRAVITY_M_S2, Stretch, with_field
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, MAG, Aid, settings_in_force
 from px4fuse.errors import SettingsError
 from px4fuse.trajectory.rotation import skew
@@ -332,11 +332,9 @@ def at_rest(
     )  # fmt: skip
     stretch.state[2] = heading_rad
     if field_gauss is not None:
-        stretch = replace(
-            stretch, state=np.concatenate([stretch.state, field_gauss, np.zeros(3)]),
-            variance=np.concatenate([stretch.variance, np.full(6, 1e-8)]), correlation=np.eye(21),
-            field=Field(np.arange(7, count, 7), np.tile(field_gauss, ((count - 1) // 7, 1)), 1.0),
-        )  # fmt: skip
+        at, known = np.arange(7, count, 7), np.append(field_gauss, np.zeros(3))
+        gauss = np.tile(field_gauss, (len(at), 1))
+        stretch = with_field(stretch, stretch.time_s[at], gauss, 1.0, known, np.full(6, 1e-8))
         stretch.variance[2] = 0.01
     stamp = 10.105 + 0.1 * np.arange(len(measured_m))
     north = np.array(measured_m)

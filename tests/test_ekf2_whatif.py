@@ -19,7 +19,7 @@ from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.inputs import Inputs, Received
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.replay import Ekf2Replay, along, rms_to_truth
-from px4fuse.ekf2.stretches import Flow, Stretch
+from px4fuse.ekf2.stretches import Sensed, Stretch
 from px4fuse.ekf2.walk import (
     ATTITUDE,
     FIELD,
@@ -151,7 +151,7 @@ def test_the_walk_changes_one_thing_after_the_other() -> None:
     # the delay was taken from the positions of GNSS that ours is given
     assert found[0].stamp_offset_s == pytest.approx(-0.16)
     assert [one.settings["EKF2_GPS_P_NOISE"] for one in found] == [0.2] * 2 + [0.5] * 6
-    flow = (made(Stretch, flow=made(Flow), heights=None),)
+    flow = (made(Stretch, flow=made(Sensed), heights=None),)
     more = {"stretches": flow, "settings": gnss.settings | {"EKF2_MAG_NOISE": 0.05}}
     variants = on_the_way(made(Inputs, **{**vars(gnss), **more}), ours)
     assert list(variants)[-5:] == [ATTITUDE, FIELD, SPEED, FLOWING, GATE]
@@ -291,7 +291,7 @@ def test_a_prediction_that_a_little_noise_changes_is_not_steady(
         monkeypatch.setattr(whatif, "disturbed", disturbed)
         monkeypatch.setattr(whatif, "replay_settings", lambda _, changes, **_more: changes)
         monkeypatch.setattr(whatif, "_of_replay", lambda *_: changed)
-        (found,) = whatif._steadied(model, [base], ((0.0, 1.0),))
+        (found,) = whatif._steadied(model, [base], ((0.0, 1.0),), {})
         return found.steady
 
     assert judged(base)
@@ -309,5 +309,5 @@ def test_a_prediction_that_a_little_noise_changes_is_not_steady(
     assert not judged(structs.replace(base, rejected_share=0.2301))
     few, many = (structs.replace(base, rejected_share=share) for share in (0.02, 0.351))
     runs.clear()
-    assert [one.steady for one in whatif._steadied(model, [few, many], ())] == [True, False]
+    assert [one.steady for one in whatif._steadied(model, [few, many], (), {})] == [True, False]
     assert runs == []  # nothing to try

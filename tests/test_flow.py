@@ -13,8 +13,9 @@ from ekf2_tools import opened
 from exchange import replace
 from ulog_tools import gnss_log, seconds_of, stamps, topic
 
-from px4fuse.ekf2.flow import FlowSamples, fuse_flow, gather_flow, with_flow
+from px4fuse.ekf2.flow import fuse_flow, with_flow
 from px4fuse.ekf2.inputs import read_gnss
+from px4fuse.ekf2.magnetometer import Samples, gather
 from px4fuse.ekf2.model import Model, replay_settings
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.flight import Columns, Ekf2, Flight, FusionRecord, Reset, Truth
@@ -116,13 +117,13 @@ def test_flow_tells_the_velocity_at_the_event_after_it(every: int) -> None:
     (stretch,) = model().inputs.stretches
     told = with_flow(stretch, flow_of(every=every), 3.0)
     assert told.flow is not None
-    end = model().intervals[0].events.end
-    found = gather_flow(told, told.flow, end)
+    end = next(iter(model().intervals.values()))[0].events.end
+    found = gather(told.flow, end, stretch.gained_m_s)
     seen = found.number > 0.0
     assert found.number.sum() == pytest.approx(len(flow_of(every=every)) * every, abs=12.0)
     speed = true_velocity(stretch.time_s[end[seen]])
     expected = np.einsum("kab,kb->ka", found.turn[seen], speed)
-    off = found.speed_m_s[seen] - expected
+    off = found.value[seen] - expected
     assert np.sqrt(np.mean(off**2)) < 0.03
     assert np.ptp(expected, axis=0).min() > 0.7
 
@@ -131,15 +132,15 @@ def test_the_mean_counts_as_often_as_it_has_samples_and_the_gate_is_of_one() -> 
     turn = np.eye(3)[None, :2]
     x, P = np.zeros((1, 15)), np.diag(np.full(15, 1e-9))[None].copy()
     P[0, 3:5, 3:5] = 0.25 * np.eye(2)
-    told = FlowSamples(np.array([[1.0, -0.5]]), turn, np.array([10.0]), np.array([0.8]))
+    told = Samples(np.array([[1.0, -0.5]]), turn, np.array([10.0]), np.array([0.8]))
     after, left = fuse_flow(x, P, told, 3.0)
     # 1/P = 1/P₀ + n/R
     assert left[0, 3, 3] == pytest.approx(1.0 / (1.0 / 0.25 + 10.0 / 0.8), rel=1e-6)
     assert after[0, 3:5] == pytest.approx(np.array([1.0, -0.5]) * left[0, 3, 3] * 10.0 / 0.8)
-    far = told._replace(speed_m_s=np.array([[3.1, 0.0]]))  # 3 σ of one sample are 3.07
+    far = told._replace(value=np.array([[3.1, 0.0]]))  # 3 σ of one sample are 3.07
     np.testing.assert_array_equal(fuse_flow(x, P, far, 3.0)[0], x)
     assert fuse_flow(x, P, far, 3.1)[0][0, 3] > 1.0
-    none = told._replace(number=np.zeros(1), noise_m2_s2=np.zeros(1), turn=np.zeros((1, 2, 3)))
+    none = told._replace(number=np.zeros(1), noise=np.zeros(1), turn=np.zeros((1, 2, 3)))
     np.testing.assert_array_equal(fuse_flow(x, P, none, 3.0)[0], x)
 
 

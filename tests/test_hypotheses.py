@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 from exchange import replace
+from findings_tools import made as part_of
 from flights import aisle_flight, unavailable, unexplained
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import noises_and_clock, turned_frame
-from px4fuse.filter.causes import Hypotheses, explained, fit, hypotheses_of
+from px4fuse.filter.causes import Hypotheses, explained, hypotheses_of
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings
@@ -121,8 +122,12 @@ def test_an_axis_of_which_a_gap_tells_less_has_a_filter_of_its_own() -> None:
 
 def test_a_fit_is_least_squares_with_the_prior_as_one_more_measurement() -> None:
     rng = np.random.default_rng(1)
-    columns, data = rng.normal(size=(40, 2)), rng.normal(size=40)
-    made = fit(data, columns, np.repeat([0, 1], [15, 25]), np.array([np.inf, 0.5]), 0.0)
+    columns, data = rng.normal(size=(2, 25, 2)), rng.normal(size=(2, 25))
+    skip = np.arange(25) % 5 == 0
+    model = part_of(Hypotheses, prior=np.array([np.inf, 0.5]))
+    made = model.regress(data, columns, 0.0, skip)
+    columns, data = columns[:, ~skip].reshape(40, 2), data[:, ~skip].ravel()
+    assert made.axis.tolist() == [0] * 20 + [1] * 20
     rows = np.vstack([columns, [0.0, 1.0 / 0.5]])
     expected, *_ = np.linalg.lstsq(rows, np.append(data, 0.0), rcond=None)
     np.testing.assert_allclose(made.coefficients, expected, rtol=1e-9)

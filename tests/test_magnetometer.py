@@ -11,19 +11,22 @@ from findings_tools import made
 from scipy.spatial.transform import Rotation
 from ulog_tools import Log, gnss_log, seconds_of, stamps, topic
 
-from px4fuse.ekf2.magnetometer import FieldSamples, fuse_field, gather
-from px4fuse.ekf2.stretches import Field, _field_s
+from px4fuse.ekf2.magnetometer import Samples, fuse_field, gather
+from px4fuse.ekf2.stretches import Sensed, _field_s
 from px4fuse.flight import Ekf2, FusionRecord
 from px4fuse.readers import read_log
 
 EARTH = np.array([0.21, 0.015, 0.43])
 
 
-def told(rotation: Rotation, body: np.ndarray, count: float = 1.0, size: int = 1) -> FieldSamples:
+def told(rotation: Rotation, body: np.ndarray, count: float = 1.0, size: int = 1) -> Samples:
     """What the magnetometer of a body that stands so measures."""
     turn = rotation.inv().as_matrix()
-    return FieldSamples(
-        np.tile(turn @ EARTH + body, (size, 1)), np.tile(turn, (size, 1, 1)), np.full(size, count)
+    return Samples(
+        np.tile(turn @ EARTH + body, (size, 1)),
+        np.tile(turn, (size, 1, 1)),
+        np.full(size, count),
+        np.zeros(size),
     )
 
 
@@ -41,7 +44,7 @@ def test_a_heading_error_is_put_right_and_its_variance_is_the_kalman_filters() -
     body = np.zeros(3)
     nominal = Rotation.from_euler("ZYX", [0.7, 0.1, -0.05])
     true = Rotation.from_rotvec([0.0, 0.0, 0.05]) * nominal
-    seen = FieldSamples(told(true, body).gauss, told(nominal, body).turn, np.ones(1))
+    seen = told(nominal, body)._replace(value=told(true, body).value)
     x, P = knowing()
     for _ in range(400):
         x, P, told_of = fuse_field(x, P, seen, np.array([0.02]), np.array([3.0]))
@@ -95,7 +98,7 @@ def test_each_variant_has_its_own_noise_and_gate_and_takes_what_it_was_sent() ->
     np.testing.assert_allclose(told_of[0, [0, 1, 3], 0], 0.3)
     assert np.isnan(told_of[:, 2]).all()
     # 0.01 gauss of noise at least, as mag_control.cpp has it
-    least, *_ = fuse_field(x[:1], P[:1], FieldSamples(*(each[:1] for each in seen)),
+    least, *_ = fuse_field(x[:1], P[:1], Samples(*(each[:1] for each in seen)),
                            np.array([0.01]), np.array([100.0]))  # fmt: skip
     np.testing.assert_allclose(after[3], least[0])
 
@@ -103,9 +106,13 @@ def test_each_variant_has_its_own_noise_and_gate_and_takes_what_it_was_sent() ->
 def test_samples_are_fused_at_the_first_event_after_them() -> None:
     rotation = Rotation.from_rotvec(0.1 * np.eye(3)[2] * np.arange(10)[:, None]).as_matrix()
     gauss = np.arange(12.0).reshape(4, 3)
-    found = gather(Field(np.array([2, 3, 6, 9]), gauss, 2.0), rotation, np.array([1, 3, 6, 6, 8]))
+    step = np.array([2, 3, 6, 9])
+    turn = rotation[step].transpose(0, 2, 1)
+    sensed = Sensed(step, gauss, turn, np.full(4, 2.0), np.array([0.1, 0.3, 0.2, 0.4]))
+    found = gather(sensed, np.array([1, 3, 6, 6, 8]))
+    np.testing.assert_allclose(found.noise, [0.0, 0.2, 0.2, 0.0, 0.0])
     assert found.number.tolist() == [0.0, 4.0, 2.0, 0.0, 0.0]
-    np.testing.assert_allclose(found.gauss[1], gauss[:2].mean(axis=0))
+    np.testing.assert_allclose(found.value[1], gauss[:2].mean(axis=0))
     np.testing.assert_allclose(found.turn[1], rotation[2:4].mean(axis=0).T)
     np.testing.assert_allclose(found.turn[2], rotation[6].T)
 

@@ -395,11 +395,11 @@ def test_the_ends_of_a_parabola_are_196_sigma_away(slope: float) -> None:
         return 0.5 * along**2 + 0.5 * across**2
 
     reach = sigma * np.sqrt(2.0 * PROFILE_DROP)
-    ends = profile_ends(score, (1.0, 2.0), (np.exp(-4.0), np.exp(6.0)))
+    ends = np.log(profile_ends(score, (1.0, 2.0), (np.exp(-4.0), np.exp(6.0))))
     assert ends == pytest.approx((1.0 - reach, 1.0 + reach), abs=0.01 * reach)
     bounds = np.exp(1.0 - 0.5 * reach), np.exp(1.0 + 0.5 * reach)
     assert profile_ends(score, (1.0, 2.0), bounds) == (None, None)
-    wide = profile_ends(score, (1.0, 2.0), (np.exp(-4.0), np.exp(6.0)), 4.0)
+    wide = np.log(profile_ends(score, (1.0, 2.0), (np.exp(-4.0), np.exp(6.0)), 4.0))
     assert wide == pytest.approx((1.0 - 2.0 * reach, 1.0 + 2.0 * reach), abs=0.02 * reach)
 
 

@@ -38,15 +38,8 @@ ONE_SIDED, RAISED, FILTER_S = 0.2, 1e3, 10.0
 
 def with_heights(
     flight: Flight, ekf2: Ekf2, record: FusionRecord, stretches: Sequence[Stretch]
-) -> tuple[tuple[Stretch, ...], str]:
-    """Stretches that hold what EKF2's height rests on; or as they are, and why they do not."""
-    made = _with_heights(flight, ekf2, record, stretches)
-    return (tuple(stretches), made) if isinstance(made, str) else (tuple(made), "")
-
-
-def _with_heights(
-    flight: Flight, ekf2: Ekf2, record: FusionRecord, stretches: Sequence[Stretch]
-) -> list[Stretch] | str:
+) -> tuple[Stretch, ...] | str:
+    """The same stretches with what EKF2's height rests on, or why the log does not tell it."""
     parameters, times = record.parameters, np.concatenate([one.time_s for one in stretches])
     if fuses_by_mask(parameters):
         return "before PX4 v1.14 EKF2 keeps to one sensor of height"
@@ -85,7 +78,7 @@ def _with_heights(
         state[DOWN] = np.interp(start_s, delayed.index, delayed)
         heights = Heights(tuple(fused), reference, bias, *samples, weight)
         made.append(replace(stretch, state=state, heights=heights))
-    return made
+    return tuple(made)
 
 
 def inside(

@@ -238,7 +238,8 @@ def prepare(  # noqa: PLR0911, PLR0912 (a reason each)
         f"{AIDS[name].label}: {why}" for name, why in doubtful.items() if name != FLOW.name
     )
     if gnss and not imposed:
-        stretches, imposed = with_heights(flight, ekf2, record, stretches)
+        found = with_heights(flight, ekf2, record, stretches)
+        stretches, imposed = (stretches, found) if isinstance(found, str) else (found, "")
     others = [MAG] if any(stretch.field for stretch in stretches) else []
     heights = stretches[0].heights
     others += [BAROMETER] if heights and BAROMETER.name in heights.fused else []

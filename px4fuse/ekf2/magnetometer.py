@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from px4fuse.arrays import Array, IntArray
-from px4fuse.ekf2.stretches import BODY_FIELD, EARTH_FIELD, FIELD_STATES, THETA, Field
+from px4fuse.ekf2.stretches import BODY_FIELD, EARTH_FIELD, THETA, Sensed
 from px4fuse.trajectory.rotation import skew
 
 MIN_SD_GAUSS = 0.01
@@ -20,80 +20,89 @@ EYE = np.eye(3)
 CROSS = skew(EYE).reshape(3, 9)  # v @ CROSS is [v]×
 
 
-class FieldSamples(NamedTuple):
-    """Field samples of the interval before each event; shape (E, ...), or (E, S, ...).
+class Samples(NamedTuple):
+    """Means of the samples that are fused at each event; shape (E, ...), or (E, S, ...).
 
-    ``gauss`` is their mean (body FRD), ``turn`` the mean rotation from NED into the body, and
-    ``number`` how many EKF2 had.
+    ``value`` and ``turn`` are as :class:`~px4fuse.ekf2.stretches.Sensed` has them, a velocity as of
+    the event; ``number`` is how many EKF2 had, and ``noise`` R of one.
     """
 
-    gauss: Array
+    value: Array
     turn: Array
     number: Array
+    noise: Array
 
 
-def gather(field: Field, rotation: Array, end: IntArray) -> FieldSamples:
-    """Samples by the event at which they are fused; ``end`` is the step of each event."""
-    event = np.searchsorted(end, field.step)
-    inside = event < len(end)
-    event, step = event[inside], field.step[inside]
-    each = np.concatenate([field.gauss[inside][:, None], rotation[step].transpose(0, 2, 1)], axis=1)
-    mean, count = mean_by_event(event, each, len(end))
-    return FieldSamples(mean[:, 0], mean[:, 1:], np.asarray(count * field.weight))
+def gather(sensed: Sensed, end: IntArray, gained_m_s: Array | None = None) -> Samples:
+    """Samples by the event at which they are fused; ``end`` is the step of each event.
 
+    ``gained_m_s`` is of :class:`~px4fuse.ekf2.stretches.Stretch`, for a velocity.
+    """
+    event = np.searchsorted(end, sensed.step)
+    inside, size = event < len(end), len(end)
+    event = event[inside]
+    count = np.maximum(np.bincount(event, minlength=size), 1)
 
-def mean_by_event(event: IntArray, rows: Array, events: int) -> tuple[Array, IntArray]:
-    """Mean of the rows of each of some events, 0 where there is none, and how many there are."""
-    count, total = np.bincount(event, minlength=events), np.zeros((events, *rows.shape[1:]))
-    np.add.at(total, event, rows)
-    return total / np.expand_dims(np.maximum(count, 1), tuple(range(1, rows.ndim))), count
+    def mean(rows: Array) -> Array:
+        total = np.zeros((size, *rows.shape[1:]))
+        np.add.at(total, event, rows[inside])
+        return np.asarray((total.T / count).T)
+
+    value, turn, noise = map(mean, (sensed.value, sensed.turn, sensed.noise))
+    if gained_m_s is not None:
+        value = value + np.einsum("eab,eb->ea", turn, gained_m_s[end])
+    number = np.bincount(event, sensed.samples[inside], size)
+    return Samples(value, turn, np.asarray(number, float), noise)
 
 
 def fuse_field(
-    x: Array, P: Array, told: FieldSamples, noise_gauss: Array, gate: Array
+    x: Array, P: Array, told: Samples, noise_gauss: Array, gate: Array
 ) -> tuple[Array, Array, Array]:
     """State and covariance of S variants after the field samples of one event.
 
     And innovation (gauss), its variance for a single sample and whether it was fused, of shape
     (3, S, 3); NaN where there was no sample.
     """
-    earth = x[:, EARTH_FIELD]
-    of_earth, of_turn = ((each @ CROSS).reshape(-1, 3, 3) for each in (earth, x[:, THETA]))
-    H = np.zeros((len(x), 3, FIELD_STATES))
-    H[:, :, THETA] = told.turn @ of_earth
-    H[:, :, EARTH_FIELD] = told.turn @ (EYE - of_turn)
-    H[:, :, BODY_FIELD] = EYE
-    seen = (H[:, :, EARTH_FIELD] @ earth[:, :, None])[:, :, 0] + x[:, BODY_FIELD]
     R = np.maximum(noise_gauss, MIN_SD_GAUSS) ** 2
-    return fuse_mean(x, P, H, told.gauss - seen, R, told.number, gate)
+    return fuse_mean(x, P, told, R, gate, EARTH_FIELD, BODY_FIELD)
 
 
 def fuse_mean(
-    x: Array, P: Array, H: Array, nu: Array, R: Array, number: Array, gate: Array
+    x: Array, P: Array, told: Samples, R: Array, gate: Array, rows: slice, own: slice | None = None
 ) -> tuple[Array, Array, Array]:
     """State and covariance of S variants after the mean of some samples, as :func:`fuse_field`.
 
     Parameters
     ----------
-    H : ndarray, shape (S, k, n)
-    nu : ndarray, shape (S, k)
-        Mean minus what is expected of it.
-    R, number : ndarray, shape (S,)
-        Variance of one sample, and how many there were.
-    gate : ndarray, shape (S,)
-        Of one sample, in standard deviations.
+    told : Samples
+        Of one event.
+    R, gate : ndarray, shape (S,)
+        Variance of one sample, and its gate in standard deviations.
+    rows : slice
+        States that are measured in the body (NED).
+    own : slice, optional
+        States that are the body's own, and are measured with them.
     """
-    HP = H @ P
+    state, number = x[:, rows], told.number
+    of_state, of_turn = ((each @ CROSS).reshape(-1, 3, 3) for each in (state, x[:, THETA]))
+    H = np.zeros((len(x), told.value.shape[-1], x.shape[1]))
+    H[:, :, THETA] = told.turn @ of_state
+    H[:, :, rows] = told.turn @ (EYE - of_turn)
+    seen = (H[:, :, rows] @ state[:, :, None])[:, :, 0]
+    if own is not None:
+        H[:, :, own] = EYE
+        seen += x[:, own]
+    nu, HP = told.value - seen, H @ P
     S = HP @ H.transpose(0, 2, 1)
-    own = S.reshape(len(S), -1)[:, :: nu.shape[1] + 1]  # its diagonal, as a view
-    told = np.empty((3, *nu.shape))
-    told[0], told[1] = nu, own + R[:, None]
-    seen = number > 0.0
-    taken = seen & (nu * nu <= gate[:, None] ** 2 * told[1]).all(axis=1)
-    told[2] = taken[:, None]
-    told[:, ~seen] = np.nan
-    own += np.where(seen, R / np.maximum(number, 1.0), 1.0)[:, None]
+    diagonal = S.reshape(len(S), -1)[:, :: nu.shape[1] + 1]  # a view
+    found = np.empty((3, *nu.shape))
+    found[0], found[1] = nu, diagonal + R[:, None]
+    there = number > 0.0
+    taken = there & (nu * nu <= gate[:, None] ** 2 * found[1]).all(axis=1)
+    found[2] = taken[:, None]
+    found[:, ~there] = np.nan
+    diagonal += np.where(there, R / np.maximum(number, 1.0), 1.0)[:, None]
     K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * taken[:, None, None]
     x = x + (K @ nu[:, :, None])[:, :, 0]
     P = P - K @ HP
-    return x, 0.5 * (P + P.transpose(0, 2, 1)), told
+    return x, 0.5 * (P + P.transpose(0, 2, 1)), found

@@ -21,7 +21,7 @@ from px4fuse.arrays import Array
 from px4fuse.display import brief
 from px4fuse.ekf2.inputs import WHAT, Inputs, prepare, same_sample
 from px4fuse.ekf2.intervals import Intervals, Timing, make_intervals
-from px4fuse.ekf2.output_predictor import follow_attitude, later, publish
+from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.recursion import HEADING, LEVEL, Run, Variant, run, with_correlation
 from px4fuse.ekf2.replay import (
     REJECTING_SHARE,
@@ -76,8 +76,8 @@ class Model:
     ----------
     flight : Flight
     inputs : Inputs
-    intervals : tuple of Intervals
-        Of each stretch, for the delay as flown.
+    intervals : mapping from Timing to tuple of Intervals
+        Of each stretch, for the delay as flown; empty where they are yet to be made.
     flown : Ekf2Replay
         With the parameters of the log.
     agreement : Agreement
@@ -88,7 +88,7 @@ class Model:
 
     flight: Flight
     inputs: Inputs
-    intervals: tuple[Intervals, ...]
+    intervals: Mapping[Timing, tuple[Intervals, ...]]
     flown: Ekf2Replay
     agreement: Agreement
     runs: list[Run] = field(default_factory=list, init=False)
@@ -99,8 +99,7 @@ class Model:
     def obedient(self) -> Ekf2Replay:
         """As flown, rejecting and resetting where EKF2 did, as far as the log tells."""
         obeys = Variant(self.inputs.settings, as_logged=True)
-        runs = _run_model(self, [obeys])
-        return _assemble(self.inputs, runs, runs[0].variants.index(obeys), {})
+        return _assemble(self.inputs, _run_model(self, [obeys]), obeys, {})
 
 
 def open_model(flight: Flight, besides: Besides = lambda _: ()) -> Model | Unavailable:
@@ -141,14 +140,15 @@ def _open(
     variants = [flown, replace(flown, as_logged=True)]
     for each in besides(inputs):
         variants += [] if each in variants else [each]
-    runs = run_variants(inputs, variants, {timing: intervals})
-    replay = _assemble(inputs, runs, 0, {})
+    known = {timing: intervals}
+    runs = run_variants(inputs, variants, known)
+    replay = _assemble(inputs, runs, flown, {})
     agreement = agreement_with_log(flight, replay)
     if isinstance(agreement, Unavailable):
         return agreement
     share = max(agreement.rejected_share_logged, agreement.rejected_share_replayed)
     if share > REJECTING_SHARE and np.isfinite(inputs.received.rejected).any():
-        obeyed = agreement_with_log(flight, _assemble(inputs, runs, 1, {}))
+        obeyed = agreement_with_log(flight, _assemble(inputs, runs, variants[1], {}))
         if isinstance(obeyed, Agreement):
             agreement = with_obedient(agreement, obeyed)
     told = {DOUBTED.get(name, name): name for name in doubted}
@@ -158,7 +158,7 @@ def _open(
         **{of: getattr(doubted[name], of) for of, name in told.items()},
     )
     replay = structs.replace(replay, agreement=agreement)
-    model = Model(flight, inputs, intervals, replay, agreement)
+    model = Model(flight, inputs, known, replay, agreement)
     model.runs.extend(runs)
     return model
 
@@ -223,10 +223,7 @@ def replay_settings(
         for change in changes
     ]
     runs = _run_model(model, variants)
-    replays = [
-        _assemble(inputs, runs, runs[0].variants.index(variant), change)
-        for variant, change in zip(variants, changes, strict=True)
-    ]
+    replays = [_assemble(inputs, runs, *each) for each in zip(variants, changes, strict=True)]
     if left_out_s is not None:
         replays = [_without(inputs, each, left_out_s) for each in replays]
     return tuple(structs.replace(each, agreement=model.agreement) for each in replays)
@@ -278,7 +275,7 @@ def moved(model: Model, turned_deg: float, later_s: float) -> Model:
     """
     if not turned_deg and not later_s:
         return model
-    inputs, received = model.inputs, model.inputs.received
+    received = model.inputs.received
     turn = Rotation.from_euler("z", turned_deg, degrees=True).as_matrix().T
     speed = received.velocity_m_s
     received = replace(
@@ -287,11 +284,8 @@ def moved(model: Model, turned_deg: float, later_s: float) -> Model:
         position_m=received.position_m @ turn,
         velocity_m_s=None if speed is None else speed @ turn,
     )
-    inputs, intervals = replace(inputs, received=received), model.intervals
-    if later_s:
-        timing = Variant(inputs.settings).timing(inputs)
-        intervals = tuple(make_intervals(inputs, stretch, timing) for stretch in inputs.stretches)
-    return replace(model, inputs=inputs, intervals=intervals)
+    known = {} if later_s else model.intervals
+    return replace(model, inputs=replace(model.inputs, received=received), intervals=known)
 
 
 def delayed_variants(model: Model, variants: Sequence[Variant]) -> Iterator[pd.DataFrame]:
@@ -308,8 +302,7 @@ def _run_model(model: Model, variants: Sequence[Variant]) -> list[Run]:
     """Runs that hold these variants: those of the model, where they are among them."""
     if model.runs and all(variant in model.runs[0].variants for variant in variants):
         return model.runs
-    timing = Variant(model.inputs.settings).timing(model.inputs)
-    return run_variants(model.inputs, variants, {timing: model.intervals})
+    return run_variants(model.inputs, variants, model.intervals)
 
 
 def run_variants(
@@ -333,12 +326,13 @@ def _track(part: Run, state: Array) -> pd.DataFrame:
 
 
 def _assemble(
-    inputs: Inputs, runs: Sequence[Run], at: int, changed: Mapping[str, float]
+    inputs: Inputs, runs: Sequence[Run], variant: Variant, changed: Mapping[str, float]
 ) -> Ekf2Replay:
+    at = runs[0].variants.index(variant)
     tracks = [_tracks(inputs, part, at) for part in runs]
     updates = [_updates(part, at) for part in runs]
     return Ekf2Replay(
-        settings=runs[0].variants[at].settings,
+        settings=variant.settings,
         changed=dict(changed),
         updates=pd.concat(updates),
         carried_s=tuple(
@@ -396,22 +390,11 @@ def _tracks(inputs: Inputs, part: Run, at: int) -> tuple[pd.DataFrame, pd.DataFr
     state, reset = delayed_states(part, at)
     horizon_s = min(variant.timing(inputs).horizon_s, MAX_HORIZON_S)
     lag = max(round(horizon_s / inputs.step_s), 1)
-    # the bias that the newest IMU samples are corrected with is the horizon's
-    force = stretch.force_m_s2 - later(state[:, ACCELEROMETER_BIAS], lag)[1:]
-    force = np.einsum("nij,nj->ni", stretch.rotation[1:], force)
+    turned = np.zeros((len(state), 3))
     if variant.attitude:  # the published attitude followed that of EKF2 itself
         apart = state[:, THETA] - stretch.attitude_error_rad
-        force += np.cross(follow_attitude(apart, lag, inputs.step_s, horizon_s)[1:], force)
-    published = publish(
-        gain_m_s=(force + GRAVITY_M_S2) * stretch.step_s[:, None],
-        step_s=stretch.step_s,
-        velocity_m_s=state[:, VELOCITY],
-        position_m=state[:, POSITION],
-        reset_m=reset,
-        lag=lag,
-        tau_velocity_s=variant.settings["EKF2_TAU_VEL"],
-        tau_position_s=variant.settings["EKF2_TAU_POS"],
-    )
+        turned = follow_attitude(apart, lag, inputs.step_s, horizon_s)
+    published = publish(stretch, state, reset, turned, lag, variant.settings)
     heading = np.arctan2(stretch.rotation[:, 1, 0], stretch.rotation[:, 0, 0]) + state[:, HEADING]
     delayed = _track(part, state).assign(heading_rad=heading)
     return delayed, _track(part, np.hstack([state[:, THETA], *published]))

@@ -9,55 +9,62 @@ filters over the whole stretch.
 Source: PX4-Autopilot ``EKF/output_predictor/output_predictor.cpp`` (``EKF/ekf.cpp`` before v1.14).
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 from scipy.linalg import lapack
 
 from px4fuse.arrays import Array
+from px4fuse.ekf2.stretches import (
+    ACCELEROMETER_BIAS,
+    GRAVITY_M_S2,
+    POSITION,
+    VELOCITY,
+    Stretch,
+)
 
 INTEGRAL_SHARE = 0.1
 ATTITUDE_SHARE = 0.5
 
 
 def publish(
-    *,
-    gain_m_s: Array,
-    step_s: Array,
-    velocity_m_s: Array,
-    position_m: Array,
-    reset_m: Array,
-    lag: int,
-    tau_velocity_s: float,
-    tau_position_s: float,
-) -> tuple[Array, Array]:
+    stretch: Stretch, state: Array, reset_m: Array, turned_rad: Array, lag: int,
+    settings: Mapping[str, float],
+) -> tuple[Array, Array]:  # fmt: skip
     """Published velocity and position at each step's end.
 
     Parameters
     ----------
-    gain_m_s : ndarray, shape (n, k)
-        Velocity gained in each step by the newest IMU samples, gravity removed.
-    step_s : ndarray, shape (n,)
-    velocity_m_s, position_m : ndarray, shape (n + 1, k)
-        The filter's state, by the time that it is of.
-    reset_m : ndarray, shape (n + 1, k)
+    stretch : Stretch
+    state : ndarray, shape (n + 1, 15) or more
+        The filter's, by the time that it is of.
+    reset_m : ndarray, shape (n + 1, 3)
         Sum of the position's resets up to each state.
+    turned_rad : ndarray, shape (n + 1, 3)
+        Published attitude against the nominal one.
     lag : int
         Steps between the horizon and the present.
-    tau_velocity_s, tau_position_s : float
-        EKF2_TAU_VEL and EKF2_TAU_POS.
+    settings : mapping
+        With EKF2_TAU_VEL and EKF2_TAU_POS.
 
     Returns
     -------
-    velocity_m_s, position_m : ndarray, shape (n + 1, k)
+    velocity_m_s, position_m : ndarray, shape (n + 1, 3)
         Before the first comparison, at step ``lag``, dead reckoning from the first state.
     """
-    mean_step = float(np.mean(step_s))
-    free = np.cumsum(np.concatenate([velocity_m_s[:1], gain_m_s]), axis=0)
-    velocity = free + _followed(velocity_m_s - free, lag, mean_step, tau_velocity_s)
+    step_s, mean_step = stretch.step_s[:, None], float(np.mean(stretch.step_s))
+    # the bias that the newest IMU samples are corrected with is the horizon's
+    force = stretch.force_m_s2 - later(state[:, ACCELEROMETER_BIAS], lag)[1:]
+    force = np.einsum("nij,nj->ni", stretch.rotation[1:], force)
+    gain = (force + np.cross(turned_rad[1:], force) + GRAVITY_M_S2) * step_s
+    free = np.cumsum(np.concatenate([state[:1, VELOCITY], gain]), axis=0)
+    followed = _followed(state[:, VELOCITY] - free, lag, mean_step, settings["EKF2_TAU_VEL"])
+    velocity = free + followed
     # within a step the velocity grows by what the IMU gives; corrections come at its end
-    moved = (velocity[:-1] + 0.5 * gain_m_s) * step_s[:, None]
-    steady = position_m - reset_m  # the buffer is moved along with a reset
+    moved = (velocity[:-1] + 0.5 * gain) * step_s
+    steady = state[:, POSITION] - reset_m  # the buffer is moved along with a reset
     free = np.cumsum(np.concatenate([steady[:1], moved]), axis=0)
-    position = free + _followed(steady - free, lag, mean_step, tau_position_s)
+    position = free + _followed(steady - free, lag, mean_step, settings["EKF2_TAU_POS"])
     return velocity, position + later(reset_m, lag)
 
 

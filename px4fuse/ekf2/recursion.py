@@ -7,17 +7,17 @@ and ``EKF/vel_pos_fusion.cpp`` (gate, fusion), ``ev_pos_control.cpp`` (noise, re
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
-from px4fuse.ekf2.flow import FlowSamples, fuse_flow, gather_flow
+from px4fuse.ekf2.flow import fuse_flow
 from px4fuse.ekf2.heights import MIN_GATE, MIN_SD, SENSORS, HeightFilter, barometer_samples
 from px4fuse.ekf2.inputs import Inputs, Rules
 from px4fuse.ekf2.intervals import FUSE, IDLE, START, Events, Intervals, Timing
-from px4fuse.ekf2.magnetometer import FieldSamples, fuse_field, gather
+from px4fuse.ekf2.magnetometer import Samples, fuse_field, gather
 from px4fuse.ekf2.stretches import (
     ACCELEROMETER_BIAS,
     BIASES,
@@ -29,8 +29,6 @@ from px4fuse.ekf2.stretches import (
     Stretch,
 )
 from px4fuse.ekf2_parameters import FLOW, GNSS_POS, GNSS_VEL, MAG, Aid
-
-Samples = TypeVar("Samples", FieldSamples, FlowSamples)
 
 # How long the first pass runs that gives the correlations at the start
 CORRELATING_S = 8.0
@@ -197,15 +195,15 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     def means(of: Aid, each: Sequence[Samples]) -> Samples:
         """What all variants were sent of an aid, while it is there."""
         together = (np.stack(part, axis=1)[:, pick] for part in zip(*each, strict=True))
-        told = type(each[0])(*together)
+        told = Samples(*together)
         return told._replace(number=np.where(on[of.name], told.number, 0.0))
 
     ends = [one.events.end for one in distinct]
     if (field := stretch.field) is not None:
-        seen = means(MAG, [gather(field, stretch.rotation, one) for one in ends])
+        seen = means(MAG, [gather(field, one) for one in ends])
         told_field = np.asarray(seen.number.any(axis=1))
     if (flow := stretch.flow) is not None:
-        speeds = means(FLOW, [gather_flow(stretch, flow, one) for one in ends])
+        speeds = means(FLOW, [gather(flow, one, stretch.gained_m_s) for one in ends])
         told_speeds = np.asarray(speeds.number.any(axis=1))
     if stretch.heights is not None:
         samples = barometer_samples(stretch, ends)
@@ -254,10 +252,10 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
             _limit_bias(P, floor, biases)
         innovation[:, 2:], R[:, 2:] = 0.0, NOT_TAKEN
         if seen is not None and told_field[e]:
-            field_now = FieldSamples(*(part[e] for part in seen))
+            field_now = Samples(*(part[e] for part in seen))
             x, P, of_field[e] = fuse_field(x, P, field_now, knob[MAG.noise], knob[MAG.gate])
         if speeds is not None and flow is not None and told_speeds[e]:
-            x, P = fuse_flow(x, P, FlowSamples(*(part[e] for part in speeds)), flow.gate)
+            x, P = fuse_flow(x, P, Samples(*(part[e] for part in speeds)), flow.gate)
         if sampled[e]:
             nu = measured[e] - x[:, TOLD]
             S = _diagonal(P)[:, TOLD] + noise[e]

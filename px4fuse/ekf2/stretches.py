@@ -53,57 +53,38 @@ GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])  # CONSTANTS_ONE_G
 # States, of Stretch.state
 STATES = 15
 MOVED = 9  # of them, those that the IMU moves: all but the biases
-FIELD_STATES = 21  # with the magnetic fields of earth (NED) and body (FRD), where they are fused
 THETA, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCELEROMETER_BIAS, BIASES = slice(9, 12), slice(12, 15), slice(9, 15)
-EARTH_FIELD, BODY_FIELD = slice(15, 18), slice(18, 21)
+EARTH_FIELD, BODY_FIELD = slice(15, 18), slice(18, 21)  # NED and FRD, where they are fused
 
 
 @dataclass(frozen=True)
-class Field:
-    """What the magnetometer measured in one stretch.
-
-    Attributes
-    ----------
-    step : ndarray of int, shape (m,)
-        At the end of which prediction step EKF2 takes each sample.
-    gauss : ndarray, shape (m, 3)
-        Body FRD.
-    weight : float
-        Samples that EKF2 had for each one in the log.
-    """
-
-    step: IntArray
-    gauss: Array
-    weight: float
-
-    __repr__ = brief
-
-
-@dataclass(frozen=True)
-class Flow:
-    """What optical flow measured in one stretch, in m means of several samples.
+class Sensed:
+    """What the magnetometer or optical flow measured in one stretch, in m means of some samples.
 
     Attributes
     ----------
     step : ndarray of int, shape (m,)
         At the end of which prediction step EKF2 takes the last sample of each.
-    speed_m_s : ndarray, shape (m, 2)
-        Forward and to the right, less what the IMU gained of it since the stretch began.
-    turn : ndarray, shape (m, 2, 3)
+    value : ndarray, shape (m, k)
+        The field in the body (gauss, FRD); or the velocity forward and to the right (m/s), less
+        what the IMU gained of it since the stretch began.
+    turn : ndarray, shape (m, k, 3)
         Mean rotation from NED to these.
-    noise_m2_s2, samples : ndarray, shape (m,)
-        R of one sample, and how many there were.
+    samples : ndarray, shape (m,)
+        How many EKF2 had.
+    noise : ndarray, shape (m,)
+        R of one sample, where the settings do not have it; else 0.
     gate : float
-        In standard deviations.
+        In standard deviations, where the settings do not have it.
     """
 
     step: IntArray
-    speed_m_s: Array
+    value: Array
     turn: Array
-    noise_m2_s2: Array
     samples: Array
-    gate: float
+    noise: Array
+    gate: float = np.inf
 
     __repr__ = brief
 
@@ -177,7 +158,7 @@ class Stretch:
         Of the state at the start; the log has variances only.
     fusing : bool
         Whether EKF2 fuses the source when it begins.
-    field : Field or None
+    field : Sensed or None
         What the magnetometer measured: then the magnetic fields are states too, and there are 21;
         None: the heading is EKF2's own as flown, whatever is changed.
     heights : Heights or None
@@ -186,7 +167,7 @@ class Stretch:
         Share of the accelerometer's axes that EKF2 relied on less in the step before: all while it
         took the vertical acceleration to be wrong, else those at the end of their range (of the
         axes together, as R turns them); None: never any.
-    flow : Flow or None
+    flow : Sensed or None
         What optical flow measured, where EKF2 fused it.
     """
 
@@ -204,10 +185,10 @@ class Stretch:
     attitude_error_rad: Array
     correlation: Array
     fusing: bool = True
-    field: Field | None = None
+    field: Sensed | None = None
     heights: Heights | None = None
     shaken: Array | None = None
-    flow: Flow | None = None
+    flow: Sensed | None = None
 
     __repr__ = brief
 
@@ -405,12 +386,13 @@ def with_field(
         At the start, of earth (NED) and body.
     """
     step, inside = steps_of(stretch, taken_s)
+    turn, count = stretch.rotation[step].transpose(0, 2, 1), len(step)
     return replace(
         stretch,
         state=np.concatenate([stretch.state, fields]),
         variance=np.concatenate([stretch.variance, variance]),
         correlation=block_diag(stretch.correlation, np.eye(len(fields))),
-        field=Field(step, gauss[inside], weight),
+        field=Sensed(step, gauss[inside], turn, np.full(count, weight), np.zeros(count)),
     )
 
 

@@ -28,6 +28,7 @@ from px4fuse.ekf2.replay import Ekf2Replay, Spans, along, rms_to_truth, settled
 from px4fuse.ekf2_parameters import FLOW, GNSS_POS, MAG
 from px4fuse.filter.kalman import Replay, state_at
 from px4fuse.filter.settings import Settings
+from px4fuse.filter.signals import Segment
 from px4fuse.flight import Columns, Ekf2, Truth, Unavailable
 from px4fuse.record import Count, NotNegative, Record
 
@@ -209,7 +210,6 @@ def walk(
             "Analyse the part of the flight in which EKF2 fused the source (--start, --end).",
         )
     span = float(times[0]), float(times[-1])
-    parts = ((max(start, span[0]), min(end, span[1])) for start, end in judged)
     directions = {name: run.axis.direction for name, run in (runs or {}).items()}
     directions = directions or {"north": np.eye(3)[0], "east": np.eye(3)[1]}
     ungated, stages = flown.delayed, []
@@ -224,15 +224,46 @@ def walk(
         )
         if stage in (ATTITUDE, FIELD, SPEED, FLOWING):  # the last without a gate
             ungated = track
-    spans = tuple((start, end) for start, end in parts if start < end)
+    spans = Segment(*span, "").cut(judged)
     coast = _coast(flown, ungated, span, judged)
-    found = {}
-    for at, (name, direction) in enumerate(directions.items()):
-        ours = state_at(runs[name], times) if runs else stages[0][at]
+    truth, found = model.flight.truth, {}
+    lacking = OTHER_TIME if isinstance(truth, Truth) else truth
+    for at, (axis, direction) in enumerate(directions.items()):
+        ours = state_at(runs[axis], times) if runs else stages[0][at]
+        # ours, after each step, and the logged EKF2, shape (k + 2, 2, n)
         path = np.array([ours, *(stage[at] for stage in stages)])
-        found[name] = _axis(
-            model, (*variants, OUTPUT), direction, times, path, spans, coast
-        )  # fmt: skip
+        apart = path - path[-1]
+        errors = [rms_to_truth(model.flight, track, direction, times) for track in path[:, 0]]
+        position, velocity = np.mean(apart[:-1] ** 2, axis=2).T.tolist()
+        moved = np.abs(np.diff(path[:-1, 0], axis=0))
+        steps = tuple(
+            Step(
+                name=name,
+                position_mean_square_m2=position[after - 1] - position[after],
+                velocity_mean_square_m2_s2=velocity[after - 1] - velocity[after],
+                position_moved_m=float(moved[after - 1].max()),
+                moved_at_s=float(times[moved[after - 1].argmax()]),
+                position_rmse_to_truth_m=errors[after],
+            )
+            for after, name in enumerate((*variants, OUTPUT), start=1)
+        )
+        ends = {"kf": errors[0], "ekf2": errors[-1]}
+        found[axis] = Why(
+            count=len(times),
+            position_mean_square_m2=position[0],
+            velocity_mean_square_m2_s2=velocity[0],
+            steps=steps,
+            position_left_mean_square_m2=position[-1],
+            velocity_left_mean_square_m2_s2=velocity[-1],
+            position_rmse_to_truth_m={
+                name: lacking if error is None else error for name, error in ends.items()
+            },
+            spans_s=spans,
+            coast=coast,
+            times_s=times,
+            apart_m=apart[0, 0],
+            left_m=apart[-2, 0],
+        )
     return found
 
 
@@ -265,55 +296,6 @@ def on_the_way(inputs: Inputs, ours: Settings) -> dict[str, Variant]:
     if FLOW.name in aids:
         variants[FLOWING] = replace(last, without={})
     return variants | {GATE: Variant(flown, as_logged=True)}
-
-
-def _axis(
-    model: Model,
-    names: tuple[str, ...],
-    direction: Array,
-    times: Array,
-    path: Array,
-    spans: Spans,
-    coast: Coast | None,
-) -> Why:
-    """Why along one axis.
-
-    ``path`` is ours, after each of the named steps, and the logged EKF2, shape (k + 2, 2, n).
-    """
-    apart = path - path[-1]
-    errors = [rms_to_truth(model.flight, track, direction, times) for track in path[:, 0]]
-    position, velocity = np.mean(apart[:-1] ** 2, axis=2).T.tolist()
-    moved = np.abs(np.diff(path[:-1, 0], axis=0))
-    most = np.argmax(moved, axis=1)
-    steps = tuple(
-        Step(
-            name=name,
-            position_mean_square_m2=position[at] - position[at + 1],
-            velocity_mean_square_m2_s2=velocity[at] - velocity[at + 1],
-            position_moved_m=float(moved[at, most[at]]),
-            moved_at_s=float(times[most[at]]),
-            position_rmse_to_truth_m=errors[at + 1],
-        )
-        for at, name in enumerate(names)
-    )
-    lacking = OTHER_TIME if isinstance(model.flight.truth, Truth) else model.flight.truth
-    ends = {"kf": errors[0], "ekf2": errors[-1]}
-    return Why(
-        count=len(times),
-        position_mean_square_m2=position[0],
-        velocity_mean_square_m2_s2=velocity[0],
-        steps=steps,
-        position_left_mean_square_m2=position[-1],
-        velocity_left_mean_square_m2_s2=velocity[-1],
-        position_rmse_to_truth_m={
-            name: lacking if error is None else error for name, error in ends.items()
-        },
-        spans_s=spans,
-        coast=coast,
-        times_s=times,
-        apart_m=apart[0, 0],
-        left_m=apart[-2, 0],
-    )
 
 
 def _coast(

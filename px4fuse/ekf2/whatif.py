@@ -30,7 +30,7 @@ from px4fuse.ekf2_parameters import AIDS, GNSS_POS, MAG, check
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.heading import heading_rad
-from px4fuse.flight import Columns, Ekf2, Flight, Unavailable
+from px4fuse.flight import AxisName, Columns, Ekf2, Flight, Unavailable
 from px4fuse.record import Count, NotNegative, Record, Share
 
 WHAT = "EKF2 what-if"
@@ -250,12 +250,7 @@ def what_if(
         agreement=model.agreement,
         logged=_of_log(flight, model.flown, judged),
         replayed=_of_replay(flight, model.flown, judged),
-        whatif=tuple(
-            replace(one, without=without)
-            for one in _steadied(
-                model, [_of_replay(flight, r, judged) for r in replays], judged, without
-            )
-        ),
+        whatif=_steadied(model, [_of_replay(flight, r, judged) for r in replays], judged, without),
         judged=judged,
         notes=(
             *(_of_heading_and_height(model) if replays and gnss else ()),
@@ -298,10 +293,7 @@ def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) 
 
 
 def _steadied(
-    model: Model,
-    found: Sequence[Summary],
-    judged: Spans,
-    without: Mapping[str, float] | None = None,
+    model: Model, found: Sequence[Summary], judged: Spans, without: Mapping[str, float]
 ) -> tuple[Summary, ...]:
     """Predictions, with whether each stays where it is when the positions are disturbed."""
     runs = [[one] for one in found]
@@ -319,6 +311,7 @@ def _steadied(
             one,
             steady=all(height.steady for height in one.heights.values())
             and (not one.changed or (one.rejected_share <= MOST_REJECTED and _alike(same))),
+            without=without,
         )
         for one, same in zip(found, runs, strict=True)
     )
@@ -347,12 +340,10 @@ def _of_replay(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
         variance[f"{axis}_m2"] = np.column_stack([s - r, after]).ravel()
     fused = used["fused_at_s"][(used["fused"] > 0) | (used["reset"] > 0)]
     return _summary(
-        flight, judged, used, replay.published, variance, replay.heights,
+        flight, replay, judged, used, replay.published, variance, replay.heights,
+        replay.delayed["heading_rad"],
         changed=replay.changed, longest_without_fusion_s=_longest(fused.to_numpy(), judged),
         resets=int(used["reset"].sum()), late=replay.late, lost=replay.lost,
-        heading_error_mean_deg=_heading_error(
-            flight, replay, replay.delayed["heading_rad"], judged
-        ),
     )  # fmt: skip
 
 
@@ -377,19 +368,20 @@ def _of_log(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
     heading = pd.Series(heading_rad(flight.attitude), flight.attitude.index)
     heights = {name: logged_height(AIDS[name], ekf2.aids[name]) for name in replay.heights}
     return _summary(
-        flight, judged, used, ekf2.state, None, heights,
+        flight, replay, judged, used, ekf2.state, None, heights, heading,
         changed={}, longest_without_fusion_s=longest, resets=len(resets),
-        heading_error_mean_deg=_heading_error(flight, replay, heading, judged),
     )  # fmt: skip
 
 
 def _summary(
     flight: Flight,
+    replay: Ekf2Replay,
     judged: Spans,
     used: pd.DataFrame,
     published: pd.DataFrame,
     variance: pd.DataFrame | None,
     heights: Mapping[str, pd.DataFrame],
+    heading: pd.Series,
     **more: Any,
 ) -> Summary:
     """What innovations, the published position and its stated variance show, and ``more``.
@@ -398,11 +390,15 @@ def _summary(
     """
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    logged, axes = ekf2.variance, {}
+    logged = ekf2.variance
     times = ekf2.state.index[settled(ekf2.state.index, judged)].to_numpy()
+
+    def error_m(direction: Array) -> float | Unavailable:
+        position = along(published, Columns.POSITION, direction, times)
+        error = rms_to_truth(flight, position, direction, times)
+        return NO_TRUTH if error is None else error
+
     for axis, direction in zip(HORIZONTAL, np.eye(3), strict=False):
-        nu = used[f"innovation_{axis}_m"].to_numpy()
-        s = used[f"innovation_variance_{axis}_m2"].to_numpy()
         sigma: float | Unavailable
         if isinstance(logged, Unavailable):
             sigma = logged
@@ -411,40 +407,33 @@ def _summary(
             known = logged if variance is None else variance
             stated = np.interp(at, known.index, known[f"{axis}_m2"])
             sigma = float(np.sqrt(np.median(stated)))
-        position = along(published, Columns.POSITION, direction, times)
-        error = rms_to_truth(flight, position, direction, times)
-        axes[axis] = AxisSummary(
-            nis_mean=float(np.mean(nu**2 / s)),
-            nis_band=nis_band(len(nu)),
-            innovation_std_m=float(np.std(nu)),
-            sigma_p_median_m=sigma,
-            position_rmse_to_truth_m=NO_TRUTH if error is None else error,
-        )
-    north, east = (axes[axis] for axis in HORIZONTAL)
-    share = float(used["rejected"].mean())
+        more[axis] = AxisSummary(*_innovations(used, axis), sigma, error_m(direction))
     if heights:
-        down = np.eye(3)[2]
-        error = rms_to_truth(flight, along(published, Columns.POSITION, down, times), down, times)
-        more["height_rmse_to_truth_m"] = NO_TRUTH if error is None else error
+        more["height_rmse_to_truth_m"] = error_m(np.eye(3)[2])
         more["heights"] = {
             name: _of_height(kept, judged)
             for name, each in heights.items()
             if len(kept := each[settled(each.index, judged)])
         }
-    return Summary(north=north, east=east, samples=len(used), rejected_share=share, **more)
+    return Summary(
+        samples=len(used), rejected_share=float(used["rejected"].mean()),
+        heading_error_mean_deg=_heading_error(flight, replay, heading, judged), **more,
+    )  # fmt: skip
+
+
+def _innovations(used: pd.DataFrame, axis: AxisName) -> tuple[float, tuple[float, float], float]:
+    """Mean NIS, its band, and the innovations' standard deviation."""
+    nu = used[f"innovation_{axis}_m"].to_numpy()
+    s = used[f"innovation_variance_{axis}_m2"].to_numpy()
+    return float(np.mean(nu**2 / s)), nis_band(len(nu)), float(np.std(nu))
 
 
 def _of_height(used: pd.DataFrame, judged: Spans) -> HeightSummary:
-    nu, rejected = (used[name].to_numpy() for name in ("innovation_down_m", "rejected"))
+    rejected = used["rejected"].to_numpy()
     fused_s = used.index.to_numpy()[rejected == 0.0]
     parts = ((fused_s[(fused_s > a) & (fused_s < b)], ((a, b),)) for a, b in judged)
-    return HeightSummary(
-        nis_mean=float(np.mean(nu**2 / used["innovation_variance_down_m2"])),
-        nis_band=nis_band(len(nu)),
-        innovation_std_m=float(np.std(nu)),
-        rejected_share=float(rejected.mean()),
-        longest_without_fusion_s=max(_longest(*part) for part in parts),
-    )
+    longest_s = max(_longest(*part) for part in parts)
+    return HeightSummary(*_innovations(used, "down"), float(rejected.mean()), longest_s)
 
 
 def _heading_error(

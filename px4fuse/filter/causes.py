@@ -18,7 +18,6 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -40,7 +39,7 @@ from px4fuse.filter.likelihood import (
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, ned_acceleration, too_few
 from px4fuse.filter.steps import Timeline, timeline
-from px4fuse.flight import AXIS_NAMES, Columns, Flight, Unavailable
+from px4fuse.flight import Columns, Flight, Unavailable
 
 CAUSES = "causes beyond noise"
 MIN_MEASUREMENTS = 50
@@ -349,38 +348,6 @@ class HypothesisFit:
         return Estimate(float(self.coefficients[column]), sigma)
 
 
-def fit(data: Array, columns: Array, axis: IntArray, prior: Array, log_s: float) -> HypothesisFit:
-    """Regress whitened innovations on their columns.
-
-    Parameters
-    ----------
-    data : ndarray, shape (n,)
-    columns : ndarray, shape (n, k)
-    axis : ndarray of int, shape (n,)
-    prior : ndarray, shape (k,)
-        Standard deviation of each coefficient before the data, infinite where nothing is known.
-    log_s : float
-        Σ ln S over all.
-    """
-    information = np.diag(prior**-2.0) + columns.T @ columns
-    # a column that nothing excites (a turn in hover) must not stop the others
-    information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(len(prior))
-    moment = columns.T @ data
-    factor = cho_factor(information)
-    covariance = cho_solve(factor, np.eye(len(prior)))
-    coefficients = covariance @ moment
-    square = float(data @ data - coefficients @ moment)
-    return HypothesisFit(
-        axis,
-        data - columns @ coefficients,
-        coefficients,
-        covariance,
-        square,
-        0.5 * (square + log_s) + float(np.sum(np.log(np.diag(factor[0])))),
-        float(np.sqrt(max(square, 0.0) / max(len(data) - CONSTANTS, 1))),
-    )
-
-
 @dataclass(frozen=True)
 class Hypotheses:
     """Axes with their columns: what every hypothesis is fitted on.
@@ -440,10 +407,21 @@ class Hypotheses:
 
     def regress(self, data: Array, columns: Array, log_s: float, skip: BoolArray) -> HypothesisFit:
         """Fit what :meth:`laid_out` gave, without the measurements that are left out."""
-        axes, kept = len(data), np.count_nonzero(~skip)
-        prior = np.append(self.prior, np.full(axes * self.steps.shape[1], np.inf))
-        rows = columns[:, ~skip].reshape(axes * kept, -1)
-        return fit(data[:, ~skip].ravel(), rows, np.repeat(np.arange(axes), kept), prior, log_s)
+        axis = np.repeat(np.arange(len(data)), np.count_nonzero(~skip))
+        data, columns = data[:, ~skip].ravel(), columns[:, ~skip].reshape(len(axis), -1)
+        count = columns.shape[1]
+        prior = np.append(self.prior, np.full(count - len(self.prior), np.inf))
+        information = np.diag(prior**-2.0) + columns.T @ columns
+        # a column that nothing excites (a turn in hover) must not stop the others
+        information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(count)
+        moment, factor = columns.T @ data, cho_factor(information)
+        covariance = cho_solve(factor, np.eye(count))
+        coefficients = covariance @ moment
+        square = float(data @ data - coefficients @ moment)
+        score = 0.5 * (square + log_s) + float(np.sum(np.log(np.diag(factor[0]))))
+        spread = float(np.sqrt(max(square, 0.0) / max(len(data) - CONSTANTS, 1)))
+        rest = data - columns @ coefficients
+        return HypothesisFit(axis, rest, coefficients, covariance, square, score, spread)
 
     def squares(self, sigma_a: float, skip: BoolArray) -> Array:
         """What a fit leaves of every measurement, over its σ: squares summed over the axes."""
@@ -523,9 +501,7 @@ def hypotheses_of(
     for axis in shifted:
         own = preintegrate(axis, settings)
         columns = [(own.delta_position_m, own.delta_velocity_m_s)]
-        columns += [
-            _added(frame.to_numpy() @ axis.direction, frame.index, line) for frame in common
-        ]
+        columns += [_added(value @ axis.direction, when, line) for when, value in common]
         dp, dv = (np.stack(part, axis=1) for part in zip(*columns, strict=True))
         measured = np.zeros_like(dp)
         # the filter starts at the first one
@@ -551,19 +527,16 @@ def _added(acceleration_m_s2: Array, time_s: ArrayLike, line: Timeline) -> tuple
     return moved(line, np.diff(velocity) / np.diff(line.time_s))
 
 
-def _common_columns(attitude: pd.DataFrame, acceleration: pd.DataFrame) -> list[pd.DataFrame]:
-    """NED acceleration that takes out a bias forward and right, and that a turn adds."""
+def _common_columns(
+    attitude: pd.DataFrame, acceleration: pd.DataFrame
+) -> list[tuple[pd.Index, Array]]:
+    """NED acceleration that takes out a bias forward and right, and that a turn adds; and when."""
     body_to_ned = Rotation.from_quat(
         attitude[Columns.QUATERNION].to_numpy(copy=True), scalar_first=True
     )
-    names: list[Any] = list(AXIS_NAMES)
-    biases = [
-        pd.DataFrame(body_to_ned.apply(np.eye(3)[axis]), index=attitude.index, columns=names)
-        for axis in (FORWARD, RIGHT)
-    ]
+    biases = [(attitude.index, body_to_ned.apply(np.eye(3)[axis])) for axis in (FORWARD, RIGHT)]
     north, east, _ = acceleration.to_numpy().T
-    turned = np.column_stack([-east, north, np.zeros(len(north))])
-    return [*biases, pd.DataFrame(turned, index=acceleration.index, columns=names)]
+    return [*biases, (acceleration.index, np.column_stack([-east, north, 0.0 * north]))]
 
 
 def _hats(start_s: float, end_s: float) -> tuple[Array, Array]:

@@ -25,6 +25,7 @@ from px4fuse.filter.fitting import Noises, fitted, most_likely, of_ratios
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
 from px4fuse.filter.marginal import Fitted, paired_products
 from px4fuse.filter.motion import (
+    COARSE_MEASUREMENTS,
     COARSE_POINTS,
     CONSTANT_SIGMA,
     SEARCH_S,
@@ -41,8 +42,6 @@ FINE_POINTS, CURVE_POINTS = 11, 121
 # EKF2 that takes fixes for younger or older than they are turns its heading until both agree, by
 # 5° for 0.2 s: a heading that is believed would hide the offset
 HEADING_RAD, WRONG_HEADING_RAD = float(CONSTANT_SIGMA[2]), 0.2
-# Enough to find the offset roughly
-COARSE_MEASUREMENTS = 600
 # A wider interval says nothing that a student could use
 MAX_HALF_INTERVAL_S = 0.15
 # A part that says less than this about its own offset (s) says nothing about a change
@@ -124,8 +123,6 @@ class ClockOffset(Shown, Clock, frozen=True, kw_only=True, eq=False):
     ----------
     curve_s, curve_drop : ndarray, shape (n,)
         Offsets, and how far each lies below the greatest log-likelihood.
-    interval_drop : float
-        How far below it the interval reaches: more than chi-square says, by the IMU's noise.
     sigma_a_m_s2, sigma_z_m : float
         Noises at the maximum.
     """
@@ -133,7 +130,6 @@ class ClockOffset(Shown, Clock, frozen=True, kw_only=True, eq=False):
     written_as = Clock
     curve_s: Array
     curve_drop: Array
-    interval_drop: float
     sigma_a_m_s2: float
     sigma_z_m: float
 
@@ -190,7 +186,7 @@ def estimate_clock_offset(
         return moved
     progress("clock offset")
     few = moved.thinned(COARSE_MEASUREMENTS)
-    offset, _ = few.search(COARSE_MEASUREMENTS, noises)
+    offset, _ = few.search(noises)
     sigma, width = 0.0, 0.1
     for some in (few, moved):
         noises = most_likely([some.at(offset)], noises, some.weight, outliers=False).noises
@@ -235,7 +231,6 @@ def estimate_clock_offset(
         reason=reason,
         curve_s=applied + curve,
         curve_drop=profile - profile.min(),
-        interval_drop=PROFILE_DROP * factor,
         parts=tuple(structs.replace(part, offset_s=applied + part.offset_s) for part in parts),
         drift_ppm=drift,
         drift_sigma_ppm=drift_sigma,

@@ -22,7 +22,7 @@ likelihood, what a turned, moved or scaled frame and late stamps would add to th
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -30,7 +30,7 @@ import pandas as pd
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
-from px4fuse.arrays import Array, BoolArray
+from px4fuse.arrays import Array
 from px4fuse.filter.causes import Jump, steps
 from px4fuse.filter.fitting import NoiseFit, Noises, fitted, most_likely
 from px4fuse.filter.likelihood import PROFILE_DROP
@@ -151,10 +151,30 @@ def hanging_together(
     time, sent = time[part], np.column_stack([axis.measurement_m[part] for axis in axes])
     for jump in jumps:
         sent = sent - np.outer(time >= jump.time_s, [step.value for step in jump.step_m])
-    source = _Source(flight, axes, settings, time, sent, np.isin(time, outlier_time_s))
-    if isinstance(prepared := source.over_imu(0.0), Unavailable):
-        return prepared
-    moved, _ = prepared
+    interval, bad = np.diff(time, prepend=time[0]), np.isin(time, outlier_time_s)
+    known = (interval < GAP_INTERVALS * np.median(interval[1:])) & (interval > 0.0)
+    directions, signals = np.array([axis.direction for axis in axes]), SignalCache()
+
+    def over_imu(tau_s: float) -> tuple[PreparedMotion | Unavailable, float]:
+        """Positions with a low pass undone, and what undoing it adds to -ln p."""
+        rho = np.where(known, np.exp(-interval / tau_s), 0.0) if tau_s else np.zeros(len(time))
+        before = np.concatenate([sent[:1], sent[:-1]])
+        undone = (sent - rho[:, None] * before) / (1.0 - rho)[:, None]
+        # what was undone with an outlier is one too: left out of all models, which are compared
+        kept = ~(bad | (known & np.concatenate([[False], bad[:-1]])))
+        moved = motion(
+            flight, time[kept], undone[kept], directions=directions, dt_s=settings.dt_s,
+            signals=signals,
+        )  # fmt: skip
+        if isinstance(moved, Unavailable):
+            return moved, 0.0
+        # nothing is known of where a stretch begins: the first one says nothing
+        used = np.isin(time, np.delete(moved.time_s, moved.edges[:-1]))
+        return moved, len(axes) * float(np.sum(np.log1p(-rho[used])))
+
+    moved, _ = over_imu(0.0)
+    if isinstance(moved, Unavailable):
+        return moved
     offsets = sorted({0.0, clock_offset_s})
     sigma, some = noises.sigma_z_m, moved.thinned(LOOK_MEASUREMENTS)
     smooth = Smoothing(0.0, 0.0, 0.0, sigma)
@@ -176,10 +196,10 @@ def hanging_together(
         return smooth, neither
 
     def undone(log_tau: float) -> tuple[float, Noises]:
-        prepared = source.over_imu(float(np.exp(log_tau)))
-        assert not isinstance(prepared, Unavailable)  # it was not, of the same measurements
-        found = _most_likely(prepared[0], 0.0, alone)
-        return _score(found) + prepared[1], found.noises
+        moved, more = over_imu(float(np.exp(log_tau)))
+        assert not isinstance(moved, Unavailable)  # it was not, of the same measurements
+        found = _most_likely(moved, 0.0, alone)
+        return _score(found) + more, found.noises
 
     low, high = np.log(LOW_PASS_S).tolist()
     log_tau = minimize_scalar(
@@ -269,36 +289,3 @@ def _best_of(
     least, scale, noises = min(found, key=lambda each: each[0])
     sizes = {name: value * scale for name, value in vars(noises).items() if name != "tau_s"}
     return least, replace(noises, **sizes)
-
-
-@dataclass(frozen=True)
-class _Source:
-    """Positions, as they were sent or with a low pass undone."""
-
-    flight: Flight
-    axes: tuple[Axis, ...]
-    settings: Settings
-    time_s: Array
-    sent_m: Array
-    bad: BoolArray
-    signals: SignalCache = field(default_factory=dict)
-
-    def over_imu(self, tau_s: float) -> tuple[PreparedMotion, float] | Unavailable:
-        """Positions over the motion of the IMU, and what undoing a low pass adds to -ln p."""
-        time, sent, bad = self.time_s, self.sent_m, self.bad
-        interval = np.diff(time, prepend=time[0])
-        known = (interval < GAP_INTERVALS * np.median(interval[1:])) & (interval > 0.0)
-        rho = np.where(known, np.exp(-interval / tau_s), 0.0) if tau_s else np.zeros(len(time))
-        before = np.concatenate([sent[:1], sent[:-1]])
-        undone = (sent - rho[:, None] * before) / (1.0 - rho)[:, None]
-        # what was undone with an outlier is one too: left out of all models, which are compared
-        kept = ~(bad | (known & np.concatenate([[False], bad[:-1]])))
-        moved = motion(
-            self.flight, time[kept], undone[kept], dt_s=self.settings.dt_s, signals=self.signals,
-            directions=np.array([axis.direction for axis in self.axes]),
-        )  # fmt: skip
-        if isinstance(moved, Unavailable):
-            return moved
-        # nothing is known of where a stretch begins: the first one says nothing
-        used = np.isin(time, np.delete(moved.time_s, moved.edges[:-1]))
-        return moved, len(self.axes) * float(np.sum(np.log1p(-rho[used])))

@@ -230,17 +230,18 @@ def _by_positions(
     """The turn as a state that may walk, by the most likely of some walks and noises."""
     time, measured = samples.index.to_numpy(), samples.to_numpy()
     legs = _legs(acceleration, time)
-    grid = np.array(list(product(TURN_WALKS, BIAS_WALKS, SIGMA_AS)))
+    # of an acceleration that SIGMA_A is over one DT, the walk over a second
+    grid = np.array(list(product(TURN_WALKS, BIAS_WALKS, SIGMA_AS * np.sqrt(dt_s))))
     still = grid[:, 0] == 0.0
     turn = 0.0
     for _ in range(LINEARISATIONS):
-        log_p, _, steps = _filter(legs, measured, turn, grid[still], sigma_z, dt_s)
+        log_p, _, steps = _filter(legs, measured, turn, grid[still], sigma_z)
         step = float(steps[-1].x[np.argmax(log_p), TURN])
         turn += step
         if abs(step) < SMALL_TURN_RAD:
             break
     turn = float(np.angle(np.exp(1j * turn)))
-    log_p, scale, steps = _filter(legs, measured, turn, grid, sigma_z, dt_s)
+    log_p, scale, steps = _filter(legs, measured, turn, grid, sigma_z)
     best = int(np.argmax(log_p))
     ratio = 2.0 * (log_p[best] - log_p[still].max())
     smoothed, variance = _smooth(steps, best)
@@ -282,11 +283,11 @@ def _transitions(moved: Array, dt_s: Array, turn: float) -> tuple[Array, Array]:
     return F, push
 
 
-def _noise(dt_s: Array, gap: Array, noises: Array, dt_of_sigma_s: float) -> Array:
+def _noise(dt_s: Array, gap: Array, noises: Array) -> Array:
     """Q of every leg for each of k settings, shape (n, k, 7, 7)."""
     position, velocity, bias = (slice(axis, axis + 2) for axis in (0, 2, 4))
     pair, count = np.eye(2), len(noises)
-    level = (noises[:, 2] ** 2 * dt_of_sigma_s)[:, None, None] * pair
+    level = (noises[:, 2] ** 2)[:, None, None] * pair
     # of each: what is added for one of q00, q01, q11, a second and a gap
     of_00, of_01, of_11, of_second, of_gap = made = np.zeros((5, count, STATE_COUNT, STATE_COUNT))
     of_00[:, position, position] = of_11[:, velocity, velocity] = level
@@ -309,12 +310,7 @@ class _Step(NamedTuple):
 
 
 def _filter(
-    legs: tuple[Array, Array, Array],
-    measured: Array,
-    turn: float,
-    noises: Array,
-    sigma_z: float,
-    dt_s: float,
+    legs: tuple[Array, Array, Array], measured: Array, turn: float, noises: Array, sigma_z: float
 ) -> tuple[Array, Array, list[_Step]]:
     """Ln p of k filters with the best scale of all noises, that of the variances, and all steps.
 
@@ -328,10 +324,8 @@ def _filter(
     steps = [_Step(np.eye(STATE_COUNT), x, P, x, P)]
     square, log_s = np.zeros(count), np.zeros(count)
     R = sigma_z**2 * np.eye(2)
-    F_of, push_of = _transitions(moved, length, turn)
-    for z, F, push, Q in zip(
-        measured[1:], F_of, push_of, _noise(length, gap, noises, dt_s), strict=True
-    ):
+    Q_of = _noise(length, gap, noises)
+    for z, F, push, Q in zip(measured[1:], *_transitions(moved, length, turn), Q_of, strict=True):
         x_prior, P_prior = x @ F.T + push, F @ P @ F.T + Q
         S = P_prior[:, :2, :2] + R
         # S⁻¹ of two rows and columns, written out

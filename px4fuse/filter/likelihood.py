@@ -307,7 +307,7 @@ def profile_ends(
     bounds: tuple[float, float],
     widening: float = 1.0,
 ) -> tuple[float | None, float | None]:
-    """Ends of a 95 % profile-likelihood interval, None where they lie beyond a bound.
+    """Ends of a parameter's 95 % profile-likelihood interval, None where beyond a bound.
 
     Parameters
     ----------
@@ -341,7 +341,7 @@ def profile_ends(
             if far == reach:
                 return None
             far = min(2.0 * far, reach)
-        return float(best[0] + side * brentq(excess, 0.0, far, xtol=1e-3 * far))
+        return float(np.exp(best[0] + side * brentq(excess, 0.0, far, xtol=1e-3 * far)))
 
     return end(-1.0, bounds[0]), end(1.0, bounds[1])
 

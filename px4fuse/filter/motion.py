@@ -35,8 +35,8 @@ CONSTANT_SIGMA = np.repeat([0.05, 0.004, 0.3, 0.1], [3, 3, 3, 1])
 # bias of 0.004 rad/s turns by 0.12 rad in one, whose square costs 0.07 m/s².
 STRETCH_S = 30.0
 SEARCH_S = 0.6
-# The whole search is gone through in so many steps
-COARSE_POINTS = 25
+# The whole search is gone through in so many steps, with about so many of the measurements
+COARSE_POINTS, COARSE_MEASUREMENTS = 25, 600
 # Numbers of signals that are made at once, and of offsets at least
 BLOCK, LEAST_OFFSETS = 2**16, 3
 # Of all stretches together, and of one
@@ -183,14 +183,12 @@ class PreparedMotion:
             yield centred(positions, scaled=True) if scaled else positions
 
     def search(
-        self, count: int, noises: Noises, factors: Sequence[float] = (1.0,), *, scaled: bool = True
+        self, noises: Noises, factors: Sequence[float] = (1.0,), *, scaled: bool = True
     ) -> tuple[float, Noises]:
         """The most likely offset over the whole search, and SIGMA_A of some.
 
         Parameters
         ----------
-        count : int
-            About so many of the measurements are used.
         noises : Noises
         factors : sequence of float
             Of SIGMA_A.
@@ -200,7 +198,7 @@ class PreparedMotion:
         offsets = np.linspace(-SEARCH_S, SEARCH_S, COARSE_POINTS)
         sigma = noises.sigma_z_m
         ratios = [factor * noises.sigma_a_m_s2 / sigma for factor in factors]
-        some = self.thinned(count)
+        some = self.thinned(COARSE_MEASUREMENTS)
         blocks = some.blocks(offsets, scaled=scaled)
         fits = of_ratios(blocks, ratios, noises.walk_m / sigma, some.weight, sigma)
         scores = np.stack([fitted.scaled(sigma).totals()[0] for fitted in fits])

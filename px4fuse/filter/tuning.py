@@ -8,7 +8,7 @@ biases; the SIGMA_A that it needs, to cover them too, is larger, and is found by
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
@@ -47,8 +47,6 @@ GRID = 40
 MAP_SIGMAS = 4.5
 MIN_MEASUREMENTS = 30
 MAX_OUTLIER_SHARE = 0.3
-# The clock offset is a nuisance here: a rough one is enough
-COARSE_MEASUREMENTS = 600
 SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 FIRST_WALK_M = 0.02
 # A value this near to the end of its search lies there
@@ -273,7 +271,26 @@ def tune_axes(
     parts = [filter_part(leg) for leg in legs]
     chosen = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
     alone = most_likely(parts, chosen, np.ones(count))
-    found = _with_biases(axes, settings, flight, alone, drifts, signals)
+    found = None  # with the IMU's constants and the clock offset taken out
+    if flight is not None and settings.input == "imu":
+        measured = np.column_stack([axis.measurement_m for axis in axes])
+        # the filter starts at the first measurement, which it does not weigh
+        weight = np.concatenate([np.ones(len(measured) - count), alone.weight])
+        directions = np.array([axis.direction for axis in axes])
+        moved = motion(
+            flight,
+            axes[0].measurement_time_s,
+            measured,
+            directions=directions,
+            dt_s=settings.dt_s,
+            weight=weight,
+            signals=signals,
+        )
+        if not isinstance(moved, Unavailable):
+            start = replace(alone.noises, walk_m=FIRST_WALK_M if drifts else 0.0)
+            # the clock offset is a nuisance here: a rough one is enough
+            offset, start = moved.search(start, SIGMA_A_FACTORS, scaled=False)
+            found = most_likely([moved.at(offset)], start, moved.weight)
     best = alone if found is None else found
     skip = alone.outlier > 0.5
     if np.mean(skip) > MAX_OUTLIER_SHARE:
@@ -306,35 +323,6 @@ def tune_axes(
         biases_fitted=found is not None,
         make_map=partial(_map, legs, alone.weight, needed, sigma_z, after),
     )
-
-
-def _with_biases(
-    axes: Sequence[Axis],
-    settings: Settings,
-    flight: Flight | None,
-    alone: NoiseFit,
-    drifts: bool,
-    signals: SignalCache | None,
-) -> NoiseFit | None:
-    """Noises with the IMU's constants and the clock offset taken out, None without an IMU."""
-    if flight is None or settings.input == "zero":
-        return None
-    measured = np.column_stack([axis.measurement_m for axis in axes])
-    moved = motion(
-        flight,
-        axes[0].measurement_time_s,
-        measured,
-        directions=np.array([axis.direction for axis in axes]),
-        dt_s=settings.dt_s,
-        # the filter starts at the first measurement, which it does not weigh
-        weight=np.concatenate([np.ones(len(measured) - len(alone.weight)), alone.weight]),
-        signals=signals,
-    )
-    if isinstance(moved, Unavailable):
-        return None
-    start = replace(alone.noises, walk_m=FIRST_WALK_M if drifts else 0.0)
-    offset, start = moved.search(COARSE_MEASUREMENTS, start, SIGMA_A_FACTORS, scaled=False)
-    return most_likely([moved.at(offset)], start, moved.weight)
 
 
 def _noise(best: NoiseFit, which: int) -> Noise:
@@ -372,11 +360,8 @@ def _bounded(
     value = float(np.exp(best[0]))
     low, high = profile_ends(score, best, search, widening)
     inside = search[0] * AT_END < value < search[1] / AT_END
-    return Noise(
-        value if inside and low is not None and high is not None else None,
-        None if low is None else float(np.exp(low)),
-        None if high is None else float(np.exp(high)),
-    )
+    closed = low is not None and high is not None
+    return Noise(value if inside and closed else None, low, high)
 
 
 def _map(

@@ -20,13 +20,12 @@ from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.ekf2.heights import inside
 from px4fuse.ekf2.inputs import NO_LIMIT, Inputs, Received, Rules
 from px4fuse.ekf2.model import delayed_states, run_variants
-from px4fuse.ekf2.output_predictor import follow_attitude, publish
+from px4fuse.ekf2.output_predictor import follow_attitude, later, publish
 from px4fuse.ekf2.recursion import EAST, HEADING, LEVEL, NORTH, Run, Variant
 from px4fuse.ekf2.stretches import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
     GYRO_BIAS,
-    POSITION,
     STATES,
     THETA,
     VELOCITY,
@@ -273,31 +272,19 @@ def _received(source: sensors.SensedPositions) -> Received:
 
 
 def _track(inputs: Inputs, done: Run, time_us: IntArray, nominal: Array) -> TopicTrack:
-    stretch, settings = done.stretch, inputs.settings
+    stretch = done.stretch
     lag = round(inputs.horizon_s / inputs.step_s)
     state, _ = delayed_states(done, 0)
     resets, aided = _held(done, state)
     moved = np.zeros((len(state), 3))
     for step, jump in resets:
         moved[step:, :2] += jump
-    # the newest IMU samples are corrected with the biases of the horizon
-    biases = np.concatenate([np.repeat(state[:1, 9:15], lag, axis=0), state[:-lag, 9:15]])[1:]
-    gyro = np.einsum("nij,nj->ni", stretch.rotation[1:], biases[:, :3])
+    # the newest IMU samples are corrected with the bias of the horizon
+    gyro = np.einsum("nij,nj->ni", stretch.rotation[1:], later(state[:, GYRO_BIAS], lag)[1:])
     turned = -stretch.correction_rad - gyro * stretch.step_s[:, None]
     free = state[0, THETA] + np.concatenate([np.zeros((1, 3)), np.cumsum(turned, axis=0)])
     ours = free + follow_attitude(state[:, THETA] - free, lag, inputs.step_s, inputs.horizon_s)
-    force = np.einsum("nij,nj->ni", stretch.rotation[1:], stretch.force_m_s2 - biases[:, 3:])
-    force = force + np.cross(ours[1:], force)
-    velocity, position = publish(
-        gain_m_s=(force + GRAVITY_M_S2) * stretch.step_s[:, None],
-        step_s=stretch.step_s,
-        velocity_m_s=state[:, VELOCITY],
-        position_m=state[:, POSITION],
-        reset_m=moved,
-        lag=lag,
-        tau_velocity_s=settings["EKF2_TAU_VEL"],
-        tau_position_s=settings["EKF2_TAU_POS"],
-    )
+    velocity, position = publish(stretch, state, moved, ours, lag, inputs.settings)
     return TopicTrack(
         time_us=time_us,
         lag=lag,

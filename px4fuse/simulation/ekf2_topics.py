@@ -216,7 +216,7 @@ def _of_field(inputs: Inputs, done: Run, track: TopicTrack, attitude_hz: float) 
     )
     seen = seen[sensors.thinned(sensors.seconds(track.time_us[end[seen]]), OTHER_AIDS_HZ)]
     rows, (innovation, variance, fused) = end[seen], np.moveaxis(done.field[seen, :, 0], 1, 0)
-    last = field.gauss[np.searchsorted(field.step, rows, side="right") - 1]
+    last = field.value[np.searchsorted(field.step, rows, side="right") - 1]
     noise = np.full(innovation.shape, settings[MAG.noise] ** 2)
     taken = fused[:, 0] > 0.0
     published = np.flatnonzero(sensors.thinned(sensors.seconds(track.time_us), attitude_hz))
