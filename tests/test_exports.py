@@ -63,9 +63,7 @@ def rows(text: str, separator: str = ",") -> list[dict[str, str]]:
 
 
 def register(sheet) -> Register:
-    made = Register(PEOPLE)
-    made.add(people_of_sheet(sheet))
-    return made
+    return Register(PEOPLE, people_of_sheet(sheet))
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])

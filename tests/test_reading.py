@@ -110,7 +110,7 @@ def test_special_and_huge_files_in_a_folder_of_logs_are_passed_over(
 
     def believed(work, reports, **_):
         (report,) = reports
-        found.append(work.keywords["logs"][log_sha256(report.results)])
+        found.append(work.keywords["logs"][log_sha256(report)])
         yield 0, Verdict("verified", (), with_log=True, page_status="same")
 
     monkeypatch.setattr(workers, "run_bounded", believed)
