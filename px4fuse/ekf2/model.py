@@ -9,7 +9,7 @@ far it can be believed is measured on each log, see :mod:`px4fuse.ekf2.replay`.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, partial
 from itertools import pairwise
 
 import numpy as np
@@ -80,6 +80,8 @@ class Model:
         Of each stretch, for the delay as flown; empty where they are yet to be made.
     flown : Ekf2Replay
         With the parameters of the log.
+    obedient : callable
+        Makes the same, once, rejecting and resetting where EKF2 did, as far as the log tells.
     agreement : Agreement
         Of ``flown`` with what the log holds.
     runs : list of Run
@@ -90,16 +92,11 @@ class Model:
     inputs: Inputs
     intervals: Mapping[Timing, tuple[Intervals, ...]]
     flown: Ekf2Replay
+    obedient: Callable[[], Ekf2Replay]
     agreement: Agreement
     runs: list[Run] = field(default_factory=list, init=False)
 
     __repr__ = brief
-
-    @cached_property
-    def obedient(self) -> Ekf2Replay:
-        """As flown, rejecting and resetting where EKF2 did, as far as the log tells."""
-        obeys = Variant(self.inputs.settings, as_logged=True)
-        return _assemble(self.inputs, _run_model(self, [obeys]), obeys, {})
 
 
 def open_model(flight: Flight, besides: Besides = lambda _: ()) -> Model | Unavailable:
@@ -143,12 +140,13 @@ def _open(
     known = {timing: intervals}
     runs = run_variants(inputs, variants, known)
     replay = _assemble(inputs, runs, flown, {})
+    obedient = cache(partial(_assemble, inputs, runs, variants[1], {}))
     agreement = agreement_with_log(flight, replay)
     if isinstance(agreement, Unavailable):
         return agreement
     share = max(agreement.rejected_share_logged, agreement.rejected_share_replayed)
     if share > REJECTING_SHARE and np.isfinite(inputs.received.rejected).any():
-        obeyed = agreement_with_log(flight, _assemble(inputs, runs, variants[1], {}))
+        obeyed = agreement_with_log(flight, obedient())
         if isinstance(obeyed, Agreement):
             agreement = with_obedient(agreement, obeyed)
     told = {DOUBTED.get(name, name): name for name in doubted}
@@ -158,7 +156,7 @@ def _open(
         **{of: getattr(doubted[name], of) for of, name in told.items()},
     )
     replay = structs.replace(replay, agreement=agreement)
-    model = Model(flight, inputs, known, replay, agreement)
+    model = Model(flight, inputs, known, replay, obedient, agreement)
     model.runs.extend(runs)
     return model
 

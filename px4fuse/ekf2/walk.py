@@ -196,7 +196,7 @@ def walk(
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
     variants = on_the_way(model.inputs, settings or Settings())
-    delayed, flown = delayed_variants(model, list(variants.values())), model.obedient
+    delayed, flown = delayed_variants(model, list(variants.values())), model.obedient()
     judged, times = model.flown.judged_s, ekf2.state.index.to_numpy()
     inside = settled(times, judged)
     # all stages have the replay's times

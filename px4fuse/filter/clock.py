@@ -186,7 +186,7 @@ def estimate_clock_offset(
         return moved
     progress("clock offset")
     few = moved.thinned(COARSE_MEASUREMENTS)
-    offset, _ = few.search(noises)
+    offset, _ = moved.search(noises)
     sigma, width = 0.0, 0.1
     for some in (few, moved):
         noises = most_likely([some.at(offset)], noises, some.weight, outliers=False).noises
