@@ -11,10 +11,10 @@ from pathlib import Path
 
 from conftest import REPOSITORY, page_of
 
+from px4fuse import workers
 from px4fuse.grading import grade as grading
 from px4fuse.grading import records
 from px4fuse.grading.model import Entry, Graded, Item
-from px4fuse.verification import workers
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import log_sha256, verify
 

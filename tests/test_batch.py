@@ -30,6 +30,7 @@ from msgspec import structs
 from ulog_tools import gnss_log
 
 import px4fuse
+from px4fuse import workers
 from px4fuse.cli import cli
 from px4fuse.cli.outputs import terminal
 from px4fuse.errors import OutputError, SettingsError
@@ -44,8 +45,7 @@ from px4fuse.report.screen import show
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.contract import schema, to_json
 from px4fuse.results.reading import read_results
-from px4fuse.verification import workers
-from px4fuse.verification.workers import Failed, run_bounded
+from px4fuse.workers import Failed, run_bounded
 
 PX4FUSE = [sys.executable, "-m", "px4fuse", "batch"]
 

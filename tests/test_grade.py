@@ -28,7 +28,7 @@ from px4fuse.grading.rubric import read_rubric
 from px4fuse.reading import files_by_sha256
 from px4fuse.verification import pages
 from px4fuse.verification.model import Verdict
-from px4fuse.verification.workers import Failed
+from px4fuse.workers import Failed
 
 pytestmark = pytest.mark.usefixtures("analysed_once")
 

@@ -13,9 +13,9 @@ from cli_tools import run_main
 from conftest import REPOSITORY
 from patience import patience
 
+from px4fuse import workers
 from px4fuse.errors import LogError, Px4FuseError
 from px4fuse.reading import max_log_bytes, read_text, read_whole, shown
-from px4fuse.verification import workers
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import log_sha256
 
