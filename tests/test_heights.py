@@ -185,8 +185,13 @@ def outdoors(baro_noise_m: float = 0.4) -> Flight:
         return simulate_flight(scenario_of("outdoor", seed=3, passes=3), parse(()))
 
 
+@cache
+def opened_once() -> Model:
+    return opened(outdoors())
+
+
 def test_what_if_predicts_the_height_of_the_flight_with_the_other_noise() -> None:
-    model = opened(outdoors())
+    model = opened_once()
     assert model.agreement.baro_hgt["down"].innovation_correlation > 0.999
     assert model.agreement.baro_hgt["down"].position_rms_difference_m < 0.02
     other = opened(outdoors(2.0))
@@ -208,7 +213,7 @@ def test_what_if_predicts_the_height_of_the_flight_with_the_other_noise() -> Non
 
 
 def test_without_its_only_sensor_the_height_drifts_and_that_is_told() -> None:
-    found = what_if(opened(outdoors()), [{}], {"baro_hgt": 40.0})
+    found = what_if(opened_once(), [{}], {"baro_hgt": 40.0})
     (lost,) = found.whatif
     assert lost.heights == {}
     assert lost.height_rmse_to_truth_m > 2.0 * found.replayed.height_rmse_to_truth_m
@@ -220,7 +225,7 @@ def test_a_height_that_would_be_rejected_for_long_is_not_predicted() -> None:
     flight = outdoors()
     jump = flight.barometer.copy()
     jump.loc[40.0:50.0, "down_m"] += 3.0
-    model = opened(flight)
+    model = opened_once()
     other = replace(flight, barometer=jump)
     stretches = with_heights(
         other, model.flight.ekf2, model.flight.ekf2.record, model.inputs.stretches
@@ -255,7 +260,7 @@ def test_a_height_that_does_not_agree_is_named_and_the_rest_stands() -> None:
 
 def test_what_the_log_lacks_of_the_heights_is_said() -> None:
     flight = outdoors()
-    model = opened(flight)
+    model = opened_once()
     ekf2, stretches = model.flight.ekf2, model.inputs.stretches
     record = ekf2.record
 
@@ -285,7 +290,7 @@ def test_what_the_log_lacks_of_the_heights_is_said() -> None:
 
 def test_an_acceleration_that_ekf2_took_to_be_wrong_is_noise_of_4_9() -> None:
     """covariance.cpp, BADACC_BIAS_PNOISE."""
-    inputs = opened(outdoors()).inputs
+    inputs = opened_once().inputs
     (stretch,) = inputs.stretches
     spoilt = replace(stretch, shaken=np.ones(len(stretch.time_s), bool))
     runs = [
@@ -309,7 +314,7 @@ def test_an_acceleration_that_ekf2_took_to_be_wrong_is_noise_of_4_9() -> None:
 
 def test_axes_at_the_end_of_their_range_are_relied_on_less_in_their_step() -> None:
     flight = outdoors()
-    (plain,) = opened(flight).inputs.stretches
+    (plain,) = opened_once().inputs.stretches
     clipped = pd.Series(0, flight.imu.index)
     at = plain.time_s[[100, 200]] - 1e-4
     clipped.iloc[np.searchsorted(flight.imu.index, at)] = [0b101, 0b111]
