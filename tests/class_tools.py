@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from contextvars import copy_context
 from pathlib import Path
 
-from conftest import REPOSITORY, page_of
+from conftest import REPORT, page_of
 
 from px4fuse.grading import grade as grading
 from px4fuse.grading import records
@@ -18,7 +18,6 @@ from px4fuse.verification import workers
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import log_sha256, verify
 
-REPORT = REPOSITORY / "reports" / "aisle_uwb.pdf"
 VERIFIED = Verdict("verified", ("the log gives every value again",), True, page_status="same")
 
 

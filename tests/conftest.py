@@ -39,6 +39,9 @@ from px4fuse.report import pdf
 from px4fuse.request import ComparisonRequest
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+SAMPLES = REPOSITORY / "sample_logs"
+LOG = SAMPLES / "aisle_uwb.ulg"
+REPORT = REPOSITORY / "reports" / "aisle_uwb.pdf"
 SHARED = REPOSITORY.parent / "shared"
 
 # A shell's background jobs ignore Ctrl-C, and so would all that the tests start
@@ -99,7 +102,7 @@ def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> 
 @pytest.fixture(scope="session")
 def sample_log() -> Path:
     """The sample flight that ships with the project."""
-    return REPOSITORY / "sample_logs" / "aisle_uwb.ulg"
+    return LOG
 
 
 @pytest.fixture(scope="session")
