@@ -21,17 +21,13 @@ from px4fuse.verification.verification import log_sha256, verify
 VERIFIED = Verdict("verified", ("the log gives every value again",), True, page_status="same")
 
 
-class Reports:
-    """The sample's report on an empty page, with another student, notes and log in its results."""
-
-    def __init__(self) -> None:
-        self._results = json.loads(REPORT.with_suffix(".json").read_text(encoding="utf-8"))
-
-    def of(self, name: str, student_id: str, log: str = "", notes: str = "") -> bytes:
-        results = {**self._results, "student": {"name": name, "id": student_id, "notes": notes}}
-        if log:
-            results["log"] = {**results["log"], "sha256": log}
-        return page_of(None, json.dumps(results))
+def report_of(name: str, student_id: str, log: str = "") -> bytes:
+    """The sample's report on an empty page, with another student and log in its results."""
+    results = json.loads(REPORT.with_suffix(".json").read_text(encoding="utf-8"))
+    results["student"] = {"name": name, "id": student_id, "notes": ""}
+    if log:
+        results["log"]["sha256"] = log
+    return page_of(None, json.dumps(results))
 
 
 def at_once(monkeypatch) -> list[str]:

@@ -10,7 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-from class_tools import Reports, at_once, entry, graded
+from class_tools import at_once, entry, graded, report_of
 from cli_tools import done, refused
 from conftest import LOG
 
@@ -109,7 +109,7 @@ def test_it_grades_what_is_in_its_folder(tmp_path, monkeypatch) -> None:
     nothing = run(folder)
     assert nothing["score"] == 0.0
     assert "No PDF" in nothing["output"]
-    (folder / "submission" / "report.pdf").write_bytes(Reports().of("Ada Lovelace", "1"))
+    (folder / "submission" / "report.pdf").write_bytes(report_of("Ada Lovelace", "1"))
     full = run(folder)
     assert full["score"] > 0.0
     # a day late, by Gradescope's own times
