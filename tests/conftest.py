@@ -237,10 +237,3 @@ def analysed_once() -> Iterator[None]:
         for place in (analysis, commands):
             patch.setattr(place, "run", _run_once)
         yield
-
-
-@pytest.fixture
-def analysed_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For tests of the analysis among others of what follows it."""
-    monkeypatch.setattr(analysis, "read_flight", _read)
-    monkeypatch.setattr(analysis, "run", _run)
