@@ -46,6 +46,9 @@ from px4fuse.report import pdf
 from px4fuse.request import ComparisonRequest
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+SAMPLES = REPOSITORY / "sample_logs"
+LOG = SAMPLES / "aisle_uwb.ulg"
+REPORT = REPOSITORY / "reports" / "aisle_uwb.pdf"
 SHARED = REPOSITORY.parent / "shared"
 
 # A shell's background jobs ignore Ctrl-C, and so would all that the tests start
@@ -106,7 +109,7 @@ def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> 
 @pytest.fixture(scope="session")
 def sample_log() -> Path:
     """The sample flight that ships with the project."""
-    return REPOSITORY / "sample_logs" / "aisle_uwb.ulg"
+    return LOG
 
 
 @pytest.fixture(scope="session")
@@ -271,10 +274,3 @@ def replayed_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(comparison, "replay", once)
         yield
-
-
-@pytest.fixture
-def analysed_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For tests of the analysis among others of what follows it."""
-    monkeypatch.setattr(analysis, "read_flight", _read)
-    monkeypatch.setattr(analysis, "run", _run)
