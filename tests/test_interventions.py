@@ -19,6 +19,7 @@ from px4fuse.comparison.interventions import (
     Intervention,
     cause_of,
     interventions,
+    to_try,
 )
 from px4fuse.comparison.interventions import RIGHT as TO_RIGHT
 from px4fuse.comparison.model import Comparison
@@ -147,7 +148,8 @@ def test_a_number_of_ekf2_is_that_of_a_what_if() -> None:
         assert one.before == analysis.axes[axis].filters["ekf2"].nis_mean
         assert one.after == pytest.approx(asked.whatif[0].axes[axis].nis_mean, rel=1e-9)
     # it was run along with EKF2 as flown; of other positions it is another
-    assert Variant({**model.inputs.settings, **change}) in model.runs[0].variants
+    known = analysis, analysis.tuning, analysis.clock, analysis.heading
+    assert Variant({**model.inputs.settings, **change}) in to_try(*known, model.inputs)
     once, other = (replay_settings(of, [change])[0] for of in (model, disturbed(model, 0.01, 1)))
     assert not once.updates.equals(other.updates)
 

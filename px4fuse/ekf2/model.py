@@ -9,7 +9,6 @@ far it can be believed is measured on each log, see :mod:`px4fuse.ekf2.replay`.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
 from itertools import pairwise
 
 import numpy as np
@@ -80,19 +79,17 @@ class Model:
         Of each stretch, for the delay as flown; empty where they are yet to be made.
     flown : Ekf2Replay
         With the parameters of the log.
-    obedient : callable
-        Makes the same, once, rejecting and resetting where EKF2 did, as far as the log tells.
     agreement : Agreement
         Of ``flown`` with what the log holds.
     runs : list of Run
-        Through each stretch, of these inputs: both, and the variants that were asked for besides.
+        Through each stretch, of these inputs: as flown, the same rejecting and resetting where EKF2
+        did, and the variants that were asked for besides. What is not there is run when needed.
     """
 
     flight: Flight
     inputs: Inputs
     intervals: Mapping[Timing, tuple[Intervals, ...]]
     flown: Ekf2Replay
-    obedient: Callable[[], Ekf2Replay]
     agreement: Agreement
     runs: list[Run] = field(default_factory=list, init=False)
 
@@ -140,13 +137,12 @@ def _open(
     known = {timing: intervals}
     runs = run_variants(inputs, variants, known)
     replay = _assemble(inputs, runs, flown, {})
-    obedient = cache(partial(_assemble, inputs, runs, variants[1], {}))
     agreement = agreement_with_log(flight, replay)
     if isinstance(agreement, Unavailable):
         return agreement
     share = max(agreement.rejected_share_logged, agreement.rejected_share_replayed)
     if share > REJECTING_SHARE and np.isfinite(inputs.received.rejected).any():
-        obeyed = agreement_with_log(flight, obedient())
+        obeyed = agreement_with_log(flight, _assemble(inputs, runs, variants[1], {}))
         if isinstance(obeyed, Agreement):
             agreement = with_obedient(agreement, obeyed)
     told = {DOUBTED.get(name, name): name for name in doubted}
@@ -156,9 +152,15 @@ def _open(
         **{of: getattr(doubted[name], of) for of, name in told.items()},
     )
     replay = structs.replace(replay, agreement=agreement)
-    model = Model(flight, inputs, known, replay, obedient, agreement)
+    model = Model(flight, inputs, known, replay, agreement)
     model.runs.extend(runs)
     return model
+
+
+def obedient(model: Model) -> Ekf2Replay:
+    """EKF2 as flown, rejecting and resetting where it did itself, as far as the log tells."""
+    variant = Variant(model.inputs.settings, as_logged=True)
+    return _assemble(model.inputs, _run_model(model, [variant]), variant, {})
 
 
 def replay_settings(

@@ -133,7 +133,7 @@ class Run:
         At the end.
     field : ndarray, shape (E, 3, S, 3)
         Of the magnetometer (body FRD): innovation (gauss), its variance for one sample, and whether
-        it was fused; NaN where there was none.
+        it was fused; NaN where there was none. Without rows where the fields are no states.
     heights : HeightFilter or None
         Where heights are fused, and are not EKF2's own.
     """
@@ -224,7 +224,7 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     usable = np.where(used, action, IDLE), event["startable"] & used, now_s, gated, as_logged
     fusion = _Fusion(inputs.rules, stretch.time_s[0], *usable, *logged)
     innovations, variances = np.full((2, events, size, 6), np.nan)
-    of_field = np.full((events, 3, size, 3), np.nan)
+    of_field = np.full((0 if seen is None else events, 3, size, 3), np.nan)
     rejected, fused, reset = np.zeros((3, events, size), bool)
     states, spreads = np.empty((2, events + 1, size, x.shape[1]))
     states[0], spreads[0] = x, _diagonal(P)
