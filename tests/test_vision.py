@@ -341,14 +341,42 @@ def test_without_gnss_ekf2_goes_to_where_vision_says_it_is() -> None:
 def test_a_reset_to_gnss_takes_the_bias_with_it() -> None:
     """Position and bias move together (resetHorizontalPositionTo): vision goes on as before."""
     inputs = flying(sent(sigma_m=0.05))
-    inputs = replace(inputs, rules=replace(inputs.rules, with_velocity=False))
-    received, start_s = inputs.received, float(inputs.stretches[0].time_s[0])
-    far = (received.stamp_s > start_s + 15.0)[:, None] * np.array([30.0, 0.0, 0.0])
-    done = ran(replace(inputs, received=replace(received, position_m=received.position_m + far)))
-    assert int(done.reset.sum()) == 1
-    assert done.moved_m.sum() == pytest.approx(30.0, abs=3.0)
+    for with_velocity in (False, True):
+        rules = replace(inputs.rules, with_velocity=with_velocity)
+        done = ran(replace(inputs, rules=rules, received=off_by(inputs.received, 30.0)))
+        # up to v1.16 a position that is fused, also of vision, holds GNSS off
+        assert int(done.reset.sum()) == (not with_velocity)
+        assert done.moved_m.sum() == pytest.approx(0.0 if with_velocity else 30.0, abs=3.0)
+        assert told(done)["fused"].mean() > 0.999
+
+
+def off_by(received: Received, north_m: float) -> Received:
+    """The same positions, off from 15 s on."""
+    start_s = float(on_gnss().inputs.stretches[0].time_s[0])
+    far = (received.stamp_s > start_s + 15.0)[:, None] * np.array([north_m, 0.0, 0.0])
+    return replace(received, position_m=received.position_m + far)
+
+
+def test_where_both_are_rejected_the_position_is_reset_to_vision_with_its_bias() -> None:
+    inputs = flying(off_by(sent(sigma_m=0.05), 20.0), seconds=20.0)
+    done = ran(replace(inputs, received=off_by(inputs.received, 40.0)))
     found = told(done)
-    assert found["fused"].mean() > 0.999
+    (reset_s,) = found.index[found["reset"] > 0.0]
+    assert reset_s == pytest.approx(float(done.stretch.time_s[0]) + 16.0, abs=0.2)
+    np.testing.assert_allclose(done.moved_m.sum(axis=(0, 1)), [20.0, 0.0], atol=0.7)
+    assert found.loc[reset_s + 0.1 :, "fused"].all()
+    assert done.vision is not None
+    np.testing.assert_allclose(-done.vision.bias.value_m[0], FRAME_M[:2], atol=0.7)
+
+
+def test_the_longest_delay_makes_the_horizon_also_where_it_is_visions() -> None:
+    inputs = flying(sent())
+    settings = inputs.settings
+    flown = Variant(settings).timing(inputs)
+    later = Variant({**settings, "EKF2_EV_DELAY": 290.0}).timing(inputs)
+    assert later.delay_s == flown.delay_s == pytest.approx(1e-3 * settings["EKF2_GPS_DELAY"])
+    assert later.horizon_s == pytest.approx(28 * inputs.step_s)
+    assert flown.horizon_s == inputs.horizon_s < later.horizon_s
 
 
 def test_samples_of_one_step_and_those_that_come_too_late() -> None:
