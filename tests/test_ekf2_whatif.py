@@ -217,12 +217,14 @@ def test_samples_that_come_too_late_are_a_note() -> None:
     for by_delay, remedy in ((False, ": raise EKF2_DELAY_MAX"), (True, "")):
         rules = replace(RULES, horizon_by_delay=by_delay)
         model: Any = SimpleNamespace(inputs=SimpleNamespace(rules=rules))
-        one: Any = SimpleNamespace(late=3, lost=2, updates=range(8), changed={"EKF2_EV_DELAY": 90})
+        one: Any = SimpleNamespace(
+            late=3, lost=2, updates=range(8), changed={"EKF2_EV_DELAY": 90}, settings={}
+        )
         (note,) = _notes(model, one)
         assert note.startswith("EKF2_EV_DELAY=90: 5 of 10 samples")
         assert note.endswith(f"(2 would never be fused){remedy}")
         one.late = one.lost = 0
-        assert _notes(model, one) == []
+        assert list(_notes(model, one)) == []
 
 
 # ------------------------------------------------------------------ where single rejections decide

@@ -84,9 +84,9 @@ def test_the_bias_is_the_scalar_kalman_filters_with_its_steady_variance() -> Non
     heights, found = standing(sampled(steps, [-1.7] * len(steps)), 4000)
     q, R = 0.13**2 * PERIOD_S, 0.25
     p = (q + np.sqrt(q * q + 4.0 * q * R)) / 2.0
-    assert heights.bias_m2[0] == pytest.approx(p * R / (p + R), rel=1e-6)
+    assert heights.bias.variance_m2[0] == pytest.approx(p * R / (p + R), rel=1e-6)
     assert found["innovation_variance_down_m2"].iloc[-1] == pytest.approx(p + R, rel=1e-6)
-    assert heights.bias_m[0] == pytest.approx(1.7, abs=1e-6)
+    assert heights.bias.value_m[0] == pytest.approx(1.7, abs=1e-6)
     # and on the way there as its recursion has it
     bias, variance, innovations = 0.0, 1.0, []
     for _ in steps:
@@ -110,14 +110,14 @@ def test_without_its_reference_the_bias_of_the_other_stays() -> None:
 def test_beyond_three_standard_deviations_nothing_is_learned_of_a_bias(down_m, learned) -> None:
     """Of √(0.25 + 0.25) m here."""
     heights, _ = standing(sampled([10], [down_m]))
-    assert (heights.bias_m[0] > 0.0) == learned
+    assert (heights.bias.value_m[0] > 0.0) == learned
 
 
 @pytest.mark.parametrize("reference", BOTH)
 def test_the_reference_has_no_bias(reference: str) -> None:
     steps = list(range(10, 400, 10))
     heights, _ = standing(sampled(steps, [-1.0] * len(steps), reference=reference))
-    assert (heights.bias_m[0] == 0.0) == (reference == "baro_hgt")
+    assert (heights.bias.value_m[0] == 0.0) == (reference == "baro_hgt")
 
 
 def test_a_sample_is_judged_by_where_the_vehicle_was_then() -> None:
@@ -247,7 +247,7 @@ def test_a_height_that_does_not_agree_is_named_and_the_rest_stands() -> None:
     assert "correlate by" in agreement.doubtful["baro_hgt"]
     assert agreement.baro_hgt["down"].innovation_correlation < 0.95
     assert ". Not so the barometer, of which nothing is concluded: " in agreement_words(agreement)
-    assert model.flown.heights == {}
+    assert model.flown.besides == {}
     own = np.interp(model.flown.delayed.index, flight.ekf2.state.index, flight.ekf2.state["down_m"])
     assert np.abs(model.flown.delayed["down_m"] - own).max() < 0.5
     found = what_if(model, [{"EKF2_GPS_DELAY": 0.0}])
