@@ -123,13 +123,8 @@ def read_log_bytes(path: Path) -> bytes:
     LogError
         It cannot be read, is not a regular file, is empty or too large.
     """
-    return read_whole(
-        path,
-        LogError,
-        max_log_bytes.get(),
-        smaller=_LARGER_LOGS,
-        again="Copy it from the vehicle again",
-    )
+    limit, again = max_log_bytes.get(), "Copy it from the vehicle again"
+    return read_whole(path, LogError, limit, smaller=_LARGER_LOGS, again=again)
 
 
 def read_text(
@@ -178,8 +173,7 @@ def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
     limit = max_log_bytes.get()
     for path in paths:
         if path.is_dir():
-            files = [file for file in files_below(path) if file.is_file()]
-            files = [file for file in files if size_of(file, LogError) <= limit]
+            files = [f for f in files_below(path) if f.is_file() and size_of(f, LogError) <= limit]
         elif (size := size_of(path, LogError)) > limit:
             raise LogError(_too_large(shown(path), size, limit), f"{_LARGER_LOGS}.")
         else:

@@ -118,9 +118,8 @@ def correlation_peak(file: OwnTrack, reference: OwnTrack, yaw_rad: float | None)
     square = np.maximum(power - 2.0 * agreed, 0.0) / (2.0 * np.maximum(count, 1.0))
     residual = np.sqrt(square + RESIDUAL_FLOOR_M**2)
     rival = int(np.argmin(np.where(rivals, residual, np.inf)))
-    return replace(
-        peak, rival_s=lag(rival) - lag(best), rival_ratio=float(residual[rival] / residual[best])
-    )
+    ratio = float(residual[rival] / residual[best])
+    return replace(peak, rival_s=lag(rival) - lag(best), rival_ratio=ratio)
 
 
 def least_squares_fit(
@@ -168,9 +167,8 @@ def least_squares_fit(
     free = [True, True, clock_free, yaw_rad is None]
     x0 = np.array([start_at.real, start_at.imag, 0.0, float(np.angle(coherence))])[free]
     limit = np.array([np.inf, np.inf, WINDOW_S, np.inf])[free]
-    solution = least_squares(
-        residual, x0, bounds=(-limit, limit), loss="soft_l1", f_scale=_scale(residual(x0))
-    )
+    scale = _scale(residual(x0))
+    solution = least_squares(residual, x0, bounds=(-limit, limit), loss="soft_l1", f_scale=scale)
     (origin, shift, yaw), r = unpack(solution.x), residual(solution.x)
     r_complex = r[: len(z)] + 1j * r[len(z) :]
     jacobian = np.asarray(solution.jac)

@@ -114,16 +114,10 @@ def place(
     )
     said = tuple(f"{file.name}: {text}" for text in (*file.detected, *file.notes))
     dropped = {file.name: file.dropped} if file.dropped else {}
-    return replace(
-        flight,
-        log=structs.replace(
-            flight.log,
-            notes=(*flight.log.notes, *said),
-            dropped={**flight.log.dropped, **dropped},
-        ),
-        positions=(track, *flight.positions),
-        inputs=(*flight.inputs, InputFile(file.name, file.sha256, file.size_bytes, "position")),
-    )
+    notes, dropped = (*flight.log.notes, *said), {**flight.log.dropped, **dropped}
+    log = structs.replace(flight.log, notes=notes, dropped=dropped)
+    inputs = (*flight.inputs, InputFile(file.name, file.sha256, file.size_bytes, "position"))
+    return replace(flight, log=log, positions=(track, *flight.positions), inputs=inputs)
 
 
 def _check_options(
@@ -181,11 +175,10 @@ def _describe(
     if compared:
         reference, correlation = EKF2_POSITION, compared[1]
     other = [] if auto else [*_other_frame(match, compared, yaw_rad)]
-    warnings = [
-        *(_match_warnings(match) if match else ()),
-        *([] if other else _poor_fit(match, compared, auto)),
-        *_unix_warnings(flight, file, clock_offset_s),
-    ]
+    hardly = compared[1] if compared and not other else None
+    warnings = _warnings(
+        flight, file, match, auto, correlation=hardly, clock_offset_s=clock_offset_s
+    )
     if not (match and match.better_frame):
         other += _other_height(flight, placed)
     alignment = Alignment(
@@ -230,19 +223,6 @@ def _compare(flight: Flight, placed: pd.DataFrame) -> tuple[Array, float | None]
     return distance_m, float(np.vdot(ours, theirs).real) / power if moves and power > 0.0 else None
 
 
-def _match_warnings(match: Match) -> Iterator[str]:
-    """What makes the match doubtful."""
-    name, fit = match.reference.name, match.clock
-    if fit.concordance < matching.GOOD_CONCORDANCE[name]:
-        yield f"The file follows the {name} only roughly (concordance {fit.concordance:.2f})."
-    if fit.rival_ratio < NEAR_RESIDUAL[name]:
-        yield (
-            f"A clock offset {fit.rival_s:+.1f} s from this one fits nearly as well, with a "
-            f"residual only {fit.rival_ratio:.1f} times as large: if this one is wrong, give "
-            "--clock-offset SECONDS."
-        )
-
-
 def _other_height(flight: Flight, placed: pd.DataFrame) -> Iterator[str]:
     """Whether the file's height runs against EKF2's: then its frame is another one."""
     if isinstance(flight.ekf2, Unavailable):
@@ -257,21 +237,6 @@ def _other_height(flight: Flight, placed: pd.DataFrame) -> Iterator[str]:
         yield (
             "The file's height runs against EKF2's (one rises where the other sinks): its z points "
             "the other way. Give another --position-frame."
-        )
-
-
-def _unix_warnings(
-    flight: Flight, file: PositionRecording, clock_offset_s: float | None
-) -> Iterator[str]:
-    """Whether the file's UNIX clock is far from the log's: then it may be of another flight."""
-    start_s = flight.log.start_unix_s
-    if file.clock != "UNIX" or start_s is None or clock_offset_s is None:
-        return
-    apart_s = abs(flight.log.boot_time_s - clock_offset_s - start_s)
-    if apart_s >= MAX_UNIX_DIFFERENCE_S:
-        yield (
-            f"By their UNIX times file and log are {apart_s:.0f} s apart: is it the same flight? "
-            "Flights along one path match each other well."
         )
 
 
@@ -293,26 +258,41 @@ def _other_frame(
     elif turned:
         yaw = np.degrees(np.angle(np.exp(1j * (match.free.yaw_rad - yaw_rad))))
         shift = np.hypot(*match.free.origin_m[:2])
-        how = f" and shifted by {shift:.1f} m" if compared else ""
-        yield (
-            f"The file's frame seems turned by {yaw:.1f}°{how} against the {name}: give "
-            "--position-yaw auto."
-        )
+        how = f"turned by {yaw:.1f}°" + (f" and shifted by {shift:.1f} m" if compared else "")
+        yield f"The file's frame seems {how} against the {name}: give --position-yaw auto."
 
 
-def _poor_fit(
-    match: Match | None, compared: tuple[Array, float | None] | None, auto: bool
-) -> Iterator[str]:
-    """What cannot be told of the frame, or does not fit however it is turned."""
-    correlation = compared[1] if compared else None
-    if auto:
-        if match is not None and match.reference.name == IMU:
+def _warnings(
+    flight: Flight, file: PositionRecording, match: Match | None, auto: bool, *,
+    correlation: float | None, clock_offset_s: float | None,
+) -> Iterator[str]:  # fmt: skip
+    """What makes the match doubtful, what it cannot tell, and whether the flight is the same."""
+    if match:
+        name, fit = match.reference.name, match.clock
+        if fit.concordance < matching.GOOD_CONCORDANCE[name]:
+            yield f"The file follows the {name} only roughly (concordance {fit.concordance:.2f})."
+        if fit.rival_ratio < NEAR_RESIDUAL[name]:
+            yield (
+                f"A clock offset {fit.rival_s:+.1f} s from this one fits nearly as well, with a "
+                f"residual only {fit.rival_ratio:.1f} times as large: if this one is wrong, give "
+                "--clock-offset SECONDS."
+            )
+        if auto and name == IMU:
             yield (
                 "The IMU tells the yaw to a few degrees only (1° to 6° off on simulated flights), "
                 "and not the origin of the file's frame, which was left at 0."
             )
-    elif correlation is not None and correlation < MIN_CONCORDANCE[EKF2_POSITION]:
+    if not auto and correlation is not None and correlation < MIN_CONCORDANCE[EKF2_POSITION]:
         yield (
             f"The file hardly follows the EKF2 position (correlation {correlation:.2f}): check "
             "clock offset, frame and yaw."
         )
+    # where its UNIX clock is far from the log's it may be of another flight
+    start_s = flight.log.start_unix_s
+    if file.clock == "UNIX" and start_s is not None and clock_offset_s is not None:
+        apart_s = abs(flight.log.boot_time_s - clock_offset_s - start_s)
+        if apart_s >= MAX_UNIX_DIFFERENCE_S:
+            yield (
+                f"By their UNIX times file and log are {apart_s:.0f} s apart: is it the same "
+                "flight? Flights along one path match each other well."
+            )

@@ -81,11 +81,8 @@ def file_track(samples: pd.DataFrame, frame: str) -> OwnTrack:
     """Read the file's axes as north, east, down; time from its first sample on."""
     order, sign = FRAMES[frame]
     time = samples.index.to_numpy()
-    return OwnTrack(
-        time - time[0],
-        samples[["x_m", "y_m", "z_m"]].to_numpy()[:, order] * sign,
-        np.ones(len(time), dtype=bool),
-    )
+    position = samples[["x_m", "y_m", "z_m"]].to_numpy()[:, order] * sign
+    return OwnTrack(time - time[0], position, np.ones(len(time), dtype=bool))
 
 
 def on_grid(track: OwnTrack) -> OwnTrack:
@@ -123,10 +120,8 @@ def _ekf2_track(state: pd.DataFrame) -> OwnTrack:
     known = finite_rows(state, Columns.POSITION[:2])
     if len(known) < MIN_SAMPLES:
         raise NoMatchError("EKF2 has no horizontal position in this log")
-    raw = OwnTrack(
-        known.index.to_numpy(), known[Columns.POSITION].to_numpy(), np.ones(len(known), dtype=bool)
-    )
-    grid = on_grid(raw)
+    time, position = known.index.to_numpy(), known[Columns.POSITION].to_numpy()
+    grid = on_grid(OwnTrack(time, position, np.ones(len(known), dtype=bool)))
     smooth = gaussian_filter1d(grid.position_m, SMOOTHING_S / STEP_S, axis=0, mode="nearest")
     return replace(grid, position_m=smooth, name=EKF2_POSITION)
 
@@ -140,11 +135,7 @@ def ekf2_references(flight: Flight) -> list[OwnTrack]:
         raise NoMatchError("the log has no EKF2 position")
     state = flight.ekf2.state
     states = [state]
-    resets = [
-        reset
-        for reset in flight.ekf2.resets
-        if reset.quantity == "position" and any(reset.delta[:2])
-    ]
+    resets = [r for r in flight.ekf2.resets if r.quantity == "position" and any(r.delta[:2])]
     if resets:
         after = state.index.to_numpy()[:, None] >= np.array([reset.time_s for reset in resets])
         moved = after @ np.array([(*reset.delta[:2], 0.0) for reset in resets])
@@ -184,10 +175,8 @@ def placed_samples(
         variance[:, :2] = variance[:, :2] @ (turn**2).T
     columns = Columns.POSITION + Columns.POSITION_VARIANCE
     values = np.hstack([position + origin_m, variance])
-    return pd.DataFrame(
-        dict(zip(columns, values.T, strict=True)),
-        index=pd.Index(track.time_s + lag_s, name="time_s"),
-    )
+    times = pd.Index(track.time_s + lag_s, name="time_s")
+    return pd.DataFrame(dict(zip(columns, values.T, strict=True)), index=times)
 
 
 def continuous_track(ekf2: Ekf2, placed: pd.DataFrame) -> OwnTrack:

@@ -124,10 +124,8 @@ class Explained:
     @property
     def bias(self) -> Estimate:
         """Size of both biases together (m/s²)."""
-        forward, right = self.forward_bias, self.right_bias
-        return Estimate(
-            math.hypot(forward.value, right.value), math.hypot(forward.sigma, right.sigma)
-        )
+        one, other = self.forward_bias, self.right_bias
+        return Estimate(math.hypot(one.value, other.value), math.hypot(one.sigma, other.sigma))
 
     @property
     def biased(self) -> bool:
@@ -493,9 +491,8 @@ def hypotheses_of(
     assert isinstance(attitude, pd.DataFrame)
     if len(axes[0].measurement_time_s) <= MIN_MEASUREMENTS:
         return too_few(CAUSES, len(axes[0].measurement_time_s), MIN_MEASUREMENTS)
-    shifted = [
-        replace(axis, measurement_time_s=axis.measurement_time_s + clock_offset_s) for axis in axes
-    ]
+    time_s = axes[0].measurement_time_s + clock_offset_s
+    shifted = [replace(axis, measurement_time_s=time_s) for axis in axes]
     settings = replace(settings, input="imu")
     line = timeline(shifted[0], settings)
     common = _common_columns(attitude, acceleration)
@@ -513,13 +510,10 @@ def hypotheses_of(
     time_s = axes[0].measurement_time_s[-len(measured) :]
     fine, hats = _hats(time_s[0] + clock_offset_s, time_s[-1] + clock_offset_s)
     slow = [_added(hat, fine, line) for hat in hats]
-    slow_position, slow_velocity = (np.stack(part, axis=1) for part in zip(*slow, strict=True))
-    prior = np.append(
-        np.full(CONSTANTS, np.inf), np.full(len(axes) * len(hats), TILT_SIGMA_RAD * constants.g)
-    )
-    return Hypotheses(
-        time_s, tuple(legs), (slow_position, slow_velocity), prior, sigma_z, steps(time_s, [])
-    )
+    position, velocity = (np.stack(part, axis=1) for part in zip(*slow, strict=True))
+    tilt = np.full(len(axes) * len(hats), TILT_SIGMA_RAD * constants.g)
+    prior = np.append(np.full(CONSTANTS, np.inf), tilt)
+    return Hypotheses(time_s, tuple(legs), (position, velocity), prior, sigma_z, steps(time_s, []))
 
 
 def _added(acceleration_m_s2: Array, time_s: ArrayLike, line: Timeline) -> tuple[Array, Array]:
@@ -533,9 +527,8 @@ def _common_columns(
     attitude: pd.DataFrame, acceleration: pd.DataFrame
 ) -> list[tuple[pd.Index, Array]]:
     """NED acceleration that takes out a bias forward and right, and that a turn adds; and when."""
-    body_to_ned = Rotation.from_quat(
-        attitude[Columns.QUATERNION].to_numpy(copy=True), scalar_first=True
-    )
+    quaternions = attitude[Columns.QUATERNION].to_numpy(copy=True)
+    body_to_ned = Rotation.from_quat(quaternions, scalar_first=True)
     biases = [(attitude.index, body_to_ned.apply(np.eye(3)[axis])) for axis in (FORWARD, RIGHT)]
     north, east, _ = acceleration.to_numpy().T
     return [*biases, (acceleration.index, np.column_stack([-east, north, 0.0 * north]))]

@@ -211,10 +211,8 @@ def estimate_clock_offset(
     low, high = float(offset - widened[0]), float(offset + widened[1])
     reason = ""
     if not closed or (high - low) / 2.0 > MAX_HALF_INTERVAL_S:
-        reason = (
-            f"the positions fit offsets from {low:+.2f} s to {high:+.2f} s almost "
-            "equally well: too little acceleration, or too noisy a source"
-        )
+        fits = f"the positions fit offsets from {low:+.2f} s to {high:+.2f} s almost equally well"
+        reason = f"{fits}: too little acceleration, or too noisy a source"
     parts: tuple[PartOffset, ...] = ()
     change_p = None
     if not reason:

@@ -320,12 +320,9 @@ def widened_by_outliers(square: Array, count: Array, outlier: Array, width: floa
     """
     share = float(np.mean(outlier))
     total, wide = 2.0 * float(np.sum(count)), 2.0 * float(np.sum(count * outlier))
-    complete = np.array(
-        [[total, wide, 0.0], [wide, wide, 0.0], [0.0, 0.0, len(square) * share * (1.0 - share)]]
-    )
-    steps = np.stack(
-        [square * (width**-2.0 - 1.0), square * width**-2.0 - count, np.ones_like(square)]
-    )
+    told, narrow = len(square) * share * (1.0 - share), width**-2.0
+    complete = np.array([[total, wide, 0.0], [wide, wide, 0.0], [0.0, 0.0, told]])
+    steps = np.stack([square * (narrow - 1.0), square * narrow - count, np.ones_like(square)])
     missing = (steps * (outlier * (1.0 - outlier))) @ steps.T
     observed = complete - missing
     if np.linalg.eigvalsh(observed)[0] <= 0.0:  # hardly any outlier: what they are adds nothing

@@ -176,16 +176,12 @@ def _parts(time: Array, turn: Array, sigma: Array) -> tuple[HeadingPart, ...]:
     # of a long flight only some measurements were taken
     count = max(int(min((time[-1] - time[0]) / PART_S, len(time) / (2 * MIN_PART_SAMPLES))), 1)
     edges = np.searchsorted(time, np.linspace(time[0], time[-1], count + 1)[1:-1])
-    return tuple(
-        HeadingPart(
-            float(time[rows[0]]),
-            float(time[rows[-1]]),
-            float(np.degrees(turn[rows].mean())),
-            float(np.degrees(np.sqrt(np.mean(sigma[rows] ** 2)))),
-        )
-        for rows in np.split(np.arange(len(time)), edges)
-        if len(rows) >= MIN_PART_SAMPLES
-    )
+    kept = [at for at in np.split(np.arange(len(time)), edges) if len(at) >= MIN_PART_SAMPLES]
+    ends = [time[at[[0, -1]]].tolist() for at in kept]
+    means = [
+        np.degrees([turn[at].mean(), np.sqrt(np.mean(sigma[at] ** 2))]).tolist() for at in kept
+    ]
+    return tuple(HeadingPart(*end, *mean) for end, mean in zip(ends, means, strict=True))
 
 
 def heading_rad(quaternions: pd.DataFrame) -> Array:

@@ -18,18 +18,7 @@ import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
-from px4fuse.filter.model import (
-    COVARIANCES,
-    INITIAL_COVARIANCE,
-    STATES,
-    H,
-    input_matrix,
-    matrix,
-    move,
-    noise,
-    spread,
-    transition,
-)
+from px4fuse.filter import model
 from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.filter.steps import Timeline, timeline
@@ -98,8 +87,8 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
     start = initial or InitialState(line.time_s[0], axis.measurement_m[0])
     kalman = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
     kalman.x = np.array([[start.position_m], [start.velocity_m_s]])
-    kalman.P = matrix(INITIAL_COVARIANCE)
-    kalman.H = H
+    kalman.P = model.matrix(model.INITIAL_COVARIANCE)
+    kalman.H = model.H
     kalman.R = np.array([[settings.sigma_z_m**2]])
     kalman.inv = np.reciprocal  # S is 1 by 1
     states, updates = [_row(kalman.x, kalman.P)], []
@@ -107,8 +96,8 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
         np.diff(line.time_s), line.acceleration_m_s2, line.input_variance_m2_s4,
         line.measurement[1:], strict=True,
     ):  # fmt: skip
-        Q = (settings.sigma_a_m_s2**2 + extra) * settings.dt_s * matrix(noise(dt))
-        kalman.predict(u=np.array([[u]]), B=input_matrix(dt), F=transition(dt), Q=Q)
+        Q = (settings.sigma_a_m_s2**2 + extra) * settings.dt_s * model.matrix(model.noise(dt))
+        kalman.predict(u=np.array([[u]]), B=model.input_matrix(dt), F=model.transition(dt), Q=Q)
         if measurement >= 0:
             z = axis.measurement_m[measurement]
             kalman.update(z)
@@ -123,10 +112,9 @@ def as_replay(
     axis: Axis, settings: Settings, line: Timeline, states: Sequence[Row], updates: Sequence[Row]
 ) -> Replay:
     """A replay of its rows: state and covariance after each step, and what each update was."""
-    time, fused = (
-        pd.Index(at, name="time_s") for at in (line.time_s, line.time_s[line.measurement >= 0])
-    )
-    steps = pd.DataFrame(states, index=time, columns=STATES + COVARIANCES)
+    times = line.time_s, line.time_s[line.measurement >= 0]
+    time, fused = (pd.Index(at, name="time_s") for at in times)
+    steps = pd.DataFrame(states, index=time, columns=model.STATES + model.COVARIANCES)
     steps["acceleration_m_s2"] = np.append(line.acceleration_m_s2, 0.0)
     steps["input_variance_m2_s4"] = np.append(line.input_variance_m2_s4, 0.0)
     return Replay(axis, settings, steps, pd.DataFrame(updates, fused, UPDATES), line.input_gap_s)
@@ -152,17 +140,17 @@ def state_at(run: Replay, times: Array) -> tuple[Array, Array]:
     """
     at, ahead, outside = _ahead(run, times)
     position, velocity, acceleration = (
-        run.steps[column].to_numpy()[at] for column in (*STATES, "acceleration_m_s2")
+        run.steps[column].to_numpy()[at] for column in (*model.STATES, "acceleration_m_s2")
     )
-    position, velocity = move(position, velocity, acceleration, ahead)
+    position, velocity = model.move(position, velocity, acceleration, ahead)
     return np.where(outside, np.nan, position), np.where(outside, np.nan, velocity)
 
 
 def variance_at(run: Replay, times: Array) -> tuple[Array, Array]:
     """Variances (m², m²/s²) that belong to :func:`state_at`: P = FPFᵀ + Q from the step before."""
     at, ahead, outside = _ahead(run, times)
-    p00, p01, p11 = run.steps[COVARIANCES].to_numpy()[at].T
+    p00, p01, p11 = run.steps[model.COVARIANCES].to_numpy()[at].T
     extra = run.steps["input_variance_m2_s4"].to_numpy()[at]
     q = (run.settings.sigma_a_m_s2**2 + extra) * run.settings.dt_s
-    (p00, _, p11), (q00, _, q11) = spread((p00, p01, p11), ahead), noise(ahead)
+    (p00, _, p11), (q00, _, q11) = model.spread((p00, p01, p11), ahead), model.noise(ahead)
     return np.where(outside, np.nan, p00 + q * q00), np.where(outside, np.nan, p11 + q * q11)

@@ -197,9 +197,8 @@ def recursion(
         ν (m), S (m²), gain, and after the update position (m), velocity (m/s) and covariance by
         its elements 00, 01, 11: each of shape (...), and a plain float where that is ().
     """
-    q, r = np.broadcast_arrays(
-        np.square(np.asarray(sigma_a_m_s2, float)), np.square(np.asarray(sigma_z_m, float))
-    )
+    squares = (np.square(np.asarray(sigma, float)) for sigma in (sigma_a_m_s2, sigma_z_m))
+    q, r = np.broadcast_arrays(*squares)
     if not q.ndim:  # in plain floats: fifty times as fast as arrays of a single element
         q, r = q.item(), r.item()
     p, v = legs.initial.position_m, legs.initial.velocity_m_s + 0.0 * q  # of the grid's shape

@@ -152,11 +152,8 @@ class Fitted:
 
     def scaled(self, sigma: float) -> Fitted:
         """The same with all noises ``sigma`` times as large."""
-        return replace(
-            self,
-            gram=self.gram / sigma**2,
-            log_determinant=self.log_determinant + 2.0 * self.freedom * float(np.log(sigma)),
-        )
+        log_determinant = self.log_determinant + 2.0 * self.freedom * float(np.log(sigma))
+        return replace(self, gram=self.gram / sigma**2, log_determinant=log_determinant)
 
     def constants(self) -> Array:
         """Most likely constants, shape (s, T, c)."""
@@ -276,10 +273,8 @@ def squares(
     weight = np.concatenate([np.ones((len(constants), 1)), constants], axis=1)
     # of each leg, by the stretch in which it ends
     of_leg = np.repeat(weight, np.diff([*positions.start, len(variance_m2)]), axis=0)[1:]
-    dp, dv = (
-        np.einsum("akn,nk->an", part[:, 0], of_leg)
-        for part in (positions.delta_position_m, positions.delta_velocity_m_s)
-    )
+    moved = positions.delta_position_m, positions.delta_velocity_m_s
+    dp, dv = (np.einsum("akn,nk->an", part[:, 0], of_leg) for part in moved)
     square = np.zeros(len(variance_m2))
     for axes, system, _ in positions.systems(sigma_a_m_s2, variance_m2):
         measured = positions.measurement_m[:, axes].T
@@ -313,41 +308,26 @@ def paired_products(
     -------
     ndarray, shape (s, k)
     """
-    by_constants = positions.delta_position_m[:, 0, 1:], positions.delta_velocity_m_s[:, 0, 1:]
-    count, constants = measured_m.shape[1], len(positions.constant_sigma)
-    own = np.zeros((len(positions.start), count))
-    by_first, by_second = np.zeros((2, len(positions.start), count, constants))
-    information = np.tile(np.diag(positions.constant_sigma**-2.0), (len(own), 1, 1))
-    for axes, system, _ in positions.systems(sigma_a_m_s2, variance_m2):
-        weight, (i00, i01, i11) = system.precision[:, 0], system.inverse
-        # the inverse covariance times a constant's signal: what no state explains of it, weighed
-        constant = [part[axes] for part in by_constants]
-        place, speed = np.moveaxis(system.solve(np.zeros(1), *constant)[..., :2], -1, 0)
-        dp = constant[0] - np.diff(place) + system.length_s * speed[..., :-1]
-        dv = constant[1] - np.diff(speed)
-        weighed = i00 * dp + i01 * dv, i01 * dp + i11 * dv
-        for begin in range(0, count, AT_ONCE):
-            few = slice(begin, begin + AT_ONCE)
-            error, *legs = (part[axes, few] for part in signals)
-            second = measured_m[axes, few]
-            left = weight * (error - system.solve(error, *legs)[..., 0]) * second
-            own[:, few] += np.add.reduceat(left.sum(axis=0), positions.start, axis=-1).T
-            for at, (first, last) in enumerate(positions.stretches):
-                rows, inside = slice(first, last), slice(first, last - 1)
-                by_first[at, few] -= _over_axes(error, weight * place, rows)
-                by_second[at, few] -= _over_axes(second, weight * place, rows)
-                for part, of in zip(legs, weighed, strict=True):
-                    by_first[at, few] += _over_axes(part, of, inside)
-        for at, (first, last) in enumerate(positions.stretches):
-            for part, of in zip(constant, weighed, strict=True):
-                information[at] += _over_axes(part, of, slice(first, last - 1))
-    taken = np.linalg.solve(information, np.swapaxes(by_second, 1, 2))
-    return np.asarray(own - np.einsum("skc,sck->sk", by_first, taken))
-
-
-def _over_axes(first: Array, second: Array, rows: slice) -> Array:
-    """Products of two sets of signals in a stretch, summed over the axes."""
-    return np.asarray((first[..., rows] @ np.swapaxes(second[..., rows], 1, 2)).sum(axis=0))
+    error, *legs = signals
+    constants = positions.delta_position_m[:, 0, 1:], positions.delta_velocity_m_s[:, 0, 1:]
+    found = []
+    for begin in range(0, measured_m.shape[1], AT_ONCE):
+        few = np.s_[:, begin : begin + AT_ONCE]
+        # one set of signals, then the other, then those of the constants
+        dp, dv = (
+            np.concatenate([leg[few], 0.0 * leg[few], of_constant], axis=1)[:, None]
+            for leg, of_constant in zip(legs, constants, strict=True)
+        )
+        measured = np.zeros((*dp.shape[:3], error.shape[-1]))
+        one, other, rest = np.split(np.arange(dp.shape[2]), np.array([1, 2]) * error[few].shape[1])
+        measured[:, 0, one], measured[:, 0, other] = error[few], measured_m[few]
+        both = replace(positions, delta_position_m=dp, delta_velocity_m_s=dv)
+        gram = fit(both, sigma_a_m_s2, variance_m2, measured).gram[:, 0]
+        information = gram[:, rest[:, None], rest] + np.diag(positions.constant_sigma**-2.0)
+        taken = np.linalg.solve(information, gram[:, rest[:, None], other])
+        by_constants = np.einsum("skc,sck->sk", gram[:, one[:, None], rest], taken)
+        found.append(gram[:, one, other] - by_constants)
+    return np.concatenate(found, axis=1)
 
 
 @dataclass(frozen=True)
@@ -519,8 +499,7 @@ def factorise(
     lower, broken = lapack.dpbtrf(bands, lower=1)
     if broken:
         raise np.linalg.LinAlgError("a stretch has too few measurements")
-    log_determinant = (
-        2.0 * np.sum(np.log(lower[0])) + log_noise - np.sum(np.log(precision[precision > 0.0]))
-    )
+    log_lower = 2.0 * np.sum(np.log(lower[0]))
+    log_determinant = log_lower + log_noise - np.sum(np.log(precision[precision > 0.0]))
     root = np.where(joined, 1.0 / np.sqrt(q11), 0.0)
     return BandedSystem(precision, length_s, inverse, root, bands, lower, float(log_determinant))

@@ -63,10 +63,8 @@ def noise_of_many_steps(dt_s: T) -> Symmetric[T]:
 
 def move(position: T, velocity: T, acceleration: T, dt_s: T) -> tuple[T, T]:
     """X = Fx + Ba: position (m) and velocity (m/s) after ``dt_s``."""
-    return (
-        position + velocity * dt_s + acceleration * dt_s**2 / 2.0,
-        velocity + acceleration * dt_s,
-    )
+    moved = position + velocity * dt_s + acceleration * dt_s**2 / 2.0
+    return moved, velocity + acceleration * dt_s
 
 
 def spread(covariance: Symmetric[T], dt_s: T) -> Symmetric[T]:

@@ -122,14 +122,9 @@ class PreparedMotion:
         if not enough.any():
             return self
         kept &= np.repeat(enough, np.diff(self.edges))
-        return replace(
-            self,
-            time_s=self.time_s[kept],
-            measurement_m=self.measurement_m[kept],
-            weight=self.weight[kept],
-            edges=np.cumsum([0, *counts[enough]]),
-            signals=tuple(each for each, good in zip(self.signals, enough, strict=True) if good),
-        )
+        some = {name: getattr(self, name)[kept] for name in ("time_s", "measurement_m", "weight")}
+        signals = tuple(each for each, good in zip(self.signals, enough, strict=True) if good)
+        return replace(self, **some, edges=np.cumsum([0, *counts[enough]]), signals=signals)
 
     def positions(self, offset_s: Array) -> Positions:
         """Positions, with what moves them where their stamps are corrected by each offset.

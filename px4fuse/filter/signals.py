@@ -141,20 +141,17 @@ def _ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
         return flight.imu
     if isinstance(flight.attitude, Unavailable):
         return flight.attitude
-    attitude_time = flight.attitude.index.to_numpy()
-    imu = flight.imu[
-        (flight.imu.index >= attitude_time[0]) & (flight.imu.index <= attitude_time[-1])
-    ]
+    known = flight.attitude.index.to_numpy()
+    imu = flight.imu[(flight.imu.index >= known[0]) & (flight.imu.index <= known[-1])]
     if len(imu) < 2:
         return Unavailable(
             "acceleration in NED",
             "IMU and attitude do not overlap in time",
             "Record both from boot (SDLOG_MODE 1).",
         )
-    rotations = Rotation.from_quat(
-        flight.attitude[Columns.QUATERNION].to_numpy(copy=True), scalar_first=True
-    )
-    body_to_ned = Slerp(attitude_time, rotations)(imu.index.to_numpy())
+    quaternions = flight.attitude[Columns.QUATERNION].to_numpy(copy=True)
+    rotations = Rotation.from_quat(quaternions, scalar_first=True)
+    body_to_ned = Slerp(known, rotations)(imu.index.to_numpy())
     acceleration = body_to_ned.apply(imu[Columns.SPECIFIC_FORCE].to_numpy(copy=True))
     acceleration[:, 2] += constants.g
     return pd.DataFrame(acceleration, index=imu.index, columns=list(AXIS_NAMES))

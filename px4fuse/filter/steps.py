@@ -74,10 +74,5 @@ def timeline(axis: Axis, settings: Settings, initial: InitialState | None = None
     leg = np.searchsorted(np.flatnonzero(measurement >= 0), np.arange(1, len(time)))
     gap_of_leg = np.bincount(leg, weights=gap_s)[leg]
     persistence = np.maximum(gap_of_leg / settings.dt_s, 1.0)
-    return Timeline(
-        time,
-        measurement,
-        mean,
-        gap * persistence * axis.acceleration.rms_m_s2**2,
-        float(np.sum(gap_s)),
-    )
+    variance = gap * persistence * axis.acceleration.rms_m_s2**2
+    return Timeline(time, measurement, mean, variance, float(np.sum(gap_s)))

@@ -276,15 +276,10 @@ def tune_axes(
         measured = np.column_stack([axis.measurement_m for axis in axes])
         # the filter starts at the first measurement, which it does not weigh
         weight = np.concatenate([np.ones(len(measured) - count), alone.weight])
-        directions = np.array([axis.direction for axis in axes])
+        along = np.array([axis.direction for axis in axes])
+        time_s, dt_s = axes[0].measurement_time_s, settings.dt_s
         moved = motion(
-            flight,
-            axes[0].measurement_time_s,
-            measured,
-            directions=directions,
-            dt_s=settings.dt_s,
-            weight=weight,
-            signals=signals,
+            flight, time_s, measured, directions=along, dt_s=dt_s, weight=weight, signals=signals
         )
         if not isinstance(moved, Unavailable):
             start = replace(alone.noises, walk_m=FIRST_WALK_M if drifts else 0.0)

@@ -71,12 +71,10 @@ def analyse(
     real = truth if request.came_back and request.landed_at is None else None
     by_truth = None if real is None else part.true_end(path, real, segment, at_rest)
     known = _known_end(path, request, by_truth)
-    claims: list[Claim] = [
-        (GivenClosure(stamp(one.time_1_s), stamp(one.time_2_s), one.sigma_m), None)
-        for one in request.closures
-    ]
-    for closure, _ in claims:
+    said = [GivenClosure(stamp(c.time_1_s), stamp(c.time_2_s), c.sigma_m) for c in request.closures]
+    for closure in said:
         _check(closure, path)
+    claims: list[Claim] = [(closure, None) for closure in said]
     if not isinstance(known, Unavailable):
         claims.insert(0, (GivenClosure(segment.start_s, segment.end_s, known.sigma_m), known))
     spacing = request.key_frames_m

@@ -157,9 +157,8 @@ def correct_by_distance(
     position = trajectory.position_m
     share = cumulative_m / cumulative_m[-1]
     turn = Rotation.from_rotvec(np.outer(-share * misclosure_heading_rad, DOWN))
-    between = Rotation.from_rotvec(
-        np.outer(-(share[1:] + share[:-1]) / 2.0 * misclosure_heading_rad, DOWN)
-    )
+    middle = (share[1:] + share[:-1]) / 2.0
+    between = Rotation.from_rotvec(np.outer(-middle * misclosure_heading_rad, DOWN))
     steps = between.apply(np.diff(position, axis=0))
     turned = position[0] + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     left = turned[-1] - (position[-1] - misclosure_m)

@@ -53,10 +53,8 @@ def by_distance(
         return {"by_distance_plain": misclosure_m, "by_distance": misclosure_m}
     plain = distribute_by_distance(path.position_m, misclosure_m, distance)
     turned = 0.0 if isinstance(heading, Unavailable) else float(np.radians(heading))
-    return {
-        "by_distance_plain": (path.moved(plain), None),
-        "by_distance": (correct_by_distance(path, distance, misclosure_m, turned), None),
-    }
+    whole = correct_by_distance(path, distance, misclosure_m, turned)
+    return {"by_distance_plain": (path.moved(plain), None), "by_distance": (whole, None)}
 
 
 def _refused(what: str, closure: Closure) -> Unavailable:
@@ -118,12 +116,8 @@ def solve_all(
             solution = solve(graph.of_edges(used), robust=robust, loops=loops[used])
             found[way] = _carried(path, nodes, graph.poses, solution.poses), solution
             if robust != "none":
-                closures = tuple(
-                    structs.replace(closure, **{f"weight_{name}": weight})
-                    for closure, weight in zip(
-                        closures, solution.weights[loops].tolist(), strict=True
-                    )
-                )
+                each = zip(closures, solution.weights[loops].tolist(), strict=True)
+                closures = tuple(structs.replace(one, **{f"weight_{name}": w}) for one, w in each)
     return found, closures
 
 

@@ -52,10 +52,8 @@ def odometry_variances(
     tilt = noise.tilt_share**2 * heading
     rotation = np.column_stack([tilt, tilt, heading])
     stated = "the defaults" if noise == OdometryNoise() else "as set"
-    said = [
-        f"drift of the odometry: position {noise.position_m:g} m and heading "
-        f"{noise.heading_deg:g}° after 100 m (one standard deviation, {stated})"
-    ]
+    size = f"position {noise.position_m:g} m and heading {noise.heading_deg:g}° after 100 m"
+    said = [f"drift of the odometry: {size} (one standard deviation, {stated})"]
     reported = _growth(path.position_variance_m2, nodes)
     if reported is not None:
         translation = np.maximum(reported.mean(axis=1), FLOOR_SHARE * translation)

@@ -80,17 +80,11 @@ def trajectory_of(flight: Flight, part: Part) -> Trajectory:
 
 def _ours(flight: Flight) -> Trajectory:
     compared = compare(flight, axes=AXIS_NAMES)
-    position = pd.DataFrame(
-        {
-            column: result.replay.steps["position_m"]
-            for column, result in zip(Columns.POSITION, compared.axes.values(), strict=True)
-        }
-    )
+    columns = zip(Columns.POSITION, compared.axes.values(), strict=True)
+    position = pd.DataFrame({name: axis.replay.steps["position_m"] for name, axis in columns})
     used = compared.settings
-    note = (
-        f"our filter over {compared.source.name}, SIGMA_A {used.sigma_a_m_s2:g} m/s², SIGMA_Z "
-        f"{used.sigma_z_m:g} m"
-    )
+    noises = f"SIGMA_A {used.sigma_a_m_s2:g} m/s², SIGMA_Z {used.sigma_z_m:g} m"
+    note = f"our filter over {compared.source.name}, {noises}"
     return _trajectory(flight, "kf", position, flight.attitude, (note,))
 
 

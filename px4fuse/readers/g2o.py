@@ -93,11 +93,9 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
         twice[order[1:]] = ids[1:] == ids[:-1]
         vertices.refuse_where(twice, "a vertex for the second time", "Take one of them out.")
     index = np.minimum(np.searchsorted(ids, ends), len(ids) - 1)
-    edges.refuse_where(
-        ids[index] != ends,
-        "an edge to a vertex that the file does not have",
-        "Add its VERTEX line, or take all of them out.",
-    )
+    what = "an edge to a vertex that the file does not have"
+    remedy = "Add its VERTEX line, or take all of them out."
+    edges.refuse_where(ids[index] != ends, what, remedy)
     edges.refuse_where(ends[:, 0] == ends[:, 1], "an edge from a vertex to itself", "Take it out.")
     graph = PoseGraph(
         dimension=dimension,
@@ -126,16 +124,12 @@ def g2o_text(graph: PoseGraph) -> str:
     kind = "SE2" if graph.dimension == 2 else "SE3:QUAT"
     ids = graph.ids.tolist()
     upper = np.triu_indices(graph.freedom)
-    lines = [
-        f"VERTEX_{kind} {number} {' '.join(map(repr, pose))}"
-        for number, pose in zip(ids, graph.poses.tolist(), strict=True)
-    ]
+    poses = zip(ids, graph.poses.tolist(), strict=True)
+    lines = [f"VERTEX_{kind} {number} {' '.join(map(repr, pose))}" for number, pose in poses]
     lines.append(f"FIX {ids[0]}")
     numbers = np.hstack([graph.measurements, graph.information[:, upper[0], upper[1]]]).tolist()
-    lines += [
-        f"EDGE_{kind} {ids[i]} {ids[j]} {' '.join(map(repr, row))}"
-        for i, j, row in zip(graph.first.tolist(), graph.second.tolist(), numbers, strict=True)
-    ]
+    edges = zip(graph.first.tolist(), graph.second.tolist(), numbers, strict=True)
+    lines += [f"EDGE_{kind} {ids[i]} {ids[j]} {' '.join(map(repr, row))}" for i, j, row in edges]
     return "\n".join(lines) + "\n"
 
 
@@ -178,11 +172,9 @@ def _unit(rows: Rows, poses: Array) -> Array:
         return poses
     with np.errstate(over="ignore"):
         norm = np.linalg.norm(poses[:, 3:], axis=1)
-    rows.refuse_where(
-        (norm < 1e-6) | ~(norm < 1e6),
-        "a quaternion whose length is far from 1 is not a rotation",
-        "Give qx qy qz qw, of length 1, behind the position.",
-    )
+    what = "a quaternion whose length is far from 1 is not a rotation"
+    remedy = "Give qx qy qz qw, of length 1, behind the position."
+    rows.refuse_where((norm < 1e-6) | ~(norm < 1e6), what, remedy)
     # What is a unit quaternion already stays as it is, so that writing and reading changes nothing
     norm[np.abs(norm - 1.0) <= _UNIT] = 1.0
     return np.hstack([poses[:, :3], poses[:, 3:] / norm[:, None]])
@@ -195,16 +187,12 @@ def _information(rows: Rows, numbers: Array, size: int) -> Array:
     made[:, row, column] = made[:, column, row] = numbers
     entry = np.abs(numbers)
     tiny = (row == column) & (entry > 0.0) & (entry < _LEAST_INFORMATION)
-    rows.refuse_where(
-        tiny | (entry > _MOST_INFORMATION),
-        "the information matrix has an entry that cannot be computed with",
-        f"Give 0 for what the edge does not tell, else {_LEAST_INFORMATION:g} to "
-        f"{_MOST_INFORMATION:g}.",
-    )
+    what = "the information matrix has an entry that cannot be computed with"
+    usual = f"{_LEAST_INFORMATION:g} to {_MOST_INFORMATION:g}"
+    remedy = f"Give 0 for what the edge does not tell, else {usual}."
+    rows.refuse_where(tiny | (entry > _MOST_INFORMATION), what, remedy)
     values = np.linalg.eigvalsh(made)
-    rows.refuse_where(
-        values[:, 0] < -_ROUNDING * np.maximum(values[:, -1], 0.0),
-        "the information matrix has a negative eigenvalue",
-        "Give the upper triangle of an inverse covariance, row by row.",
-    )
+    what = "the information matrix has a negative eigenvalue"
+    remedy = "Give the upper triangle of an inverse covariance, row by row."
+    rows.refuse_where(values[:, 0] < -_ROUNDING * np.maximum(values[:, -1], 0.0), what, remedy)
     return made

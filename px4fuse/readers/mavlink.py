@@ -9,7 +9,6 @@ from types import MappingProxyType
 
 import numpy as np
 import pandas as pd
-from msgspec import structs
 
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, REPORTED, settings_in_force
 from px4fuse.flight import AXIS_NAMES, Columns, Ekf2, Flight, FlightMode, Unavailable
@@ -60,10 +59,10 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     recording = settle_clocks(frames, address)
     mapped = senders.map_senders(recording)
     parameters = _read_parameters(recording, autopilot)
-    remedies, replay = messages.remedies_of(autopilot)
+    remedies, _ = messages.remedies_of(autopilot)
     imu = _read_imu(recording, remedies["imu"])
     attitude = _read_attitude(recording, remedies["attitude"])
-    ekf2 = _read_ekf2(recording, parameters, autopilot, remedies, replay)
+    ekf2 = _read_ekf2(recording, parameters, autopilot)
     # other autopilots do not tell by how much they take a fix to be older than its stamp
     known = settings_in_force(parameters, GNSS_POS) if autopilot == "PX4" else {}
     delay_s = 1e-3 * known.get(GNSS_POS.delay, 0.0)
@@ -71,13 +70,8 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     truth = read_truth(recording, positions, remedies)
     airborne = _read_airborne(recording, remedies["landed"])
     in_flight = parts.ends_in_flight(airborne, recording.duration_s)
-    end = (parts.cut_off("frame", recording.duration_s, in_flight),) if frames.in_frame else ()
     return Flight(
-        log=structs.replace(
-            _describe(recording, parameters, autopilot),
-            damage=(*end, *recording.damage),
-            ends_in_flight=in_flight,
-        ),
+        log=_describe(recording, parameters, autopilot, in_flight),
         imu=imu,
         attitude=attitude,
         positions=positions,
@@ -132,13 +126,10 @@ def _read_attitude(recording: Recording, remedy: str) -> pd.DataFrame | Unavaila
 
 
 def _read_ekf2(
-    recording: Recording,
-    parameters: Mapping[str, float],
-    autopilot: str,
-    remedies: Mapping[str, str],
-    replay: Unavailable,
+    recording: Recording, parameters: Mapping[str, float], autopilot: str
 ) -> Ekf2 | Unavailable:
     """EKF2's output as the autopilot sent it, or why there is none."""
+    remedies, replay = messages.remedies_of(autopilot)
     counts = {layout.topic: len(recording.rows(layout.topic)) for layout in messages.STATES}
     # the one with variances as long as it is not much sparser than the one without
     dense = (one for one in messages.STATES if 2 * counts[one.topic] >= max(counts.values()))
@@ -159,19 +150,15 @@ def _read_ekf2(
     if "reset_counter" in samples and (
         count := np.count_nonzero(samples["reset_counter"].diff()[1:])
     ):
-        notes.append(
-            f"EKF2 reset its state {count} times in the recording; ODOMETRY does not say by "
-            "how much, so nothing was undone"
-        )
+        reset = f"EKF2 reset its state {count} times in the recording"
+        notes.append(f"{reset}; ODOMETRY does not say by how much, so nothing was undone")
     found = samples.reindex(columns=VARIANCE_COLUMNS)
     found = found[(found > 0.0).all(axis=1)]
     if found.empty:
         message, found = messages.ACCURACY.topic, _variance_by_accuracy(recording)
         if len(found):
-            notes.append(
-                "EKF2's position variances are from ESTIMATOR_STATUS: its horizontal accuracy "
-                "squared, half to each axis; velocity variances are not sent"
-            )
+            by = "from ESTIMATOR_STATUS: its horizontal accuracy squared, half to each axis"
+            notes.append(f"EKF2's position variances are {by}; velocity variances are not sent")
     lacking = "no ODOMETRY with covariance and no ESTIMATOR_STATUS of the autopilot"
     variance: pd.DataFrame | Unavailable = found
     if found.empty:
@@ -255,9 +242,10 @@ def _read_parameters(recording: Recording, autopilot: str) -> MappingProxyType[s
 
 
 def _describe(
-    recording: Recording, parameters: MappingProxyType[str, float], autopilot: str
+    recording: Recording, parameters: Mapping[str, float], autopilot: str, in_flight: bool
 ) -> LogInfo:
     frames = recording.frames
+    end = (parts.cut_off("frame", recording.duration_s, in_flight),) if frames.in_frame else ()
     firmware, firmware_hash = f"{autopilot} (version not in the recording)", "unknown"
     vehicle = ""
     rows = recording.rows("AUTOPILOT_VERSION")
@@ -272,10 +260,8 @@ def _describe(
         vehicle = uid if uid.strip("0") else ""
     beats = frames.table("HEARTBEAT", recording.rows("HEARTBEAT"))
     kind = messages.VEHICLE_TYPES.get(int(beats["type"][0]), "vehicle") if len(beats) else "vehicle"
-    dropped = [
-        dropped_note(count, message, "zero, go back, or lie outside the recording")
-        for message, count in sorted(recording.dropped.items())
-    ]
+    why = "zero, go back, or lie outside the recording"
+    dropped = [dropped_note(n, message, why) for message, n in sorted(recording.dropped.items())]
     return LogInfo(
         name=frames.name,
         sha256=frames.sha256,
@@ -295,6 +281,8 @@ def _describe(
         start_unix_s=_start_unix_s(recording),
         senders=senders.describe_senders(recording),
         vehicle=vehicle,
+        damage=(*end, *recording.damage),
+        ends_in_flight=in_flight,
         bytes_read=len(frames.content) - frames.bad_bytes,
     )
 

@@ -165,10 +165,8 @@ def map_clock(
     boot_at_receipt = boot_of_receipt.at(received_s)
     if not tells_time(stamp_s):
         distinct = len(np.unique(stamp_s))
-        note = (
-            f"its {len(stamp_s)} time stamps take only {distinct} values, so the {receipt} stands "
-            "in for them"
-        )
+        few = f"its {len(stamp_s)} time stamps take only {distinct} values"
+        note = f"{few}, so the {receipt} stands in for them"
         # what the receipt adds to evenly sent samples; gaps are no jitter
         intervals = np.diff(received_s)
         regular = intervals[intervals < MAX_INTERVAL_S]

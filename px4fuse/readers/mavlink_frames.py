@@ -43,9 +43,7 @@ PIECE = 1 << 12
 MIN_GOOD_SHARE = 0.01
 # A stamp further than this from the median one is damaged (pymavlink's own limit)
 MAX_STAMP_DISTANCE_US = 3 * 24 * 3600 * 1_000_000
-MESSAGE_IDS: Mapping[str, int] = {
-    message.msgname: number for number, message in dialect.mavlink_map.items()
-}
+MESSAGE_IDS: Mapping[str, int] = {one.msgname: at for at, one in dialect.mavlink_map.items()}
 # Last byte of the checksum's input by message id; -1 where the dialect does not know the message
 _SEEDS = np.full(max(1 << 16, *(number + 1 for number in dialect.mavlink_map)), -1, dtype=np.int16)
 _SEEDS[[*dialect.mavlink_map]] = [message.crc_extra for message in dialect.mavlink_map.values()]

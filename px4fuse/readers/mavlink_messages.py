@@ -14,19 +14,8 @@ from scipy import constants
 
 from px4fuse.flight import RECORD_NOT_LOGGED, Columns, Unavailable
 from px4fuse.origin import MOTION_CAPTURE, RECEIVED, Origin
-from px4fuse.readers.layouts import (
-    GLOBAL,
-    GLOBAL_COLUMNS,
-    GLOBAL_SCALE,
-    POSE_DIAGONAL,
-    POSITION_AND_VELOCITY,
-    ROTATION_DIAGONAL,
-    VELOCITY,
-    XYZ,
-    Layout,
-    elements,
-    fields,
-)
+from px4fuse.readers import layouts
+from px4fuse.readers.layouts import Layout, elements, fields
 
 AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: a ground station, a camera, a companion computer
@@ -115,31 +104,32 @@ OWN_MESSAGES = (
     "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "SYS_STATUS", "ESTIMATOR_STATUS",
 )  # fmt: skip
 _ANGLES = {"roll": "roll", "pitch": "pitch", "yaw": "yaw"}
+_Q = elements(Columns.QUATERNION, "q")
 # Equally dense ones are taken in this order
 ATTITUDE = (
     Layout("ATTITUDE_QUATERNION", {name: f"q{i}" for i, name in enumerate(Columns.QUATERNION, 1)}),
     Layout("ATTITUDE", _ANGLES),
-    Layout("ODOMETRY", elements(Columns.QUATERNION, "q")),
+    Layout("ODOMETRY", _Q),
 )
 
 
 def _pose(covariance: str) -> dict[str, str]:
     """Variances of position and orientation, which stand on the diagonal of a covariance."""
-    return elements(Columns.POSITION_VARIANCE, covariance, POSE_DIAGONAL) | elements(
-        Columns.ROTATION_VARIANCE, covariance, ROTATION_DIAGONAL
+    return elements(Columns.POSITION_VARIANCE, covariance, layouts.POSE_DIAGONAL) | elements(
+        Columns.ROTATION_VARIANCE, covariance, layouts.ROTATION_DIAGONAL
     )
 
 
 ODOMETRY = Layout(
     "ODOMETRY",
-    POSITION_AND_VELOCITY
-    | elements(Columns.QUATERNION, "q")
+    layouts.POSITION_AND_VELOCITY
+    | _Q
     | _pose("pose_covariance")
-    | elements(Columns.VELOCITY_VARIANCE, "velocity_covariance", POSE_DIAGONAL)
+    | elements(Columns.VELOCITY_VARIANCE, "velocity_covariance", layouts.POSE_DIAGONAL)
     | {name: name for name in ("frame_id", "child_frame_id", "reset_counter")},
 )
 # EKF2's state, that with variances first
-STATES = (ODOMETRY, Layout("LOCAL_POSITION_NED", POSITION_AND_VELOCITY))
+STATES = (ODOMETRY, Layout("LOCAL_POSITION_NED", layouts.POSITION_AND_VELOCITY))
 ACCURACY = Layout(
     "ESTIMATOR_STATUS", {"horizontal_m": "pos_horiz_accuracy", "vertical_m": "pos_vert_accuracy"}
 )
@@ -148,10 +138,10 @@ ACCURACY = Layout(
 TRUTH = (
     Layout(
         "HIL_STATE_QUATERNION",
-        GLOBAL | VELOCITY | elements(Columns.QUATERNION, "attitude_quaternion"),
-        scale=GLOBAL_SCALE | dict.fromkeys(Columns.VELOCITY, 1e-2),
+        layouts.GLOBAL | layouts.VELOCITY | elements(Columns.QUATERNION, "attitude_quaternion"),
+        scale=layouts.GLOBAL_SCALE | dict.fromkeys(Columns.VELOCITY, 1e-2),
     ),
-    Layout("SIMSTATE", fields(GLOBAL_COLUMNS[:2], "lat lng"), scale=GLOBAL_SCALE),
+    Layout("SIMSTATE", fields(layouts.GLOBAL_COLUMNS[:2], "lat lng"), scale=layouts.GLOBAL_SCALE),
 )
 
 
@@ -185,7 +175,7 @@ _MOCAP = "motion capture, which EKF2 never fuses"
 POSITION_INPUTS = (
     PositionInput(
         "VISION_POSITION_ESTIMATE",
-        Layout("VISION_POSITION_ESTIMATE", XYZ | _ANGLES | _pose("covariance")),
+        Layout("VISION_POSITION_ESTIMATE", layouts.XYZ | _ANGLES | _pose("covariance")),
         "usec", RECEIVED, f"external vision position {_SENT}",
     ),
     PositionInput(
@@ -204,7 +194,7 @@ POSITION_INPUTS = (
     PositionInput("ODOMETRY_MOCAP", ODOMETRY, "time_usec", MOTION_CAPTURE, _MOCAP, 6),
     PositionInput(
         "ATT_POS_MOCAP",
-        Layout("ATT_POS_MOCAP", XYZ | elements(Columns.QUATERNION, "q") | _pose("covariance")),
+        Layout("ATT_POS_MOCAP", layouts.XYZ | _Q | _pose("covariance")),
         "time_usec", MOTION_CAPTURE, _MOCAP,
     ),
 )  # fmt: skip
@@ -215,18 +205,18 @@ POSITION_INPUTS = (
 GNSS_INPUTS = tuple(
     Layout(
         message,
-        GLOBAL | {"fix_type": "fix_type", "eph_m": "h_acc", "epv_m": "v_acc"},
-        scale=GLOBAL_SCALE | {"eph_m": 1e-3, "epv_m": 1e-3},
+        layouts.GLOBAL | {"fix_type": "fix_type", "eph_m": "h_acc", "epv_m": "v_acc"},
+        scale=layouts.GLOBAL_SCALE | {"eph_m": 1e-3, "epv_m": 1e-3},
     )
     for message in ("GPS_RAW_INT", "GPS2_RAW")
 )
 PRESSURE = Layout("SCALED_PRESSURE", {"pressure_hpa": "press_abs"})
 ORIGIN = Layout(
     "GPS_GLOBAL_ORIGIN",
-    fields(GLOBAL_COLUMNS, "latitude longitude altitude"),
-    scale=GLOBAL_SCALE,
+    fields(layouts.GLOBAL_COLUMNS, "latitude longitude altitude"),
+    scale=layouts.GLOBAL_SCALE,
 )
-GLOBAL_STATE = Layout("GLOBAL_POSITION_INT", GLOBAL, scale=GLOBAL_SCALE)
+GLOBAL_STATE = Layout("GLOBAL_POSITION_INT", layouts.GLOBAL, scale=layouts.GLOBAL_SCALE)
 
 
 class FrameOfReference(NamedTuple):

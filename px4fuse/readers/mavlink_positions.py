@@ -19,7 +19,7 @@ from px4fuse.readers.mavlink_frames import Address
 from px4fuse.readers.mavlink_recording import BOOT_CLOCK, RECEIPT_CLOCK, Recording
 from px4fuse.readers.mavlink_senders import senders_of
 from px4fuse.readers.parts import attitude_of, orientation_of
-from px4fuse.readers.px4_positions import projected, unproject
+from px4fuse.readers.px4_positions import Place, projected, unproject
 
 # A boot clock's stamp is no further from its receipt
 OWN_CLOCK_S = 5.0
@@ -89,10 +89,8 @@ def _read_track(
     if source.drops_covariance:
         samples[Columns.POSITION_VARIANCE + Columns.ROTATION_VARIANCE] = np.nan
     orientation = orientation_of(samples)
-    statement = clock.statement
-    mapped = (
-        "" if statement.method == "boot clock" else f", mapped to boot time by {statement.method}"
-    )
+    told = clock.statement
+    mapped = "" if told.method == "boot clock" else f", mapped to boot time by {told.method}"
     return px4_positions.make_track(
         name,
         samples,
@@ -100,10 +98,10 @@ def _read_track(
         remedy=remedy,
         description=source.description,
         frame=frame,
-        clock=statement.clock + mapped,
+        clock=told.clock + mapped,
         topics=(source.message,),
         log=recording.frames.name,
-        clock_map=statement,
+        clock_map=told,
         orientation=orientation,
     )
 
@@ -149,15 +147,14 @@ def pressure_altitude(pressure_hpa: pd.Series[float]) -> pd.Series[float]:
     return 288.15 / 0.0065 * (1.0 - (pressure_hpa / 1013.25) ** exponent)
 
 
-def local_origin(recording: Recording) -> tuple[float, float, float] | None:
+def local_origin(recording: Recording) -> Place | None:
     """The autopilot's origin on the globe (degrees, degrees, m), None where it does not tell.
 
     As it is sent, or else by its global and its local position.
     """
     sent = recording.read(messages.ORIGIN).dropna()
     if len(sent):
-        latitude, longitude, altitude = sent[GLOBAL_COLUMNS].iloc[-1]
-        return float(latitude), float(longitude), float(altitude)
+        return tuple(sent[GLOBAL_COLUMNS].iloc[-1].tolist())
     state = recording.read(messages.STATES[-1])[Columns.POSITION]
     both = pd.merge_asof(
         recording.read(messages.GLOBAL_STATE), state, left_index=True, right_index=True,
@@ -167,12 +164,9 @@ def local_origin(recording: Recording) -> tuple[float, float, float] | None:
     if both.empty:
         return None
     geo, local = both[GLOBAL_COLUMNS].to_numpy(), both[Columns.POSITION].to_numpy()
-    places = [
-        np.concatenate([np.ravel(unproject(-north, -east, (at[0], at[1]))), [at[2] + down]])
-        for at, (north, east, down) in zip(geo, local, strict=True)
-    ]
-    latitude, longitude, altitude = np.median(places, axis=0)
-    return float(latitude), float(longitude), float(altitude)
+    pairs = zip(geo, local, strict=True)
+    places = [(*unproject(-n, -e, tuple(at[:2])), at[2] + d) for at, (n, e, d) in pairs]
+    return tuple(np.median(places, axis=0).tolist())
 
 
 def read_truth(
@@ -201,11 +195,11 @@ def read_truth(
         state = pd.concat([projected(samples, origin), samples[Columns.VELOCITY]], axis=1)
         return Truth(layout.topic, state[Columns.STATE], attitude_of(samples))
     captured = px4_positions.motion_capture(positions, "ATT_POS_MOCAP")
-    if captured is None:
-        return Unavailable(
-            "ground truth",
-            "neither simulation truth nor motion capture is in the recording",
-            remedies["truth"],
-        )
-    recording.came_from("truth", *captured.topics, clock=captured.clock)
-    return px4_positions.captured_truth(captured)
+    for track in positions:
+        if captured and track.name == captured.name:
+            recording.came_from("truth", *track.topics, clock=track.clock)
+    return captured or Unavailable(
+        "ground truth",
+        "neither simulation truth nor motion capture is in the recording",
+        remedies["truth"],
+    )

@@ -121,12 +121,8 @@ class Recording:
             values[:, at] = field_values.astype(np.float64) * layout.scale.get(column, 1.0)
         del table
         values[~np.isfinite(values)] = np.nan
-        samples = pd.DataFrame(
-            values,
-            index=pd.Index(boot_s[keep] - self.zero_s, name="time_s"),
-            columns=list(layout.columns),
-            copy=False,
-        )
+        times = pd.Index(boot_s[keep] - self.zero_s, name="time_s")
+        samples = pd.DataFrame(values, times, list(layout.columns), copy=False)
         if "roll" in samples:
             turns = Rotation.from_euler("ZYX", samples[["yaw", "pitch", "roll"]].to_numpy())
             samples[Columns.QUATERNION] = turns.as_quat(scalar_first=True)

@@ -59,9 +59,8 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
     counts = dict(_counts(frames))
     vehicles = _vehicles(frames)
     flying = [s for s in counts if s in vehicles and _flies(*vehicles[s])]
-    own = dict(
-        _counts(frames, np.concatenate([frames.rows(name) for name in messages.OWN_MESSAGES]))
-    )
+    rows = np.concatenate([frames.rows(name) for name in messages.OWN_MESSAGES])
+    own = dict(_counts(frames, rows))
     # a companion may call itself an autopilot; one without a heartbeat is known by what it sends,
     # or else by its component
     candidates = [s for s in flying if s in own] or [s for s in own if s not in vehicles] or flying
@@ -144,19 +143,13 @@ def clock_maps(recording: Recording, mapped: dict[Address, Mapped]) -> tuple[Clo
     clocks = [sender.statement for sender in mapped.values()]
     received_us, line = recording.frames.received_us, recording.boot_of_receipt
     if received_us is not None and line.pairs:
-        clocks.append(
-            ClockMap(
-                "time of receipt (the recording computer's UNIX time)",
-                "receive time",
-                line.pairs,
-                line.y0 - line.x0 - float(received_us[0]) * 1e-6,
-                (line.slope - 1.0) * 1e6,
-                line.jitter,
-                "by the least delayed messages; used only to order messages and to map clocks"
-                if abs(line.slope - 1.0) < OTHER_SPEED
-                else "the recording did not run at the flight's own speed (a replay?)",
-            )
-        )
+        name = "time of receipt (the recording computer's UNIX time)"
+        note = "the recording did not run at the flight's own speed (a replay?)"
+        if abs(line.slope - 1.0) < OTHER_SPEED:
+            note = "by the least delayed messages; used only to order messages and to map clocks"
+        offset_s = line.y0 - line.x0 - float(received_us[0]) * 1e-6
+        numbers = line.pairs, offset_s, (line.slope - 1.0) * 1e6, line.jitter
+        clocks.append(ClockMap(name, "receive time", *numbers, note))
     return tuple(clocks)
 
 

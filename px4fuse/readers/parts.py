@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray
-from px4fuse.flight import Columns, Ekf2, FlightMode, Truth, Unavailable
+from px4fuse.flight import Columns, Ekf2, FlightMode, Unavailable
 
 # No position, velocity, acceleration or angle of a flight in SI units comes near it
 DAMAGED = 1e9
@@ -15,16 +15,11 @@ BEYOND_IMU = 1e4
 MIN_NORM = 0.5  # a zero quaternion is no attitude
 
 
-def missing_parts(
-    imu: pd.DataFrame | Unavailable,
-    attitude: pd.DataFrame | Unavailable,
-    ekf2: Ekf2 | Unavailable,
-    truth: Truth | Unavailable,
-) -> tuple[Unavailable, ...]:
-    """Parts of a flight that its log lacks, those of EKF2 included."""
-    parts: list[object] = [imu, attitude, ekf2, truth]
-    if isinstance(ekf2, Ekf2):
-        parts += [ekf2.variance, *ekf2.innovations.values(), ekf2.fusing]
+def missing_parts(*parts: object) -> tuple[Unavailable, ...]:
+    """Those of some parts of a flight that its log lacks, with what it lacks of EKF2."""
+    for part in parts:
+        if isinstance(part, Ekf2):
+            parts += (part.variance, *part.innovations.values(), part.fusing)
     return tuple(part for part in parts if isinstance(part, Unavailable))
 
 
@@ -48,18 +43,15 @@ def ends_in_flight(
     airborne: tuple[tuple[float, float], ...] | Unavailable, duration_s: float
 ) -> bool:
     """Whether the last stretch of flight has no end but that of the data."""
-    return not isinstance(airborne, Unavailable) and bool(
-        airborne and airborne[-1][1] >= duration_s
-    )
+    flown = () if isinstance(airborne, Unavailable) else airborne[-1:]
+    return any(end >= duration_s for _, end in flown)
 
 
 def cut_off(part: str, duration_s: float, in_flight: bool) -> str:
     """What is said of a file that ends in the middle of a part of it."""
     flying = ", in flight" if in_flight else ""
-    return (
-        f"the file ends in mid-{part} after {duration_s:.1f} s{flying}: what came after is not "
-        "in it"
-    )
+    end = f"the file ends in mid-{part} after {duration_s:.1f} s{flying}"
+    return f"{end}: what came after is not in it"
 
 
 def stretches_of_modes(names: pd.Series, end_s: float) -> tuple[FlightMode, ...]:

@@ -20,15 +20,8 @@ import pandas as pd
 
 from px4fuse.arrays import Array
 from px4fuse.errors import LogError, SettingsError
-from px4fuse.readers.position_names import (
-    LENGTH_UNITS,
-    TIME_KINDS,
-    TIME_UNITS,
-    Meaning,
-    find_position,
-    find_sigma,
-    meaning,
-)
+from px4fuse.readers import position_names
+from px4fuse.readers.position_names import LENGTH_UNITS, TIME_UNITS, Meaning, meaning
 from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S, quote, text_of
 from px4fuse.readers.ulog_topics import increasing
 from px4fuse.reading import read_whole, shown
@@ -204,10 +197,8 @@ def read_position_csv(
     numbers = numbers.iloc[keep].set_index(pd.Index(seconds[keep], name="time_s"))
     step = float(np.median(np.diff(numbers.index)))
     if not MIN_INTERVAL_S <= step <= MAX_INTERVAL_S:
-        notes.append(
-            f"one sample in {step:.3g} s (median) is not a rate of a UWB: check "
-            "--position-time-unit"
-        )
+        rate = f"one sample in {step:.3g} s (median)"
+        notes.append(f"{rate} is not a rate of a UWB: check --position-time-unit")
     scales, length_words = _length_units(numbers, axes, meanings, length_unit)
     chosen = zip(SAMPLE_COLUMNS, (*position, *sigma), strict=True)
     lengths = {name: np.nan if at is None else numbers[at] * scales[at] for name, at in chosen}
@@ -318,7 +309,7 @@ def _is_header(fields: list[str], wanted: set[str]) -> bool:
         return wanted <= {name.casefold() for name in fields}
     meanings = [meaning(name) for name in fields]
     has_time = any(column.kind == "time" for column in meanings)
-    return has_time and find_position(meanings) is not None
+    return has_time and position_names.find_position(meanings) is not None
 
 
 def _resolve(table: _Table, columns: tuple[str, ...]) -> list[int]:
@@ -351,24 +342,22 @@ def _choose(
     if told:
         time, words = told[0], table.label(told[0])
         # the names may tell the frame, and with it the order of the axes
-        found = find_position(
-            [m if at in told[1:4] else Meaning() for at, m in enumerate(meanings)]
-        )
+        own = [m if at in told[1:4] else Meaning() for at, m in enumerate(meanings)]
+        found = position_names.find_position(own)
         position: _Columns = (*told[1:4], None)[:3]
         frame, position = found if found and {*found[1]} == {*position} else (None, position)
     else:
         times = [at for at, column in enumerate(meanings) if column.kind == "time"]
         empty = numbers[times].fillna(0.0).eq(0.0).mean() >= 0.5
-        time, *others = sorted(
-            times, key=lambda at: (bool(empty[at]), TIME_KINDS.index(meanings[at].key))
-        )
+        rank = position_names.TIME_KINDS.index
+        time, *others = sorted(times, key=lambda at: (bool(empty[at]), rank(meanings[at].key)))
         words = table.label(time)
         if others:
             words += f", the {meanings[time].key} (not used: {table.label(*others)})"
-        frame, position = find_position(meanings) or (None, ())
+        frame, position = position_names.find_position(meanings) or (None, ())
     if position[2] is not None and numbers[position[2]].isna().all():
         position = (*position[:2], None)
-    sigma = (told[4],) * 3 if len(told) > 4 else find_sigma(meanings, frame)
+    sigma = (told[4],) * 3 if len(told) > 4 else position_names.find_sigma(meanings, frame)
     return time, position, sigma, frame, words
 
 

@@ -118,7 +118,5 @@ def find_sigma(meanings: Sequence[Meaning], frame: str | None) -> tuple[int | No
     # of several with one meaning the first is kept, as of positions
     sigmas = {m.key: at for at, m in [*enumerate(meanings)][::-1] if m.kind == "sigma"}
     axes = next(axes for name, axes in _FRAMES if name == frame)
-    return tuple(
-        sigmas.get(axis, sigmas.get(letter, sigmas.get("")))
-        for axis, letter in zip(axes, "xyz", strict=True)
-    )
+    both = zip(axes, "xyz", strict=True)
+    return tuple(sigmas.get(axis, sigmas.get(letter, sigmas.get(""))) for axis, letter in both)

@@ -16,7 +16,6 @@ from px4fuse.ekf2_parameters import AIDS
 from px4fuse.flight import AidLog, at_times
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.layouts import Layout
-from px4fuse.readers.px4_topics import STATUS_FLAGS, AidSource
 from px4fuse.readers.ulog_topics import Topics
 
 # innovations and variances are logged by separate rate limiters, up to one interval of the default
@@ -49,11 +48,11 @@ def intentions(topics: Topics) -> dict[str, pd.Series[float]]:
 
     By its flags, or else by the bits of the older topic.
     """
-    meant, tables = {}, topics.of(STATUS_FLAGS)
+    meant, tables = {}, topics.of(px4.STATUS_FLAGS)
     named = {flag for source in px4.SOURCES.values() for group in source.flags for flag in group}
     known = sorted(named.intersection(*tables)) if tables else []
     if known:
-        flags = topics.of_primary(Layout(STATUS_FLAGS, dict(zip(known, known, strict=True))),
+        flags = topics.of_primary(Layout(px4.STATUS_FLAGS, dict(zip(known, known, strict=True))),
                                   step=True)  # fmt: skip
         for name, source in px4.SOURCES.items():
             group = next((group for group in source.flags if {*group} <= {*known}), None)
@@ -69,7 +68,7 @@ def intentions(topics: Topics) -> dict[str, pd.Series[float]]:
 
 
 def _own_topic(
-    topics: Topics, name: str, source: AidSource, meant: pd.Series[float] | None
+    topics: Topics, name: str, source: px4.AidSource, meant: pd.Series[float] | None
 ) -> AidLog | None:
     """An aid by its ``estimator_aid_src`` topic."""
     count = len(source.axes)
@@ -83,9 +82,8 @@ def _own_topic(
             ("noise", "observation_variance"), ("ratio", "test_ratio"),
         )
     }  # fmt: skip
-    layout = Layout(
-        f"estimator_aid_src_{name}", columns | {"fused": "fused", "rejected": "innovation_rejected"}
-    )
+    columns |= {"fused": "fused", "rejected": "innovation_rejected"}
+    layout = Layout(f"estimator_aid_src_{name}", columns)
     if topics.find(layout) is None:  # most aids of most logs: an empty table takes its time
         return None
     frame = topics.of_primary(layout).dropna()
@@ -95,10 +93,10 @@ def _own_topic(
 
 
 def _snapshots(
-    topics: Topics, name: str, source: AidSource, meant: pd.Series[float] | None
+    topics: Topics, name: str, source: px4.AidSource, meant: pd.Series[float] | None
 ) -> AidLog | None:
     """An aid by the topics that hold the last value of every aid."""
-    gauss = name == "mag_heading" and any("cs_mag" in one for one in topics.of(STATUS_FLAGS))
+    gauss = name == "mag_heading" and any("cs_mag" in one for one in topics.of(px4.STATUS_FLAGS))
     layouts = [] if gauss or not source.fields else [
         tuple(
             Layout(topic, _columns(what, source, source.fields))
@@ -134,13 +132,13 @@ def _fresh(frame: pd.DataFrame) -> pd.DataFrame:
     return known[first.ne(first.shift()) & (first != 0.0)]
 
 
-def _columns(name: str, source: AidSource, fields: Iterable[str]) -> dict[str, str]:
+def _columns(name: str, source: px4.AidSource, fields: Iterable[str]) -> dict[str, str]:
     return {f"{name}_{axis}": field for axis, field in zip(source.axes, fields, strict=True)}
 
 
 def _log(
     topics: tuple[str, ...],
-    source: AidSource,
+    source: px4.AidSource,
     frame: pd.DataFrame,
     meant: pd.Series[float] | None,
     left_out: int = 0,

@@ -13,28 +13,14 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
+from px4fuse import flight
 from px4fuse.arrays import Array, IntArray
 from px4fuse.ekf2_parameters import AIDS, EV_POS, FLOW, settings_in_force
-from px4fuse.flight import (
-    BAD_ACCELERATION,
-    BIAS_NOT_LOGGED,
-    EKF2_STEP_S,
-    FLOW_SHARE,
-    GROUND_EFFECT,
-    HORIZON_NOT_LOGGED,
-    RECORD_NOT_LOGGED,
-    Columns,
-    Ekf2,
-    FusionRecord,
-    Reset,
-    Unavailable,
-    at_times,
-)
+from px4fuse.flight import Columns, Ekf2, FusionRecord, Reset, Unavailable, at_times
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.layouts import Layout, elements
 from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S, intentions, read_aids
 from px4fuse.readers.px4_innovations import innovations_of
-from px4fuse.readers.px4_topics import STATUS, STATUS_FLAGS
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 
 VISION = "vehicle_visual_odometry"
@@ -158,11 +144,8 @@ def _read_delayed(topics: Topics, step_s: float) -> pd.DataFrame | Unavailable:
         state[:, 10:16] /= step_s
         variance = np.hstack([_attitude_variance(state[:, :4], variance[:, :4]), variance[:, 4:]])
         variance[:, 9:15] /= step_s**2
-    return pd.DataFrame(
-        np.hstack([state, variance]),
-        index=raw.index,
-        columns=Columns.DELAYED_STATE + Columns.DELAYED_VARIANCE,
-    )
+    columns = Columns.DELAYED_STATE + Columns.DELAYED_VARIANCE
+    return pd.DataFrame(np.hstack([state, variance]), index=raw.index, columns=columns)
 
 
 def _variance(delayed: pd.DataFrame | Unavailable) -> pd.DataFrame | Unavailable:
@@ -176,7 +159,7 @@ def _variance(delayed: pd.DataFrame | Unavailable) -> pd.DataFrame | Unavailable
 
 def target_step_s(topics: Topics) -> float:
     """EKF2_PREDICT_US, in s."""
-    return topics.log.parameters.get("EKF2_PREDICT_US", EKF2_STEP_S * 1e6) * 1e-6
+    return topics.log.parameters.get("EKF2_PREDICT_US", flight.EKF2_STEP_S * 1e6) * 1e-6
 
 
 def _step_s(topics: Topics) -> float:
@@ -228,7 +211,7 @@ def _accelerometer_bias(
     if len(own := topics.of_primary(px4.SENSOR_BIAS).dropna()):
         return own
     if isinstance(delayed, Unavailable) or delayed.empty:
-        return BIAS_NOT_LOGGED
+        return flight.BIAS_NOT_LOGGED
     return delayed[Columns.ACCELEROMETER_BIAS].set_axis(Columns.SPECIFIC_FORCE, axis=1)
 
 
@@ -241,7 +224,7 @@ def _horizon_s(topics: Topics, step_s: float) -> float | Unavailable:
     age = _age_s(topics, _state_vector(topics)[0])
     if len(age) and (lag := float(age.median())) > step_s:
         return lag
-    return HORIZON_NOT_LOGGED
+    return flight.HORIZON_NOT_LOGGED
 
 
 def _age_s(topics: Topics, topic: str) -> pd.Series:
@@ -261,11 +244,11 @@ def _fusing(topics: Topics, meant: Mapping[str, pd.Series[float]]) -> pd.DataFra
     if not {*vision.values()} <= meant.keys():
         return Unavailable(
             "EKF2 fusion flags",
-            f"neither {STATUS_FLAGS} nor {STATUS} is in the log",
+            f"neither {px4.STATUS_FLAGS} nor {px4.STATUS} is in the log",
             px4.DEFAULT_PROFILE,
         )
     frame = pd.DataFrame({group: meant[aid] for group, aid in vision.items()}).dropna()
-    topic = STATUS_FLAGS if topics.instances(STATUS_FLAGS) else STATUS
+    topic = px4.STATUS_FLAGS if topics.instances(px4.STATUS_FLAGS) else px4.STATUS
     if frame.empty:
         return Unavailable("EKF2 fusion flags", f"{topic} holds no usable sample", "Record again.")
     topics.came_from("ekf2_fusing", topic)
@@ -297,11 +280,11 @@ def _read_record(
     """What the log tells of the inside of EKF2's filter; ``local`` is the published position."""
     topic, attitude = _state_vector(topics)
     if topic != px4.ESTIMATOR_STATES[0] or isinstance(delayed, Unavailable):
-        return RECORD_NOT_LOGGED
+        return flight.RECORD_NOT_LOGGED
     norm = np.linalg.norm(delayed[Columns.QUATERNION], axis=1)
     inside = delayed[np.abs(norm - 1.0) < 0.01].copy()
     if inside.empty:
-        return RECORD_NOT_LOGGED
+        return flight.RECORD_NOT_LOGGED
     horizontal, altitude_m = Columns.POSITION[:2], 0.0
     if not inside[horizontal].to_numpy().any():  # from v1.16 kept as latitude and longitude
         inside[horizontal] = np.nan
@@ -323,7 +306,7 @@ def _read_record(
         field_gauss=_read_field(topics, step_s),
         flow=_read_flow(topics, meant),
         altitude_m=altitude_m,
-        states={one: meant[one] for one in (GROUND_EFFECT, BAD_ACCELERATION) if one in meant},
+        states={one: meant[one] for one in px4.DISTURBANCES if one in meant},
         height_bias={
             name: topics.of_primary(layout).dropna()
             for name, layout in px4.HEIGHT_BIAS.items()
@@ -360,7 +343,7 @@ def _read_flow(topics: Topics, meant: Mapping[str, pd.Series[float]]) -> pd.Data
     if FLOW.name in meant:
         row = row[at_times(meant[FLOW.name], times[row]) > 0.0]
     samples = np.rint((times[row] - times[row - 1]) / interval_s)
-    kept = ((1.0 - FLOW_SHARE) ** samples)[:, None]
+    kept = ((1.0 - flight.FLOW_SHARE) ** samples)[:, None]
     low_passed = speed[["forward_m_s", "right_m_s"]].to_numpy()
     forward, right = ((low_passed[row] - kept * low_passed[row - 1]) / (1.0 - kept)).T
     now = speed.iloc[row]

@@ -71,10 +71,8 @@ def with_gnss(ekf2: Ekf2, source: Fused = GNSS) -> Ekf2:
     log = ekf2.aids.get("gnss_pos")
     logged = {} if log is None else log.parameters
     gate = logged.get(GNSS_POS.gate, GNSS_POS.default_gate)
-    innovations, topics = innovations_of(ekf2.aids, fusing, gate, source)
-    return replace(
-        ekf2, innovations=innovations, innovation_topics=topics, fusing=fusing, gate=gate
-    )
+    found, topics = innovations_of(ekf2.aids, fusing, gate, source)
+    return replace(ekf2, innovations=found, innovation_topics=topics, fusing=fusing, gate=gate)
 
 
 def innovations_of(
@@ -123,9 +121,7 @@ def innovations_of(
 def along(log: AidLog, axis: AxisName, gate: float) -> pd.DataFrame:
     """One axis of what was fused or rejected; a rejection is of all axes of the aid."""
     samples = log.samples
-    nis = {
-        name: samples[f"innovation_{name}"] ** 2 / samples[f"variance_{name}"] for name in log.axes
-    }
+    nis = {one: samples[f"innovation_{one}"] ** 2 / samples[f"variance_{one}"] for one in log.axes}
     beyond = pd.DataFrame(nis).max(axis=1) > gate**2
     frame = pd.DataFrame(
         {

@@ -11,16 +11,7 @@ from msgspec import structs
 
 from px4fuse.arrays import Array
 from px4fuse.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, settings_in_force
-from px4fuse.flight import (
-    AXIS_NAMES,
-    Columns,
-    Ekf2,
-    PositionTrack,
-    Truth,
-    Unavailable,
-    best_first,
-    sample_rate,
-)
+from px4fuse.flight import Columns, Ekf2, PositionTrack, Truth, Unavailable, best_first, sample_rate
 from px4fuse.origin import Origin, with_orientation
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.layouts import GLOBAL_COLUMNS
@@ -42,6 +33,8 @@ HEIGHT_TOLERANCE_S = 0.05
 # Logged no faster than this, a receiver's positions were thinned: they give 5 to 20 a second
 THINNED_HZ = 4.0
 AUTOPILOT_CLOCK = "autopilot boot clock (as PX4 mapped the sender's stamp)"
+# Latitude and longitude in degrees, and perhaps altitude in m
+Place = tuple[float, ...]
 
 
 def read_positions(
@@ -192,10 +185,8 @@ def _with_height(
         direction="nearest", tolerance=HEIGHT_TOLERANCE_S,  # type: ignore[arg-type]
     )  # fmt: skip
     lacking = int(joined.pop("_found").isna().sum())
-    note = (
-        f"{lacking} of {len(joined)} positions of external vision have no height within "
-        f"{1e3 * HEIGHT_TOLERANCE_S:.0f} ms"
-    )
+    within = f"within {1e3 * HEIGHT_TOLERANCE_S:.0f} ms"
+    note = f"{lacking} of {len(joined)} positions of external vision have no height {within}"
     return joined, (note,) if lacking else ()
 
 
@@ -213,8 +204,7 @@ def _rebuild(topics: Topics, ekf2: Ekf2 | Unavailable, turns: bool) -> PositionT
     if isinstance(ekf2, Unavailable):
         return unavailable(px4.RECONSTRUCTION, "no EKF2 output")
     tracks = {}
-    for axis, column in zip(AXIS_NAMES, Columns.POSITION, strict=True):
-        innovations = ekf2.innovations[axis]
+    for column, innovations in zip(Columns.POSITION, ekf2.innovations.values(), strict=True):
         if isinstance(innovations, pd.DataFrame):
             tracks[column] = innovations["innovation_m"] + np.interp(
                 innovations.index, ekf2.state.index, ekf2.state[column], left=np.nan, right=np.nan
@@ -233,9 +223,7 @@ def _rebuild(topics: Topics, ekf2: Ekf2 | Unavailable, turns: bool) -> PositionT
     )  # fmt: skip
 
 
-def project(
-    latitude_deg: Array, longitude_deg: Array, origin: tuple[float, float]
-) -> tuple[Array, Array]:
+def project(latitude_deg: Array, longitude_deg: Array, origin: Place) -> tuple[Array, Array]:
     """North and east (m) of an origin by the azimuthal equidistant projection that PX4 uses.
 
     Source: PX4 ``MapProjection::project``, src/lib/geo/geo.cpp (Snyder 1987, equation 25-2).
@@ -243,20 +231,16 @@ def project(
     latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
     latitude_0, longitude_0 = np.radians(origin[0]), np.radians(origin[1])
     difference = longitude - longitude_0
-    cosine = np.sin(latitude_0) * np.sin(latitude) + np.cos(latitude_0) * np.cos(latitude) * np.cos(
-        difference
-    )
-    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    sine, cosine, along = np.sin(latitude), np.cos(latitude), np.cos(difference)
+    sine_0, cosine_0 = np.sin(latitude_0), np.cos(latitude_0)
+    angle = np.arccos(np.clip(sine_0 * sine + cosine_0 * cosine * along, -1.0, 1.0))
     k = np.where(angle > 0, angle / np.where(angle > 0, np.sin(angle), 1.0), 1.0)
-    north = k * (
-        np.cos(latitude_0) * np.sin(latitude)
-        - np.sin(latitude_0) * np.cos(latitude) * np.cos(difference)
-    )
-    east = k * np.cos(latitude) * np.sin(difference)
+    north = k * (cosine_0 * sine - sine_0 * cosine * along)
+    east = k * cosine * np.sin(difference)
     return north * EARTH_RADIUS_M, east * EARTH_RADIUS_M
 
 
-def unproject(north_m: Array, east_m: Array, origin: tuple[float, float]) -> tuple[Array, Array]:
+def unproject(north_m: Array, east_m: Array, origin: Place) -> tuple[Array, Array]:
     """Latitude and longitude (degrees) of what :func:`project` gives.
 
     Source: PX4 ``MapProjection::reproject``, src/lib/geo/geo.cpp (Snyder 1987, equation 20-14).
@@ -266,14 +250,13 @@ def unproject(north_m: Array, east_m: Array, origin: tuple[float, float]) -> tup
     c = np.hypot(x, y)
     # sin(c)/c, which is 1 at the origin
     share = np.sinc(c / np.pi)
-    latitude = np.arcsin(np.cos(c) * np.sin(latitude_0) + x * share * np.cos(latitude_0))
-    longitude = longitude_0 + np.arctan2(
-        y * share, np.cos(latitude_0) * np.cos(c) - x * np.sin(latitude_0) * share
-    )
+    sine, cosine = np.sin(latitude_0), np.cos(latitude_0)
+    latitude = np.arcsin(np.cos(c) * sine + x * share * cosine)
+    longitude = longitude_0 + np.arctan2(y * share, cosine * np.cos(c) - x * sine * share)
     return np.degrees(latitude), np.degrees(longitude)
 
 
-def _local_origin(topics: Topics) -> tuple[float, float, float] | None:
+def _local_origin(topics: Topics) -> Place | None:
     """EKF2's geographic origin (degrees, degrees, m), where it had one."""
     local = topics.read(px4.LOCAL_POSITION)
     columns = ["ref_lat", "ref_lon", "ref_alt"]
@@ -283,11 +266,10 @@ def _local_origin(topics: Topics) -> tuple[float, float, float] | None:
     origin = origin[origin["ref_lat"] != 0]
     if origin.empty:
         return None
-    latitude, longitude, altitude = origin.iloc[-1]
-    return float(latitude), float(longitude), float(altitude)
+    return tuple(origin.iloc[-1].tolist())
 
 
-def projected(geo: pd.DataFrame, origin: tuple[float, float, float] | None) -> pd.DataFrame:
+def projected(geo: pd.DataFrame, origin: Place | None) -> pd.DataFrame:
     """Latitude, longitude and altitude as north, east, down (m).
 
     About an origin, or where there is none about their own first sample.
@@ -295,9 +277,8 @@ def projected(geo: pd.DataFrame, origin: tuple[float, float, float] | None) -> p
     latitude, longitude, altitude = geo[GLOBAL_COLUMNS].to_numpy().T
     origin = origin or (latitude[0], longitude[0], altitude[0])
     north, east = project(latitude, longitude, origin[:2])
-    return pd.DataFrame(
-        {"north_m": north, "east_m": east, "down_m": origin[2] - altitude}, index=geo.index
-    )
+    place = {"north_m": north, "east_m": east, "down_m": origin[2] - altitude}
+    return pd.DataFrame(place, index=geo.index)
 
 
 def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unavailable:
@@ -399,14 +380,11 @@ def read_truth(
         velocity = geo.reindex(columns=Columns.VELOCITY)
         samples = projected(geo, _local_origin(topics)).join(velocity)
         return Truth(px4.TRUTH_GLOBAL.topic, samples, attitude)
-    captured = motion_capture(positions, "vehicle_mocap_odometry")
-    if captured is None:
-        return Unavailable(
-            "ground truth",
-            "neither simulation ground truth nor motion capture is in the log",
-            "Real flights have truth only from motion capture (send ATT_POS_MOCAP).",
-        )
-    return captured_truth(captured)
+    return motion_capture(positions, "vehicle_mocap_odometry") or Unavailable(
+        "ground truth",
+        "neither simulation ground truth nor motion capture is in the log",
+        "Real flights have truth only from motion capture (send ATT_POS_MOCAP).",
+    )
 
 
 def _about_origin(local: pd.DataFrame, there: pd.DataFrame) -> pd.DataFrame:
@@ -419,13 +397,11 @@ def _about_origin(local: pd.DataFrame, there: pd.DataFrame) -> pd.DataFrame:
     return moved
 
 
-def captured_truth(track: PositionTrack) -> Truth:
-    """Motion capture as the truth."""
-    state = track.samples.reindex(columns=Columns.STATE)
-    return Truth(track.name, state, attitude_of(track.orientation))
-
-
-def motion_capture(positions: tuple[PositionTrack, ...], topic: str) -> PositionTrack | None:
-    """Motion capture by its topic, where another track feeds EKF2: then it is the truth."""
-    fed = any(track.origin.is_vision for track in positions)
-    return next((track for track in positions if fed and track.topics[0] == topic), None)
+def motion_capture(positions: tuple[PositionTrack, ...], topic: str) -> Truth | None:
+    """Motion capture by its topic as the truth, which it is where another track feeds EKF2."""
+    if any(track.origin.is_vision for track in positions):
+        for track in positions:
+            if track.topics[0] == topic:
+                state = track.samples.reindex(columns=Columns.STATE)
+                return Truth(track.name, state, attitude_of(track.orientation))
+    return None

@@ -11,18 +11,8 @@ from dataclasses import dataclass
 from px4fuse.ekf2_parameters import AID_MASK, EV_POS
 from px4fuse.flight import BAD_ACCELERATION, GROUND_EFFECT, Columns
 from px4fuse.origin import ALIGNED, GNSS, KEPT, MOTION_CAPTURE, REBUILT, RECEIVED, Origin
-from px4fuse.readers.layouts import (
-    GLOBAL,
-    GLOBAL_COLUMNS,
-    GLOBAL_SCALE,
-    POSE_DIAGONAL,
-    POSITION_AND_VELOCITY,
-    ROTATION_DIAGONAL,
-    XYZ,
-    Layout,
-    elements,
-    fields,
-)
+from px4fuse.readers import layouts
+from px4fuse.readers.layouts import Layout, elements, fields
 
 IMU = Layout(
     "sensor_combined",
@@ -39,7 +29,7 @@ ATTITUDE = Layout("vehicle_attitude", elements(Columns.QUATERNION, "q"))
 _RESETS = ("xy_reset_counter", "z_reset_counter", "vxy_reset_counter", "vz_reset_counter")
 LOCAL_POSITION = Layout(
     "vehicle_local_position",
-    POSITION_AND_VELOCITY,
+    layouts.POSITION_AND_VELOCITY,
     {name: name for name in (*_RESETS, "ref_lat", "ref_lon", "ref_alt")}
     | {"delta_down_m": "delta_z", "delta_down_m_s": "delta_vz"}
     | elements(["delta_north_m", "delta_east_m"], "delta_xy")
@@ -85,10 +75,10 @@ NAV_STATES: Mapping[int, str] = {
     **{22 + number: f"External {number}" for number in range(1, 9)},
 }  # fmt: skip
 
-TRUTH_LOCAL = Layout("vehicle_local_position_groundtruth", POSITION_AND_VELOCITY)
+TRUTH_LOCAL = Layout("vehicle_local_position_groundtruth", layouts.POSITION_AND_VELOCITY)
 TRUTH_GLOBAL = Layout(
     "vehicle_global_position_groundtruth",
-    GLOBAL,
+    layouts.GLOBAL,
     fields(Columns.VELOCITY, "vel_n vel_e vel_d"),
 )
 TRUTH_ATTITUDE = Layout("vehicle_attitude_groundtruth", elements(Columns.QUATERNION, "q"))
@@ -130,17 +120,18 @@ def _of_receiver(names: Mapping[str, str]) -> dict[str, str]:
 GPS = (
     Layout(  # main of 2026
         "vehicle_gnss",
-        _of_receiver(fields(GLOBAL_COLUMNS, "latitude longitude altitude_msl")),
+        _of_receiver(fields(layouts.GLOBAL_COLUMNS, "latitude longitude altitude_msl")),
         _of_receiver(_VEHICLE_GNSS | {"speed_accuracy_m_s": "speed_accuracy"})
         | elements(ANTENNA_COLUMNS, "antenna_offset"),
     ),
     Layout(  # v1.14
         "vehicle_gps_position",
-        fields(GLOBAL_COLUMNS, "latitude_deg longitude_deg altitude_msl_m"),
+        fields(layouts.GLOBAL_COLUMNS, "latitude_deg longitude_deg altitude_msl_m"),
         _GPS_OPTIONAL
         | fields(ANTENNA_COLUMNS, "antenna_offset_x antenna_offset_y antenna_offset_z"),
     ),
-    Layout("vehicle_gps_position", GLOBAL, _GPS_OPTIONAL, GLOBAL_SCALE),  # v1.8 to v1.13
+    # v1.8 to v1.13
+    Layout("vehicle_gps_position", layouts.GLOBAL, _GPS_OPTIONAL, layouts.GLOBAL_SCALE),
 )
 
 FUSED_FIXES = (
@@ -178,11 +169,11 @@ FRAMES: Mapping[str, Mapping[int, str]] = {
 }
 
 
-_OLD_POSE = elements(Columns.POSITION_VARIANCE, "pose_covariance", POSE_DIAGONAL)
+_OLD_POSE = elements(Columns.POSITION_VARIANCE, "pose_covariance", layouts.POSE_DIAGONAL)
 _OLD_ODOMETRY = (
     _OLD_POSE
     | elements(Columns.QUATERNION, "q")
-    | elements(Columns.ROTATION_VARIANCE, "pose_covariance", ROTATION_DIAGONAL)
+    | elements(Columns.ROTATION_VARIANCE, "pose_covariance", layouts.ROTATION_DIAGONAL)
     | {"local_frame": "local_frame"}
 )
 
@@ -197,7 +188,7 @@ def _odometry(topic: str) -> tuple[Layout, ...]:
             | elements(Columns.QUATERNION, "q")
             | elements(Columns.ROTATION_VARIANCE, "orientation_variance"),
         ),
-        Layout(topic, XYZ, _OLD_ODOMETRY),  # v1.9 to v1.13
+        Layout(topic, layouts.XYZ, _OLD_ODOMETRY),  # v1.9 to v1.13
     )
 
 
@@ -219,8 +210,8 @@ _TRACKS = (
         "estimator_visual_odometry_aligned", ALIGNED, "external vision rotated into EKF2's frame",
         "Logged by PX4 v1.10 to v1.13 when external vision is fused.",
         (
-            Layout("estimator_visual_odometry_aligned", XYZ, _OLD_ODOMETRY),  # v1.12, v1.13
-            Layout("vehicle_visual_odometry_aligned", XYZ, _OLD_POSE),  # v1.10, v1.11
+            Layout("estimator_visual_odometry_aligned", layouts.XYZ, _OLD_ODOMETRY),  # v1.12, v1.13
+            Layout("vehicle_visual_odometry_aligned", layouts.XYZ, _OLD_POSE),  # v1.10, v1.11
         ),
     ),
     TrackSource(
@@ -298,6 +289,8 @@ def _of(name: str, count: int, first: int = 0) -> tuple[str, ...]:
 
 _GPS = (("cs_gnss_pos",), ("cs_gps",))
 _GPS_VELOCITY = (("cs_gnss_vel",), ("cs_gps",))
+# No aids, but what bears on them
+DISTURBANCES = (GROUND_EFFECT, BAD_ACCELERATION)
 SOURCES: Mapping[str, AidSource] = {
     "gnss_pos": AidSource(
         _HORIZONTAL, _of("gps_hpos", 2), _of("vel_pos_innov", 2, 3), _GPS, 2
@@ -343,7 +336,6 @@ SOURCES: Mapping[str, AidSource] = {
     "fake_pos": AidSource(
         _HORIZONTAL, (), (), (("cs_fake_pos", "cs_valid_fake_pos"), ("cs_fake_pos",))
     ),
-    # no aids, but what bears on them
     GROUND_EFFECT: AidSource((), flags=(("cs_gnd_effect",),), bit=20),
     BAD_ACCELERATION: AidSource((), flags=(("fs_bad_acc_vertical",),)),
 }  # fmt: skip

@@ -47,14 +47,6 @@ def is_number(text: str) -> bool:
     return _NUMBER.fullmatch(text) is not None
 
 
-def seconds_of(ticks: Any, per_second: int) -> Array:
-    """Seconds of time stamps in their own unit; exact where they are integers of 19 digits.
-
-    In two parts, as float64 does not hold the digits of UNIX time in ns.
-    """
-    return np.asarray(ticks // per_second + ticks % per_second / per_second)
-
-
 def quote(text: str) -> str:
     """Quote a text of the file, shortened."""
     return repr(text if len(text) <= 40 else text[:37] + "...")

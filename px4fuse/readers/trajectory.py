@@ -17,15 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.errors import TrajectoryError
-from px4fuse.readers.text_table import (
-    UNIX_END_S,
-    UNIX_START_S,
-    Rows,
-    is_number,
-    quote,
-    seconds_of,
-    text_of,
-)
+from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S, Rows, is_number, quote, text_of
 from px4fuse.reading import read_whole, shown
 from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
 
@@ -93,11 +85,8 @@ def read_trajectory(path: str | Path) -> Trajectory:
     w_first, words = _order(rows, separator, comments)
     stamps, values = rows.parse(1, columns - 1, separator)
     time, time_words = _seconds(rows, stamps[:, 0].tolist())
-    rows.refuse_where(
-        ~(np.abs(values[:, :7]) < MAX_VALUE),
-        f"a value that is not finite, or beyond {MAX_VALUE:.0e}",
-        "Remove that line.",
-    )
+    what = f"a value that is not finite, or beyond {MAX_VALUE:.0e}"
+    rows.refuse_where(~(np.abs(values[:, :7]) < MAX_VALUE), what, "Remove that line.")
     position, rotation = values[:, :3], _rotation(rows, values[:, 3:7], w_first)
     keep, dropped = _increasing(rows, time)
     time, position, rotation = time[keep], position[keep], rotation[keep]
@@ -226,7 +215,8 @@ def _seconds(rows: Rows, stamps: list[str]) -> tuple[Array, str]:
         if is_known and last < UNIX_END_S and MIN_INTERVAL_S <= step / per_second <= MAX_INTERVAL_S:
             ticks = np.array([int(Decimal(stamp)) for stamp in stamps], dtype=np.int64)
             words = f"Its stamps are {unit} and were divided by {per_second:.0e}."
-            return seconds_of(ticks, per_second), words
+            # in two parts, as float64 does not hold the digits of UNIX time in ns
+            return ticks // per_second + ticks % per_second / per_second, words
     raise TrajectoryError(
         f"{rows.file}: its stamps are {step:.3g} apart (median), which is not an interval of "
         "frames in seconds or nanoseconds",
@@ -237,29 +227,22 @@ def _seconds(rows: Rows, stamps: list[str]) -> tuple[Array, str]:
 def _increasing(rows: Rows, time: Array) -> tuple[BoolArray, str]:
     """Rows whose stamps increase: of those that repeat the first, and the words on the others."""
     steps = np.diff(time, prepend=-np.inf)
-    rows.refuse_where(
-        steps < 0.0,
-        "its time is before that of the line above",
-        "Sort the lines by time, or separate the recordings.",
-    )
+    remedy = "Sort the lines by time, or separate the recordings."
+    rows.refuse_where(steps < 0.0, "its time is before that of the line above", remedy)
     repeated = int((steps == 0.0).sum())
     if repeated > MAX_REPEATED * len(steps):
-        rows.refuse_where(
-            steps == 0.0,
-            f"its time is that of the line above, as in {repeated} of {len(steps)} lines",
-            "Export the stamps with all their digits (%.9f).",
-        )
+        what = f"its time is that of the line above, as in {repeated} of {len(steps)} lines"
+        remedy = "Export the stamps with all their digits (%.9f)."
+        rows.refuse_where(steps == 0.0, what, remedy)
     note = f"Dropped poses with the stamp of the one before: {repeated}." if repeated else ""
     return steps > 0.0, note
 
 
 def _rotation(rows: Rows, quaternion: Array, w_first: bool) -> Rotation:
     norms = np.linalg.norm(quaternion, axis=1)
-    rows.refuse_where(
-        np.abs(norms - 1.0) > MAX_NORM_ERROR,
-        "columns 5 to 8 are not a quaternion: its norm is not 1",
-        f"Remove that line, or check the order of the columns. {_REMEDY}",
-    )
+    what = "columns 5 to 8 are not a quaternion: its norm is not 1"
+    remedy = f"Remove that line, or check the order of the columns. {_REMEDY}"
+    rows.refuse_where(np.abs(norms - 1.0) > MAX_NORM_ERROR, what, remedy)
     norms[np.abs(norms - 1.0) < UNIT_NORM] = 1.0
     quaternion = np.roll(quaternion, -1, axis=1) if w_first else quaternion
     return Rotation(quaternion / norms[:, None], normalize=False)
@@ -306,10 +289,8 @@ def _gaps(time: Array, kind: Kind) -> str:
     median = float(np.median(steps))
     near: BoolArray = np.abs(steps - median) <= REGULAR_WITHIN * median
     if near.mean() < REGULAR_SHARE:
-        return (
-            f"Poses come at no rate (every {median:.3g} s in the median, {steps.max():.3g} s apart "
-            "at most): key frames, or a recording that lost many."
-        )
+        apart = f"every {median:.3g} s in the median, {steps.max():.3g} s apart at most"
+        return f"Poses come at no rate ({apart}): key frames, or a recording that lost many."
     gaps = np.flatnonzero(steps > max(GAP_INTERVALS * median, GAP_S))
     if not len(gaps):
         return ""
@@ -318,7 +299,5 @@ def _gaps(time: Array, kind: Kind) -> str:
     longest = time[gaps[np.argmax(lost)]] - time[0]
     what = "Tracking lost" if kind == "slam" else "No poses"
     several = f"in {len(gaps)} gaps, the longest " if len(gaps) > 1 else ""
-    return (
-        f"{what} for {lost.sum():.1f} s {several}at {longest:.1f} s after its start, {missing} "
-        "frames missing."
-    )
+    where = f"{several}at {longest:.1f} s after its start"
+    return f"{what} for {lost.sum():.1f} s {where}, {missing} frames missing."

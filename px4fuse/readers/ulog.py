@@ -44,15 +44,13 @@ def read_ulog(name: str, content: bytes) -> Flight:
     altitude_m = topics.read(px4.BAROMETER)["altitude_m"]
     delay_s = topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3
     in_flight = parts.ends_in_flight(airborne, topics.log.duration_s)
-    dropped = tuple(
-        dropped_note(count, topic, "zero or go back")
-        for (topic, _), count in sorted(topics.dropped.items())
-    )
+    dropped = [(topic, count) for (topic, _), count in sorted(topics.dropped.items())]
+    notes = (dropped_note(count, topic, "zero or go back") for topic, count in dropped)
     return Flight(
         log=structs.replace(
             topics.log,
-            notes=topics.log.notes + dropped,
-            dropped={topic: count for (topic, _), count in sorted(topics.dropped.items())},
+            notes=(*topics.log.notes, *notes),
+            dropped=dict(dropped),
             start_unix_s=_start_unix(topics),
             damage=(*_lost(topics, imu, in_flight), *topics.log.damage),
             ends_in_flight=in_flight,
@@ -87,10 +85,9 @@ def _lost(topics: Topics, imu: pd.DataFrame | Unavailable, in_flight: bool) -> t
         silent_s = float(steps[steps > LOST_FROM_S].sum())
         where = "in one place" if framing.places == 1 else f"in {framing.places} places"
         missing = f"; {silent_s:.1f} s of the IMU are missing" if silent_s else ""
-        said.append(
-            f"{framing.lost_bytes:,} of its {log.bytes:,} bytes "
-            f"({framing.lost_bytes / log.bytes:.2%}) could not be read, {where}{missing}"
-        )
+        share = f"{framing.lost_bytes / log.bytes:.2%}"
+        lost = f"{framing.lost_bytes:,} of its {log.bytes:,} bytes ({share})"
+        said.append(f"{lost} could not be read, {where}{missing}")
     return tuple(said)
 
 

@@ -291,11 +291,8 @@ def read_topics(name: str, content: bytes) -> Topics:
     if NOTE_KEY in ulog.msg_info_dict:
         notes += (_text(ulog.msg_info_dict, NOTE_KEY, ""),)
     zero_us, end_us = _data_span(placed, name)
-    given = {
-        name: float(value)
-        for name, value in ulog.initial_parameters.items()
-        if isinstance(value, int | float) and np.isfinite(value)
-    }
+    every = ulog.initial_parameters.items()
+    given = {of: float(v) for of, v in every if isinstance(v, int | float) and np.isfinite(v)}
     log = LogInfo(
         name=name,
         sha256=hashlib.sha256(content).hexdigest(),
@@ -331,9 +328,7 @@ def _tables(ulog: ULog) -> dict[tuple[str, int], dict[str, NDArray[Any]]]:
         table = {name: np.asarray(values) for name, values in data.data.items()}
         if key in tables:
             first = tables[key]
-            table = {
-                name: np.concatenate([first[name], table[name]]) for name in first if name in table
-            }
+            table = {one: np.concatenate([first[one], table[one]]) for one in first if one in table}
             order = np.argsort(table["timestamp"], kind="stable")
             table = {name: values[order] for name, values in table.items()}
         tables[key] = table
@@ -344,10 +339,7 @@ def _data_span(
     tables: dict[tuple[str, int], dict[str, NDArray[Any]]], name: str
 ) -> tuple[int, int]:
     """First and last time (µs) of the IMU, or else of the topic with most samples."""
-    candidates = sorted(
-        tables, key=lambda key: (key[0] != IMU.topic, -len(tables[key]["timestamp"]))
-    )
-    for key in candidates:
+    for key in sorted(tables, key=lambda of: (of[0] != IMU.topic, -len(tables[of]["timestamp"]))):
         time_us = tables[key]["timestamp"].astype(np.int64)
         kept = time_us[increasing(time_us)]
         if len(kept):

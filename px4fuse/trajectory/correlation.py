@@ -43,20 +43,16 @@ def moments(a: Series, b: Series, a_known: BoolArray, b_known: BoolArray) -> Mom
         At least one sample of each.
     """
     # about their means, else roundings matter
-    a, b = (
-        np.where(known, values - np.mean(values[known]), 0.0)
-        for values, known in ((a, a_known), (b, b_known))
-    )
+    both = (a, a_known), (b, b_known)
+    a, b = (np.where(known, values - np.mean(values[known]), 0.0) for values, known in both)
     m, n = a_known.astype(float), b_known.astype(float)
     count = np.rint(_correlated(n, m).real)
     weight = 1.0 / np.maximum(count, 1.0)
     sum_a, sum_b = _correlated(n, a), _correlated(b, m)  # the first conjugate
-    return Moments(
-        count,
-        _correlated(b, a) - sum_a * sum_b * weight,
-        _correlated(n, np.abs(a) ** 2).real - np.abs(sum_a) ** 2 * weight,
-        _correlated(np.abs(b) ** 2, m).real - np.abs(sum_b) ** 2 * weight,
-    )
+    covariance = _correlated(b, a) - sum_a * sum_b * weight
+    power_a = _correlated(n, np.abs(a) ** 2).real - np.abs(sum_a) ** 2 * weight
+    power_b = _correlated(np.abs(b) ** 2, m).real - np.abs(sum_b) ** 2 * weight
+    return Moments(count, covariance, power_a, power_b)
 
 
 def autocovariance(values: Array | Complex) -> Array:

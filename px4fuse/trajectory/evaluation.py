@@ -143,12 +143,9 @@ def evaluate(
         A delta is not above zero, or not whole for frames.
     """
     offset, offset_warnings = _time_offset(estimate, reference, time_offset_s)
+    later_s = offset.offset_s or 0.0
     x, y, matched = associate(
-        estimate,
-        reference,
-        method=association,
-        max_gap_s=max_gap_s,
-        time_offset_s=offset.offset_s or 0.0,
+        estimate, reference, method=association, max_gap_s=max_gap_s, time_offset_s=later_s
     )
     reason = "As asked for."
     if alignment is None:
@@ -234,11 +231,8 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     if free:
         made = "comes from SLAM, whose world is its first key frame"
         why = f"as {free[0].name} {made if free[0].kind == 'slam' else 'does not say what made it'}"
-    because = [
-        f"{one.name} says that it is monocular"
-        for one in (estimate, reference)
-        if _MONO.search(one.name)
-    ]
+    named = [one.name for one in (estimate, reference) if _MONO.search(one.name)]
+    because = [f"{name} says that it is monocular" for name in named]
     if abs(scale - 1.0) > MAX_SCALE_ERROR:
         because.append(f"the scale is {scale:.3g}, more than {MAX_SCALE_ERROR:.0%} off")
     if not free or not because:

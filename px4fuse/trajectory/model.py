@@ -141,13 +141,8 @@ class Trajectory(Shown):
         ``turn`` is of their world: one, or one for each pose.
         """
         turned = self.rotation if self.rotation is None or turn is None else turn * self.rotation
-        return replace(
-            self,
-            position_m=position_m,
-            rotation=turned,
-            position_variance_m2=None,
-            rotation_variance_rad2=None,
-        )
+        unknown: dict[str, Any] = {"position_variance_m2": None, "rotation_variance_rad2": None}
+        return replace(self, position_m=position_m, rotation=turned, **unknown)
 
     def track(self) -> Track:
         """What results say about it."""

@@ -137,9 +137,9 @@ def _search(sparse: Trajectory, dense: Trajectory) -> TimeOffset:
     best = _refine(sparse, dense, best.offset_s, FINE_WINDOW_S) or best
     half = _half_interval(sparse, dense, best)
     if not half <= MAX_HALF_INTERVAL_S:
+        width = f" (95 %: ±{half:.2g} s)" if np.isfinite(half) else ""
         return _unknown(
-            "the speed hardly changes: a shift in time is as good as one in space"
-            + (f" (95 %: ±{half:.2g} s)" if np.isfinite(half) else "")
+            f"the speed hardly changes: a shift in time is as good as one in space{width}"
         )
     return TimeOffset(
         offset_s=best.offset_s,

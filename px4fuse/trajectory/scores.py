@@ -270,10 +270,8 @@ def rotations_of(
     """Rotations of both, or the reason why what was asked for is not possible."""
     if aligned.rotation is not None and reference.rotation is not None:
         return aligned.rotation, reference.rotation
-    side = "estimate" if aligned.rotation is None else "reference"
-    return Unavailable(
-        what, f"the {side} has no orientation", "Give a trajectory with orientation."
-    )
+    reason = f"the {'estimate' if aligned.rotation is None else 'reference'} has no orientation"
+    return Unavailable(what, reason, "Give a trajectory with orientation.")
 
 
 def rmse_interval(

@@ -9,7 +9,6 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import TrajectoryError
 from px4fuse.record import Count, NotNegative, Record, Share
 from px4fuse.trajectory.graph import lie, model
-from px4fuse.trajectory.graph.model import PoseGraph
 
 # Chance that the gate rejects a closure that is true
 GATE_ALPHA = 0.001
@@ -42,7 +41,7 @@ class GateResult(Record, frozen=True):
     accepted: bool
 
 
-def gate(graph: PoseGraph, edge_indices: Sequence[int] | IntArray) -> list[GateResult]:
+def gate(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -> list[GateResult]:
     """Test closures against odometry alone, before they have pulled at anything.
 
     ``d2 = r' (J Sigma J' + Omega^-1)^-1 r`` with r the log of the closure's inverse times the
@@ -95,13 +94,11 @@ def gate(graph: PoseGraph, edge_indices: Sequence[int] | IntArray) -> list[GateR
     residual = lie.log(lie.between(graph.measurements[tested], relative))
     jacobian = lie.right_jacobian_inverse(residual)
     covariance = jacobian @ covariance @ jacobian.transpose(0, 2, 1)
-    return [
-        _tested(graph, edge, r, sigma)
-        for edge, r, sigma in zip(tested.tolist(), residual, covariance, strict=True)
-    ]
+    each = zip(tested.tolist(), residual, covariance, strict=True)
+    return [_tested(graph, edge, r, sigma) for edge, r, sigma in each]
 
 
-def _tested(graph: PoseGraph, edge: int, residual: Array, covariance: Array) -> GateResult:
+def _tested(graph: model.PoseGraph, edge: int, residual: Array, covariance: Array) -> GateResult:
     ends = int(graph.ids[graph.first[edge]]), int(graph.ids[graph.second[edge]])
     directions, variance = model.observed_directions(graph.information[edge])
     freedom = len(variance)
@@ -119,7 +116,7 @@ def _tested(graph: PoseGraph, edge: int, residual: Array, covariance: Array) -> 
     return GateResult(*ends, d2, freedom, p, p >= GATE_ALPHA)
 
 
-def _covariances(graph: PoseGraph, used: IntArray) -> Array:
+def _covariances(graph: model.PoseGraph, used: IntArray) -> Array:
     """Covariances of odometry edges in the axes of the later pose."""
     scale, scaled = model.unit_diagonal(graph.information[used])
     whole = np.linalg.eigvalsh(scaled)[:, 0] > 1e-12
