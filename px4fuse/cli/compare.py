@@ -21,11 +21,7 @@ SEVERITIES = get_args(Severity)
 @inputs.report_options(
     "The report.  [default: reports/LOG.pdf, settings that are not at their defaults in its name]"
 )
-@inputs.option("--fail-on", "Exit with 1 on a finding at least so severe.")
-@inputs.option(
-    "--checks",
-    "Exit with 1 if a verdict on EKF2 is bad: an aid starved, biased or trusted too much.",
-)
+@inputs.options("compare")
 @inputs.open_option
 def compare(
     log: Path,

@@ -15,9 +15,7 @@ from px4fuse.writing import STANDARD_OUTPUT
 @click.argument("b", type=inputs.Named())
 @inputs.max_size_option
 @inputs.report_options("The report.  [default: reports/A_to_B.pdf]")
-@inputs.option(
-    "--fail-on", "Exit with 1 if a number is significantly worse in B, or B has a new error."
-)
+@inputs.options("diff")
 @inputs.open_option
 def diff(
     a: Path,

@@ -37,12 +37,7 @@ def delta(text: str) -> Delta:
 @click.command()
 @click.argument("estimate", type=inputs.Named())
 @click.argument("reference", type=inputs.Named())
-@inputs.option(
-    "--rpe DELTA",
-    "RPE over a distance (5m), a time (10s) or frames (1f); may be repeated.  [default: some "
-    "that suit the path]",
-    type=delta, multiple=True,
-)  # fmt: skip
+@inputs.options("evaluate", rpe={"type": delta, "multiple": True})
 @inputs.request_options(EvaluationRequest, EVALUATION_OPTIONS)
 @inputs.max_size_option
 @inputs.report_options("The page.  [default: reports/A_against_B.pdf]")
