@@ -42,12 +42,11 @@ def compare(
 
     person = inputs.read_person(given)
     request = inputs.comparison_request(log, given)
-    alone = json_path == STANDARD_OUTPUT
     outputs.report_paths(output, json_path)  # before the work, not after it
     with outputs.progress(json_path) as step:
         found = run_or_judge_aids(request, step)
         results = judged_results(request, found, person)
-        if output is None and not alone:
+        if output is None and json_path != STANDARD_OUTPUT:
             output = outputs.free_report(log.stem, settings_name(request), results)
         contents = outputs.result_files(results, json_path, output, found, step)
     outputs.finish(contents, summary(found, results, output), request)

@@ -34,11 +34,10 @@ def diff(
     from px4fuse.fleet.changes import diff as compared
     from px4fuse.report.changes import summary
 
-    alone = json_path == STANDARD_OUTPUT
     outputs.report_paths(output, json_path)  # before the work, not after it
     with outputs.progress(json_path) as step:
         results = compared(a, b, progress=step)
-        if output is None and not alone:
+        if output is None and json_path != STANDARD_OUTPUT:
             output = outputs.free_report(f"{a.stem}_to_{b.stem}", "", results)
         contents = outputs.result_files(results, json_path, output, results, step)
     outputs.finish(contents, summary(results))

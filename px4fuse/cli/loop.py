@@ -93,12 +93,11 @@ def loop(
         _solve(source, json_path, g2o, True if given["robust"] else None)
         return
     request = loop_request(source, given)
-    alone = output is None and json_path is not None
     outputs.check_targets([tum, g2o, *outputs.report_paths(output, json_path)])
     with outputs.progress(json_path) as step:
         found = run_loop(request, step)
         made = loop_results(request, found, person)
-        if output is None and not alone:
+        if output is None and json_path is None:
             output = outputs.free_report(f"{file_name(source)}_loop", settings_name(request), made)
         contents = _files(found, tum, g2o)
         contents |= outputs.result_files(made, json_path, output, found, step)

@@ -58,7 +58,7 @@ def slow(analysis: Analysis) -> Found:
     if (beyond := found.white_m / float(np.nanmin(assumed_m))) > NOISE_FITS:
         evidence[WHITE_BEYOND] = beyond
     told = info if gnss else warning
-    yield told("source_coloured", evidence, source=source, over=over, gnss=gnss)
+    yield told("source_coloured", evidence, found=found, source=source, over=over, gnss=gnss)
 
 
 def repeats(analysis: Analysis) -> Found:
