@@ -80,7 +80,7 @@ def smoothing(analysis: Analysis) -> Found:
     found = low_pass(analysis)
     if found is not None:
         told = error if found.lag_s >= LAG_ERROR_S else warning
-        yield told("source_smoothed", asdict(found), source=analysis.source.name)
+        yield told("source_smoothed", asdict(found), found=found, source=analysis.source.name)
 
 
 def jumps(analysis: Analysis) -> Found:
