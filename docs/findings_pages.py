@@ -1,7 +1,7 @@
 """Pages of the findings, each from its detector's file and from a flight on which it is found.
 
 ``write(folder)`` makes ``index.md`` and ``<id>.md`` for every name in
-``px4fuse.findings.causes.NAMES``. Words, thresholds and remedies are the detector's own; the
+``px4fuse.findings.NAMES``. Words, thresholds and remedies are the detector's own; the
 flights are those of the tests, and simulated ones; the rates are ``tests/studies/rates.csv``.
 """
 
@@ -37,8 +37,8 @@ from px4fuse.comparison.comparison import compare  # noqa: E402
 from px4fuse.ekf2.aids import judge_aids  # noqa: E402
 from px4fuse.filter.heading import HeadingPart, turned  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402
-from px4fuse.findings import Finding, find, find_aids, find_loop, source_frame  # noqa: E402
-from px4fuse.findings.causes import CONSEQUENCES, NAMES, RECORDING, SETTINGS  # noqa: E402
+from px4fuse.findings import NAMES, Finding, find, find_aids, find_loop, source_frame  # noqa: E402
+from px4fuse.findings.causes import CONSEQUENCES, RECORDING, SETTINGS  # noqa: E402
 from px4fuse.flight import Columns  # noqa: E402
 from px4fuse.simulation.flights import simulate_flight  # noqa: E402
 from px4fuse.simulation.mistakes import parse  # noqa: E402

@@ -8,7 +8,6 @@ import json
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from html import escape
 from typing import Any
 
 import numpy as np
@@ -209,31 +208,10 @@ def practice_text(
         progress(f"flight {number + 1}", number, count)
         data, script = _flown(one, number)
         scripts.append(script)
-    choices = "\n".join(
-        f'<label><input type="checkbox" name="choice" value="{name}"> {escape(words)}</label>'
-        for name, words in CHOICES.items()
-    )
     return page_text(
         "\n".join(scripts), [data], command="practice", heading="What is wrong with this flight?",
-        title=f"seed {seed}, level {level}", practice="practice",
-        quiz=QUIZ.format(count=count, choices=choices),
+        title=f"seed {seed}, level {level}", rounds=count, choices=CHOICES,
     )  # fmt: skip
-
-
-QUIZ = """<section class="card" id="quiz" data-rounds="{count}" aria-labelledby="quiz-title">
-<h2 id="quiz-title"></h2>
-<p id="quiz-ask">Look, turn the knobs to prove it, then choose all that is wrong. Simulated; the
-truth comes after your answer.</p>
-<fieldset id="quiz-choices"><legend>What is wrong</legend><div class="choices">{choices}</div>
-</fieldset>
-<div class="buttons"><button type="button" id="quiz-check">Check</button>
-<button type="button" id="quiz-next">Next flight</button>
-<button type="button" id="quiz-again">Begin again</button>
-<span id="quiz-score" class="note"></span></div>
-<p id="quiz-said" role="status"></p><div id="quiz-told"></div>
-<p class="note">Practice, not an exam: the answers are in this page, and the score is in its
-address. Nothing is sent anywhere.</p>
-</section>"""
 
 
 def _flown(one: Round, number: int) -> tuple[dict[str, Any], str]:

@@ -9,8 +9,8 @@ import re
 import shlex
 import subprocess
 from collections.abc import Iterator, Mapping
-from pathlib import PurePath
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from pathlib import Path, PurePath
+from typing import Annotated, Any, Literal, Self
 
 import msgspec
 
@@ -250,7 +250,7 @@ class EvaluationRequest(_Asked, frozen=True, kw_only=True):
 Request = ComparisonRequest | LoopRequest | WhatIfRequest
 
 
-class Option(NamedTuple):
+class Option(msgspec.Struct, frozen=True):
     """How a field of a request is typed on the command line; what it takes is the field's type.
 
     Attributes
@@ -272,134 +272,13 @@ class Option(NamedTuple):
     metavar: str | None = None
 
 
-_SYSTEM = Option(
-    "--system", "MAVLink system id of the vehicle.  [default: the one with the most data]",
-    metavar="ID",
-)  # fmt: skip
-# Which recordings of one flight are read
-RECORDINGS = {
-    "mavlink": Option(
-        "--mavlink", "MAVLink recording of the same flight: gives what LOG lacks.",
-        metavar="FILE.tlog",
-    ),
-    "system": _SYSTEM,
-}  # fmt: skip
-POSITION_OPTIONS = {
-    "path": Option(
-        "--position", "The positioning system's own recording: time, x, y, z.", metavar="FILE.csv"
-    ),
-    "frame": Option(
-        "--position-frame",
-        "What its x, y, z are.  [default: from its column names, or what fits EKF2]",
-    ),
-    "yaw_deg": Option(
-        "--position-yaw",
-        "Turn it clockwise, seen from above; auto finds yaw and origin.  [default: 0]", "°", 30.0,
-    ),
-    "columns": Option(
-        "--position-columns", "Names or numbers of its columns.  [default: by their names]",
-        metavar="TIME,X,Y,Z[,SIGMA]",
-    ),
-    "time_unit": Option("--position-time-unit", "Unit of its time.  [default: detected]"),
-    "length_unit": Option("--position-unit", "Unit of its x, y, z.  [default: detected]"),
-}  # fmt: skip
-# Of what the filter does, for one flight or many
-FILTER_OPTIONS = {
-    "sigma_a_m_s2": Option(
-        "--sigma-a", "Process noise SIGMA_A, 0.0001 to 100.", "m/s²", 0.5
-    ),
-    "sigma_z_m": Option(
-        "--sigma-z", "Measurement noise SIGMA_Z, 0.0001 to 100.  [default: 0.1; of GNSS what EKF2 "
-        "takes]", "m", 0.1,
-    ),
-    "dt_s": Option("--dt", "Prediction step DT, 0.001 to 1; Q is proportional to it.", "s"),
-    "input": Option(
-        "--input",
-        "Acceleration from the IMU, or constant velocity.  [default: imu where logged]",
-    ),
-    "axes": Option(
-        "--axis",
-        "Axis to analyse; may be repeated.  [default: all that the source supports; of "
-        "GNSS the horizontal ones]",
-    ),
-    "heading_deg": Option(
-        "--heading",
-        "Heading of the aisle, clockwise from north.  [default: from the track]", "°", 30.0,
-    ),
-    "start_s": Option(
-        "--start", "Start, seconds from the first data.  [default: take-off]", "s", 20.0
-    ),
-    "end_s": Option("--end", "End.  [default: touch-down]", "s", 60.0),
-    "position_source": Option(
-        "--position-source",
-        "Position source, for example vehicle_gps_position.  [default: the best logged]",
-        metavar="NAME",
-    ),
-    "source_kind": Option(
-        "--source-kind",
-        "What the position source is, where its messages do not tell: odometry (vio) drifts, "
-        "motion capture that is sent in the same messages does not.  [default: vio with an "
-        "orientation that turns]",
-    ),
-    "height": Option(
-        "--height",
-        "What --axis down is from with GNSS.  [default: what EKF2 fused, GNSS first]",
-    ),
-}  # fmt: skip
-CLOCK_OPTION = {
-    "clock_offset_s": Option(
-        "--clock-offset", "Added to the position source's time stamps; auto estimates it.  "
-        "[default: 0; auto with --position]", "s",
-    )
-}  # fmt: skip
-LOOP_OPTIONS = {
-    "start_s": Option(
-        "--from", "Start of the loop: seconds from the first data, or a trajectory's own stamps.  "
-        "[default: take-off]", "s", 20.0,
-    ),
-    "end_s": Option("--to", "End.  [default: landing]", "s", 60.0),
-    "landed_at": Option("--landed-at"),
-    "came_back": Option("--open"),
-    "closures": Option("--closure"),
-    "reference": Option(
-        "--reference", "What the paths are scored against, besides the log's ground truth: a SLAM "
-        "trajectory.", metavar="FILE|LOG:PART",
-    ),
-    "position_drift_m": Option(
-        "--drift", "Standard deviation of the odometry's position after 100 m.", "m", 1.0
-    ),
-    "heading_drift_deg": Option(
-        "--heading-drift", "Standard deviation of its heading after 100 m.", "°", 3.0
-    ),
-    "key_frames_m": Option(
-        "--key-frames",
-        "Distance between key frames.  [default: a fiftieth of the extent, 0.02 to 0.5]", "m", 0.2,
-    ),
-    "frame": Option("--frame", "Axes of a trajectory file.  [default: recognised]"),
-    "system": _SYSTEM,
-}  # fmt: skip
-EVALUATION_OPTIONS = {
-    "alignment": Option(
-        "--alignment", "What is fitted before comparing.  [default: yaw for VIO, EKF2 and our "
-        "filter; se3 for SLAM; sim3 for monocular SLAM]",
-    ),
-    "association": Option(
-        "--association", "Interpolate the reference, or take its nearest pose (as evo does)."
-    ),
-    "max_gap_s": Option(
-        "--max-gap", "Longest gap of the reference to interpolate across; for nearest the largest "
-        "difference in time.  [default: from its rate; 0.01 for nearest]", "s",
-    ),
-    "time_offset_s": Option(
-        "--time-offset", "Added to the estimate's stamps; auto finds it from the motion.  "
-        "[default: auto where the two do not overlap]", "s",
-    ),
-    "rpe": Option("--rpe"),
-    "consecutive": Option(
-        "--consecutive", "RPE over pairs end to end, instead of from every pose."
-    ),
-    "system": _SYSTEM,
-}  # fmt: skip
+_TABLES = msgspec.toml.decode(
+    Path(__file__).with_name("options.toml").read_bytes(), type=dict[str, dict[str, Option]]
+)
+# Which recordings of one flight are read, and what the filter does, for one flight or many
+RECORDINGS, FILTER_OPTIONS = _TABLES["recordings"], _TABLES["filter"]
+POSITION_OPTIONS, CLOCK_OPTION = _TABLES["position"], _TABLES["clock"]
+LOOP_OPTIONS, EVALUATION_OPTIONS = _TABLES["loop"], _TABLES["evaluation"]
 OPTIONS = RECORDINGS | POSITION_OPTIONS | CLOCK_OPTION | FILTER_OPTIONS
 _OF_REQUESTS: dict[type[msgspec.Struct], Mapping[str, Option]] = {
     ComparisonRequest: OPTIONS,

@@ -22,34 +22,9 @@ CLUSTERS = ("slurm", "kubernetes")
 
 @click.command()
 @click.argument("logs", nargs=-1, metavar="LOGS...")
-@inputs.option("-o, --output DIR", "Folder for the table and every log's results.")
-@inputs.option("--reports", "Make every log's PDF report too.")
-@inputs.option("--timeout SECONDS", "Time for one log; what takes longer is ended.", 1.0)
-@inputs.option(
-    "--workers N", "How many logs at once on this computer.  [default: one per core]", 1, 1024
-)
-@inputs.option(
-    "--memory GB", "Memory for each (on Linux); what needs more is ended.  [default: 4]", 1.0
-)
-@inputs.option(
-    "--scheduler ADDRESS",
-    "Dask scheduler that runs already, as tcp://host:8786; slurm or kubernetes prints how to start "
-    "one.",
-)
-@inputs.option(
-    "--baseline FILE.parquet",
-    "Table of an earlier run: the column change says what is worse than in it.",
-)
-@inputs.option(
-    "--junit FILE.xml",
-    "Write JUnit XML: a test case per log, which fails where the log failed or is worse.",
-)
+@inputs.options("batch")
 @inputs.settings_options
-@inputs.option(
-    "--fail-on",
-    "Exit with 1 if a log has failed, is worse than the baseline (or has failed), or there is a "
-    "finding of at least this severity.",
-)
+@inputs.options("batch-ends")
 @inputs.open_option
 def batch(
     logs: tuple[str, ...],

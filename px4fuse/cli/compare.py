@@ -21,11 +21,7 @@ SEVERITIES = get_args(Severity)
 @inputs.report_options(
     "The report.  [default: reports/LOG.pdf, settings that are not at their defaults in its name]"
 )
-@inputs.option("--fail-on", "Exit with 1 on a finding at least so severe.")
-@inputs.option(
-    "--checks",
-    "Exit with 1 if a verdict on EKF2 is bad: an aid starved, biased or trusted too much.",
-)
+@inputs.options("compare")
 @inputs.open_option
 def compare(
     log: Path,
@@ -47,13 +43,12 @@ def compare(
 
     person = inputs.read_person(given)
     request = inputs.comparison_request(log, given)
-    alone = json_path == STANDARD_OUTPUT
     outputs.report_paths(output, json_path)  # before the work, not after it
     with outputs.progress(json_path) as step:
         found = run_or_judge_aids(request, step)
         results = judged_results(request, found, person)
         give_back()
-        if output is None and not alone:
+        if output is None and json_path != STANDARD_OUTPUT:
             output = outputs.free_report(log.stem, settings_name(request), results)
         contents = outputs.result_files(results, json_path, output, found, step)
     outputs.finish(contents, summary(found, results, output), request)

@@ -15,9 +15,7 @@ from px4fuse.writing import STANDARD_OUTPUT
 @click.argument("b", type=inputs.Named())
 @inputs.max_size_option
 @inputs.report_options("The report.  [default: reports/A_to_B.pdf]")
-@inputs.option(
-    "--fail-on", "Exit with 1 if a number is significantly worse in B, or B has a new error."
-)
+@inputs.options("diff")
 @inputs.open_option
 def diff(
     a: Path,
@@ -36,11 +34,10 @@ def diff(
     from px4fuse.fleet.changes import diff as compared
     from px4fuse.report.changes import summary
 
-    alone = json_path == STANDARD_OUTPUT
     outputs.report_paths(output, json_path)  # before the work, not after it
     with outputs.progress(json_path) as step:
         results = compared(a, b, progress=step)
-        if output is None and not alone:
+        if output is None and json_path != STANDARD_OUTPUT:
             output = outputs.free_report(f"{a.stem}_to_{b.stem}", "", results)
         contents = outputs.result_files(results, json_path, output, results, step)
     outputs.finish(contents, summary(results))

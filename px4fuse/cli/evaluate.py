@@ -37,12 +37,7 @@ def delta(text: str) -> Delta:
 @click.command()
 @click.argument("estimate", type=inputs.Named())
 @click.argument("reference", type=inputs.Named())
-@inputs.option(
-    "--rpe DELTA",
-    "RPE over a distance (5m), a time (10s) or frames (1f); may be repeated.  [default: some "
-    "that suit the path]",
-    type=delta, multiple=True,
-)  # fmt: skip
+@inputs.options("evaluate", rpe={"type": delta, "multiple": True})
 @inputs.request_options(EvaluationRequest, EVALUATION_OPTIONS)
 @inputs.max_size_option
 @inputs.report_options("The page.  [default: reports/A_against_B.pdf]")
@@ -72,7 +67,6 @@ def evaluate(
     )
     if request.max_gap_s is not None and request.max_gap_s <= 0.0:
         raise SettingsError(f"--max-gap {request.max_gap_s:g}: give more than 0 seconds.")
-    alone = output is None and json_path is not None
     outputs.report_paths(output, json_path)
     with outputs.progress(json_path) as step:
         step("reading")
@@ -87,7 +81,7 @@ def evaluate(
             **{name: given[name] for name in AS_GIVEN},
         )
         results = evaluation_results(request, found)
-        if output is None and not alone:
+        if output is None and json_path is None:
             name = f"{file_name(estimate)}_against_{file_name(reference)}"
             output = outputs.free_report(name, settings_name(request), results)
         contents = outputs.result_files(results, json_path, output, found, step)

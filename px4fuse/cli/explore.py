@@ -14,7 +14,7 @@ from px4fuse.request import settings_name
 @click.command()
 @click.argument("logs", nargs=-1, type=inputs.Named())
 @inputs.analysis_options
-@inputs.option("-o, --output FILE.html", "The page.  [default: reports/LOG.html]")
+@inputs.options("explore")
 @inputs.open_option
 def explore(logs: tuple[Path, ...], output: Path | None, **given: Any) -> None:
     """Write a web page with sliders for SIGMA_A, SIGMA_Z, DT and the clock offset.

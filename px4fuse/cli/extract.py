@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from px4fuse.cli.inputs import Named, comparison_request, option, recording_options
+from px4fuse.cli.inputs import Named, comparison_request, options, recording_options
 from px4fuse.cli.outputs import write_outputs
 from px4fuse.errors import OutputError, on_one_line
 from px4fuse.reading import read_text
@@ -24,8 +24,7 @@ MAX_DESCRIPTION_BYTES = 50_000_000
 
 @click.command()
 @click.argument("log", type=Named())
-@option("-o, --output DIR", "Folder for the tables.")
-@option("--format", 'Of the tables; Parquet needs pip install "px4fuse[parquet]".')
+@options("extract")
 @recording_options
 def extract(
     log: Path,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from px4fuse.cli.inputs import Named, max_size_option, open_option, option
+from px4fuse.cli.inputs import Named, max_size_option, open_option, options
 from px4fuse.cli.outputs import Interrupted, finish, progress, write_new
 from px4fuse.errors import OutputError, SettingsError
 
@@ -19,42 +19,9 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("submissions", nargs=-1, type=Named())
-@option(
-    "--logs DIR",
-    "Folder of the flight logs (or one log); may be repeated. Without a report's log its numbers "
-    "cannot be verified.",
-)
-@option("--rubric FILE.toml", "What is worth how many points.  [default: of this lab]")
+@options("grade-reads")
 @max_size_option
-@option("--key FILE.json", "Answer key of px4fuse simulate --assignment.")
-@option("-o, --output DIR", "Folder for the class table and the feedback.")
-@option("--title", "Of the class page.  [default: the rubric's]")
-@option("--roster FILE.csv", "Everyone in the class.  [default: those of --key]")
-@option("--attempt", "Which of a student's files counts.")
-@option(
-    "--due TIME",
-    "When it was due: '2026-11-20 23:59', in this computer's time zone or with '+01:00' or "
-    "'Europe/Berlin' behind it. Platforms' times without a zone are in the same.",
-)
-@option(
-    "--late RULE",
-    "What being late costs: '10%/day' or '10%/day up to 50%' of all points, per started day.",
-)
-@option("--include-pending", "Enter points that still wait for you as they are proposed.")
-@option(
-    "--worksheet FILE.csv",
-    "Moodle's grading worksheet, Canvas's gradebook, or another table with ids or names: a copy "
-    "with the grades filled in is written. May be repeated.",
-)
-@option("--column TITLE", "Of the worksheets, for the grade.")
-@option("--anonymous", "The class page shows pseudonyms; names.csv says whose.")
-@option("--jobs N", "How many reports at once.  [default: one per core]", 1, 256)
-@option("--write-rubric FILE.toml", "Write the default rubric, to edit it, and stop.")
-@option(
-    "--write-autograder FILE.zip",
-    "Write an autograder for Gradescope, with --logs, --key, --rubric and --late, and stop.",
-)
-@option("--gradescope DIR", "Run inside that autograder, on its folder.")
+@options("grade")
 @open_option
 def grade(
     submissions: tuple[Path, ...],

@@ -13,6 +13,7 @@ from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import click
+import msgspec
 from click.core import ParameterSource
 from msgspec import NODEFAULT, Struct
 from msgspec.structs import fields
@@ -157,6 +158,30 @@ def option(
     return add
 
 
+class _Typed(Struct, frozen=True):
+    """A row of ``options.toml``; as :func:`option` takes it."""
+
+    typed: str
+    meaning: str
+    least: int | float | None = None
+    most: int | float | None = None
+
+
+_TABLES = msgspec.toml.decode(
+    Path(__file__).with_name("options.toml").read_bytes(), type=dict[str, dict[str, _Typed]]
+)
+
+
+def options(table: str, **more: Mapping[str, Any]) -> Option:
+    """The options of a table of ``options.toml``; of some more, as click has it."""
+    return _together(
+        *(
+            option(one.typed, one.meaning, one.least, one.most, name=name, **more.get(name, {}))
+            for name, one in _TABLES[table].items()
+        )
+    )
+
+
 def request_options(kind: type[Struct], options: Mapping[str, Declared]) -> Option:
     """The options of some fields of a request: what each takes and its default are the field's."""
     hints, defaults = get_type_hints(kind), {field.name: field for field in fields(kind)}
@@ -233,12 +258,7 @@ open_option = _opened("--open, --show", "opened")
 #: Of the command whose --open is of a loop that did not close
 show_option = _opened("--show", "shown")
 #: Whose report it is
-person_options = _together(
-    option("--student NAME", "Name on the report."),
-    option("--id ID", "Student number on the report.", name="student_id"),
-    option("--notes FILE.md", "Your own words, printed in the report.", type=Named()),
-    option("--answers FILE.toml", "The form of px4fuse answers, filled in.", type=Named()),
-)
+person_options = options("person", notes={"type": Named()}, answers={"type": Named()})
 
 
 def report_options(meaning: str) -> Option:

@@ -53,27 +53,18 @@ def closure(text: str) -> GivenClosure:
 
 @click.command()
 @click.argument("source", type=inputs.Named())
-@inputs.option(
-    "--landed-at FORWARD,RIGHT[,DEG]",
-    "Where it really landed, by tape from the place of take-off: m along its nose there, m to "
-    "the right, and degrees it was turned clockwise.  [default: the log's ground truth, else 0,0]",
-    type=landing,
-)
-@inputs.option("--open", "It did not come back: use no landing.", name="opened", is_flag=True)
-@inputs.option(
-    "--closure T1,T2[,SIGMA]",
-    "It was at the same place at two times, within SIGMA m (0.10); may be repeated.",
-    name="closures", type=closure, multiple=True,
-)  # fmt: skip
-@inputs.option(
-    "--robust", "Solve a pose graph of over 1000 closures robustly too: minutes.", is_flag=True
+@inputs.options(
+    "loop",
+    landed_at={"type": landing},
+    opened={"is_flag": True},
+    closures={"type": closure, "multiple": True},
+    robust={"is_flag": True},
 )
 @inputs.request_options(LoopRequest, LOOP_OPTIONS)
 @inputs.max_size_option
 @inputs.person_options
 @inputs.report_options("The report.  [default: reports/SOURCE_loop.pdf]")
-@inputs.option("--tum FILE", "Write the corrected path as a TUM file, in the axes of SOURCE.")
-@inputs.option("--g2o FILE", "Write the pose graph, solved, as a g2o file.")
+@inputs.options("loop-writes")
 @inputs.show_option
 def loop(
     source: Path,
@@ -102,12 +93,11 @@ def loop(
         _solve(source, json_path, g2o, True if given["robust"] else None)
         return
     request = loop_request(source, given)
-    alone = output is None and json_path is not None
     outputs.check_targets([tum, g2o, *outputs.report_paths(output, json_path)])
     with outputs.progress(json_path) as step:
         found = run_loop(request, step)
         made = loop_results(request, found, person)
-        if output is None and not alone:
+        if output is None and json_path is None:
             output = outputs.free_report(f"{file_name(source)}_loop", settings_name(request), made)
         contents = _files(found, tum, g2o)
         contents |= outputs.result_files(made, json_path, output, found, step)

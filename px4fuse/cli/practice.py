@@ -6,15 +6,12 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli.inputs import option
+from px4fuse.cli.inputs import options
 from px4fuse.cli.outputs import OPENED, finish, progress, web_page
 
 
 @click.command()
-@option("--seed N", "The same number gives the same flights.  [default: drawn]", 0, 2**32 - 1)
-@option("--level", "1: one mistake, large; 2: smaller; 3: small, and sometimes two.", 1, 3)
-@option("--flights N", "How many.", 1, 20)
-@option("-o, --output FILE.html", "The page.  [default: reports/practice_SEED.html]")
+@options("practice")
 @click.option("--open/--no-open", "opened", default=None, help="Open it.  [default: on a terminal]")
 @click.pass_context
 def practice(

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli.inputs import option
+from px4fuse.cli.inputs import options
 from px4fuse.cli.outputs import finish
 
 FOLDER = Path("sample_logs")
@@ -41,7 +41,7 @@ def sample_log() -> Path:
 
 
 @click.command()
-@option("-o, --output DIR", "Where to.  [default: sample_logs]")
+@options("sample")
 def sample(output: Path = FOLDER) -> None:
     """Write the sample flights: an aisle with UWB, a loop on visual-inertial odometry."""
     from importlib.resources import files

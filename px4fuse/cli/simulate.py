@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
 import click
 
-from px4fuse.cli.inputs import TypedQuantity, option, typed_parameters
+from px4fuse.cli.inputs import TypedQuantity, options, typed_parameters
 from px4fuse.cli.outputs import check_targets, finish, progress
 from px4fuse.errors import OutputError, SettingsError, on_one_line
 from px4fuse.reading import read_text
@@ -64,38 +64,7 @@ class WithMistakes(click.Command):
 
 
 @click.command(cls=WithMistakes)
-@option("-o, --output FLIGHT.ulg|DIR", "The log, or a class's folder.")
-@option(
-    "--assignment ROSTER.csv",
-    "A flight for every student of a class list (student id, name), with noises and mistakes of "
-    "their own, and the answer key beside the folder.",
-)
-@option(
-    "--secret-file FILE",
-    "Holds the secret from which assignments are drawn: the same secret and id give the same "
-    "flight.  [default: made up, and kept in the answer key]",
-)
-@option(
-    "--mistakes N",
-    "How many mistakes each assigned flight has.  [default: drawn: none, one or two]",
-)
-@option("--preview", "Print what --assignment draws; write nothing.")
-@option(
-    "--kind",
-    "Passes along an aisle with UWB, or laps around a square with drifting VIO or, outdoors, with "
-    "GNSS. With --assignment mixed: a loop for a third of the class, the aisle for the others.",
-)
-@option("--seed N", "The same number: the same flight.")
-@option("--mistake NAME[=VALUE]", "See below. Repeatable.")
-@option(
-    "--answer FILE.json",
-    "Write the answer: mistakes, biases, outliers, clock offset. Keep it to yourself.  [default "
-    "with --assignment: DIR_answers.json]",
-)
-@option("--no-truth", "Leave the ground truth out of the log.")
-@option("--no-ekf2", "Fly without EKF2, which is faster.")
-@option("--passes N", "Passes [6], or laps of a square [1; outdoors 3].")
-@option("--yaw", "Of the nose.  [default: fixed; follow around a square]")
+@options("simulate")
 @_scenario_options
 def simulate(
     output: Path,

@@ -17,20 +17,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("log", type=inputs.Named())
-@inputs.option(
-    "--set NAME=VALUE",
-    "Parameter to change, in PX4's unit; may be repeated.  [default: what the data ask for]",
-    name="changes",
-)
-@inputs.option("--sweep NAME=LOW:HIGH[:COUNT]", "Parameter to change over several values.")
-@inputs.option(
-    "--without AID",
-    "Aid that is no longer fused, as gnss_pos, gnss_vel, baro_hgt, mag or ev_pos; may be repeated.",
-)
-@inputs.option(
-    "--from SECONDS", "When the aids of --without are lost.  [default: from the start]",
-    name="since", type=inputs.TypedQuantity("s", 60.0),
-)  # fmt: skip
+@inputs.options("whatif", since={"type": inputs.TypedQuantity("s", 60.0)})
 @inputs.flight_options
 @inputs.report_options("A page, and its results beside it.")
 @inputs.open_option

@@ -1,8 +1,8 @@
 """The page as one file: Bokeh, the flights' data, the engine and what moves them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
-from typing import Any, Literal
+from typing import Any
 
 from bokeh.resources import Resources
 
@@ -51,7 +51,6 @@ def html_text(analyses: Sequence[Analysis]) -> str:
         command="explore",
         heading="Turn the knobs and watch",
         title=" and ".join(one["log"] for one in data),
-        practice="no_practice",
     )
 
 
@@ -84,7 +83,7 @@ def data_scripts(
 
 def page_text(
     scripts: str, data: list[dict[str, Any]], *, command: str, heading: str, title: str,
-    practice: Literal["no_practice", "practice"], quiz: str = "",
+    rounds: int = 0, choices: Mapping[str, str] = {},
 ) -> str:  # fmt: skip
     """The page around data that :func:`data_scripts` made.
 
@@ -94,11 +93,12 @@ def page_text(
     data : list of dict
         The flights that stand side by side.
     command, heading, title : str
-    practice : {"no_practice", "practice"}
-        The script that asks, or does not.
-    quiz : str
-        HTML of the questions.
+    rounds : int
+        How many flights are asked about.
+    choices : mapping of str to str
+        What may be answered, by name in words; none where nothing is asked.
     """
+    practice = "practice" if choices else "no_practice"
     code = {
         # BokehJS itself, without widgets, tables and formulas; what follows it only sets a log
         # level, and says so on the console
@@ -115,7 +115,8 @@ def page_text(
         title=title,
         made_with=f"px4fuse {version('px4fuse')}",
         data=scripts,
-        quiz=quiz,
+        rounds=rounds,
+        choices=choices,
         panels=PANELS,
         flights=[
             (one["log"], any(isinstance(axis["truth"], dict) for axis in one["axes"]))

@@ -1,11 +1,11 @@
 """The mistakes that px4fuse names: a file for those that share a condition.
 
-A file declares thresholds with unit and source and, in ``detect``, the condition, words, evidence
-and remedy of its findings. A detector never prints and never guesses: what it cannot see it does
-not mention.
+A file declares thresholds with unit and source and, in ``detect``, the condition and evidence of
+its findings; their words stand in ``words.toml``. A detector never prints and never guesses: what
+it cannot see it does not mention.
 
-To add a finding: its file with a ``detect``, its name and place in ``causes.py``, and the flights
-on which its rate is measured in ``tests/studies/rates.csv``.
+To add a finding: its file with a ``detect``, its words in ``words.toml``, and the flights on which
+its rate is measured in ``tests/studies/rates.csv``.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,9 +17,9 @@ from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.findings.aids import find_in as find_in_aids
-from px4fuse.findings.causes import NAMES, by_cause
+from px4fuse.findings.causes import by_cause
 from px4fuse.findings.loops import find_in
-from px4fuse.findings.model import SEVERITIES, Finding, Found, Severity, by_root
+from px4fuse.findings.model import NAMES, SEVERITIES, Finding, Found, Severity, by_root
 from px4fuse.loop.model import Loop
 
 __all__ = [

@@ -40,14 +40,9 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
         cause = _sensor(switch, source) or (CHANGE if changed else "")
         yield warning(
             "aid_starved",
-            f"EKF2 had {longest.longest_without:.0f} s without {labels} that it meant to fuse",
-            f" (more than {STARVED_S:g} s; {longest.rejected_share:.1%} of its samples were "
-            "rejected): it went on by its other aids and the IMU, whose errors grow.",
-            "See what the sensor lacked then (reception, range, light), or whether EKF2 rejected "
-            "it; what carried EKF2 meanwhile is in the table.",
             {"aid": labels, "longest_without_s": longest.longest_without,
              "rejected_share": longest.rejected_share, CAUSE: cause},
-            (longest.longest_without_s,),
+            (longest.longest_without_s,), most_s=STARVED_S,
         )  # fmt: skip
     for name, aid in judged.items():
         changes = {axis: one.change for axis, one in aid.axes.items() if one.change is not None}
@@ -55,46 +50,26 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
             axis, (time_s, moved) = max(changes.items(), key=lambda item: abs(item[1][1]))
             yield warning(
                 "aid_changed",
-                f"Innovations of {_named(aid)} change in flight: from about {time_s:.0f} s on "
-                f"their mean is {abs(moved):.1f} √S from where it was ({axis})",
-                ": the sensor and what else EKF2 fuses contradict each other from then on, and "
-                "EKF2 is pulled until its own states have taken it in.",
-                "See what was switched, moved or passed near the sensor then (current, metal, "
-                "wash, heat).",
                 {"aid": name, "axis": axis, "time_s": time_s, "moved": moved},
-                ((time_s, time_s + WINDOW_S),),
-            )
+                ((time_s, time_s + WINDOW_S),), label=_named(aid), by=abs(moved),
+            )  # fmt: skip
         elif aid.verdict == "variance understated" and name != source:
-            factor, noise = aid.nis_mean**0.5, AIDS[name].noise
-            raised = f"raise {noise}" if noise else "its reported accuracy is too small"
+            noise = AIDS[name].noise
             yield warning(
                 "aid_understated",
-                f"EKF2 is {factor_words(factor)} times too sure of {_named(aid)}",
-                f" (mean NIS {number_words(aid.nis_mean)}, 1 is consistent; "
-                f"{aid.rejected_share:.1%} rejected): its errors are larger than R"
-                f"{_noise_words(aid)} says, or another aid pulls against it.",
-                # never a value: innovations alone do not tell noise from a wrong delay
-                "Look for what is wrong first (outliers, the sensor's delay or place, another "
-                f"aid); where it is the sensor's own noise, {raised}.",
-                {
-                    "aid": name,
-                    "nis_mean": aid.nis_mean,
-                    "rejected_share": aid.rejected_share,
-                    CAUSE: _sensor(AIDS[name].switch, source),
-                },
-            )
+                {"aid": name, "nis_mean": aid.nis_mean, "rejected_share": aid.rejected_share,
+                 CAUSE: _sensor(AIDS[name].switch, source)},
+                label=_named(aid), times=factor_words(aid.nis_mean**0.5), r=_noise_words(aid),
+                nis=number_words(aid.nis_mean), raised=bool(noise), noise=noise,
+            )  # fmt: skip
         elif aid.verdict == "biased":
             axis, worst = max(aid.axes.items(), key=lambda item: abs(item[1].pull))
             yield info(
                 "aid_biased",
-                f"Innovations of {_named(aid)} are not zero in the mean",
-                f" ({number_words(worst.innovation_mean)} {aid.unit}, {axis}; √S is "
-                f"{number_words(worst.s_sqrt_median)}): it and another aid contradict each other, "
-                "and EKF2 stands between them.",
-                "Find the one that is wrong (calibration, place of the sensor, interference): "
-                "noises do not cure a bias.",
                 {"aid": name, "axis": axis, "innovation_mean": worst.innovation_mean,
                  "s_sqrt_median": worst.s_sqrt_median},
+                label=_named(aid), unit=aid.unit, mean=number_words(worst.innovation_mean),
+                s=number_words(worst.s_sqrt_median),
             )  # fmt: skip
 
 

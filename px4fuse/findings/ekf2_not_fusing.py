@@ -1,5 +1,7 @@
 """EKF2 did not use the source for horizontal position, or not all the time."""
 
+from typing import Any
+
 from px4fuse.comparison.model import Comparison
 from px4fuse.findings.model import Found, error, share_on, spans_at, warning
 from px4fuse.flight import Ekf2, FusionRecord, Unavailable
@@ -19,69 +21,37 @@ def detect(analysis: Comparison) -> Found:
     fusing = ekf2.fusing["horizontal"]
     share = share_on(fusing, segment)
     evidence = {"fusing_share": share, "source_interval_s": 1.0 / source.rate_hz}
-    only = f"fused the source in only {share:.0%} of the segment"
     if not source.origin.is_vision:
         if source.name == "vehicle_mocap_odometry" and share == 0.0:
-            yield warning(
-                "ekf2_not_fusing",
-                "EKF2 never fuses motion capture (ATT_POS_MOCAP), and nothing else of external "
-                "vision reached it",
-                ": its track does not come from this source.",
-                "Send the position as VISION_POSITION_ESTIMATE if EKF2 is to fuse it.",
-                {"fusing_share": share},
-            )
+            yield warning("ekf2_not_fusing", {"fusing_share": share}, case="mocap")
     elif share < FUSING_SHARE_ERROR:
-        why, remedy = _cause(analysis, ekf2)
-        yield error(
-            "ekf2_not_fusing",
-            f"EKF2 {only if share else 'never fused the source in this segment'}",
-            f": {why}.",
-            remedy,
-            evidence,
-        )
+        why, facts = _cause(analysis, ekf2)
+        told = "seldom" if share else "never"
+        yield error("ekf2_not_fusing", evidence, case=why, headline=told, **facts)
     elif share < FUSING_SHARE_WARNING:
-        yield warning(
-            "ekf2_fusion_interrupted",
-            f"EKF2 {only}",
-            "; in between its track rests on its other sensors.",
-            "Look at the gaps and rejections below; EKF2 (v1.14 and later) stops after "
-            f"{EV_STOP_INTERVAL_S:g} s without a sample.",
-            evidence,
-            spans_at(0.0, fusing, segment),
-        )
+        spans = spans_at(0.0, fusing, segment)
+        yield warning("ekf2_fusion_interrupted", evidence, spans, stop_s=EV_STOP_INTERVAL_S)
 
 
-def _cause(analysis: Comparison, ekf2: Ekf2) -> tuple[str, str]:
-    """Why EKF2 does not fuse the source, and the remedy."""
+def _cause(analysis: Comparison, ekf2: Ekf2) -> tuple[str, dict[str, Any]]:
+    """Why EKF2 does not fuse the source, in the word of its text and remedy, and their facts."""
     parameters, interval_s = analysis.flight.log.parameters, 1.0 / analysis.source.rate_hz
     control = parameters.get("EKF2_EV_CTRL")
-    switch, bit, what = "EKF2_EV_CTRL", 0, "horizontal position"
+    switch, bit, of = "EKF2_EV_CTRL", 0, "horizontal position"
     if control is None:  # before v1.14
-        switch, bit, what = "EKF2_AID_MASK", 3, "vision position"
+        switch, bit, of = "EKF2_AID_MASK", 3, "vision position"
     value = parameters.get(switch)
     if value is not None and not int(value) >> bit & 1:
-        return (
-            f"{switch} is {value:.0f}, bit {bit} ({what}) is not set",
-            f"Set {switch} to {int(value) | 1 << bit}.",
-        )
+        asked = int(value) | 1 << bit
+        return "off", {"switch": switch, "value": value, "bit": bit, "of": of, "asked": asked}
     horizon_s, age_s = ekf2.horizon_s, _age_s(analysis, ekf2)
     if isinstance(horizon_s, float) and age_s > horizon_s + MAX_LATE_S:
-        return (
-            f"its samples arrive {age_s:.2f} s after their stamps, and EKF2 keeps no more than "
-            f"{horizon_s:.2f} s",
-            "Check the source's clock (stamps that are too early look late), then raise "
-            "EKF2_DELAY_MAX (v1.15 and later).",
-        )
+        return "late", {"age_s": age_s, "horizon_s": horizon_s}
     # the rate of a reconstructed source is the logger's, not its own
     own_rate = control is not None and not analysis.source.origin.reconstructed
     if own_rate and interval_s > EV_START_INTERVAL_S:
-        return (
-            f"its samples come every {interval_s:.2f} s, and EKF2 (v1.14 and later) starts only "
-            f"when they are less than {EV_START_INTERVAL_S:g} s apart and stops after "
-            f"{EV_STOP_INTERVAL_S:g} s",
-            "Send the UWB position at 10 Hz; 5 Hz starts only thanks to jitter.",
-        )
-    return "the log does not show why", "Check EKF2_EV_CTRL (EKF2_AID_MASK before v1.14)."
+        return "slow", {"start_s": EV_START_INTERVAL_S, "stop_s": EV_STOP_INTERVAL_S}
+    return "unknown", {}
 
 
 def _age_s(analysis: Comparison, ekf2: Ekf2) -> float:

@@ -41,14 +41,10 @@ def _narrow_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> Found:
             yield finding(
                 rejections[0].severity,
                 "ekf2_gate_small",
-                f"{aid.gate} is {ekf2.gate:g}: such a gate rejects {must:.0%} of the samples of "
-                "a source that is as good as EKF2 expects",
-                f"; here it rejected {rejections[0].evidence['rejected_share']:.0%}, and what it "
-                "kept pulled EKF2 less than it should.",
-                f"Set {aid.gate} to {aid.default_gate:g}, PX4's default, and judge the rest of it "
-                "then.",
                 {"gate": ekf2.gate, "rejected_by_gate": must},
-            )
+                name_of_gate=aid.gate, default=aid.default_gate,
+                rejected=rejections[0].evidence["rejected_share"],
+            )  # fmt: skip
 
 
 def _rejections(analysis: Analysis) -> Found:
@@ -61,23 +57,20 @@ def _rejections(analysis: Analysis) -> Found:
         known = frame["rejected"].dropna()
         share = float(known.mean())  # NaN where it is not known
         if share >= REJECTED_SHARE_WARNING:
-            what = "height" if name == "down" else "horizontal position"
             yield finding(
                 "error" if share >= REJECTED_SHARE_ERROR else "warning",
                 "ekf2_rejecting",
-                f"EKF2 rejected {share:.1%} of the source's samples for {what}",
-                f" (outside {ekf2.gate:g} √S): outliers, a noise set too small, or a late clock.",
-                in_order(remedy.aid_of(analysis, name))
-                if name == "down"
-                else _remedy(analysis, name),
                 {"rejected_share": share, "count": len(frame), "axis": name},
-                moments(known.index[known > 0.0]),
-            )
+                moments(known.index[known > 0.0]), down=name == "down", gate=ekf2.gate,
+                remedy=_remedy(analysis, name),
+            )  # fmt: skip
 
 
 def _remedy(analysis: Analysis, axis: str) -> str:
     """What puts the cause of the innovations right, which the gate is there for."""
-    order, model = in_order(remedy.aid_of(analysis)), analysis.ekf2_model
+    order, model = in_order(remedy.aid_of(analysis, axis)), analysis.ekf2_model
+    if axis == "down":
+        return order
     if isinstance(model, Unavailable):
         return f"{order} {remedy.not_replayed(model)}"
     cause = cause_of(analysis.causes, "ekf2", axis)

@@ -25,25 +25,13 @@ def detect(analysis: Analysis) -> Found:
         yield finding(
             "warning" if horizontal else "info",
             "ekf2_resets",
-            f"EKF2 reset its {'height' if not horizontal else 'position'} {times(len(inside))}"
-            + (f" ({horizontal} horizontally)" if 0 < horizontal < len(inside) else "")
-            + f", by up to {max(sizes):.2f} m at {at_s:.1f} s",
-            f". In the comparison: {treated}.",
-            "Look for the gap or rejection at that time."
-            if horizontal
-            else "A height reset at take-off is usual; in mid-flight look for a change of the "
-            "height source.",
             {"count": len(inside), "largest_m": max(sizes), "at_s": at_s},
-            moments(r.time_s for r in inside),
-        )
+            moments(r.time_s for r in inside), often=times(len(inside)), treated=treated,
+            horizontal=horizontal, part=0 < horizontal < len(inside),
+            case=horizontal > 0,
+        )  # fmt: skip
     switches = [time for time, _ in ekf2.instances if segment.start_s < time <= segment.end_s]
     if switches:
-        yield warning(
-            "ekf2_instance_switch",
-            f"The primary EKF2 instance changed {times(len(switches))}, first at "
-            f"{switches[0]:.1f} s",
-            "; each part of the comparison uses the one in charge.",
-            "Compare the IMUs (vehicle_imu_status); set EKF2_MULTI_IMU to 1 for a lab flight.",
-            {"count": len(switches), "at_s": switches[0]},
-            moments(switches),
-        )
+        evidence = {"count": len(switches), "at_s": switches[0]}
+        often = times(len(switches))
+        yield warning("ekf2_instance_switch", evidence, moments(switches), often=often)

@@ -18,7 +18,7 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.causes import CAUSE
-from px4fuse.findings.model import Finding, Found, finding, info
+from px4fuse.findings.model import WORDS, Finding, Found, finding, info
 from px4fuse.findings.since import cure_words, kind_of, since_words
 from px4fuse.loop.model import Loop
 from px4fuse.plain import factor_words, number_words
@@ -29,19 +29,7 @@ SMALL_NIS = 0.5  # innovations are 30 % smaller than claimed
 OWN_ERROR = 0.7  # times: of EKF2's mean square error half is its own
 FRAME_SHARE = 0.5  # of the error: what is left is less than what turning took away
 FILTERS: Mapping[FilterName, str] = {"kf": "our filter", "ekf2": "EKF2"}
-REMEDIES = {
-    "drift": "Take no noise from these innovations: correct the drift at a loop (px4fuse loop "
-    "LOG), or give the filter a second, absolute source.",
-    "frame": "Turn and shift the source's frame into that of the truth before you judge a filter "
-    "by it, and take no noise from these innovations.",
-    "ekf2": "Our filter errs less with the same source, so the error is EKF2's own: look at the "
-    "delay that it takes the source to have, at its heading, and at what else it fuses.",
-    "shared": "Look for an error that source and filter share: the clock (px4fuse sync LOG), a "
-    "source that smooths its positions, slow errors (reflections, geometry of the anchors), its "
-    "scale, the survey of the anchors.",
-    "gnss": "Look for an error that receiver and filter share: the age of a fix (px4fuse sync "
-    "LOG), slow errors of reception, EKF2's heading, a wrong lever arm of the antenna.",
-}
+REMEDIES: Mapping[str, str] = WORDS["errors_larger_than_claimed"]["remedy"]
 
 
 def hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, Hidden]]:
@@ -86,34 +74,35 @@ def larger(analysis: Analysis, hidden: list[tuple[FilterName, str, Hidden]]) -> 
                 f"{number_words(one.nis_mean, 2)}; 1 is consistent)"
                 f"{since_words(analysis, causes[owner])}"
             )
-    words, small = "; ".join(said) + ".", worst.nis_mean < SMALL_NIS
+    words = "; ".join(said) + "."
     ours = analysis.axes[main].filters["kf"].truth
     less = isinstance(ours, AgainstTruth) and ours.position_rmse_m < OWN_ERROR * worst.rmse_m
     alone = less and all(owner == "ekf2" for owner, *_ in hidden)
     shared = "gnss" if analysis.source.origin.is_gnss else "shared"
-    remedy = REMEDIES["drift" if drifts else "ekf2" if alone else shared]
+    remedy = "drift" if drifts else "ekf2" if alone else shared
     known = filter(None, (causes[erring], *causes.values()))
     evidence |= {CAUSE: kind_of(analysis, next(known, None))}
     if cures := {
         cure_words(analysis, cause): None for cause in causes.values() if cause is not None
     }:
-        remedy = " ".join(cures)
+        remedy = "cured"
     elif frame := _after_turning(analysis, erring):
         before, left = frame
         evidence |= {"position_rmse_horizontal_m": before, "position_rmse_aligned_m": left}
         remain = f"of {before:.2f} m horizontally {left:.2f} m remain after the best shift and turn"
         if left < FRAME_SHARE * before:
             words += f" Most of it is how the source's frame lies: {remain}."
-            remedy = REMEDIES["frame"]
+            remedy = "frame"
         elif drifts:
             words += f" The source drifts, and the filter follows it: {remain}."
     return finding(
         "error" if worst.nees >= NEES_ERROR else "warning",
         "errors_larger_than_claimed",
-        f"Innovations {'small, errors large' if small else 'consistent, errors not'}",
-        f": {words} Innovations judge a filter against its source, truth judges both.",
-        remedy,
         evidence,
+        small=worst.nis_mean < SMALL_NIS,
+        words=words,
+        remedy=remedy,
+        cures=" ".join(cures),
     )
 
 
@@ -161,13 +150,4 @@ def drift(analysis: Analysis) -> Finding:
     if isinstance(loop, Loop) and (gap_m := loop.closure_error_m) is not None:
         evidence |= {"closure_error_m": gap_m, "path_length_m": loop.path_length_m}
         more += f" Its loop misses by {gap_m:.2f} m after {loop.path_length_m:.0f} m."
-    return info(
-        "source_may_drift",
-        f"Consistency with {name} is not correctness",
-        ": it comes with a heading of its own, as odometry (VIO, SLAM) does, and odometry drifts. "
-        "Innovations say how well a filter follows its source, not where the vehicle was."
-        f"{more}",
-        "Judge it by a loop (px4fuse loop LOG) or by a truth (ATT_POS_MOCAP). Only if it is motion "
-        "capture, which does not drift, do its innovations tell its noise (--source-kind mocap).",
-        evidence,
-    )
+    return info("source_may_drift", evidence, shown=more)

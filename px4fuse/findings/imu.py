@@ -9,7 +9,6 @@ from px4fuse.filter.signals import Segment, imu_gaps, within
 from px4fuse.findings.model import MOMENT_S, Found, finding, warning
 from px4fuse.flight import Columns, Ekf2, Flight, sample_rate
 from px4fuse.record import Span
-from px4fuse.recording import LogInfo
 
 BIAS_ERROR_M_S2 = 0.3  # as SIGMA_A tripled; 0.15 m after one second
 TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))
@@ -37,39 +36,21 @@ def bias(analysis: Analysis) -> Found:
     innovations in a way that nothing else does. EKF2's stands in where there is none, and for the
     down axis.
     """
-    found, of_ekf2, in_ekf2 = analysis.explained, _ekf2_bias(analysis), ""
-    if of_ekf2 is not None:
-        in_ekf2 = f"{of_ekf2[0]:+.2f} forward, {of_ekf2[1]:+.2f} right"
-    if isinstance(found, Explained):
+    found, of_ekf2 = analysis.explained, _ekf2_bias(analysis)
+    if isinstance(found, Explained) and found.biased:
         forward, right, size = found.forward_bias, found.right_bias, found.bias.value
-        if found.biased:
-            yield finding(
-                "error" if size >= BIAS_ERROR_M_S2 else "warning",
-                "accelerometer_bias",
-                f"The accelerometer reads {forward.value:+.2f} m/s² too much forward and "
-                f"{right.value:+.2f} right",
-                f" (± {1.96 * forward.sigma:.2f}), by what the positions show of the motion: our "
-                "filter integrates it as acceleration. An attitude that is off by "
-                f"{size * TILT_DEG_PER_M_S2:.1f}° does the same."
-                + (f" EKF2 subtracts {in_ekf2}." if in_ekf2 else ""),
-                "Calibrate the accelerometers and the level horizon, at the temperature of the "
-                "flight; a larger SIGMA_A only hides it.",
-                {"bias_m_s2": size, "sigma_m_s2": found.bias.sigma},
-            )
-            return
-    if of_ekf2 is None:
-        return
-    # horizontally ours is the better estimate, where there is one
-    size = float(np.linalg.norm(of_ekf2[2:] if isinstance(found, Explained) else of_ekf2))
-    if size >= BIAS_M_S2:
-        yield warning(
+        yield finding(
+            "error" if size >= BIAS_ERROR_M_S2 else "warning",
             "accelerometer_bias",
-            f"EKF2 subtracts an accelerometer bias of {size:.2f} m/s²",
-            f" ({in_ekf2}, {of_ekf2[2]:+.2f} down). Our filter integrates it and needs a larger "
-            "SIGMA_A for that.",
-            "Calibrate the accelerometers, at the temperature of the flight.",
-            {"bias_m_s2": size},
-        )
+            {"bias_m_s2": size, "sigma_m_s2": found.bias.sigma},
+            case=True, forward=forward.value, right=right.value, within=1.96 * forward.sigma,
+            tilt_deg=size * TILT_DEG_PER_M_S2, ekf2=of_ekf2, and_ekf2=of_ekf2 is not None,
+        )  # fmt: skip
+    elif of_ekf2 is not None:
+        # horizontally ours is the better estimate, where there is one
+        size = float(np.linalg.norm(of_ekf2[2:] if isinstance(found, Explained) else of_ekf2))
+        if size >= BIAS_M_S2:
+            yield warning("accelerometer_bias", {"bias_m_s2": size}, case=False, ekf2=of_ekf2)
 
 
 def _ekf2_bias(analysis: Analysis) -> list[float] | None:
@@ -87,13 +68,9 @@ def tumbling(analysis: Analysis) -> Found:
         yield finding(
             "error",
             "vehicle_tumbled",
-            "The vehicle tumbled: PX4's failure detector found roll or pitch beyond its limit",
-            " (FD_FAIL_R, FD_FAIL_P). What both filters do from then on says nothing of the "
-            "flight before.",
-            f"Judge the flight up to then: --end {max(spans[0][0] - 1.0, 0.0):.1f}; what the "
-            "other findings say of the time before may be why.",
             {"total_s": sum(end - start for start, end in spans)},
             spans,
+            end_s=max(spans[0][0] - 1.0, 0.0),
         )
 
 
@@ -109,12 +86,6 @@ def clipping(analysis: Analysis) -> Found:
         bursts = np.split(time_s, np.flatnonzero(np.diff(time_s) > CLIPPED_APART_S) + 1)
         yield warning(
             "accelerometer_clipped",
-            f"The accelerometer reached the end of its range in {len(time_s)} samples, "
-            f"{total_s:.2f} s in all",
-            ": what is beyond is lost, and both filters integrate what is left of it. Height and "
-            "vertical velocity suffer first, and what looks like a bias may come from it.",
-            "Look for what shakes or strikes it (propellers, motors, mounting, a hard landing), "
-            "and choose a segment without it (--start, --end).",
             {"count": len(time_s), "total_s": total_s},
             tuple((float(each[0]), float(each[-1])) for each in bursts),
         )
@@ -124,16 +95,12 @@ def gaps(analysis: Analysis) -> Found:
     """Missing for longer than two steps of prediction and of the IMU."""
     gap_s, imu = next(iter(analysis.axes.values())).replay.input_gap_s, analysis.flight.imu
     interval_s = 1.0 / sample_rate(imu) if isinstance(imu, pd.DataFrame) else 0.0
-    recorded = analysis.flight.log.format.startswith("MAVLink")
-    remedy = "Record where the link loses no messages" if recorded else "Use a faster SD card"
     if gap_s > max(IMU_GAP_TOTAL_S, 2.0 * interval_s):
         yield warning(
             "imu_gap",
-            f"The IMU is missing for {gap_s:.2f} s of the segment",
-            "; the process noise was raised there to the size of the motion.",
-            f"{remedy}, or choose a segment without the gap (--start, --end).",
             {"total_s": gap_s},
             _spans(imu, analysis.segment) if isinstance(imu, pd.DataFrame) else (),
+            recorded=analysis.flight.log.format.startswith("MAVLink"),
         )
 
 
@@ -162,23 +129,11 @@ def rates(flight: Flight) -> Found:
         topic = flight.streams[name].topics[0] if name in flight.streams else default
         if isinstance(part, pd.DataFrame) and too_slow(part, needed_hz):
             rate_hz = sample_rate(part)
+            streamed = "streamed" if flight.log.has_ulog else "sent"
+            how = streamed if flight.log.format.startswith("MAVLink") else "logged"
             yield warning(
                 "logging_rate_low",
-                f"{topic} was logged at {rate_hz:.1f} Hz, below the {needed_hz:g} Hz that the "
-                "acceleration needs",
-                ": motion between samples is lost.",
-                _faster(flight.log, topic, 2.0 * needed_hz),
                 {"rate_hz": rate_hz, "needed_hz": needed_hz, "topic": topic},
+                case=how,
+                asked_hz=2.0 * needed_hz,
             )
-
-
-def _faster(log: LogInfo, topic: str, rate_hz: float) -> str:
-    """How to log a topic at a rate."""
-    if not log.format.startswith("MAVLink"):
-        return f'Put the line "{topic} 0" into etc/logging/logger_topics.txt on the SD card.'
-    if not log.has_ulog:
-        return f"Ask for {topic} at {rate_hz:g} Hz (MAV_CMD_SET_MESSAGE_INTERVAL)."
-    return (
-        f"Raise its stream rate (mavlink stream -d DEVICE -s {topic} -r {rate_hz:g} in PX4's "
-        "console), or join the ULog (--mavlink)."
-    )

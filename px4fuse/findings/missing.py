@@ -1,5 +1,7 @@
 """What the log lacks: EKF2, an acceleration, innovations, the position as it arrived."""
 
+from typing import Any
+
 import pandas as pd
 
 from px4fuse.analysis import Analysis
@@ -32,17 +34,14 @@ def unavailable(analysis: Analysis) -> Found:
     """The report has to do without, with the reason and the remedy that stand in its place."""
     ekf2, acceleration = analysis.flight.ekf2, analysis.lines[0].acceleration
     if isinstance(ekf2, Unavailable):
-        more = f": {ekf2.reason}. The report holds our filter alone."
-        yield warning("ekf2_unavailable", "Nothing to compare with", more, ekf2.remedy)
+        yield warning("ekf2_unavailable", lacking=ekf2, remedy=ekf2.remedy)
     if isinstance(acceleration, Unavailable):
-        more = f" ({acceleration.what}: {acceleration.reason}); our filter assumes constant "
-        remedy = acceleration.remedy
-        yield warning("input_unavailable", "No acceleration input", f"{more}velocity.", remedy)
+        yield warning("input_unavailable", lacking=acceleration, remedy=acceleration.remedy)
     for result in analysis.axes.values():
         ours = result.filters["kf"]
         if isinstance(ours, Unavailable):
-            said, count = "No statement on consistency", {"count": len(result.replay.updates)}
-            yield warning("too_few_innovations", said, f": {ours.reason}.", ours.remedy, count)
+            count = {"count": len(result.replay.updates)}
+            yield warning("too_few_innovations", count, lacking=ours, remedy=ours.remedy)
             return
 
 
@@ -52,28 +51,19 @@ def source_as_sent(analysis: Comparison) -> Found:
     logged = any(track.origin.preference == received for track in analysis.flight.positions)
     if source.origin.as_sent or logged:
         return
-    name, rate_hz = source.name, source.rate_hz
-    profile = int(analysis.flight.log.parameters.get("SDLOG_PROFILE", 1))
+    rate_hz, profile = source.rate_hz, int(analysis.flight.log.parameters.get("SDLOG_PROFILE", 1))
     reasons = (part.reason for part in analysis.missing if part.source == WANTED)
-    remedy = f"Set SDLOG_PROFILE to {profile | VISION_PROFILE_BIT} and fly again."
+    facts: dict[str, Any] = {"source": source, "asked": profile | VISION_PROFILE_BIT}
     yield warning(
         "source_not_logged",
-        f"The log lacks {WANTED}, the position as it arrived",
-        f" ({next(reasons, 'it is not in this log')}); {name} ({source.description}) stands in "
-        f"for it at {rate_hz:.1f} Hz.",
-        remedy,
         {"rate_hz": rate_hz, "sdlog_profile": profile},
+        reason=next(reasons, "it is not in this log"),
+        **facts,
     )
-    for interval in LOGGER_INTERVALS_S.get(name, ()):
+    for interval in LOGGER_INTERVALS_S.get(source.name, ()):
         if abs(1.0 / rate_hz / interval - 1.0) < LOGGER_TOLERANCE:
-            yield warning(
-                "source_decimated",
-                f"{name} is logged at {rate_hz:.1f} Hz, the logger's own limit for it",
-                f" ({1 / interval:g} Hz): the source may have run faster, the samples between are "
-                "lost.",
-                remedy,
-                {"rate_hz": rate_hz, "logger_limit_hz": 1.0 / interval},
-            )
+            evidence = {"rate_hz": rate_hz, "logger_limit_hz": 1.0 / interval}
+            yield warning("source_decimated", evidence, **facts)
 
 
 def innovations(analysis: Comparison) -> Found:
@@ -91,10 +81,6 @@ def innovations(analysis: Comparison) -> Found:
     if logged / count < MIN_INNOVATION_SHARE:
         air = analysis.source.aid(axis) == BAROMETER
         topic = (ekf2.aids[BAROMETER.name].topics if air else ekf2.innovation_topics)[0]
-        yield info(
-            "ekf2_innovations_decimated",
-            f"The log holds {logged} EKF2 innovations for {count} measurements",
-            f": {1 - logged / count:.0%} of what EKF2 did with the source is not in it.",
-            f'Put the line "{topic} 0" into etc/logging/logger_topics.txt on the SD card.',
-            {"logged": logged, "measurements": count},
-        )
+        evidence = {"logged": logged, "measurements": count}
+        lost = 1 - logged / count
+        yield info("ekf2_innovations_decimated", evidence, topic=topic, lost=lost)

@@ -2,8 +2,10 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
 import pandas as pd
 from msgspec import Meta
@@ -13,6 +15,11 @@ from px4fuse.record import Record, Span
 
 Severity = Literal["error", "warning", "info"]
 SEVERITIES: tuple[Severity, Severity, Severity] = ("error", "warning", "info")
+# Of each finding, in the order in which those of one rank are told
+WORDS: Mapping[str, Mapping[str, Any]] = msgspec.toml.decode(
+    Path(__file__).with_name("words.toml").read_bytes()
+)
+NAMES: Mapping[str, str] = {name: words["called"] for name, words in WORDS.items()}
 # More times are not listed one by one
 MOST_SPANS = 3
 # Shorter is told as one moment
@@ -75,12 +82,20 @@ Found = Iterator[Finding]
 
 
 def finding(
-    severity: Severity, name: str, headline: str, explanation: str, remedy: str,
-    evidence: Mapping[str, int | float | str] | None = None, spans_s: tuple[Span, ...] = (),
+    severity: Severity, name: str, evidence: Mapping[str, int | float | str] = {},
+    spans_s: tuple[Span, ...] = (), **facts: Any,
 ) -> Finding:  # fmt: skip
-    """A finding whose message begins with its headline and goes on with the explanation."""
-    message = f"{headline}{explanation}"
-    return Finding(name, severity, message, remedy, evidence or {}, headline, spans_s=spans_s)
+    """A finding in its words of ``words.toml``, filled with the evidence and more facts.
+
+    Of several texts a fact of their name chooses one, and ``case`` where there is none of it.
+    """
+    said: dict[str, Any] = {**evidence, **facts}
+    for part, text in WORDS[name].items():
+        one = text if isinstance(text, str) else text[said[part if part in said else "case"]]
+        said[part] = one.format_map(said)
+    message = f"{said['headline']}{said['more']}"
+    return Finding(name, severity, message, said["remedy"], evidence, said["headline"],
+                   spans_s=spans_s)  # fmt: skip
 
 
 error, warning, info = (partial(finding, severity) for severity in SEVERITIES)

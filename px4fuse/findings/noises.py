@@ -39,22 +39,13 @@ from px4fuse.findings.since import cure_words, ekf2_cure_words, kind_of, reason_
 from px4fuse.findings.source_positions import hardly_moved
 from px4fuse.flight import Columns, Unavailable, sample_rate
 from px4fuse.plain import factor_words, number_words
-from px4fuse.request import OPTIONS
 
 NOISE_OFF = 1.5  # times, in standard deviation; below, the tracks hardly change
 NOISE_OFF_ERROR = 4.0  # times: the gain is a different one
 RESPONSE_TIME_S = 2.5  # five times the lesson's; a vehicle turns around in less
 BEYOND = 1.5  # times the 95 % interval's reach; 0.3 % of clean flights lie beyond
 LAG1_SLOW = 0.3  # correlation; white innovations stay below 2/√n, 0.2 at n = 100
-# What such a setting does
-READINGS = {
-    ("sigma_z", "small"): "The filter mistakes the noise of the measurements for motion.",
-    ("sigma_z", "large"): "The filter distrusts measurements that are better than it thinks.",
-    ("sigma_a", "small"): "The variance grows too little between updates, the gain is too small, "
-    "and the filter lags behind.",
-    ("sigma_a", "large"): "The variance grows too much between updates, and the filter jumps to "
-    "every measurement.",
-}
+
 SIGMA_OFF_ERROR = 2.0  # times, in standard deviation
 NOISE_FITS = 1.25  # times: the median's own scatter below n = 100 (1.17/√n, two σ)
 NOT_EXPLAINED = (
@@ -63,7 +54,7 @@ NOT_EXPLAINED = (
 )
 UNKNOWN_NOISE = "Which noise the data ask for could not be told: see tuning."
 
-OWNERS = {"kf": "Our", "ekf2": "EKF2's"}
+
 GROUPS = {"horizontal": ("north", "east", "aisle"), "vertical": ("down",)}
 ONLY_HORIZONTAL = Unavailable("EKF2 replay", "the model of EKF2 is of horizontal position", "None.")
 AGAINST_DRIFT = (
@@ -126,27 +117,20 @@ def settings_off(analysis: Analysis) -> Found:
     unseen = None if isinstance(tuned.held_out, Unavailable) else tuned.held_out.gain_nats
     cure, first = remedy.filter_words(analysis, values, unseen_nats=unseen), None
     for name in worst_first:
-        (value, size, severity), noise, unit = off[name], asked[name], OPTIONS[name].unit
-        label, side = name[:7], "small" if chosen[name] < value else "large"
-        least, most, range_ = "at least ", "at most ", ""
-        if noise.value is not None:
-            least, most = "", ""
-            range_ = f", 95 % {noise.low or 0.0:.3g} to {noise.high:.3g}" if noise.high else ""
+        (value, size, severity), noise = off[name], asked[name]
+        known, side = noise.value is not None, "small" if chosen[name] < value else "large"
         told = finding(
             severity,
-            f"{label}_{side}",
-            f"{label.upper()} {chosen[name]:g} {unit} is {least}{factor_words(size)} times too "
-            f"{side}",
-            f": the innovations ({tuned.name}) ask for {most}{value:.3g} {unit}{range_}. "
-            f"{READINGS[label, side]}",
-            cure,
+            f"{name[:7]}_{side}",
             {
                 "chosen": chosen[name],
                 "most_likely": value,
                 "factor": chosen[name] / value,
                 "lag1_autocorrelation": getattr(tuned.before, "lag1_autocorrelation", float("nan")),
             },
-        )
+            axes=tuned.name, times=factor_words(size), case=known, low=noise.low or 0.0,
+            high=noise.high, within=known and bool(noise.high), remedy=cure,
+        )  # fmt: skip
         yield structs.replace(told, caused_by=first)
         first = first or told.id
 
@@ -189,12 +173,9 @@ def forgotten(analysis: Analysis) -> Found:
         more = "" if needed is None else f" {remedy.filter_words(analysis, {SIGMA_A: needed})}"
         yield error(
             "process_noise_forgotten",
-            f"With SIGMA_A {analysis.settings.sigma_a_m_s2:g} m/s² Q is forgotten",
-            f": σ_p hardly grows between updates ({growth:.1%} in variance), the gain is "
-            f"{gain:.3f}, and the filter needs {response_s:.0f} s to follow (along {name}).",
-            f"Raise SIGMA_A.{more}",
             {"relative_growth": growth, "gain": gain, "response_s": response_s, "axis": name},
-        )
+            sigma_a=analysis.settings.sigma_a_m_s2, cure=more,
+        )  # fmt: skip
         return
 
 
@@ -218,7 +199,6 @@ def _of_group(analysis: Analysis, owner: FilterName, group: str, members: list[M
     """One finding for a group of axes, on the axis whose NIS is furthest from 1."""
     result, statement = max(members, key=lambda pair: abs(np.log(pair[1].nis_mean)))
     over, factor = statement.sigma_factor > 1.0, statement.times_off
-    low, high = statement.nis_band
     severity: Severity = "error" if factor >= SIGMA_OFF_ERROR else "warning"
     if _is_default(analysis, owner, result):
         severity = lowered(severity)
@@ -251,13 +231,10 @@ def _of_group(analysis: Analysis, owner: FilterName, group: str, members: list[M
     return finding(
         severity,
         f"{owner}_variance_{stated}",
-        f"{OWNERS[owner]} innovation variance is {stated} "
-        f"{factor_words(factor)} times in σ along {result.axis.name}",
-        f" (mean NIS {number_words(statement.nis_mean)}, consistent is {low:.2f} to {high:.2f}; "
-        f"{group}).",
-        cure,
         evidence,
-    )
+        times=factor_words(factor), nis=number_words(statement.nis_mean),
+        band=statement.nis_band, group=group, remedy=cure,
+    )  # fmt: skip
 
 
 def _above_stated(analysis: Analysis) -> str:

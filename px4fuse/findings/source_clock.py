@@ -35,15 +35,9 @@ def offset(analysis: Analysis, clock: ClockOffset) -> Found:
     evidence = {"offset_s": clock.offset_s, "interval_low_s": low, "interval_high_s": high}
     if clock.change_p is not None and clock.change_p < CHANGE_P:
         yield error(
-            "source_clock_changes",
-            f"The clock offset of {source.name} is not the same throughout",
-            f" (p {clock.change_p:.1g}): {clock.parts[0].offset_s:+.2f} s at the beginning, "
-            f"{clock.parts[-1].offset_s:+.2f} s at the end. PX4 takes the time of arrival until "
-            "500 TIMESYNC answers have come.",
-            "Let the clocks synchronise for a minute before take-off; analyse one side of the "
-            "change with --start, --end.",
-            {**evidence, "change_p": clock.change_p},
-        )
+            "source_clock_changes", {**evidence, "change_p": clock.change_p}, source=source.name,
+            first=clock.parts[0], last=clock.parts[-1],
+        )  # fmt: skip
         return
     size = abs(clock.remaining_s)
     # one offset cannot hold for stamps that are of arrival in a part of the flight only
@@ -55,18 +49,14 @@ def offset(analysis: Analysis, clock: ClockOffset) -> Found:
         if errors[1] > remedy.WORSE_FILTER_ERROR * errors[0]:
             return  # the truth knows better
         typed += f": position error {errors[0]:.3f} → {errors[1]:.3f} m (replayed)"
-    side, ends = "early", (low - clock.applied_s, high - clock.applied_s)
-    if clock.remaining_s < 0:
-        side, ends = "late", (-ends[1], -ends[0])
+    ends, late = (low - clock.applied_s, high - clock.applied_s), clock.remaining_s < 0
     yield finding(
         "error" if size > OFFSET_ERROR_S else "warning",
         "source_clock_offset",
-        f"The stamps of {source.name} are {side} by {size:.3f} s against the IMU",
-        f" (95 % {ends[0]:.3f} to {ends[1]:.3f} s): at 1 m/s that is an error of {size:.2f} m, "
-        "which neither filter's innovations show.",
-        f"{typed}{_for_ekf2(analysis, clock)}.",
         evidence,
-    )
+        source=source.name, late=late, size_s=size, ends=(-ends[1], -ends[0]) if late else ends,
+        remedy=f"{typed}{_for_ekf2(analysis, clock)}.",
+    )  # fmt: skip
 
 
 def _for_ekf2(analysis: Analysis, clock: ClockOffset) -> str:
@@ -109,21 +99,16 @@ def delay(analysis: Analysis, clock: ClockOffset) -> Found:
     if delay_ms is None or abs(delay_ms - asked_ms) < known_ms:
         return
     low_ms, high_ms = (-1e3 * end for end in reversed(clock.interval_s))
-    asked, more = f"the data ask for {round(asked_ms)} ms", ""
-    ends = f"{round(low_ms)} to {round(high_ms)}"
-    if low_ms <= 0.0 <= high_ms:
-        asked, ends = "the data ask for none", f"{ends} ms"
-    elif asked_ms < 0.0:
-        asked = f"the stamps are early by {round(-asked_ms)} ms"
-        ends, more = f"{round(-high_ms)} to {round(-low_ms)}", ", for which there is no delay"
+    low, high = round(low_ms), round(high_ms)
+    case = "none" if low_ms <= 0.0 <= high_ms else "early" if asked_ms < 0.0 else "delay"
+    if case == "early":
+        low, high = -high, -low
     yield warning(
         "ekf2_ev_delay_wrong",
-        f"EKF2_EV_DELAY is {delay_ms:g} ms, while {asked}",
-        f" (95 % {ends}){more}: EKF2 fuses each position at the wrong time, and its track lags or "
-        "leads by the difference.",
-        delay_remedy(analysis, 0.0 if low_ms <= 0.0 else asked_ms, delay_ms),
         {"ekf2_ev_delay_ms": delay_ms, "asked_ms": asked_ms},
-    )
+        case=case, size=round(abs(asked_ms)), low=low, high=high,
+        remedy=delay_remedy(analysis, 0.0 if low_ms <= 0.0 else asked_ms, delay_ms),
+    )  # fmt: skip
 
 
 def delay_remedy(analysis: Analysis, delay_ms: float, flown_ms: float) -> str:

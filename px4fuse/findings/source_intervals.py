@@ -36,21 +36,16 @@ def detect(analysis: Analysis) -> Found:
 
 def gaps(analysis: Analysis) -> Found:
     """The source stopped for a while."""
-    rate_hz, sight = analysis.source.rate_hz, "line of sight to the anchors and the link"
-    if analysis.source.origin.is_gnss:
-        sight = "the antenna's view of the sky, its cable, and what radiates on board"
+    rate_hz = analysis.source.rate_hz
     silent = source_gaps(analysis.lines[0].measurement_time_s, rate_hz)
     if silent:
         at, until = max(silent, key=lambda gap: gap[1] - gap[0])
         yield warning(
             "source_gap",
-            f"The source was silent {times(len(silent))} for more than "
-            f"{longest_s(1.0 / rate_hz):.1f} s, the longest time {until - at:.1f} s at {at:.1f} s",
-            ": only the IMU carries the position there.",
-            f"Check {sight}; analyse one side with --start, --end.",
             {"count": len(silent), "longest_s": until - at, "at_s": at},
-            silent,
-        )
+            silent, often=times(len(silent)), usual_s=longest_s(1.0 / rate_hz),
+            gnss=analysis.source.origin.is_gnss,
+        )  # fmt: skip
 
 
 def losses(analysis: Analysis) -> Found:
@@ -62,15 +57,11 @@ def losses(analysis: Analysis) -> Found:
     lost = int(np.sum(np.rint(intervals / typical) - 1.0))
     sent = lost + len(intervals)
     if len(intervals) > 1 and lost / sent > LOST_SHARE:
-        in_ulog = "; the ULog has what arrived (SDLOG_PROFILE 129)"
         yield info(
             "source_samples_lost",
-            f"About {lost / sent:.0%} of {source.name} is not in the recording",
-            f" ({lost} samples of {sent} at one per {typical:.2f} s); EKF2 may have received them.",
-            "Record on the companion, or on a link that does not lose messages"
-            f"{in_ulog if analysis.flight.log.has_ulog else ''}.",
             {"lost": lost, "lost_share": lost / sent},
-        )
+            source=source.name, sent=sent, typical_s=typical, in_ulog=analysis.flight.log.has_ulog,
+        )  # fmt: skip
 
 
 def thinning(analysis: Analysis) -> Found:
@@ -93,17 +84,12 @@ def thinning(analysis: Analysis) -> Found:
         return
     interval_s = float(np.mean(intervals))
     slow = interval_s > EV_START_INTERVAL_S
-    starts = f" EKF2 (v1.14 and later) starts only below {EV_START_INTERVAL_S:g} s apart."
     yield finding(
         "error" if slow else "warning",
         "source_thinned",
-        f"{source.name} comes at {1.0 / interval_s:.2g} Hz, at whole multiples of {base:.3g} s",
-        f": of a source of {1.0 / base:.2g} Hz {lost:.0%} is missing, thinned on its way or lost."
-        f"{starts if slow else ''}",
-        "Send every position: raise the rate of the stream at the sender (MAVROS, the bridge, "
-        "the link), and do not limit it.",
         {"rate_hz": 1.0 / interval_s, "source_rate_hz": 1.0 / base, "lost_share": lost},
-    )
+        source=source.name, base_s=base, starts=slow, least_s=EV_START_INTERVAL_S,
+    )  # fmt: skip
 
 
 def _intervals(analysis: Analysis) -> tuple[Array, float]:

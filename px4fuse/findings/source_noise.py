@@ -52,32 +52,13 @@ def slow(analysis: Analysis) -> Found:
         return  # smoothed
     low, high = (number_words(end, 1) for end in (found.low_s, found.high_s))
     over = f"{low} to {high} s" if np.isfinite(found.high_s) else f"at least {low} s"
-    gnss = analysis.source.origin.is_gnss
+    gnss, source = analysis.source.origin.is_gnss, analysis.source.name
     evidence = {name: value for name, value in asdict(found).items() if np.isfinite(value)}
     assumed_m = [analysis.settings.sigma_z_m, *map(ekf2_noise_m, analysis.axes.values())]
     if (beyond := found.white_m / float(np.nanmin(assumed_m))) > NOISE_FITS:
         evidence[WHITE_BEYOND] = beyond
-    yield (info if gnss else warning)(
-        "source_coloured",
-        f"The errors of {analysis.source.name} hang together over {over}",
-        f": a slow part of about {found.slow_m:.2g} m beside white noise of {found.white_m:.2g} m. "
-        "Both filters take each error for new: they follow the slow part, which shows in no "
-        "innovation, and claim to be better than they are.",
-        "No SIGMA_Z and no noise of EKF2 describes both parts: do not lower it to the white part. "
-        + (
-            "A receiver's errors are like that: let its accuracy, and R, cover both."
-            if gnss
-            else "Look for what is slow (reflections, geometry of the anchors, a filter in the "
-            "sender), or feed the filters fewer positions, further apart than that time."
-        ),
-        evidence,
-    )
-
-
-def _in_view(analysis: Analysis) -> str:
-    if analysis.source.origin.is_gnss:
-        return "satellites in view, walls and trees, what radiates on board"
-    return "anchors in view, distance, people in between"
+    told = info if gnss else warning
+    yield told("source_coloured", evidence, found=found, source=source, over=over, gnss=gnss)
 
 
 def repeats(analysis: Analysis) -> Found:
@@ -89,14 +70,8 @@ def repeats(analysis: Analysis) -> Found:
     count, share = int(again.sum()), float(again.mean()) if len(again) else 0.0
     if count < MIN_REPEATS or share < REPEATS:
         return
-    yield (error if share >= REPEATS_ERROR else warning)(
-        "source_repeats",
-        f"{share:.0%} of the positions of {analysis.source.name} are the one before, sent again",
-        f" ({count} of {len(again)}): the source holds a position until it has another. Each "
-        "repetition counts as a new measurement, with a time at which it was not measured.",
-        "Send each position once, with the time at which it was measured.",
-        {"count": count, "share": share},
-    )
+    told, evidence = error if share >= REPEATS_ERROR else warning, {"count": count, "share": share}
+    yield told("source_repeats", evidence, source=analysis.source.name, of=len(again))
 
 
 def unequal(analysis: Analysis) -> Found:
@@ -123,13 +98,9 @@ def unequal(analysis: Analysis) -> Found:
         return
     yield warning(
         "source_axes_unequal",
-        f"The noise of {analysis.source.name} is {large:.2g} m along {more}, and {small:.2g} m "
-        f"along {less}",
-        ": one SIGMA_Z, or one noise of EKF2, is too large for this or too small for that axis.",
-        f"Judge each axis by itself (--axis {more} --sigma-z {large:.2g}); for EKF2 take the "
-        "larger. Place the anchors so that they surround the flight in both directions.",
         {f"{less}_sigma_z_m": small, f"{more}_sigma_z_m": large},
-    )
+        source=analysis.source.name, large=large, noisier=more, small=small, less=less,
+    )  # fmt: skip
 
 
 def levels(analysis: Analysis) -> Found:
@@ -180,11 +151,6 @@ def levels(analysis: Analysis) -> Found:
     start, end = float(time[edges[begins]]), float(time[edges[ends] - 1])
     yield (error if ratio >= LEVELS_ERROR else warning)(
         "source_noise_changes",
-        f"{analysis.source.name} is noisier from {start:.0f} s to {end:.0f} s: innovations are "
-        f"{ratio:.1f} times as large as in the rest of the flight",
-        ", most of them and not single ones. No SIGMA_Z fits all of it.",
-        f"Look for what changed there ({_in_view(analysis)}); let the sender state its variance "
-        "for each position, or analyse the parts with --start, --end.",
         {"ratio": ratio, "first_s": start, "until_s": end},
-        ((start, end),),
-    )
+        ((start, end),), source=analysis.source.name, gnss=analysis.source.origin.is_gnss,
+    )  # fmt: skip

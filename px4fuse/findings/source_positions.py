@@ -18,7 +18,7 @@ from px4fuse.filter.coloured import Coloured, Smoothing
 from px4fuse.filter.signals import within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.imu import MIN_IMU_RATE_HZ, too_slow
-from px4fuse.findings.model import Found, finding, moments, times, warning
+from px4fuse.findings.model import Found, error, finding, moments, times, warning
 from px4fuse.findings.source_stamps import arrivals
 from px4fuse.flight import Columns, Unavailable
 from px4fuse.plain import factor_words
@@ -77,20 +77,10 @@ def _clock_known(analysis: Analysis) -> bool:
 
 def smoothing(analysis: Analysis) -> Found:
     """A low pass makes errors agree and positions late."""
-    found, name = low_pass(analysis), analysis.source.name
+    found = low_pass(analysis)
     if found is not None:
-        yield finding(
-            "error" if found.lag_s >= LAG_ERROR_S else "warning",
-            "source_smoothed",
-            f"{name} is smoothed before it is sent",
-            ": the errors of successive positions agree (correlation about "
-            f"{found.correlation:.1f}), and they come about {found.lag_s:.2f} s behind the motion. "
-            f"Behind that is a noise of {found.sigma_z_m:.2g} m. Both filters take the noise of "
-            "each position for new, trust them too much, and lag.",
-            "Switch the smoothing (averaging, filter) of the positioning system off and send raw "
-            "positions; it is no clock error, so leave the stamps as they are.",
-            asdict(found),
-        )
+        told = error if found.lag_s >= LAG_ERROR_S else warning
+        yield told("source_smoothed", asdict(found), found=found, source=analysis.source.name)
 
 
 def jumps(analysis: Analysis) -> Found:
@@ -109,25 +99,10 @@ def jumps(analysis: Analysis) -> Found:
         yield finding(
             "error" if size >= JUMP_ERROR_M else "warning",
             "source_jumps",
-            f"{analysis.source.name} jumps {times(len(large))} and stays there, by {size:.2f} m "
-            f"(± {1.96 * sigma:.2f}) at {at_s:.1f} s, while the IMU measures no such motion",
-            f": {_jumped(analysis)}. After it both filters are wrong by that, and consistent.",
-            f"Analyse one side of the jump with --start, --end; {_steady(analysis)} in flight.",
             {"count": len(large), "size_m": size, "at_s": at_s, "sigma_m": sigma},
-            moments(jump.time_s for jump in large),
-        )
-
-
-def _jumped(analysis: Analysis) -> str:
-    if analysis.source.origin.is_gnss:
-        return "another set of satellites, reflections, or RTK that was won or lost"
-    return "a false match, another set of anchors or an origin that was set again"
-
-
-def _steady(analysis: Analysis) -> str:
-    if analysis.source.origin.is_gnss:
-        return "wait for a steady fix (RTK) before take-off, and let nothing cover the antenna"
-    return "let the source keep one origin and one set of anchors"
+            moments(jump.time_s for jump in large), source=analysis.source.name,
+            often=times(len(large)), within_m=1.96 * sigma, case=analysis.source.origin.is_gnss,
+        )  # fmt: skip
 
 
 def scale(analysis: Analysis) -> Found:
@@ -148,14 +123,9 @@ def scale(analysis: Analysis) -> Found:
         yield finding(
             "error" if abs(off) >= SCALE_ERROR else "warning",
             "source_scale_wrong",
-            f"Distances of {analysis.source.name} are {abs(off):.0%} too "
-            f"{'long' if off > 0 else 'short'} (± {1.96 * sigma:.0%}) against the motion that the "
-            "IMU measures",
-            ": neither filter's innovations show it, since both follow the positions.",
-            "Measure a known distance with the source; survey the anchors again, and check its "
-            "unit and its calibration.",
             {"scale": 1.0 + off, "sigma": sigma},
-        )
+            source=analysis.source.name, off=abs(off), long=off > 0, within=1.96 * sigma,
+        )  # fmt: skip
 
 
 def outliers(analysis: Analysis) -> Found:
@@ -173,22 +143,14 @@ def outliers(analysis: Analysis) -> Found:
     count, share = len(times_s), len(times_s) / tuned.count
     if share < OUTLIERS or count < MIN_OUTLIERS:
         return
-    first = ", ".join(f"{time:.1f}" for time in times_s[:3])
-    origin, likely = analysis.source.origin, "for UWB most likely reflections without line of sight"
-    cure = "Give the tag line of sight to the anchors there, or reject them before they are sent"
-    if origin.is_gnss:
-        likely = "of GNSS most likely reflections, or a solution that changed"
-        cure = "Give the antenna a free sky, away from walls and from what radiates"
+    first, origin = ", ".join(f"{time:.1f}" for time in times_s[:3]), analysis.source.origin
     yield finding(
         "error" if share >= OUTLIERS_ERROR else "warning",
         "source_outliers",
-        f"{count} of {tuned.count} measurements ({share:.1%}) are outliers that no noise explains",
-        f" ({tuned.name}; at {first} s{' and more' if count > 3 else ''}): {likely}. They pull "
-        "both filters, and look like noise unless they are left out.",
-        f"{cure}; do not raise SIGMA_Z{f' or {origin.aid.noise}' if origin.aid else ''} for them.",
         {"count": count, "share": share, "first_s": times_s[0]},
-        moments(times_s),
-    )
+        moments(times_s), tuned=tuned, first=first, others=count > 3, case=origin.is_gnss,
+        aid=origin.aid, or_noise=origin.aid is not None,
+    )  # fmt: skip
 
 
 def stated_variance(analysis: Analysis) -> Found:
@@ -203,26 +165,20 @@ def stated_variance(analysis: Analysis) -> Found:
     if reported.empty or noise is None or low is None or high is None:
         return
     sigma = float(np.sqrt(reported.to_numpy().mean(axis=1)).mean())
-    factor, more = (sigma / noise) ** 2, ""
+    factor = (sigma / noise) ** 2
     size = max(factor, 1.0 / factor)
-    if factor > 1.0:  # slow errors, which R has to cover too, show in no innovation
-        if (error_m := _error_m(analysis)) is None:
-            more = ", unless slow errors, which no innovation shows, are the rest"
-        elif sigma**2 < REPORTED * error_m**2:
-            return
+    # slow errors, which R has to cover too, show in no innovation
+    error_m = _error_m(analysis) if factor > 1.0 else None
+    if error_m is not None and sigma**2 < REPORTED * error_m**2:
+        return
     if size >= REPORTED and not low <= sigma <= high:
         yield finding(
             "error" if size >= REPORTED_ERROR else "warning",
             "source_variance_wrong",
-            f"{source.name} reports a standard deviation of {sigma:.3g} m, and its noise is "
-            f"{noise:.3g} m",
-            f" (95 % {low:.3g} to {high:.3g}): the variance that it sends is {factor_words(size)} "
-            f"times too {'small' if factor < 1.0 else 'large'}{more}. EKF2 takes R from it "
-            "(EKF2_EV_NOISE_MD 0), though never less than EKF2_EVP_NOISE.",
-            f"Correct it at the sender: a variance of {noise**2:.2g} m², or set EKF2_EV_NOISE_MD "
-            f"to 1 and EKF2_EVP_NOISE to {noise:.2g}.",
             {"reported_sigma_m": sigma, "sigma_z_m": noise, "variance_factor": factor},
-        )
+            source=source.name, low=low, high=high, times=factor_words(size), small=factor < 1.0,
+            slow=factor > 1.0 and error_m is None, variance_m2=noise**2,
+        )  # fmt: skip
 
 
 def _error_m(analysis: Analysis) -> float | None:
@@ -258,10 +214,4 @@ def motion(analysis: Analysis) -> Found:
     """The vehicle hardly moved: nothing about dynamics can be identified."""
     extent = motion_range_m(analysis)
     if hardly_moved(analysis):
-        yield warning(
-            "no_motion",
-            f"The vehicle moved only {extent:.2f} m horizontally",
-            " (5 to 95 %): velocity, heading and clock offset cannot be judged from this flight.",
-            "Fly several passes of 5 m or more, with clear starts and stops.",
-            {"range_m": extent},
-        )
+        yield warning("no_motion", {"range_m": extent})

@@ -5,7 +5,7 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.findings.model import Found, error, finding, warning
+from px4fuse.findings.model import Found, error, warning
 from px4fuse.flight import ARRIVAL_METHODS, Ekf2, FusionRecord
 from px4fuse.recording import ClockMap
 
@@ -15,10 +15,6 @@ LATENCY_S = 0.02  # at 1 m/s a fifth of a good UWB's noise
 LATENCY_ERROR_S = 0.10  # at 1 m/s a good UWB's noise
 MIN_SAMPLES = 10
 PURE = 0.95  # of the samples of each part; a late message now and then passes
-ANSWER = (
-    "Let the companion answer TIMESYNC (MAVROS does by default; with pymavlink answer every "
-    "request), and send the positions after 500 answers, 50 s at 10 Hz."
-)
 
 
 def detect(analysis: Analysis) -> Found:
@@ -29,39 +25,21 @@ def detect(analysis: Analysis) -> Found:
     elif clock.distinct_stamps is not None:
         yield from constant(analysis.source.name, clock, clock.distinct_stamps)
     elif clock.method in ARRIVAL_METHODS:
-        ours = f"has the sender's own stamps, mapped by the {clock.method}"
-        if clock.method == "arrival time":
-            ours = "has to do the same, so that its track is late by the age of the positions"
         yield warning(
             "companion_not_synchronised",
-            f"The clock of the sender of {analysis.source.name} was never synchronised with the "
-            "autopilot's",
-            " (TIMESYNC): EKF2 took the time at which a position arrived for the time at which it "
-            f"was measured. Our filter {ours}.",
-            ANSWER,
             {"jitter_s": clock.jitter_s},
-        )
+            source=analysis.source.name, method=clock.method, own=clock.method != "arrival time",
+        )  # fmt: skip
 
 
 def constant(name: str, clock: ClockMap, distinct: int) -> Found:
     """They take too few values, and the receipt that stands in for them may jitter."""
-    yield error(
-        "source_stamps_constant",
-        f"The {clock.pairs} time stamps of {name} take only {distinct} "
-        f"{'values' if distinct > 1 else 'value'}",
-        ": when each position was measured is not known, the time of receipt stands in.",
-        "Send the time of measurement in the message (usec, time_usec), in microseconds as an "
-        "integer: a 32-bit float cannot hold it.",
-        {"stamps": clock.pairs, "distinct": distinct},
-    )
-    if clock.jitter_s > RECEIPT_JITTER_S:
+    evidence = {"stamps": clock.pairs, "distinct": distinct}
+    yield error("source_stamps_constant", evidence, source=name, values=distinct > 1)
+    if (jitter_s := clock.jitter_s) > RECEIPT_JITTER_S:
+        jitter_ms = jitter_s * 1e3
         yield warning(
-            "source_receipt_jitter",
-            f"The receipt of {name}, which stands in for its time stamps, jitters by "
-            f"{clock.jitter_s * 1e3:.0f} ms",
-            f": at 1 m/s that is an error of {clock.jitter_s:.3f} m.",
-            "Send the time of measurement in the message, and record close to the sender.",
-            {"jitter_s": clock.jitter_s},
+            "source_receipt_jitter", {"jitter_s": jitter_s}, source=name, jitter_ms=jitter_ms
         )
 
 
@@ -78,27 +56,12 @@ def arrivals(analysis: Analysis) -> Found:
     cut = until_synchronised(analysis)
     if cut is not None:
         until, latency = cut
-        yield finding(
-            "error" if latency >= LATENCY_ERROR_S else "warning",
-            "source_stamps_of_arrival",
-            f"Until {until:.1f} s the stamps of {name} are the times at which it arrived, from "
-            f"then on those of the measurement, {latency:.3f} s before it arrives",
-            ": the clocks were not synchronised before (PX4 wants 500 TIMESYNC answers). One clock "
-            "offset cannot hold for both parts.",
-            f"Analyse the rest (px4fuse compare LOG --start {until:.0f}), and let the clocks "
-            "synchronise for a minute before take-off.",
-            {"until_s": until, "latency_s": latency},
-            ((float(age.index[0]), until),),
-        )
+        told = error if latency >= LATENCY_ERROR_S else warning
+        evidence, spans = {"until_s": until, "latency_s": latency}, ((float(age.index[0]), until),)
+        yield told("source_stamps_of_arrival", evidence, spans, source=name, case=True)
     elif np.mean(age.abs() < ARRIVAL_AGE_S) >= PURE:
-        yield warning(
-            "source_stamps_of_arrival",
-            f"The stamps of {name} are the times at which it arrived, not those of the measurement",
-            ": the sender's clock was never synchronised with the autopilot's (TIMESYNC), and "
-            "every position is late by its latency.",
-            ANSWER,
-            {"until_s": float(age.index[-1])},
-        )
+        evidence = {"until_s": float(age.index[-1])}
+        yield warning("source_stamps_of_arrival", evidence, source=name, case=False)
 
 
 def until_synchronised(analysis: Analysis) -> tuple[float, float] | None:

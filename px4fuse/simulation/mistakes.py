@@ -1,4 +1,4 @@
-"""The mistakes that a simulated flight can have, as a table of data.
+"""The mistakes that a simulated flight can have; ``mistakes.toml`` has a row for each.
 
 Values are typed with their unit (``0.08``, ``80ms``, ``5%``, ``8s,40s``) or left out, which gives a
 clear case.
@@ -6,8 +6,9 @@ clear case.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import Literal
+from pathlib import Path
+
+import msgspec
 
 from px4fuse.errors import SettingsError, did_you_mean
 from px4fuse.simulation.scenario import KINDS, Kind, number, quantities
@@ -86,7 +87,7 @@ class Mistake:
     """
 
     fields: tuple[str, ...]
-    usual: float | Literal[True]
+    usual: float | bool
     help: str
     finding: str
     kinds: tuple[Kind, ...] = KINDS
@@ -104,161 +105,9 @@ class Mistake:
         return first + "".join(f"[,{name[1:]}]" for name in rest)
 
 
-# Of a source in a frame and with a clock of its own, which the log may lack
-INDOORS: tuple[Kind, ...] = ("aisle", "loop")
-
-
-MISTAKES: Mapping[str, Mistake] = MappingProxyType({
-    "clock-offset": Mistake(
-        ("clock_offset_s",), 0.25,
-        "Position stamps are late by this (negative: early).",
-        "NIS hardly shows it; the clock offset to add is minus this, and innovations correlate "
-        "with the acceleration.",
-    ),
-    "clock-drift": Mistake(
-        ("clock_drift_ppm",), 2000.0,
-        "The clock of the positions runs fast by this many parts per million.",
-        "The clock offset grows through the flight: the two halves give different offsets.",
-        kinds=INDOORS,
-    ),
-    "clock-jump": Mistake(
-        ("clock_jump_s",), 0.25,
-        "Until TIMESYNC converges at 50 s, stamps are times of arrival, late by this.",
-        "timestamp equals timestamp_sample for 50 s and not after; analyse the rest (--start 50).",
-        kinds=INDOORS,
-    ),
-    "nlos": Mistake(
-        ("nlos_percent", "nlos_size_m"), 5.0,
-        "This share of the positions is off by about SIZE (2 m), in bursts: no line of sight.",
-        "Innovations outside the gate while the bulk fits: remove outliers, leave SIGMA_Z.",
-    ),
-    "dropout": Mistake(
-        ("dropout_s", "dropout_at_s"), 8.0,
-        "The position source is silent that long, from AT seconds on (the middle).",
-        "A gap of the source: σ_p grows until the next update.",
-    ),
-    "imu-dropout": Mistake(
-        ("imu_dropout_s", "imu_dropout_at_s"), 2.0,
-        "The IMU is missing that long, from AT seconds on (the middle).",
-        "A gap of the IMU: the filter must raise Q there or it diverges.",
-    ),
-    "decimate": Mistake(
-        ("decimate_hz",), 2.0,
-        "The position source is thinned to this rate.",
-        "Below 5 Hz EKF2 would not fuse it; σ grows longer between updates.",
-    ),
-    "r-scale": Mistake(
-        ("r_scale",), 0.1,
-        "The reported variance and EKF2's noise² for the source are this factor times the truth.",
-        "The data ask for the true SIGMA_Z, not for the reported one: below 1 trusts the source "
-        "too much.",
-    ),
-    "yaw": Mistake(
-        ("yaw_deg",), 20.0,
-        "The position frame is turned against north, clockwise.",
-        "Innovations grow at every start and stop; the track's heading is off by this.",
-        kinds=INDOORS,
-    ),
-    "scale": Mistake(
-        ("scale_percent",), 5.0,
-        "Distances of the position source are too long: anchors surveyed wrongly.",
-        "NIS hardly shows it; a tape measure or the truth does.",
-        kinds=INDOORS,
-    ),
-    "jump": Mistake(
-        ("jump_m", "jump_at_s"), 1.0,
-        "Positions jump by this along the first leg at AT (two thirds) and stay: a false match.",
-        "One burst of innovations of the same sign; around a loop a closure error that is no "
-        "drift.",
-    ),
-    "smoothed": Mistake(
-        ("smoothed_s",), 0.5,
-        "The positioning system low-pass filters its positions with this time constant.",
-        "Innovations are correlated, and positions look late by this without a clock error.",
-    ),
-    "slow-error": Mistake(
-        ("slow_error_m", "slow_error_s"), 0.5,
-        "A further error of the positions changes slowly, over about TIME (30 s): multipath.",
-        "Innovations hardly show it, and both filters claim less than they err: R describes "
-        "independent errors only.",
-    ),
-    "heading": Mistake(
-        ("heading_deg", "heading_at_s"), 20.0,
-        "EKF2's heading is too large by this, from AT on (the start): a disturbed compass, and "
-        "outdoors an EKF2 that takes the heading from it as it is (EKF2_MAG_TYPE 1).",
-        "Innovations grow at every start, stop and corner; the positions are turned against the "
-        "attitude.",
-    ),
-    "mag": Mistake(
-        ("mag_gauss", "mag_at_s"), 0.2,
-        "A current beside the magnetometer adds this to its right axis from AT on (the middle).",
-        "The magnetometer's innovations change then, and EKF2's heading with them; away from "
-        "cables, or calibrate it with the motors running.",
-        kinds=("outdoor",),
-    ),
-    "accel-bias": Mistake(
-        ("accel_bias_m_s2",), 0.5,
-        "The accelerometer's forward axis reads too much by this.",
-        "Innovations have a mean along the nose: calibrate the accelerometer.",
-    ),
-    "vibration": Mistake(
-        ("vibration_m_s2",), 1.5,
-        "The accelerometer is this much noisier (mean over 0.1 s): propellers out of balance.",
-        "The data ask for a larger SIGMA_A.",
-    ),
-    "imu-rate": Mistake(
-        ("imu_rate_hz",), 20.0,
-        "The IMU is logged at this rate only, without averaging.",
-        "Logging rate too low: motion between samples is lost, noise is folded in.",
-    ),
-    "no-motion": Mistake(
-        ("no_motion",), True,
-        "The vehicle hovers where it took off.",
-        "Nothing about velocity, heading and clock can be identified.",
-    ),
-    "open-end": Mistake(
-        ("open_end_m",), 3.0,
-        "The loop ends this far before its start (loop only).",
-        "A false loop closure: forcing the end onto the start bends the whole path.",
-        kinds=("loop",),
-    ),
-    "no-vvo": Mistake(
-        ("no_vvo",), True,
-        "vehicle_visual_odometry is not logged, as with SDLOG_PROFILE 1.",
-        "The position source is not in the log, and what EKF2 kept of it stands in, thinned: set "
-        "SDLOG_PROFILE to 129.",
-        kinds=INDOORS,
-    ),
-    "ekf2-noise": Mistake(
-        ("ekf2_noise_m",), 0.02,
-        "EKF2_EVP_NOISE is this (outdoors EKF2_GPS_P_NOISE, which matters above 0.4 m).",
-        "Below the source's noise EKF2's NIS is far above 1 and it rejects good samples; above it "
-        "NIS is far below 1.",
-        of_ekf2=True,
-    ),
-    "ekf2-delay": Mistake(
-        ("ekf2_delay_s",), 0.175,
-        "EKF2_EV_DELAY is this, while the stamps are right (outdoors EKF2_GPS_DELAY, where fixes "
-        "are 110 ms old).",
-        "EKF2 takes positions for older than they are, so that its track runs ahead of the truth; "
-        "set EKF2_EV_DELAY to 0 (EKF2_GPS_DELAY to 110).",
-        of_ekf2=True,
-    ),
-    "ekf2-gate": Mistake(
-        ("ekf2_gate",), 1.0,
-        "EKF2_EVP_GATE (EKF2_GPS_P_GATE) is this: samples further off than so many √S are "
-        "rejected.",
-        "EKF2 rejects good samples, loses its track and resets to a sample now and then.",
-        of_ekf2=True,
-    ),
-    "ekf2-off": Mistake(
-        ("ekf2_off",), True,
-        "EKF2_EV_CTRL (EKF2_GPS_CTRL) is 0.",
-        "EKF2 never fuses the positions and does not know where it is; set EKF2_EV_CTRL to 1 "
-        "(EKF2_GPS_CTRL to 5).",
-        of_ekf2=True,
-    ),
-})  # fmt: skip
+MISTAKES: Mapping[str, Mistake] = msgspec.toml.decode(
+    Path(__file__).with_name("mistakes.toml").read_bytes(), type=dict[str, Mistake]
+)
 
 
 def parse(texts: Iterable[str]) -> Mistakes:
