@@ -54,6 +54,7 @@ class Columns:
     ]
     EARTH_FIELD: Final = [f"earth_field_{axis}_gauss" for axis in AXIS_NAMES]
     BODY_FIELD: Final = [f"body_field_{axis}_gauss" for axis in ("forward", "right", "down")]
+    FIELD_INNOVATION: Final = [f"innovation_{axis}_gauss" for axis in ("forward", "right", "down")]
     DELAYED_STATE: Final = [
         *QUATERNION, *VELOCITY, *POSITION, *GYRO_BIAS,
         *ACCELEROMETER_BIAS, *EARTH_FIELD, *BODY_FIELD,
@@ -274,14 +275,17 @@ class FusionRecord:
     vision_age_s : Series
         How long after its measurement stamp each external vision sample was published (s), by that
         stamp; empty where not logged.
-    field_gauss : DataFrame, shape (m, 4)
+    field_gauss : DataFrame, shape (m, 4) or (m, 7)
         Magnetic field that was measured, body FRD, by time of measurement, and ``fused_3d``: 1
-        where EKF2 fused all of it, 0 where only its heading; empty where not logged.
+        where EKF2 fused all of it, 0 where only its heading; empty where not logged. From v1.16 on
+        also EKF2's low pass of all its innovations (expected minus measured).
     flow : DataFrame, shape (l, 5)
         Velocity of the body by optical flow, ``forward_m_s`` and ``right_m_s`` (FRD), by the time
         that EKF2 takes the last of ``samples`` to be of, which are ``interval_s`` apart and count
         for less the older they are (:data:`FLOW_SHARE`); ``noise_m2_s2`` is R of each. Empty where
         the log does not hold it.
+    latitude_deg : float
+        Of the origin; NaN where the log has none.
     altitude_m : float
         Of the origin, where EKF2 keeps its height as altitude above the sea (from v1.16); else 0.
     height_bias : mapping from PX4's name of an aid to DataFrame, shape (k, 2)
@@ -298,11 +302,17 @@ class FusionRecord:
     vision_age_s: pd.Series
     field_gauss: pd.DataFrame = field(default_factory=pd.DataFrame)
     flow: pd.DataFrame = field(default_factory=pd.DataFrame)
+    latitude_deg: float = np.nan
     altitude_m: float = 0.0
     height_bias: Mapping[str, pd.DataFrame] = field(default_factory=dict)
     states: Mapping[str, pd.Series[float]] = field(default_factory=dict)
 
     __repr__ = brief
+
+    @property
+    def keeps_latitude(self) -> bool:
+        """Whether EKF2 keeps its position as latitude and longitude (from v1.16)."""
+        return not np.isfinite(self.delayed["north_m"]).any()
 
     def was(self, state: str, times_s: Array) -> BoolArray:
         """Whether EKF2 was in one of :attr:`states` then; not where the log does not tell."""

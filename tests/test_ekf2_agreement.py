@@ -75,6 +75,9 @@ def agreeing(
         (agreeing(0.95), 0.0, 0.0, True, "correlate by 0.9500"),
         (agreeing(published_m=0.09), 0.0, 0.0, True, "correlate by 1.0000 or better"),
         (agreeing(published_m=0.11), 0.0, 0.0, False, "what is published is 0.11 m off the log"),
+        # with digits enough to be beyond what is allowed
+        (agreeing(published_m=0.1028), 0.0, 0.0, False, "is 0.103 m off the log (RMS; at most 0.1"),
+        (agreeing(published_m=0.10004), 0.0, 0.0, False, "published is 0.10004 m off the log"),
         (agreeing(0.949), 0.0, 0.09, False, "correlate by 0.9490 only"),
         # where much is rejected, shares and NIS decide
         (agreeing(0.5), 0.1, 0.06, True, "6.0% of the samples are rejected, 10.0% in the log"),

@@ -16,7 +16,7 @@ from golden_tools import agrees, rounded, value
 
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
-from px4fuse.ekf2.model import MODEL_NOTE
+from px4fuse.ekf2.inputs import MODEL_NOTE
 from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import NAMES, Finding, by_root, find

@@ -201,7 +201,7 @@ def test_fixes_that_come_while_ekf2_does_without_gnss_are_not_fused() -> None:
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize(
-    ("name", "least"), [("v1.16.1_gps_stock_flow", 0.996), ("main202603_gps_outage_flow", 0.998)]
+    ("name", "least"), [("v1.16.1_gps_stock_flow", 0.999), ("main202603_gps_outage_flow", 0.999)]
 )
 def test_flights_with_flow_are_replayed(
     name: str, least: float, shared_logs: Path, model_of: Any
@@ -215,12 +215,11 @@ def test_flights_with_flow_are_replayed(
         assert 0.99 < axis.s_ratio_p5 < axis.s_ratio_p95 < 1.01
         assert axis.position_rms_difference_m < 0.03
     if "outage" in name:
-        # of 50 samples a second the log tells of 47, and heading and scale of the flow drift
-        assert agreement.carried_difference_m == pytest.approx(0.5, abs=0.05)
-        assert set(agreement.doubtful) == {"optical_flow"}
-        lost_s, back_s = found.inputs.stretches[0].time_s[-1], found.inputs.stretches[1].time_s[0]
+        assert agreement.carried_difference_m < 0.5
+        assert agreement.doubtful == {}
+        ((lost_s, back_s),) = found.flown.carried_s
         assert lost_s == pytest.approx(42.1, abs=0.2)  # 35.2 s after take-off
-        assert back_s == pytest.approx(74.0, abs=1.0)
+        assert back_s == pytest.approx(72.6, abs=1.0)
     else:
         assert agreement.carried_difference_m is None
         said = " ".join(
@@ -231,11 +230,24 @@ def test_flights_with_flow_are_replayed(
 
 
 @pytest.mark.reallogs
+def test_what_flow_carried_too_far_off_is_left_out(
+    shared_logs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("px4fuse.ekf2.replay.MAX_CARRIED_OFF_M", 0.3)
+    found = opened(read_log(shared_logs / "gps" / "main202603_gps_outage_flow.ulg"))
+    assert set(found.agreement.doubtful) == {"optical_flow"}
+    assert 0.3 < found.agreement.carried_difference_m < 0.5
+    before, after = found.inputs.stretches
+    assert before.time_s[-1] == pytest.approx(42.1, abs=0.2)
+    assert after.time_s[0] == pytest.approx(74.0, abs=1.0)
+
+
+@pytest.mark.reallogs
 def test_a_flight_that_crashes_is_followed_up_to_its_tumble(shared_logs: Path) -> None:
     """Vertical velocity was reset at 47 s, and much of the IMU clipped at 26 and at 46 s."""
     found = opened(read_log(shared_logs / "real" / "PX4_flight-review-rs_ekf_failure.ulg"))
     ends = [(one.time_s[0], one.time_s[-1]) for one in found.inputs.stretches]
-    assert np.array(ends) == pytest.approx(np.array([(6.7, 24.7), (30.7, 44.2), (49.7, 67.4)]),
+    assert np.array(ends) == pytest.approx(np.array([(6.7, 24.7), (30.7, 44.2), (49.7, 67.2)]),
                                            abs=0.1)  # fmt: skip
     agreement = found.agreement
     for axis in (*agreement.gnss_pos.values(), *agreement.gnss_hgt.values(),

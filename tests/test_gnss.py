@@ -477,9 +477,9 @@ def test_ekf2_on_gnss_is_replayed(models: dict[str, Model]) -> None:
             assert axis.s_ratio_median == pytest.approx(1.0, abs=0.002)
         assert agreement.rejected_share_replayed == agreement.rejected_share_logged == 0.0
     for axis in models["fullrate"].agreement.gnss_pos.values():
-        assert axis.innovation_correlation > 0.9995
-        assert axis.innovation_rms_difference < 0.01
-        assert axis.position_rms_difference_m < 0.012
+        assert axis.innovation_correlation > 0.9999
+        assert axis.innovation_rms_difference < 0.004
+        assert axis.position_rms_difference_m < 0.004
     rejecting = models["overconfident"].agreement
     assert rejecting.good
     assert rejecting.rejected_share_replayed == pytest.approx(

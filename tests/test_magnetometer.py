@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from ulog_tools import Log, gnss_log, seconds_of, stamps, topic
 
 from px4fuse.ekf2.magnetometer import Samples, fuse_field, gather
-from px4fuse.ekf2.stretches import Sensed, _field_s
-from px4fuse.flight import FusionRecord
+from px4fuse.ekf2.stretches import Sensed, Stretch, _field_s, _mean_field
+from px4fuse.flight import Columns, FusionRecord
 from px4fuse.readers import read_log
 
 EARTH = np.array([0.21, 0.015, 0.43])
@@ -153,6 +153,65 @@ def test_what_ekf2_kept_is_taken_where_that_is_more(tmp_path: Path) -> None:
     np.testing.assert_allclose(field.iloc[:, :3], np.tile(2.0 * EARTH, (len(field), 1)), rtol=1e-6)
     stamped_s = seconds_of(log["estimator_aid_src_mag"]["timestamp"])[0]
     assert field.index[0] - stamped_s == pytest.approx(0.02 + 0.5 * 0.01, abs=1e-6)
+
+
+def test_samples_between_two_rows_are_told_by_the_low_pass_of_innovations(tmp_path: Path) -> None:
+    """Those that EKF2 kept at a low rate are taken all the same, unless the sensor has them all."""
+    log = magnetic()
+    kept = log["estimator_aid_src_mag"]
+    kept["innovation_filtered"] = np.linspace(0.0, 0.01, kept["timestamp"].size)[:, None] + EARTH
+    field = record_of(log, tmp_path).field_gauss
+    assert len(field) == kept["timestamp"].size
+    np.testing.assert_allclose(field.iloc[:, :3], np.tile(2.0 * EARTH, (len(field), 1)), rtol=1e-6)
+    np.testing.assert_allclose(field[Columns.FIELD_INNOVATION], kept["innovation_filtered"], 1e-6)
+    at = stamps(20.0, 12.0)
+    log.drop("vehicle_magnetometer")
+    log.add(topic("vehicle_magnetometer", at, {"magnetometer_ga": np.tile(EARTH, (len(at), 1))}))
+    field = record_of(log, tmp_path).field_gauss
+    assert len(field) == len(at)
+    assert list(field) == ["forward_gauss", "right_gauss", "down_gauss", "fused_3d"]
+
+
+def test_a_mean_of_samples_is_what_was_expected_less_the_mean_innovation() -> None:
+    """The vehicle turns, EKF2's attitude is off the published one, and the sensor is noisy."""
+    count, every, rows = 12, 7, 30
+    interval_s, dt = 0.5 / every, 0.008
+    time_s = 100.0 + dt * np.arange(round(rows * 0.5 / dt) + 200)
+    heading = 0.8 * np.sin(0.9 * time_s)
+    rotation = Rotation.from_euler("ZY", np.column_stack([heading, 0.2 * heading]))
+    error = np.tile([0.002, -0.003, 0.01], (len(time_s), 1))
+    body = np.array([0.02, -0.01, 0.03])
+    rng = np.random.default_rng(7)
+    taken_s = time_s[0] + 0.2 + interval_s * np.arange(rows * every)
+    step = np.searchsorted(time_s, taken_s - 1e-9)
+    measured = rng.normal(0.0, 0.3, (len(taken_s), 3))
+    own = Rotation.from_rotvec(error[step]) * rotation[step]
+    innovation = own.inv().apply(EARTH) + body - measured
+    share = interval_s / (interval_s + 0.5)
+    filtered = innovation.copy()
+    for k in range(1, len(taken_s)):
+        filtered[k] = filtered[k - 1] + share * (innovation[k] - filtered[k - 1])
+    kept = np.r_[np.arange(every - 1, len(taken_s), every)]
+    kept = np.delete(kept, [count, *range(20, 26)])  # the logger missed one, then three seconds
+    fields = [*Columns.EARTH_FIELD, *Columns.BODY_FIELD]
+    delayed = pd.DataFrame(dict(zip(fields, [*EARTH, *body], strict=True)), [99.0, 200.0])
+    stretch = made(
+        Stretch, time_s=time_s, rotation=rotation.as_matrix(), attitude_error_rad=error
+    )  # fmt: skip
+    found = _mean_field(stretch, delayed, taken_s[kept], filtered[kept])
+    near = np.flatnonzero(np.diff(kept) < 20) + 1
+    assert found.samples.tolist() == np.diff(kept)[near - 1].tolist()
+    assert sorted(set(found.samples)) == [7.0, 14.0]
+    assert found.step.tolist() == step[kept[near]].tolist()
+    for row, samples, value, turn in zip(
+        kept[near], found.samples.astype(int), found.value, found.turn, strict=True
+    ):
+        of = row - np.arange(samples)
+        weight = (1.0 - share) ** np.arange(samples)
+        weight /= weight.sum()
+        np.testing.assert_allclose(value, weight @ measured[of], atol=1e-4)
+        expected = np.einsum("k,kab->ba", weight, rotation[step[of]].as_matrix())
+        np.testing.assert_allclose(turn, expected, atol=1e-9)
 
 
 def settled(frame_hz: float, on: slice, count: int = 60) -> tuple[float, float] | None:

@@ -11,7 +11,8 @@ from exchange import replace
 from flights import unexplained
 
 from px4fuse.comparison.comparison import compare
-from px4fuse.ekf2.model import MODEL_NOTE, open_model
+from px4fuse.ekf2.inputs import MODEL_NOTE
+from px4fuse.ekf2.model import open_model
 from px4fuse.ekf2.replay import Agreement
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.settings import Settings

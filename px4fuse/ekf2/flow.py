@@ -15,7 +15,7 @@ import pandas as pd
 
 from px4fuse.arrays import Array
 from px4fuse.ekf2.magnetometer import Samples, fuse_mean
-from px4fuse.ekf2.stretches import VELOCITY, Sensed, Stretch
+from px4fuse.ekf2.stretches import VELOCITY, Sensed, Stretch, low_passed
 from px4fuse.flight import FLOW_SHARE
 
 
@@ -33,11 +33,7 @@ def with_flow(stretch: Stretch, flow: pd.DataFrame, gate: float) -> Stretch:
     begin_s = flow.index - (flow["samples"] - 1.0) * flow["interval_s"]
     flow = flow[(begin_s > stretch.time_s[0]) & (flow.index <= stretch.time_s[-1])]
     count, interval_s = flow["samples"].to_numpy(), flow["interval_s"].to_numpy()
-    back = np.arange(int(count.max(initial=1.0)))
-    weight = np.where(back < count[:, None], (1.0 - FLOW_SHARE) ** back, 0.0)
-    weight /= weight.sum(axis=1, keepdims=True)
-    taken_s = flow.index.to_numpy()[:, None] - back * interval_s[:, None]
-    step = np.searchsorted(stretch.time_s, taken_s - 1e-9)
+    step, weight = low_passed(stretch, flow.index.to_numpy(), count, interval_s, FLOW_SHARE)
     turn = stretch.rotation[step].swapaxes(2, 3)[:, :, :2]
     gained = np.einsum("ki,kiab,kib->ka", weight, turn, stretch.gained_m_s[step])
     speed, mean = flow[["forward_m_s", "right_m_s"]], np.einsum("ki,kiab->kab", weight, turn)

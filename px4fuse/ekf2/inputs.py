@@ -13,6 +13,7 @@ import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
+from px4fuse.ekf2.earth import metres_of
 from px4fuse.ekf2.flow import with_flow
 from px4fuse.ekf2.heights import with_heights
 from px4fuse.ekf2.stretches import IMU_GAP_S, MIN_STRETCH_S, Stretch, find_stretches, predict_s
@@ -38,6 +39,10 @@ from px4fuse.readers.px4_topics import DEFAULT_PROFILE
 from px4fuse.trajectory.rotation import conjugate, interpolate, matrix, multiply
 
 WHAT = "EKF2 replay"
+# Where a log's EKF2 is this model (simulated flights), the log says so in these words
+MODEL_NOTE = (
+    "EKF2 in this log is px4fuse's model of EKF2, run on the simulated sensors, not PX4's EKF2"
+)
 # Logger limits of the topics that hold a copy of the vision samples (logged_topics.cpp)
 COPY_INTERVAL_S = {"estimator_visual_odometry_aligned": 0.2, "estimator_aid_src_ev_pos": 0.5}
 ROTATE_VISION_BIT = 64  # EKF2_AID_MASK, up to v1.13
@@ -203,6 +208,8 @@ def prepare(  # noqa: PLR0911, PLR0912 (a reason each)
     record, horizon_s = ekf2.record, ekf2.horizon_s
     if isinstance(record, Unavailable):
         return record
+    if MODEL_NOTE in flight.log.notes:  # whose earth is a sphere that does not turn
+        record = replace(record, latitude_deg=np.nan)
     if isinstance(innovations := ekf2.innovations["north"], Unavailable):
         return innovations
     modelled = (*OF_GNSS, *([FLOW.label] if len(record.flow) else [])) if gnss else ()
@@ -303,7 +310,7 @@ def _rules(record: FusionRecord, step_s: float, *, gnss: bool) -> Rules:
     if gnss:
         # resetHorizontalPositionTo, gps_control.cpp: from v1.16 on, which keeps latitude and
         # longitude, with twice the variance; since main of 2026 each aid by itself
-        scale = 1.0 if np.isfinite(record.delayed["north_m"]).any() else 2.0
+        scale = 2.0 if record.keeps_latitude else 1.0
         both = GNSS_MODE not in record.parameters
         return Rules(np.inf, np.inf, 7.0, NO_LIMIT, floor, by_delay, scale, both)
     # EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h
@@ -360,7 +367,7 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> Received | Un
     return Received(
         stamp,
         stamp,
-        samples[Columns.POSITION].to_numpy(),
+        samples[Columns.POSITION].to_numpy() * metres_of(record),
         stated.to_numpy(),
         *_decisions(ekf2, record, stamp, GNSS_POS),
         track.name,
@@ -429,7 +436,8 @@ def _besides(
     if isinstance(seen, Unavailable):
         return seen
     off = at_times(meant, seen.stamp_s) == 0.0
-    return replace(seen, position_m=np.where(off[:, None], np.nan, seen.position_m))
+    position_m = seen.position_m * metres_of(record)
+    return replace(seen, position_m=np.where(off[:, None], np.nan, position_m))
 
 
 def _decisions(

@@ -57,10 +57,6 @@ from px4fuse.errors import SettingsError
 from px4fuse.flight import Columns, Ekf2, Flight, Unavailable
 from px4fuse.readers.px4_innovations import with_gnss
 
-# Where a log's EKF2 is this model (simulated flights), the log says so in these words
-MODEL_NOTE = (
-    "EKF2 in this log is px4fuse's model of EKF2, run on the simulated sensors, not PX4's EKF2"
-)
 MAX_HORIZON_S = 1.0  # EKF2_DELAY_MAX
 
 # What an agreement says of an aid by another name
@@ -329,7 +325,8 @@ def run_variants(
 def _track(part: Run, state: Array) -> pd.DataFrame:
     """Position and velocity of a state at each step's end."""
     index = pd.Index(part.stretch.time_s, name="time_s")
-    return pd.DataFrame(np.hstack([state[:, POSITION], state[:, VELOCITY]]), index, Columns.STATE)
+    position = state[:, POSITION] / part.stretch.metres
+    return pd.DataFrame(np.hstack([position, state[:, VELOCITY]]), index, Columns.STATE)
 
 
 def _assemble(

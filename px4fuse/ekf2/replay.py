@@ -264,8 +264,9 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     carried_m = _carried_off_m(ekf2, replay)
     if carried_m is not None and carried_m > MAX_CARRIED_OFF_M:
         doubtful[FLOW.name] = (
-            f"while it alone carried the position, what is published comes {carried_m:.2f} m off "
-            f"the log (at most {MAX_CARRIED_OFF_M:g} m)"
+            "while it alone carried the position, what is published comes "
+            f"{_beyond(carried_m, MAX_CARRIED_OFF_M)} m off the log (at most "
+            f"{MAX_CARRIED_OFF_M:g} m)"
         )
     return Agreement(
         north=north,
@@ -475,8 +476,9 @@ def _verdict(
         most_m = looser * MAX_PUBLISHED_OFF_M
         if off_m > most_m:
             return False, (
-                f"the innovations agree, but what is published is {off_m:.2f} m off the log (RMS; "
-                f"at most {most_m:g} m): EKF2's output is not of this filter alone"
+                "the innovations agree, but what is published is "
+                f"{_beyond(off_m, most_m)} m off the log (RMS; at most {most_m:g} m): EKF2's "
+                "output is not of this filter alone"
             )
         return True, f"{correlated} or better"
     if max(logged_share, replayed_share) < REJECTING_SHARE:
@@ -490,6 +492,11 @@ def _verdict(
     if off > MAX_REJECTED_OFF or nis > MAX_NIS_OFF:
         return False, f"{words} (at most {MAX_REJECTED_OFF:.0%} and {MAX_NIS_OFF:.0%} are allowed)"
     return True, f"{words}; single samples part, since each rejection decides the next"
+
+
+def _beyond(value: float, most: float) -> str:
+    """A value beyond what is allowed, with two decimals, or as many as it takes to show that."""
+    return next(f"{value:.{n}f}" for n in range(2, 17) if round(value, n) > most or n == 16)
 
 
 def with_obedient(agreement: Agreement, obedient: Agreement) -> Agreement:

@@ -14,6 +14,7 @@ from scipy.linalg import block_diag
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
+from px4fuse.ekf2.earth import earth_rate_rad_s, metres_of
 from px4fuse.flight import BAD_ACCELERATION, Columns, Ekf2, Flight, FusionRecord, Unavailable
 from px4fuse.readers.px4_ekf2 import same_stamps, samples_per_step
 from px4fuse.trajectory.rotation import (
@@ -42,6 +43,8 @@ FIELD_AFTER_S = 1.0
 # EKF2 fuses 14 samples of the field a second (SENS_MAG_RATE is 15): one of fewer that are in the
 # log stands for several, down to this rate
 FIELD_HZ, LEAST_FIELD_HZ = 14.0, 1.5
+# Time constant of EKF2's low pass of innovations (updateAidSourceStatus, ekf_helper.cpp)
+FILTER_S = 0.5
 MIN_STRETCH_S = 10.0
 # Resets are published up to the longest delay and a row of the log later
 RESET_LATE_S = 0.5
@@ -139,7 +142,8 @@ class Stretch:
     rotation : ndarray, shape (n + 1, 3, 3)
         Nominal attitude, body FRD to NED.
     correction_rad : ndarray, shape (n, 3)
-        By how much the nominal attitude turns in each step beyond what the gyro measured.
+        By how much the nominal attitude turns in each step beyond what the gyro measured of the
+        vehicle, less how the earth turned.
     force_m_s2 : ndarray, shape (n, 3)
         Specific force of the body in each step, nominal bias removed, in the frame at its end.
     accelerometer_bias_m_s2 : ndarray, shape (3,)
@@ -170,6 +174,8 @@ class Stretch:
         axes together, as R turns them); None: never any.
     flow : Sensed or None
         What optical flow measured, where EKF2 fused it.
+    metres : (float, float, float)
+        What a metre of a track is in those of the state's position.
     """
 
     time_s: Array
@@ -190,6 +196,7 @@ class Stretch:
     heights: Heights | None = None
     shaken: Array | None = None
     flow: Sensed | None = None
+    metres: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     __repr__ = brief
 
@@ -307,10 +314,21 @@ def find_stretches(
         if np.all(np.diff(time)[covered] <= IMU_GAP_S):
             made = _stretch(imu, attitude, ekf2, record, at, high)
             if gnss:
+                made = _on_earth(made, record)
                 made = replace(made, shaken=_shaken(imu, record, made.time_s))
             within = of_field and of_field[0] <= states[at] and high <= of_field[1]
             found.append(_with_field(made, record, at, ekf2.step_s) if within else made)
     return tuple(found)
+
+
+def _on_earth(stretch: Stretch, record: FusionRecord) -> Stretch:
+    """The same stretch on an earth that turns, its position in EKF2's own metres."""
+    metres, state = metres_of(record), stretch.state.copy()
+    state[POSITION] *= metres
+    turned = earth_rate_rad_s(record) * stretch.step_s[:, None]
+    return replace(
+        stretch, state=state, metres=metres, correction_rad=stretch.correction_rad + turned
+    )
 
 
 def _breaks_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
@@ -416,10 +434,65 @@ def _with_field(stretch: Stretch, record: FusionRecord, at: int, step_s: float) 
     stamps = frame.index.to_numpy()
     age_s = record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     weight = max(FIELD_HZ * float(np.median(np.diff(stamps))), 1.0)
-    gauss = frame.drop(columns="fused_3d").to_numpy()
+    gauss = frame.iloc[:, :3].to_numpy()
     fields = np.asarray(start[[*Columns.EARTH_FIELD, *Columns.BODY_FIELD]])
     variance = np.asarray(start[Columns.DELAYED_VARIANCE[-6:]])
-    return with_field(stretch, stamps - age_s, gauss, weight, fields, variance)
+    made = with_field(stretch, stamps - age_s, gauss, weight, fields, variance)
+    if Columns.FIELD_INNOVATION[0] not in frame:
+        return made
+    filtered = frame[Columns.FIELD_INNOVATION].to_numpy()
+    return replace(made, field=_mean_field(stretch, record.delayed, stamps - age_s, filtered))
+
+
+def _mean_field(
+    stretch: Stretch, delayed: pd.DataFrame, taken_s: Array, filtered_gauss: Array
+) -> Sensed:
+    """Of the field, means of all samples between two rows, by EKF2's low pass of its innovations.
+
+    An innovation is what EKF2 expected minus what was measured, and what it expected is known.
+    """
+    between_s = np.diff(taken_s)
+    inside = (taken_s[:-1] > stretch.time_s[0]) & (taken_s[1:] <= stretch.time_s[-1])
+    row = np.flatnonzero(inside & (between_s > 0.0) & (between_s < RESTART_GAP_S)) + 1
+    taken_s, between_s = taken_s[row], between_s[row - 1]
+    count = np.maximum(np.rint(FIELD_HZ * between_s), 1.0)
+    share = between_s / (between_s + count * FILTER_S)
+    kept = ((1.0 - share) ** count)[:, None]
+    innovation = (filtered_gauss[row] - kept * filtered_gauss[row - 1]) / (1.0 - kept)
+    step, weight = low_passed(stretch, taken_s, count, between_s / count, share)
+    turn = stretch.rotation[step].swapaxes(2, 3)
+    earth, body = (
+        np.column_stack([np.interp(taken_s, delayed.index, delayed[name]) for name in names])
+        for names in (Columns.EARTH_FIELD, Columns.BODY_FIELD)
+    )
+    seen = earth[:, None] - np.cross(stretch.attitude_error_rad[step], earth[:, None])
+    expected = np.einsum("ki,kiab,kib->ka", weight, turn, seen) + body
+    mean = np.einsum("ki,kiab->kab", weight, turn)
+    return Sensed(step[:, 0], expected - innovation, mean, count, np.zeros(len(row)))
+
+
+def low_passed(
+    stretch: Stretch, newest_s: Array, count: Array, interval_s: Array, share: Array | float
+) -> tuple[IntArray, Array]:
+    """Of the samples that a low pass has the mean of: at which steps, and for how much each counts.
+
+    Parameters
+    ----------
+    newest_s, count, interval_s : ndarray, shape (m,)
+        When the newest of each mean was taken, how many there are, and how far apart.
+    share : float or ndarray, shape (m,)
+        Of a new sample in the low pass.
+
+    Returns
+    -------
+    step, weight : ndarray, shape (m, k)
+        Newest first, for the k of the longest.
+    """
+    back = np.arange(int(count.max(initial=1.0)))
+    weight = np.where(back < count[:, None], (1.0 - np.reshape(share, (-1, 1))) ** back, 0.0)
+    weight /= weight.sum(axis=1, keepdims=True)
+    taken_s = newest_s[:, None] - back * interval_s[:, None]
+    return np.searchsorted(stretch.time_s, taken_s - 1e-9), weight
 
 
 def with_field(

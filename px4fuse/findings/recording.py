@@ -4,7 +4,7 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
-from px4fuse.ekf2.model import MODEL_NOTE
+from px4fuse.ekf2.inputs import MODEL_NOTE
 from px4fuse.findings.model import Found, finding, info, times, warning
 from px4fuse.flight import Ekf2, Flight
 from px4fuse.plain import capital

@@ -26,6 +26,7 @@ from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 VISION = "vehicle_visual_odometry"
 STATES = 22  # attitude, velocity, position, biases, magnetic fields; the rest is wind and terrain
 MAG_3D_BIT = 5  # filter_control_status_u, common.h
+ALL_FIELD_HZ = 10.0  # EKF2 has 14 samples a second
 FIELD_COLUMNS = ("forward_gauss", "right_gauss", "down_gauss")
 # So near to a half, IMU samples per step may be rounded either way
 HALF = 0.05
@@ -289,8 +290,7 @@ def _read_record(
     if not inside[horizontal].to_numpy().any():  # from v1.16 kept as latitude and longitude
         inside[horizontal] = np.nan
         # and its height, where there is an origin, as altitude above the sea (ekf_helper.cpp)
-        origin_m = local["ref_alt"].dropna() if "ref_alt" in local else pd.Series(dtype=float)
-        altitude_m = float(origin_m.iloc[-1]) if len(origin_m) else 0.0
+        altitude_m = _last(local, "ref_alt", 0.0)
         inside["down_m"] += altitude_m
     age = _age_s(topics, VISION).sort_index()
     return FusionRecord(
@@ -305,6 +305,7 @@ def _read_record(
         vision_age_s=age[~age.index.duplicated()],
         field_gauss=_read_field(topics, step_s),
         flow=_read_flow(topics, meant),
+        latitude_deg=_last(local, "ref_lat", np.nan),
         altitude_m=altitude_m,
         states={one: meant[one] for one in px4.DISTURBANCES if one in meant},
         height_bias={
@@ -315,16 +316,29 @@ def _read_record(
     )
 
 
+def _last(frame: pd.DataFrame, column: str, otherwise: float) -> float:
+    """The last finite value of a column, where there is one."""
+    known = frame[column].dropna().to_numpy() if column in frame else np.zeros(0)
+    return float(known[-1]) if len(known) else otherwise
+
+
 def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
-    """What the magnetometer measured, of the two topics that have it the one with more rows."""
+    """What the magnetometer measured, of the two topics that have it.
+
+    The one with all samples, else the one that tells of those between its rows, else with more.
+    """
     found = []
     for topic, name in px4.MAGNETOMETER:
-        frame = topics.of_primary(Layout(topic, elements(list(FIELD_COLUMNS), name))).dropna()
+        own = elements(Columns.FIELD_INNOVATION, "innovation_filtered")
+        frame = topics.of_primary(Layout(topic, elements(list(FIELD_COLUMNS), name), own)).dropna()
         if name == "observation":  # by the time that EKF2 takes it to be of
             delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3
             frame = frame.set_axis(frame.index + delay_s + 0.5 * step_s)
         found.append(frame)
-    used, bits = max(found, key=len), topics.read(px4.CONTROL_BITS, step=True)["bits"].dropna()
+    all_of_it = [one for one in found if len(one) > ALL_FIELD_HZ * topics.log.duration_s]
+    means = [one for one in found if Columns.FIELD_INNOVATION[0] in one]
+    used = max(all_of_it or means or found, key=len)
+    bits = topics.read(px4.CONTROL_BITS, step=True)["bits"].dropna()
     if used.empty or bits.empty:
         return pd.DataFrame()
     flags = at_times(bits, used.index).astype(np.int64)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from px4fuse.ekf2.model import MODEL_NOTE
+from px4fuse.ekf2.inputs import MODEL_NOTE
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Flight

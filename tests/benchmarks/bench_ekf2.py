@@ -31,7 +31,7 @@ SIMULATED, ON_GNSS = SHARED / "simulated", SHARED / "gps"
 SAMPLE = REPOSITORY / "sample_logs" / "aisle_uwb.ulg"
 PAGE = REPOSITORY / "docs" / "ekf2.md"
 BEGIN, END = "<!-- bench_ekf2: begin -->", "<!-- bench_ekf2: end -->"
-OVERCONFIDENT, OUTLIERS, STOCK = "overconfident", "nlos", "stock_flow"
+OVERCONFIDENT, OUTLIERS = "overconfident", "nlos"
 
 
 def opened(path: Path) -> Model | Unavailable:
@@ -69,8 +69,6 @@ def judge_agreement(name: str, model: Model) -> None:
             assert abs(axis.nis_mean_replayed / axis.nis_mean_logged - 1.0) < 0.10, name
             continue
         least = 0.99 if OUTLIERS in name else 0.998 if gnss else 0.995
-        if STOCK in name:  # noises far smaller than R: so are its innovations
-            least = 0.996
         assert axis.innovation_correlation >= least, name
         assert abs(axis.s_ratio_median - 1.0) < 0.01, name
         assert axis.s_ratio_p5 > 0.96, name

@@ -1,0 +1,35 @@
+"""The earth as EKF2 takes it: how it turns, and the radii by which metres become degrees.
+
+From v1.16 on EKF2 keeps latitude and longitude, and moves and measures them by radii of curvature,
+while what PX4 publishes in metres, as every track here, is by a sphere.
+
+Sources: PX4-Autopilot ``lib/lat_lon_alt/lat_lon_alt.cpp`` (computeRadiiOfCurvature: that of the
+meridian is by q to the power of 2.5, where the ellipsoid has 1.5), ``EKF/ekf_helper.cpp``
+(calcEarthRateNED), ``EKF/ekf.cpp`` (predictState).
+"""
+
+import numpy as np
+
+from px4fuse.arrays import Array
+from px4fuse.flight import FusionRecord
+from px4fuse.readers.px4_positions import EARTH_RADIUS_M
+
+SPIN_RAD_S = 7.292115e-5
+EQUATOR_M, ECCENTRICITY = 6_378_137.0, 0.0818191908425
+
+
+def earth_rate_rad_s(record: FusionRecord) -> Array:
+    """Rate at which EKF2 takes the earth to turn, NED, shape (3,); 0 where it knows no latitude."""
+    latitude = np.radians(record.latitude_deg)
+    return np.nan_to_num(SPIN_RAD_S * np.array([np.cos(latitude), 0.0, -np.sin(latitude)]))
+
+
+def metres_of(record: FusionRecord) -> tuple[float, float, float]:
+    """EKF2's metres north, east and down in one metre of a track."""
+    if np.isnan(record.latitude_deg) or not record.keeps_latitude:
+        return 1.0, 1.0, 1.0
+    squared = ECCENTRICITY**2
+    q = 1.0 - squared * np.sin(np.radians(record.latitude_deg)) ** 2
+    radii_m = EQUATOR_M * np.array([(1.0 - squared) / q**2.5, q**-0.5]) + record.altitude_m
+    north, east = (radii_m / EARTH_RADIUS_M).tolist()
+    return north, east, 1.0

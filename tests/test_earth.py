@@ -1,0 +1,87 @@
+"""The earth in the model of EKF2: metres where EKF2 keeps latitude, and how the earth turns."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from ekf2_tools import opened
+from exchange import replace
+from findings_tools import made
+
+from px4fuse.ekf2.earth import earth_rate_rad_s, metres_of
+from px4fuse.ekf2.inputs import MODEL_NOTE
+from px4fuse.flight import Ekf2, FusionRecord
+from px4fuse.readers.px4_positions import EARTH_RADIUS_M
+from px4fuse.simulation.flights import simulate_flight
+from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.scenario import scenario_of
+
+# Metres of a degree of latitude and of longitude on WGS84, from a table of both
+DEGREE_M = {0.0: (110_574.0, 111_320.0), 45.0: (111_132.0, 78_847.0), 60.0: (111_412.0, 55_800.0)}
+ECCENTRICITY2 = 0.00669438
+
+
+def record(latitude_deg: float, altitude_m: float = 0.0, north_m: float = np.nan) -> FusionRecord:
+    delayed = pd.DataFrame({"north_m": [north_m]})
+    return made(
+        FusionRecord, latitude_deg=latitude_deg, altitude_m=altitude_m, delayed=delayed
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("latitude_deg", DEGREE_M)
+def test_metres_are_by_the_radii_that_ekf2_has(latitude_deg: float) -> None:
+    """That of the meridian is longer than the earth's, by what PX4's power has too much."""
+    north_m, east_m = DEGREE_M[latitude_deg]
+    latitude = np.radians(latitude_deg)
+    of_degree = np.radians(1.0) * EARTH_RADIUS_M
+    too_long = 1.0 / (1.0 - ECCENTRICITY2 * np.sin(latitude) ** 2)
+    north, east, down = metres_of(record(latitude_deg))
+    assert north * of_degree == pytest.approx(north_m * too_long, rel=2e-5)
+    assert east * of_degree * np.cos(latitude) == pytest.approx(east_m, rel=2e-5)
+    assert down == 1.0
+    higher = metres_of(record(latitude_deg, 637.1))
+    assert np.subtract(higher, (north, east, down)) == pytest.approx([1e-4, 1e-4, 0.0], abs=1e-12)
+
+
+def test_metres_are_those_of_the_track_where_ekf2_keeps_metres_or_has_no_origin() -> None:
+    assert metres_of(record(45.0, north_m=3.0)) == (1.0, 1.0, 1.0)
+    assert metres_of(record(np.nan)) == (1.0, 1.0, 1.0)
+
+
+def test_the_earth_turns_eastwards_once_in_a_sidereal_day() -> None:
+    rate = 2.0 * np.pi / 86_164.1
+    for latitude_deg, expected in ((0.0, (rate, 0.0, 0.0)), (90.0, (0.0, 0.0, -rate)),
+                                   (-30.0, (rate * 0.75**0.5, 0.0, 0.5 * rate))):  # fmt: skip
+        found = earth_rate_rad_s(record(latitude_deg))
+        np.testing.assert_allclose(found, expected, atol=1e-10)
+    np.testing.assert_array_equal(earth_rate_rad_s(record(np.nan)), np.zeros(3))
+
+
+def test_a_flight_on_gnss_is_replayed_on_the_earth() -> None:
+    """In EKF2's metres inside, in those of the tracks outside; simulated ones are on a sphere."""
+    flight = simulate_flight(scenario_of("outdoor", seed=3), parse(()))
+    assert MODEL_NOTE in flight.log.notes
+    known = flight.ekf2
+    assert isinstance(known, Ekf2)
+    assert isinstance(known.record, FusionRecord)
+    flat, round_ = (
+        opened(replace(flight, log=replace(flight.log, notes=notes)))
+        for notes in (flight.log.notes, ())
+    )
+    metres = metres_of(known.record)
+    assert metres == pytest.approx((1.00357, 1.00302, 1.0), abs=1e-5)
+    np.testing.assert_allclose(
+        round_.inputs.received.position_m, flat.inputs.received.position_m * metres
+    )
+    (flat_stretch,), (stretch,) = flat.inputs.stretches, round_.inputs.stretches
+    np.testing.assert_allclose(stretch.state[6:9], flat_stretch.state[6:9] * metres)
+    turned = stretch.correction_rad - flat_stretch.correction_rad
+    expected = earth_rate_rad_s(known.record) * stretch.step_s[:, None]
+    np.testing.assert_allclose(turned, expected, atol=1e-12)
+    for name in ("delayed", "published"):
+        apart = getattr(round_.flown, name) - getattr(flat.flown, name)
+        off_m = apart[["north_m", "east_m"]].abs().to_numpy()
+        assert 1e-4 < off_m.max() < 0.05
+        # not with the distance from the origin, which is up to 20 m
+        assert getattr(flat.flown, name)[["north_m", "east_m"]].abs().to_numpy().max() > 15.0
