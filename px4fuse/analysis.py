@@ -108,9 +108,11 @@ class Analysis(Comparison):
     @cached_property
     def causes(self) -> tuple[Intervention, ...]:
         """What was changed, each by itself, and what that explains of each discrepancy."""
-        return interventions(
-            self, self.tuning, self.clock, self.heading, self.explained, self.ekf2_model
-        )
+        model = self.ekf2_model
+        tried = interventions(self, self.tuning, self.clock, self.heading, self.explained, model)
+        if isinstance(model, Model):  # the largest part of it, which nothing else asks for
+            model.runs.clear()
+        return tried
 
     @cached_property
     def explained(self) -> Explained | Unavailable:

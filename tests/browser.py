@@ -120,6 +120,7 @@ class Browser:
     def open(self, path: Path, *, scripts: bool = True, width: int = 1400) -> None:
         self.call("Emulation.setScriptExecutionDisabled", value=not scripts)
         self._measure(width, 900)
+        self.scheme("")
         self.events.clear()
         self.call("Page.navigate", url=path.as_uri())
         while not any(event["method"] == "Page.loadEventFired" for event in self.events):
@@ -149,32 +150,10 @@ class Browser:
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 
-    def contrasts(self, scheme: str) -> dict[tuple[str, str, str], float]:
-        """Contrast of everything that shows text, by its colour, that behind it, and its class."""
-        self.call(
-            "Emulation.setEmulatedMedia",
-            features=[{"name": "prefers-color-scheme", "value": scheme}],
-        )
-        try:
-            found = self.ask(
-                """(() => {
-                  const behind = (node) => {
-                    for (let n = node; n; n = n.parentElement) {
-                      const colour = getComputedStyle(n).backgroundColor;
-                      if (colour !== "rgba(0, 0, 0, 0)") return colour;
-                    }
-                    return "rgb(255, 255, 255)";
-                  };
-                  return [...document.querySelectorAll(
-                    "h1, h2, small, dt, dd, th, td, .chip, .name, .file, li, label, .count,"
-                    + "figcaption, .note, button, kbd, mark"
-                  )].filter((node) => node.checkVisibility())
-                    .map((node) => [getComputedStyle(node).color, behind(node), node.className]);
-                })()"""
-            )
-        finally:
-            self.call("Emulation.setEmulatedMedia", features=[])
-        return {(front, back, name): contrast(front, back) for front, back, name in found}
+    def scheme(self, name: str) -> None:
+        """Whether the reader prefers "light" or "dark"; "" for what is usual."""
+        features = [{"name": "prefers-color-scheme", "value": name}] if name else []
+        self.call("Emulation.setEmulatedMedia", features=features)
 
     def click(self, selector: str) -> None:
         """Where a finger would: so that it fails on what is covered or hidden."""
@@ -229,18 +208,6 @@ class Browser:
             for event in self.events
             if event["method"] == "Network.requestWillBeSent"
         }
-
-
-def contrast(one: str, other: str) -> float:
-    """Of two colours as a browser writes them, by WCAG 2."""
-
-    def luminance(colour: str) -> float:
-        parts = [int(part) / 255.0 for part in re.findall(r"\d+", colour)[:3]]
-        linear = [p / 12.92 if p <= 0.04045 else ((p + 0.055) / 1.055) ** 2.4 for p in parts]
-        return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
-
-    low, high = sorted((luminance(one), luminance(other)))
-    return (high + 0.05) / (low + 0.05)
 
 
 @pytest.fixture(scope="session")

@@ -9,30 +9,25 @@ from collections.abc import Mapping
 from contextvars import copy_context
 from pathlib import Path
 
-from conftest import REPOSITORY, page_of
+from conftest import REPORT, page_of
 
+from px4fuse import workers
 from px4fuse.grading import grade as grading
 from px4fuse.grading import records
 from px4fuse.grading.model import Entry, Graded, Item
-from px4fuse.verification import workers
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import log_sha256, verify
 
-REPORT = REPOSITORY / "reports" / "aisle_uwb.pdf"
 VERIFIED = Verdict("verified", ("the log gives every value again",), True, page_status="same")
 
 
-class Reports:
-    """The sample's report on an empty page, with another student, notes and log in its results."""
-
-    def __init__(self) -> None:
-        self._results = json.loads(REPORT.with_suffix(".json").read_text(encoding="utf-8"))
-
-    def of(self, name: str, student_id: str, log: str = "", notes: str = "") -> bytes:
-        results = {**self._results, "student": {"name": name, "id": student_id, "notes": notes}}
-        if log:
-            results["log"] = {**results["log"], "sha256": log}
-        return page_of(None, json.dumps(results))
+def report_of(name: str, student_id: str, log: str = "") -> bytes:
+    """The sample's report on an empty page, with another student and log in its results."""
+    results = json.loads(REPORT.with_suffix(".json").read_text(encoding="utf-8"))
+    results["student"] = {"name": name, "id": student_id, "notes": ""}
+    if log:
+        results["log"]["sha256"] = log
+    return page_of(None, json.dumps(results))
 
 
 def at_once(monkeypatch) -> list[str]:

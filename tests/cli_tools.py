@@ -9,11 +9,28 @@ import pytest
 from click.testing import CliRunner, Result
 
 from px4fuse.cli import cli, main
+from px4fuse.errors import Px4FuseError
 
 
-def run(*arguments: str | Path) -> Result:
+def run(*arguments: object) -> Result:
     """In a pipe, in which no line is wrapped, whatever runs the tests says of its own width."""
     return CliRunner(env={"COLUMNS": None}).invoke(cli, [str(argument) for argument in arguments])
+
+
+def done(*arguments: object, code: int = 0) -> Result:
+    """A command that ends with this exit code."""
+    result = run(*arguments)
+    assert result.exit_code == code, (arguments, result.output, result.exception)
+    return result
+
+
+def refused(*arguments: object) -> str:
+    """What is said, in one line, of what cannot be done."""
+    result = run(*arguments)
+    assert isinstance(result.exception, Px4FuseError), (arguments, result.output)
+    assert result.stdout == ""
+    assert "\n" not in str(result.exception)
+    return str(result.exception)
 
 
 def run_main(monkeypatch, capsys, *arguments: str | Path) -> tuple[int, str, str]:

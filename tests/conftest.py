@@ -13,6 +13,7 @@ from __future__ import annotations
 import gc
 import io
 import os
+import pickle
 import signal
 from collections.abc import Callable, Iterator
 from functools import lru_cache
@@ -28,10 +29,16 @@ from exchange import replace
 from explore_tools import explored, page  # noqa: F401 - fixtures
 from hypothesis import HealthCheck, settings
 from pypdf import PdfWriter
+from ulog_tools import Log
 
 import px4fuse
 from px4fuse import analysis
+from px4fuse.comparison import comparison
 from px4fuse.ekf2.model import Model, open_model
+from px4fuse.filter import kalman
+from px4fuse.filter.kalman import Replay
+from px4fuse.filter.settings import Settings
+from px4fuse.filter.signals import Axis
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.notebook import commands
 from px4fuse.readers import read_log
@@ -39,6 +46,9 @@ from px4fuse.report import pdf
 from px4fuse.request import ComparisonRequest
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+SAMPLES = REPOSITORY / "sample_logs"
+LOG = SAMPLES / "aisle_uwb.ulg"
+REPORT = REPOSITORY / "reports" / "aisle_uwb.pdf"
 SHARED = REPOSITORY.parent / "shared"
 
 # A shell's background jobs ignore Ctrl-C, and so would all that the tests start
@@ -99,7 +109,7 @@ def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> 
 @pytest.fixture(scope="session")
 def sample_log() -> Path:
     """The sample flight that ships with the project."""
-    return REPOSITORY / "sample_logs" / "aisle_uwb.ulg"
+    return LOG
 
 
 @pytest.fixture(scope="session")
@@ -138,6 +148,21 @@ def shared_logs() -> Path:
 def model_of() -> Callable[[Path], Model | Unavailable]:
     """EKF2's model of a log; the last ones of a process are kept."""
     return lru_cache(8)(lambda path: open_model(read_log(path)))
+
+
+@pytest.fixture
+def read(tmp_path: Path) -> Callable[..., Flight]:
+    """Write a made log or recording and read it as a flight."""
+
+    def write_and_read(made: Any, *, stamped: bool = True, system: int | None = None) -> Flight:
+        if isinstance(made, Log):
+            return read_log(made.write(tmp_path / "made.ulg"))
+        recorder = getattr(made, "record", lambda: made)()
+        path = tmp_path / "made.tlog"
+        path.write_bytes(recorder.tlog() if stamped else recorder.raw())
+        return read_log(path, system=system)
+
+    return write_and_read
 
 
 def page_of(*drawn: Any) -> bytes:
@@ -236,8 +261,16 @@ def analysed_once() -> Iterator[None]:
         yield
 
 
-@pytest.fixture
-def analysed_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For tests of the analysis among others of what follows it."""
-    monkeypatch.setattr(analysis, "read_flight", _read)
-    monkeypatch.setattr(analysis, "run", _run)
+@pytest.fixture(scope="module")
+def replayed_once() -> Iterator[None]:
+    """The same axis runs through our filter once: of made flights often EKF2 alone is another."""
+    kept: dict[bytes, Replay] = {}
+
+    def once(axis: Axis, chosen: Settings) -> Replay:
+        known = pickle.dumps((axis, chosen))
+        kept[known] = kept.get(known) or kalman.replay(axis, chosen)
+        return kept[known]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(comparison, "replay", once)
+        yield

@@ -1,7 +1,5 @@
 """EKF2's model written down plainly, one prediction at a time: the oracle of the fast one."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from px4fuse.ekf2.inputs import Inputs, Rules

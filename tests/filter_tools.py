@@ -1,7 +1,5 @@
 """Axes and flights for the filter, with noises, biases and clocks that are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 from exchange import replace
@@ -138,10 +136,7 @@ def made_flight(
     imu = imu_table(time, force, rate)
     imu = imu[(time <= middle) | (time >= middle + hole_s)]
     flight = replace(
-        base,
-        imu=imu,
-        attitude=table(logged, quaternion, Columns.QUATERNION),
-        positions=(track,),
+        base, imu=imu, attitude=table(logged, quaternion, Columns.QUATERNION), positions=(track,)
     )
     return flight, outlier
 

@@ -1,7 +1,5 @@
 """Analyses that hold no more than a finding reads, so that the right answer is plain."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Iterable
 from types import SimpleNamespace

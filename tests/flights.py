@@ -6,8 +6,6 @@ consistent by construction. EKF2 is made by hand: truth plus noise of the size t
 say, and innovations whose NIS is what the test wants.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
@@ -24,6 +22,7 @@ from px4fuse.filter.signals import Axis, Segment, project_acceleration
 from px4fuse.filter.tuning import HORIZONTAL, tune
 from px4fuse.flight import (
     AXIS_NAMES,
+    Alignment,
     Columns,
     Ekf2,
     Flight,
@@ -324,6 +323,15 @@ def random_walk(
         a = rng.normal(0.0, sigma_a)
         p, v = p + v * DT + a * DT**2 / 2.0, v + a * DT
     return line(DT * per_update * np.arange(count), measured)
+
+
+def given_placement(*warnings: str) -> Alignment:
+    """Make the placement of a position file for which all was given."""
+    return Alignment(
+        frame="enu", frame_reason="given", yaw_deg=0.0, yaw_reason="given",
+        origin_m=(0.0, 0.0, 0.0), clock_offset_s=0.0, clock_reason="given", reference="",
+        warnings=warnings,
+    )  # fmt: skip
 
 
 def unexplained(comparison: Comparison) -> Analysis:

@@ -17,11 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from flights import GRAVITY_M_S2, motion
 from pymavlink.dialects.v20 import all as dialect
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array
+from px4fuse.flight import Flight, PositionTrack
 
 Address = tuple[int, int]
 
@@ -126,6 +128,15 @@ class Recorder:
 
     def raw(self) -> bytes:
         return b"".join(content for _, _, content in self.frames())
+
+
+def boot(flight: Flight, samples: pd.DataFrame) -> np.ndarray:
+    """Boot times of samples, s."""
+    return samples.index.to_numpy() + flight.log.boot_time_s
+
+
+def track_of(flight: Flight, name: str) -> PositionTrack:
+    return next(track for track in flight.positions if track.name == name)
 
 
 def same(boot_s: float) -> float:

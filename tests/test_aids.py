@@ -1,7 +1,5 @@
 """EKF2's aids: read from logs of each release, and judged by their own innovations."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +19,7 @@ from px4fuse.errors import MissingDataError
 from px4fuse.findings import find_aids
 from px4fuse.findings.aids import find_in
 from px4fuse.findings.causes import CAUSE, CHANGE, SENSOR
-from px4fuse.flight import AidLog, Unavailable
+from px4fuse.flight import AidLog, Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_innovations import innovations_of
 from px4fuse.results.reading import read_results
@@ -60,10 +58,13 @@ def aid_log(
     return AidLog(("a_topic",), axes, frame, meant, parameters)
 
 
-def judged(log: AidLog, name: str = "gnss_pos") -> AidResult:
+def with_aids(**aids: AidLog) -> Flight:
     flight = aisle_flight(duration_s=60.0)
-    found = judge_aids(replace(flight, ekf2=replace(flight.ekf2, aids={name: log})))
-    return found[name]
+    return replace(flight, ekf2=replace(flight.ekf2, aids=aids))
+
+
+def judged(log: AidLog, name: str = "gnss_pos") -> AidResult:
+    return judge_aids(with_aids(**{name: log}))[name]
 
 
 @pytest.mark.parametrize(
@@ -71,9 +72,7 @@ def judged(log: AidLog, name: str = "gnss_pos") -> AidResult:
     [(0.5, "consistent"), (0.58, "consistent"), (0.68, "variance understated"),
      (0.43, "consistent"), (0.37, "variance overstated")],
 )  # fmt: skip
-def test_a_verdict_needs_more_than_chance_and_a_quarter_in_sigma(
-    sigma: float, verdict: str
-) -> None:
+def test_a_verdict_needs_more_than_chance_and_a_quarter_in_sigma(sigma, verdict) -> None:
     aid = judged(aid_log(sigma=sigma))
     assert aid.verdict == verdict
     assert aid.nis_mean == pytest.approx((sigma / 0.5) ** 2, rel=0.06)
@@ -170,11 +169,10 @@ def test_an_aid_logged_once_a_second_is_not_starved_by_a_few_rows() -> None:
 def test_findings_name_the_aid_its_figures_and_when() -> None:
     log = aid_log()
     silent = replace(log, samples=outage_free(log, 20.0, 41.0), meant=steps((0.0, 1.0)))
-    flight = aisle_flight(duration_s=60.0)
-    aids = {"gnss_pos": silent, "gnss_vel": silent, "baro_hgt": aid_log(sigma=1.5),
-            "mag": aid_log(mean=-0.4), "ev_pos": aid_log(sigma=9.0), "rng_hgt": log}  # fmt: skip
-    found = judge_aids(replace(flight, ekf2=replace(flight.ekf2, aids=aids)))
-    assert not isinstance(found, Unavailable)
+    found = judge_aids(with_aids(
+        gnss_pos=silent, gnss_vel=silent, baro_hgt=aid_log(sigma=1.5), mag=aid_log(mean=-0.4),
+        ev_pos=aid_log(sigma=9.0), rng_hgt=log,
+    ))  # fmt: skip
     by_id = {one.id: one for one in find_aids(found)}
     assert set(by_id) == {"aid_starved", "aid_understated", "aid_biased"}
     assert "GNSS position, GNSS velocity" in by_id["aid_starved"].headline
@@ -213,9 +211,7 @@ def test_an_aid_that_changes_in_flight_is_told_with_the_time() -> None:
 
 
 @pytest.mark.parametrize("generation", ["v1.9", "v1.12", "v1.14", "v1.16"])
-def test_each_release_s_innovations_are_read_once_and_with_everybody_s_sign(
-    generation: str, tmp_path: Path
-) -> None:
+def test_each_release_s_innovations_are_read_once_and_with_everybody_s_sign(generation, tmp_path):
     flight = read_log(gnss_log(generation).write(tmp_path / "a.ulg"))
     aids = flight.ekf2.aids  # type: ignore[union-attr]
     assert [name for name in aids if name in ("gnss_pos", "gnss_hgt", "baro_hgt")] == ["gnss_pos"]
@@ -234,9 +230,7 @@ def test_each_release_s_innovations_are_read_once_and_with_everybody_s_sign(
 # ------------------------------------------------------------------------------ reported
 
 
-def test_checks_end_a_rig_where_a_verdict_on_ekf2_is_bad(
-    tmp_path: Path, monkeypatch, capsys
-) -> None:
+def test_checks_end_a_rig_where_a_verdict_on_ekf2_is_bad(tmp_path, monkeypatch, capsys) -> None:
     log, report = gnss_log("v1.16").write(tmp_path / "a.ulg"), tmp_path / "a.pdf"
     code, _, err = run_main(monkeypatch, capsys, "compare", log, "--checks", "-o", report)
     bad = [each.label for each in judge_aids(read_log(log)).values() if each.is_bad]
@@ -247,8 +241,7 @@ def test_checks_end_a_rig_where_a_verdict_on_ekf2_is_bad(
 @pytest.mark.parametrize(("sigma", "bad"), [(0.5, False), (0.25, False), (1.5, True)])
 def test_what_is_bad_for_a_rig(sigma: float, bad: bool) -> None:
     """Too sure is, too modest is not."""
-    flight = aisle_flight(duration_s=60.0)
-    made = replace(flight, ekf2=replace(flight.ekf2, aids={"gnss_pos": aid_log(sigma=sigma)}))
+    made = with_aids(gnss_pos=aid_log(sigma=sigma))
     alone = AidsAlone(made, judge_aids(made), Unavailable("it", "not there", "Log it."))
     assert bad_verdicts(alone) == ({"GNSS position": "variance understated"} if bad else {})
 

@@ -6,13 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from cli_tools import done, refused
 from flights import aisle_flight
 from pypdf import PdfReader
 
 from px4fuse.answers import MISTAKES, Claim, asked, form_text, read_answers
 from px4fuse.assignment.truth import quantity_truth
-from px4fuse.cli import cli
 from px4fuse.comparison.comparison import compare
 from px4fuse.errors import SettingsError
 from px4fuse.filter.kalman import replay
@@ -125,16 +124,11 @@ def test_silence_is_predicted_step_by_step() -> None:
 def test_the_way_of_a_form(tmp_path: Path, sample_log: Path) -> None:
     """``answers`` writes it, ``compare`` reads it into page and results."""
     form, report = tmp_path / "f.toml", tmp_path / "r.pdf"
-    made = CliRunner().invoke(cli, ["answers", str(sample_log), "-o", str(form)])
-    assert made.exit_code == 0, made.output
-    again = CliRunner().invoke(cli, ["answers", str(sample_log), "-o", str(form)],
-                               standalone_mode=False)  # fmt: skip
-    assert "exists already" in str(again.exception)
+    done("answers", sample_log, "-o", form)
+    assert "exists already" in refused("answers", sample_log, "-o", form)
     text = form.read_text(encoding="utf-8").replace('kind = ""', 'kind = "none"')
     form.write_text(text, encoding="utf-8")
-    words = ["compare", str(sample_log), "--answers", str(form), "-o", str(report)]
-    done = CliRunner().invoke(cli, words, standalone_mode=False)
-    assert done.exception is None, done.output
+    done("compare", sample_log, "--answers", form, "-o", report)
     reader = PdfReader(report)
     results = read_results(reader.attachments["results.json"][0])
     assert isinstance(results, ComparisonResults)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import pytest
-from click.testing import CliRunner
+from cli_tools import done
 from conftest import page_of
 from exchange import replace
 from forgery import Base, Change, base, forged, on_page, put, read_again, report_of
@@ -23,7 +23,6 @@ from results_tools import LOOP, SHA256, changed, decoded
 from px4fuse.answers import form_text
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.truth import truth_of
-from px4fuse.cli import cli
 from px4fuse.grading.model import Graded
 from px4fuse.grading.rubric import Rubric, assess, read_rubric, refused
 from px4fuse.report import pdf as pdf_module
@@ -102,15 +101,10 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     form = form.replace('kind = ""', 'kind = "nlos"', 1) + GAP
     (folder / "a.toml").write_text(form, encoding="utf-8")
     notes.write_text(HONEST, encoding="utf-8")
-    words = ["compare", str(log), "-o", str(pdf), "--student", "Ada", "--id", "s01"]
+    own = "--student", "Ada", "--id", "s01", "--notes", notes, "--answers", folder / "a.toml"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pdf_module, "render", page_of)  # drawn below, from its results
-        outcome = CliRunner().invoke(
-            cli,
-            [*words, "--notes", str(notes), "--answers", str(folder / "a.toml")],
-            standalone_mode=False,
-        )
-    assert outcome.exception is None, outcome.output
+        done("compare", log, "-o", pdf, *own)
     honest = base(pdf.read_bytes(), log)
     (sha256,) = honest.files
     truth = truth_of(simulation, sha256)

@@ -4,8 +4,6 @@ Whatever the bytes are, :func:`read_log` returns a flight or raises one of px4fu
 does not hang, it does not print and it does not leak an exception of the parser.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import re
@@ -344,14 +342,14 @@ def test_too_few_samples_of_everything(tmp_path, count):
 
 
 @pytest.mark.parametrize("command", ["sync", "tune", "loop"])
-@pytest.mark.parametrize(("value", "whole"), [(3e38, True), (-1e30, False), (1e20, False)])
+@pytest.mark.parametrize(("value", "whole"), [(3e38, True), (-1e20, False)])
 @pytest.mark.parametrize(
     ("name", "column"),
     [("vehicle_visual_odometry", "position"), ("sensor_combined", "accelerometer_m_s2")],
 )
 def test_impossible_values_are_damage_and_no_command_computes_with_them(
     tmp_path, monkeypatch, capsys, name, column, whole, value, command
-) -> None:
+):
     """Warnings of overflow are errors in these tests."""
     log = make_log("v1.16", 20.0)
     values = log[name][column]

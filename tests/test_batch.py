@@ -24,13 +24,14 @@ import psutil
 import pytest
 from batch_tools import environment, started, tiny_log, tiny_logs
 from class_tools import in_turn
-from click.testing import CliRunner
+from cli_tools import done, refused
+from cli_tools import run as typed
 from made_up_fleet import DAMAGED, made_up
 from msgspec import structs
 from ulog_tools import gnss_log
 
 import px4fuse
-from px4fuse.cli import cli
+from px4fuse import workers
 from px4fuse.cli.outputs import terminal
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.fleet import engine, job, run
@@ -44,10 +45,7 @@ from px4fuse.report.screen import show
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.contract import schema, to_json
 from px4fuse.results.reading import read_results
-from px4fuse.verification import workers
-from px4fuse.verification.workers import Failed, run_bounded
-
-PX4FUSE = [sys.executable, "-m", "px4fuse", "batch"]
+from px4fuse.workers import Failed, run_bounded
 
 
 @pytest.fixture(autouse=True)
@@ -88,8 +86,22 @@ def assert_same(table: pd.DataFrame, expected: pd.DataFrame) -> None:
     pd.testing.assert_frame_equal(table, expected, check_exact=True)
 
 
+def running(logs: Path, output: Path, *options: str, **how: Any) -> subprocess.Popen[str]:
+    """The command in a process of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "px4fuse", "batch", logs, "-o", output, *options],
+        text=True, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, env=environment(), **how,
+    )  # fmt: skip
+
+
+def until_one_is_done(process: subprocess.Popen[str], output: Path) -> None:
+    while not list(output.glob("rows/*.json")):
+        assert process.poll() is None
+        time.sleep(0.05)
+
+
 def command(*arguments: str | Path) -> Any:
-    return CliRunner().invoke(cli, ["batch", *map(str, arguments)])
+    return typed("batch", *arguments)
 
 
 # ------------------------------------------------------------------ the table
@@ -230,22 +242,16 @@ def test_a_second_run_does_only_what_is_new(flights, tmp_path, monkeypatch):
 def test_ctrl_c_at_a_terminal_keeps_what_is_done_and_says_so_on_one_line(
     flights, undisturbed, tmp_path
 ):
-    process = subprocess.Popen(
-        [*PX4FUSE, flights, "-o", tmp_path, "--workers", "1"],
-        stderr=subprocess.PIPE, text=True, env=environment(), start_new_session=True,
-    )  # fmt: skip
-    while not list(tmp_path.glob("rows/*.json")):
-        assert process.poll() is None
-        time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the workers too
-    _, said = process.communicate()
+    with running(flights, tmp_path, "--workers", "1", start_new_session=True) as process:
+        until_one_is_done(process, tmp_path)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the workers too
+        _, said = process.communicate()
     assert process.returncode == 130
     assert said.startswith("px4fuse: interrupted, what is done is kept in")
     assert said.count("\n") == 1
-    again = command(flights, "-o", tmp_path)
-    assert again.exit_code == 0, again.output
-    assert "3 logs: 3 done" in again.output
-    assert "0 as before" not in again.output
+    again = done("batch", flights, "-o", tmp_path).output
+    assert "3 logs: 3 done" in again
+    assert "0 as before" not in again
     assert_same(pd.read_parquet(tmp_path / "fleet.parquet"), undisturbed)
 
 
@@ -324,17 +330,16 @@ def test_what_ends_a_run_keeps_what_is_done(flights, undisturbed, tmp_path, monk
     assert_same(pd.read_parquet(tmp_path / "fleet.parquet"), undisturbed)
 
 
+@pytest.mark.usefixtures("in_this_process")  # one of them
 def test_two_runs_in_one_folder(tmp_path):
     """Both end well, and what they leave is one whole table."""
     logs, out = tiny_logs(tmp_path / "logs", 3, truth=False), tmp_path / "out"
-    both = [
-        subprocess.Popen(
-            [*PX4FUSE, logs, "-o", out, "--workers", "1"], text=True, stderr=subprocess.PIPE,
-            stdout=subprocess.DEVNULL, env=environment(),
-        )
-        for _ in range(2)
-    ]  # fmt: skip
-    assert [(one.communicate(timeout=300)[1], one.returncode) for one in both] == [("", 0)] * 2
+    with running(logs, out, "--workers", "1") as other:
+        while not out.exists():
+            assert other.poll() is None
+            time.sleep(0.01)
+        done("batch", logs, "-o", out)
+        assert (other.communicate(timeout=300)[1], other.returncode) == ("", 0)
     table = pd.read_parquet(out / "fleet.parquet")
     assert table.groupby("name")["status"].unique().map(list).to_dict() == {
         f"f{number}.ulg": ["done"] for number in (1, 2, 3)
@@ -348,8 +353,7 @@ def test_junk_in_hundreds_costs_a_line_each(tmp_path):
     for number in range(160):
         rng = random.Random(number)
         (folder / f"{number}.ulg").write_bytes(rng.randbytes(rng.choice((0, 7, 200, 5000))))
-    done = command(folder, "-o", tmp_path / "out")
-    assert done.exit_code == 0, done.output
+    done("batch", folder, "-o", tmp_path / "out")
     table = pd.read_parquet(tmp_path / "out" / "fleet.parquet")
     assert len(table) == 160
     assert set(table["status"]) <= {"failed", "not judged"}
@@ -396,9 +400,10 @@ def test_logs_are_found_in_folders_globs_and_urls(tmp_path, monkeypatch):
 def test_shared_logs_of_every_kind_in_one_run(shared_logs, tmp_path):
     """But for those of the sample's release, two long ones, and GNSS, which test_gnss.py has.
 
-    Of a flight that two programs recorded there is one.
+    Of a flight that two programs recorded there is one; simulated ones of other releases are in
+    test_flown.py and test_whatif_cli.py.
     """
-    others = r"v1\.16|ArduPilot_UAV|.*_gps_|v1\.13.*vision\.ulg|mbiuki.*\.tlog"
+    others = r"v1\.1[46]|ArduPilot_UAV|.*_gps_|v1\.13.*(vision|175)\.ulg|mbiuki.*\.tlog"
     files = [
         str(file)
         for file in sorted(shared_logs.glob("*/*"))
@@ -425,47 +430,6 @@ def test_shared_logs_of_every_kind_in_one_run(shared_logs, tmp_path):
 # ------------------------------------------------------------------ a cluster of its own
 
 
-LOCAL = ("--no-dashboard", "--host", "127.0.0.1")
-
-
-def started_scheduler(log: Path, **more: str) -> Any:
-    ports = ("--port", "0", "--dashboard-address", ":0", "--host", "127.0.0.1")
-    return started("scheduler", *ports, says="Scheduler at:", log=log, **more)
-
-
-def started_worker(address: str, log: Path, **more: str) -> Any:
-    """Without a process that starts another one in its place."""
-    arguments = ("--nthreads", "1", "--no-nanny", *LOCAL)
-    return started("worker", address, *arguments, says="Starting Worker plugin", log=log, **more)
-
-
-def test_a_scheduler_that_goes_is_said_on_one_line(tmp_path):
-    """Its process is ended while a log is being compared."""
-    logs, out = tiny_logs(tmp_path / "logs", 6, truth=False), tmp_path / "out"
-    with started_scheduler(tmp_path / "scheduler") as line:
-        address = line.split()[-1]
-        with started_worker(address, tmp_path / "worker"):
-            process = subprocess.Popen(
-                [*PX4FUSE, logs, "-o", out, "--scheduler", address], text=True,
-                stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, env=environment(),
-            )  # fmt: skip
-            while not list(out.glob("results/*.json")):
-                assert process.poll() is None
-                time.sleep(0.05)
-            port = int(address.rpartition(":")[2])
-            (owner,) = {
-                one.pid
-                for one in psutil.net_connections("tcp")
-                if one.status == psutil.CONN_LISTEN and one.laddr.port == port
-            }
-            psutil.Process(owner).kill()
-            _, said = process.communicate(timeout=120)
-    assert process.returncode == 2
-    assert said.startswith("px4fuse: the scheduler is gone")
-    assert said.endswith("What is done is kept: the same command goes on from there.\n")
-    assert said.count("\n") == 1
-
-
 def test_what_a_cluster_lacks_is_one_line(monkeypatch, flights):
     monkeypatch.setattr(engine, "CONNECT_S", 0.5)
     for address in ("tcp://127.0.0.1:1", "nonsense://x", ""):
@@ -478,34 +442,43 @@ def test_what_a_cluster_lacks_is_one_line(monkeypatch, flights):
         px4fuse.batch(flights, scheduler="tcp://127.0.0.1:1")
 
 
-@pytest.fixture(scope="module")
-def cluster(tmp_path_factory) -> Any:
-    """Address of a scheduler with two workers."""
-    logs = tmp_path_factory.mktemp("cluster")
+def started_worker(address: str, log: Path, path: str) -> Any:
+    """Without a process that starts another one in its place."""
+    local = ("--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1")
+    says = "Starting Worker plugin"
+    return started("worker", address, *local, says=says, log=log, PYTHONPATH=path)
+
+
+def test_a_cluster_that_runs_already(flights, undisturbed, tmp_path):
+    """A scheduler and two workers; at the end the scheduler goes."""
     path = os.pathsep.join((str(batch_tools.REPOSITORY / "tests"), str(batch_tools.REPOSITORY)))
-    with started_scheduler(logs / "scheduler", PYTHONPATH=path) as line:
+    ports = ("--port", "0", "--dashboard-address", ":0", "--host", "127.0.0.1")
+    named = {"says": "Scheduler at:", "log": tmp_path / "scheduler", "PYTHONPATH": path}
+    with started("scheduler", *ports, **named) as line:
         address = line.split()[-1]
         with (
-            started_worker(address, logs / "one", PYTHONPATH=path),
-            started_worker(address, logs / "other", PYTHONPATH=path),
+            started_worker(address, tmp_path / "one", path),
+            started_worker(address, tmp_path / "other", path),
         ):
-            yield address
+            the_table_is_the_same(address, flights, undisturbed, tmp_path)
+            a_bad_job_is_lost_alone(address)
+            a_scheduler_that_goes_is_said_on_one_line(address, tmp_path)
 
 
-def test_a_scheduler_and_two_workers_that_run_already(cluster, flights, undisturbed, tmp_path):
-    arguments = [flights, "-o", tmp_path / "out", "--scheduler", cluster]
-    result = command(*arguments, "--fail-on", "failed")
-    assert result.exit_code == 0, result.output
+def the_table_is_the_same(address, flights, undisturbed, tmp_path):
+    """And another version of px4fuse is refused."""
+    arguments = [flights, "-o", tmp_path / "out", "--scheduler", address]
+    done("batch", *arguments, "--fail-on", "failed")
     assert_same(pd.read_parquet(tmp_path / "out" / "fleet.parquet"), undisturbed)
     other = tmp_path / "px4fuse-9.9.dist-info"
     other.mkdir()
     (other / "METADATA").write_text("Metadata-Version: 2.1\nName: px4fuse\nVersion: 9.9\n")
     path = f"{tmp_path}{os.pathsep}{batch_tools.REPOSITORY}"
-    with started_worker(cluster, tmp_path / "third", PYTHONPATH=path):
-        assert "has px4fuse 9.9, and this is" in str(command(*arguments).exception)
+    with started_worker(address, tmp_path / "third", path):
+        assert "has px4fuse 9.9, and this is" in refused("batch", *arguments)
 
 
-def test_a_bad_job_is_lost_alone_on_a_cluster_too(cluster):
+def a_bad_job_is_lost_alone(address):
     """And a worker that is killed costs nothing; the session's own client is taken."""
     from distributed import Client
 
@@ -513,7 +486,7 @@ def test_a_bad_job_is_lost_alone_on_a_cluster_too(cluster):
     jobs = [("square", 3), ("unreadable", 0), ("exit", 3), ("hang", 0), ("square", 4)]
     work = partial(run_bounded, bad_jobs.act, timeout_s=5.0, memory_bytes=2 * 10**9)
     expected = [9, "could not be read (ValueError)", "exit code 3", "longer than 5 s", 16]
-    with Client(cluster) as client, connected() as same:
+    with Client(address) as client, connected() as same:
         assert same is client
         found = []
         for one, result in outcomes(client, work, [*jobs, ("square", 5)]):
@@ -524,3 +497,22 @@ def test_a_bad_job_is_lost_alone_on_a_cluster_too(cluster):
     assert dict(found).keys() == {*jobs, ("square", 5)}
     for one, what in zip(jobs, expected, strict=True):
         assert str(what) in str(dict(found)[one])
+
+
+def a_scheduler_that_goes_is_said_on_one_line(address, tmp_path):
+    """Its process is ended while a log is being compared."""
+    logs, out = tiny_logs(tmp_path / "logs", 6, truth=False), tmp_path / "lost"
+    process = running(logs, out, "--scheduler", address)
+    until_one_is_done(process, out)
+    port = int(address.rpartition(":")[2])
+    (owner,) = {
+        one.pid
+        for one in psutil.net_connections("tcp")
+        if one.status == psutil.CONN_LISTEN and one.laddr.port == port
+    }
+    psutil.Process(owner).kill()
+    _, said = process.communicate(timeout=120)
+    assert process.returncode == 2
+    assert said.startswith("px4fuse: the scheduler is gone")
+    assert said.endswith("What is done is kept: the same command goes on from there.\n")
+    assert said.count("\n") == 1

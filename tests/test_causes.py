@@ -1,10 +1,10 @@
 """One finding per cause, advice for what nobody chose, and the order in which causes are told."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
+from typing import Any
 
+import pytest
 from exchange import replace
 
 from px4fuse.analysis import Analysis
@@ -34,20 +34,6 @@ def test_detectors_give_every_fact_that_the_words_name() -> None:
             assert re.search(rf'\b{fact}=|"{fact}"', source), (name, fact)
 
 
-def test_what_a_cause_brings_with_it_is_told_behind_it() -> None:
-    cause, effect = by_cause([one("ekf2_rejecting", "error"), one("ekf2_variance_understated")])
-    assert (cause.id, cause.caused_by) == ("ekf2_variance_understated", None)
-    assert (effect.id, effect.caused_by) == ("ekf2_rejecting", "ekf2_variance_understated")
-    assert cause.severity == "error"  # as severe as what it brings with it
-
-
-def test_a_variance_follows_from_what_its_evidence_names() -> None:
-    outliers = one("source_outliers")
-    for named, joined in (("outliers", True), ("measurement noise", False)):
-        found = by_cause([outliers, one("kf_variance_understated", cause=named)])
-        assert [each.caused_by for each in found] == [None, "source_outliers" if joined else None]
-
-
 def test_the_table_has_inner_causes_before_outer_ones() -> None:
     outer = list(CONSEQUENCES)
     for at, cause in enumerate(outer):
@@ -55,50 +41,45 @@ def test_the_table_has_inner_causes_before_outer_ones() -> None:
         assert inner <= set(outer[:at])
 
 
-def test_where_the_noise_changes_a_jump_and_a_scale_follow_from_it() -> None:
-    """Both are judged by one noise; what a jump brings with it stays behind it."""
-    names = ("source_noise_changes", "source_jumps", "source_scale_wrong", "ekf2_resets")
-    found = by_cause(map(one, names))
-    assert {each.id: each.caused_by for each in found} == {
-        "source_noise_changes": None, "source_jumps": "source_noise_changes",
-        "source_scale_wrong": "source_noise_changes", "ekf2_resets": "source_jumps",
-    }  # fmt: skip
+UNDERSTATED, REJECTING = "ekf2_variance_understated", "ekf2_rejecting"
 
 
-def test_consequences_of_consequences_are_told_too() -> None:
-    found = by_cause(
-        [
-            one("source_outliers", "error"),
-            one("ekf2_variance_understated", cause="outliers"),
-            one("ekf2_rejecting"),
-        ]
-    )
-    assert [(each.id, each.caused_by) for each in found] == [
-        ("source_outliers", None), ("ekf2_variance_understated", "source_outliers"),
-        ("ekf2_rejecting", "ekf2_variance_understated"),
-    ]  # fmt: skip
-
-
-def test_the_size_of_our_variance_does_not_make_advice_an_error() -> None:
-    cause, _ = by_cause(
-        [
-            one("sigma_z_large", "info"),
-            one("kf_variance_overstated", "error", cause="measurement noise"),
-        ]
-    )
-    assert cause.severity == "info"
-
-
-def test_what_the_recording_lacks_comes_before_noises() -> None:
-    order = by_cause(
-        [
-            one("no_motion"), one("sigma_a_large", "error"), one("ekf2_resets", "info"),
-            one("source_gap"), one("source_clock_changes", "error"),
-        ]
-    )  # fmt: skip
-    assert [each.id for each in order] == [
-        "source_clock_changes", "source_gap", "sigma_a_large", "no_motion", "ekf2_resets",
-    ]  # fmt: skip
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        # the cause is as severe as what it brings with it
+        ([one(REJECTING, "error"), one(UNDERSTATED)],
+         [(UNDERSTATED, "error", None), (REJECTING, "error", UNDERSTATED)]),
+        # a variance follows from what its evidence names
+        ([one("source_outliers"), one("kf_variance_understated", cause="outliers")],
+         [("source_outliers", "warning", None),
+          ("kf_variance_understated", "warning", "source_outliers")]),
+        ([one("source_outliers"), one("kf_variance_understated", cause="measurement noise")],
+         [("source_outliers", "warning", None), ("kf_variance_understated", "warning", None)]),
+        # so does what follows from a consequence
+        ([one("source_outliers", "error"), one(UNDERSTATED, cause="outliers"), one(REJECTING)],
+         [("source_outliers", "error", None), (UNDERSTATED, "warning", "source_outliers"),
+          (REJECTING, "warning", UNDERSTATED)]),
+        # jump and scale are judged by one noise; what a jump brings with it stays behind it
+        ([*map(one, ("source_noise_changes", "source_jumps", "source_scale_wrong", "ekf2_resets"))],
+         [("source_noise_changes", "warning", None),
+          ("source_jumps", "warning", "source_noise_changes"),
+          ("ekf2_resets", "warning", "source_jumps"),
+          ("source_scale_wrong", "warning", "source_noise_changes")]),
+        # the size of our variance does not make advice an error
+        ([one("sigma_z_large", "info"),
+          one("kf_variance_overstated", "error", cause="measurement noise")],
+         [("sigma_z_large", "info", None), ("kf_variance_overstated", "error", "sigma_z_large")]),
+        # what the recording lacks comes before noises
+        ([one("no_motion"), one("sigma_a_large", "error"), one("ekf2_resets", "info"),
+          one("source_gap"), one("source_clock_changes", "error")],
+         [("source_clock_changes", "error", None), ("source_gap", "warning", None),
+          ("sigma_a_large", "error", None), ("no_motion", "warning", None),
+          ("ekf2_resets", "info", None)]),
+    ],
+)  # fmt: skip
+def test_what_a_cause_brings_with_it_is_told_behind_it(given: Any, told: Any) -> None:
+    assert [(each.id, each.severity, each.caused_by) for each in by_cause(given)] == told
 
 
 def test_verdicts_that_could_be_misread_have_a_sentence(sample: Analysis) -> None:

@@ -1,7 +1,5 @@
 """The clock offset against flights whose stamps are wrong by a known amount."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np
@@ -54,15 +52,7 @@ from px4fuse.filter.motion import (
 )
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Columns, Flight, Unavailable
-from px4fuse.origin import (
-    ALIGNED,
-    GIVEN_FILE,
-    GNSS,
-    KEPT,
-    MOTION_CAPTURE,
-    Origin,
-    with_orientation,
-)
+from px4fuse.origin import ALIGNED, GIVEN_FILE, GNSS, KEPT, MOTION_CAPTURE, with_orientation
 from px4fuse.report.clock import clock_advice
 
 DT = SETTINGS.dt_s
@@ -309,9 +299,7 @@ def test_a_parabola_gives_its_vertex_sigma_and_interval() -> None:
 
 @pytest.mark.parametrize("offset_s", [0.0, -0.2, -0.21, 0.333])
 @pytest.mark.parametrize("factor", [1.0, 2.5])
-def test_parts_and_change_are_those_of_their_profiles(
-    monkeypatch: pytest.MonkeyPatch, offset_s: float, factor: float
-) -> None:
+def test_parts_and_change_are_those_of_their_profiles(monkeypatch, offset_s, factor) -> None:
     """Profiles that are parabolas, about multiples of the grid's step from the whole's offset."""
     shift, sigma = np.array([-0.05, 0.025, 0.0, 0.0]), np.array([0.03, 0.02, 0.03, 0.5])
 
@@ -334,9 +322,7 @@ def test_parts_and_change_are_those_of_their_profiles(
     assert p == pytest.approx(chi2.sf(ratio, 2), abs=0.03)
 
 
-def test_what_is_simulated_for_the_scatter_is_the_noise_of_the_imu(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_is_simulated_for_the_scatter_is_the_noise_of_the_imu(monkeypatch) -> None:
     """Of legs and measurements as large as the noises say, with the velocity that goes with it."""
     given: list[Array] = []
 
@@ -371,16 +357,6 @@ def test_what_is_simulated_for_the_scatter_is_the_noise_of_the_imu(
 # --- recovery ---
 
 
-@pytest.mark.parametrize("offset_s", [-0.3, 0.0, 0.2])
-def test_the_offset_is_recovered_in_spite_of_tilt_and_biases(offset_s: float) -> None:
-    found = estimate(made_flight(round(100 * offset_s) + 50, offset_s=offset_s)[0])
-    assert found.determinable
-    assert found.offset_s == pytest.approx(offset_s, abs=0.02)
-    assert covers(found, offset_s)
-    # the noises were found, too
-    assert found.sigma_z_m == pytest.approx(SIGMA_Z, rel=0.10)
-
-
 SEEDS = 12
 
 
@@ -392,6 +368,10 @@ def test_the_interval_covers_the_truth_as_often_as_it_says() -> None:
         found = estimate(made_flight(seed, offset_s=true_s, duration_s=40.0)[0])
         inside.append(covers(found, true_s))
         normalised.append((found.offset_s - true_s) / found.sigma_s)
+        # in spite of tilt and biases, and the noises were found, too
+        assert found.determinable
+        assert found.offset_s == pytest.approx(true_s, abs=0.03)
+        assert found.sigma_z_m == pytest.approx(SIGMA_Z, rel=0.12)
     # 1 % in the tail of a binomial distribution
     assert sum(inside) >= binom.ppf(0.01, SEEDS, 0.95)
     assert abs(np.mean(normalised)) < 2.6 / np.sqrt(SEEDS)
@@ -502,9 +482,7 @@ def stated(*offsets: float, sigma_s: float = 0.02, change_p: float | None = 1e-7
     ("origin", "drifts"),
     [(GIVEN_FILE, False), (MOTION_CAPTURE, False), (GNSS, False), (ALIGNED, True), (KEPT, True)],
 )
-def test_external_vision_with_an_orientation_that_turns_may_drift(
-    origin: Origin, drifts: bool
-) -> None:
+def test_external_vision_with_an_orientation_that_turns_may_drift(origin, drifts) -> None:
     assert with_orientation(origin, turns=True).may_drift is drifts
     assert not with_orientation(origin, turns=False).may_drift
 
@@ -528,7 +506,6 @@ def test_parts_as_far_apart_as_their_noise_change_nothing() -> None:
 
 def test_a_step_that_drift_cannot_imitate_is_a_change() -> None:
     found = with_drift(stated(-0.41, -0.36, 0.03, -0.04, 0.02, 0.05, -0.03, 0.0))
-    assert found.change_p is not None
     assert found.change_p < 1e-3
 
 

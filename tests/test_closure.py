@@ -1,7 +1,5 @@
 """Loop closure by distance against closed forms and the lesson's own code."""
 
-from __future__ import annotations
-
 import itertools
 import math
 
@@ -12,15 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from trajectory_tools import square
 
-from px4fuse.loop.closure import (
-    correct_by_distance,
-    distribute_by_distance,
-    heading_change_rad,
-    in_frame,
-    key_frame_spacing_m,
-    key_frames,
-    upright,
-)
+from px4fuse.loop import closure
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
 COORDINATE = st.floats(-50.0, 50.0)
@@ -37,7 +27,7 @@ def test_distribution_equals_the_lessons_own_code(odom: list[tuple[float, float]
         (x - s / cum[-1] * err[0], y - s / cum[-1] * err[1])
         for (x, y), s in zip(odom, cum, strict=True)
     ]
-    found = distribute_by_distance(np.array(odom), np.array(err))
+    found = closure.distribute_by_distance(np.array(odom), np.array(err))
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
 
 
@@ -59,11 +49,11 @@ def test_heading_drift_that_grows_with_distance_is_undone() -> None:
     turned = Rotation.from_rotvec(np.outer(share * drift, [0, 0, 1])) * rotation
     misclosure = drifted[-1] - position[-1]
     assert np.linalg.norm(misclosure) > 1.0
-    found = correct_by_distance(trajectory(drifted, turned), distance, misclosure, drift)
+    found = closure.correct_by_distance(trajectory(drifted, turned), distance, misclosure, drift)
     np.testing.assert_allclose(found.position_m, position, atol=1e-9)
     assert np.max((found.rotation * rotation.inv()).magnitude()) < 1e-9
     # distributing only the position leaves the shape sheared
-    sheared = distribute_by_distance(drifted, misclosure)
+    sheared = closure.distribute_by_distance(drifted, misclosure)
     assert np.max(np.linalg.norm(sheared - position, axis=1)) > 0.3
 
 
@@ -72,14 +62,14 @@ def test_translation_drift_in_proportion_to_distance_is_undone() -> None:
     distance = cumulative_distance(position)
     misclosure = np.array([1.2, -0.8, 0.1])
     drifted = position + (distance / distance[-1])[:, None] * misclosure
-    found = correct_by_distance(trajectory(drifted, rotation), distance, misclosure, 0.0)
+    found = closure.correct_by_distance(trajectory(drifted, rotation), distance, misclosure, 0.0)
     np.testing.assert_allclose(found.position_m, position, atol=1e-12)
 
 
 def test_length_on_key_frames_is_not_lengthened_by_noise() -> None:
     position, _ = square(600, 20.0)  # 80 m, 3.3 cm a step
     noisy = position + np.random.default_rng(1).normal(0.0, 0.02, position.shape)
-    frames = key_frames(noisy, key_frame_spacing_m(noisy))
+    frames = closure.key_frames(noisy, closure.key_frame_spacing_m(noisy))
     assert cumulative_distance(noisy)[-1] > 95.0
     assert abs(cumulative_distance(noisy[frames])[-1] - 80.0) < 0.8
     assert frames[0] == 0
@@ -90,7 +80,7 @@ def test_length_on_key_frames_is_not_lengthened_by_noise() -> None:
 def test_heading_change_is_the_twist_about_the_vertical(yaw: float, x: float, y: float) -> None:
     tilt = Rotation.from_rotvec([x, y, 0.0])
     turn = Rotation.from_rotvec([0.0, 0.0, yaw])
-    assert abs(heading_change_rad(turn * tilt) - yaw) < 1e-9
+    assert abs(closure.heading_change_rad(turn * tilt) - yaw) < 1e-9
 
 
 def test_a_cameras_world_becomes_forward_right_down() -> None:
@@ -99,7 +89,7 @@ def test_a_cameras_world_becomes_forward_right_down() -> None:
     looking_right = Rotation.from_rotvec([0.0, np.pi / 2, 0.0])  # about the camera's y, down
     rotation = Rotation.concatenate([Rotation.identity(), looking_right, looking_right])
     camera = Trajectory("c", "slam", np.arange(3.0), position, rotation, "camera")
-    found = upright(camera)
+    found = closure.upright(camera)
     assert found.frame == "FRD"
     np.testing.assert_allclose(found.position_m[1], [1.0, 2.0, -3.0])
     nose = found.rotation[1].apply([1.0, 0.0, 0.0])
@@ -109,8 +99,8 @@ def test_a_cameras_world_becomes_forward_right_down() -> None:
 def test_east_north_up_becomes_north_east_down() -> None:
     position = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0], [1.0, 2.0, 4.0]])
     given = Trajectory("m", "truth", np.arange(3.0), position, None, "ENU")
-    found = upright(replace(given, position_variance_m2=position**2))
+    found = closure.upright(replace(given, position_variance_m2=position**2))
     np.testing.assert_allclose(found.position_m[1], [2.0, 1.0, -3.0])
     np.testing.assert_allclose(found.position_variance_m2, found.position_m**2)
     assert found.frame == "NED"
-    np.testing.assert_allclose(in_frame(found, "ENU").position_m, position)
+    np.testing.assert_allclose(closure.in_frame(found, "ENU").position_m, position)

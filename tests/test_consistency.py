@@ -1,7 +1,5 @@
 """NIS, bias and whiteness against closed forms and against what was injected."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -9,12 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from px4fuse.filter.consistency import (
-    Consistency,
-    assess,
-    assess_horizontal,
-    nis_band,
-)
+from px4fuse.filter.consistency import Consistency, assess, assess_horizontal, nis_band
 from px4fuse.flight import Unavailable
 
 # n and the 95 % band of the mean NIS of two degrees of freedom of real flights

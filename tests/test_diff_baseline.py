@@ -11,10 +11,9 @@ import pandas as pd
 import pytest
 from batch_tools import tiny_logs
 from class_tools import in_turn
-from click.testing import CliRunner
+from cli_tools import done, refused
 from scipy.stats import t as student
 
-from px4fuse.cli import cli
 from px4fuse.errors import SettingsError
 from px4fuse.fleet import run
 from px4fuse.fleet.junit import junit
@@ -159,8 +158,8 @@ def test_what_is_no_table_of_batch_is_refused(tmp_path):
     ):  # fmt: skip
         with pytest.raises(SettingsError, match=said):
             read_baseline(tmp_path / f"{name}.parquet")
-    done = CliRunner().invoke(cli, ["batch", "x.ulg", "-o", str(tmp_path), "--fail-on", "worse"])
-    assert "requires --baseline" in str(done.exception)
+    said = refused("batch", "x.ulg", "-o", tmp_path, "--fail-on", "worse")
+    assert "requires --baseline" in said
 
 
 # -- JUnit -----------------------------------------------------------------------------------------
@@ -205,18 +204,12 @@ def test_the_command_marks_writes_and_fails(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(run, "run_bounded", in_turn)
     tiny_logs(tmp_path / "logs", 1)
-    common = ["batch", "logs", "--axis", "north"]
-    options = ["--baseline", "before/fleet.parquet", "--junit", "j.xml", "--fail-on", "worse"]
-
-    def ran(code: int, *more: str) -> str:
-        done = CliRunner().invoke(cli, [*common, *more])
-        assert done.exit_code == code, done.output
-        return done.output
-
-    ran(0, "-o", "before")
-    same = ran(0, "-o", "after", *options)
+    common = "batch", "logs", "--axis", "north"
+    options = "--baseline", "before/fleet.parquet", "--junit", "j.xml", "--fail-on", "worse"
+    done(*common, "-o", "before")
+    same = done(*common, "-o", "after", *options).output
     unchanged = Path("j.xml").read_bytes()
-    ran(1, "-o", "worse", "--sigma-z", "0.3", *options)
+    done(*common, "-o", "worse", "--sigma-z", "0.3", *options, code=1)
     assert "Held against the baseline: 1 by the same log" in same
     assert b'failures="0"' in unchanged
     table = pd.read_parquet("worse/fleet.parquet")

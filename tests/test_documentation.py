@@ -11,7 +11,7 @@ import matplotlib as mpl
 import pytest
 from batch_tools import tiny_logs
 from class_tools import in_this_process, in_turn
-from click.testing import CliRunner
+from cli_tools import done
 from conftest import REPOSITORY as ROOT
 from matplotlib import pyplot
 
@@ -48,9 +48,8 @@ def at_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-def typed(line: str) -> None:
-    result = CliRunner().invoke(cli, shlex.split(line, comments=True)[1:])
-    assert result.exit_code == 0, (line, result.output)
+def typed(line: str) -> str:
+    return done(*shlex.split(line, comments=True)[1:]).output
 
 
 @pytest.mark.usefixtures("no_drawing", "at_root")  # tests of their own draw each kind of report
@@ -82,11 +81,9 @@ def test_the_instructors_four_commands_run_in_order(monkeypatch) -> None:
     Path("notes.md").write_text("# What I found\n\nThe stamps are late.\n")
     lines = commands("docs/instructors.md")
     assert len(lines) == 4
-    for line in lines:
-        result = CliRunner().invoke(cli, shlex.split(line)[1:])
-        assert result.exit_code == 0, (line, result.output)
+    said = [typed(line) for line in lines]
     assert {path.name for path in Path("flights").glob("*.ulg")} == {"1001.ulg", "1002.ulg"}
-    assert "verified" in result.output
+    assert "verified" in said[-1]
     table = Path("class/class.csv").read_text(encoding="utf-8-sig")
     assert "Ada Lovelace,1001,verified" in table
 

@@ -3,8 +3,6 @@
 The limits are written out here, so that one that is changed must be changed here as well.
 """
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 
@@ -156,7 +154,7 @@ def compared(count: int, *, varying: bool = True) -> Agreement | Unavailable:
         updates[f"innovation_variance_{axis}_m2"] = 0.01
     updates.loc[updates.index[-1], "rejected"] = 1.0
     replay = SimpleNamespace(
-        updates=updates, published=state, judged_s=((14.5, 999.0),), settings={}, heights={},
+        updates=updates, published=state, judged_s=((14.5, 999.0),), settings={}, besides={},
         carried_s=(),
     )  # fmt: skip
     return agreement_with_log(SimpleNamespace(ekf2=ekf2), replay)  # type: ignore[arg-type]

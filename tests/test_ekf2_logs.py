@@ -1,7 +1,5 @@
 """EKF2's model on every further log: agreement, walk and what-if, or why there is none."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

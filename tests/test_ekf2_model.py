@@ -1,7 +1,5 @@
 """The model of EKF2 against its equations written plainly, and against the log."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """EKF2's output predictor against its buffer, step by step."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from findings_tools import made as made_of

@@ -1,7 +1,5 @@
 """The inside of EKF2's filter, read from each generation into one layout and unit."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

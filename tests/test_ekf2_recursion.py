@@ -3,8 +3,6 @@
 The limits are written out here, so that one that is changed must be changed here as well.
 """
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 from typing import Any

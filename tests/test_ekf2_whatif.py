@@ -1,7 +1,5 @@
 """What if EKF2 had had other parameters, and why it differs: sums, sweeps and messages."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from types import SimpleNamespace
@@ -172,12 +170,10 @@ def test_the_longest_run_of_rejections_is_said_with_how_far_it_led() -> None:
     away.iloc[:, 1] = np.where(time == 26.5, -4.0, np.where(time < 24.0, 99.0, 0.0))
     one = made(Ekf2Replay, updates=updates, delayed=away)
     found = _coast(one, still, (0.0, 99.0), ((0.0, 99.0),))
-    assert found is not None
     assert (found.start_s, found.samples, found.duration_s) == (24.5, 3, 3.0)
     assert found.distance_m == pytest.approx(5.0)
     # what is not judged, and what nobody rejected
     early = _coast(one, still, (0.0, 22.0), ((0.0, 99.0),))
-    assert early is not None
     assert (early.start_s, early.samples, early.duration_s) == (21.5, 1, 0.0)
     assert _coast(one, still, (22.4, 24.4), ((0.0, 99.0),)) is None
 
@@ -221,12 +217,14 @@ def test_samples_that_come_too_late_are_a_note() -> None:
     for by_delay, remedy in ((False, ": raise EKF2_DELAY_MAX"), (True, "")):
         rules = replace(RULES, horizon_by_delay=by_delay)
         model: Any = SimpleNamespace(inputs=SimpleNamespace(rules=rules))
-        one: Any = SimpleNamespace(late=3, lost=2, updates=range(8), changed={"EKF2_EV_DELAY": 90})
+        one: Any = SimpleNamespace(
+            late=3, lost=2, updates=range(8), changed={"EKF2_EV_DELAY": 90}, settings={}
+        )
         (note,) = _notes(model, one)
         assert note.startswith("EKF2_EV_DELAY=90: 5 of 10 samples")
         assert note.endswith(f"(2 would never be fused){remedy}")
         one.late = one.lost = 0
-        assert _notes(model, one) == []
+        assert list(_notes(model, one)) == []
 
 
 # ------------------------------------------------------------------ where single rejections decide

@@ -1,7 +1,5 @@
 """ATE, RPE, alignment and clocks: against evo, closed forms and what was put in."""
 
-from __future__ import annotations
-
 import copy
 from functools import cache
 from typing import Any
@@ -15,22 +13,14 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
-from trajectory_tools import (
-    NAMES,
-    PUBLISHED,
-    SHIFT,
-    TURN,
-    flight,
-    moved,
-    published,
-)
+from trajectory_tools import NAMES, PUBLISHED, SHIFT, TURN, flight, moved, published
 
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.flight import Unavailable
 from px4fuse.trajectory.alignment import AlignmentKind, fit
 from px4fuse.trajectory.association import Method, associate
 from px4fuse.trajectory.evaluation import choose_alignment, evaluate
-from px4fuse.trajectory.model import Frame, Kind, Trajectory
+from px4fuse.trajectory.model import Trajectory
 from px4fuse.trajectory.offset import clock_difference, estimate_time_offset
 from px4fuse.trajectory.scores import (
     MIN_BLOCKS,
@@ -353,13 +343,8 @@ def test_what_cannot_be_had_is_absent_with_the_reason() -> None:
     ],
 )
 def test_the_alignment_follows_from_what_the_two_are(
-    estimate: tuple[Kind, Frame],
-    reference: tuple[Kind, Frame],
-    name: str,
-    scale: float,
-    expected: str,
-    why: str,
-) -> None:
+    estimate, reference, name, scale, expected, why
+):
     y = replace(flight(), kind=reference[0], frame=reference[1])
     x = moved(y, TURN, SHIFT, scale, kind=estimate[0], frame=estimate[1], name=name)
     kind, reason = choose_alignment(x, y)
@@ -379,7 +364,6 @@ def test_an_aisle_is_aligned_by_yaw_where_z_is_vertical() -> None:
 
 def test_a_camera_is_compared_around_its_constant_rotation_in_the_vehicle() -> None:
     reference = flight()
-    assert reference.rotation is not None
     mounted = Rotation.from_euler("ZYX", [90.0, 0.0, 90.0], degrees=True)
     camera = moved(reference, TURN, SHIFT, kind="slam", frame="camera")
     noise = Rotation.from_rotvec(np.random.default_rng(1).normal(0.0, 0.01, (len(camera), 3)))

@@ -1,8 +1,5 @@
 """The page of ``evaluate``: what they say and draw, against closed forms."""
 
-from __future__ import annotations
-
-import io
 import re
 from functools import cache
 from typing import Any
@@ -12,8 +9,7 @@ import pytest
 from conftest import REPOSITORY
 from exchange import replace
 from matplotlib.axes import Axes
-from page_tools import every
-from pypdf import PdfReader
+from page_tools import every, words
 from scipy.spatial.transform import Rotation
 from trajectory_tools import flight, moved
 
@@ -28,17 +24,13 @@ from px4fuse.report.evaluation import (
     views,
 )
 from px4fuse.report.page import Page
-from px4fuse.report.pdf import render
 from px4fuse.report.style import report_style
-from px4fuse.request import EvaluationRequest
-from px4fuse.results.build import evaluation_results
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
-from px4fuse.trajectory.model import Frame, Trajectory
+from px4fuse.trajectory.model import Trajectory
 from px4fuse.trajectory.scores import Delta
 
 LOOP = REPOSITORY / "sample_logs" / "loop_vio.ulg"
 DELTAS = (Delta(1.0, "m"), Delta(10.0, "m"))
-REQUEST = EvaluationRequest(estimate="a.tum", reference="b.tum")
 
 
 @cache
@@ -82,11 +74,6 @@ def panels(score: Evaluation) -> dict[str, Axes]:
 def panel(score: Evaluation, title: str) -> Axes:
     """The panel whose title begins so."""
     return next(axes for name, axes in panels(score).items() if name.startswith(title))
-
-
-def said(score: Evaluation) -> str:
-    pages = PdfReader(io.BytesIO(render(score, evaluation_results(REQUEST, score), "{}"))).pages
-    return " ".join(" ".join(page.extract_text().split()) for page in pages)
 
 
 # -- what is said ----------------------------------------------------------------------------------
@@ -134,9 +121,7 @@ def test_an_error_that_grows_with_distance_has_the_quarters_of_a_ramp() -> None:
     [(np.full(2000, 0.3), "10%"), (np.arange(2000) // 100 == 7, "100%"), (np.zeros(2000), "0%")],
     ids=["even", "a peak", "none"],
 )
-def test_whether_a_few_moments_decide_is_the_share_of_the_worst_tenth(
-    error: np.ndarray, share: str
-) -> None:
+def test_whether_a_few_moments_decide_is_the_share_of_the_worst_tenth(error, share) -> None:
     words = time_words(wrong_by(across(error.astype(np.float64))))
     assert f"makes {share} of the squared error" in words
 
@@ -164,9 +149,7 @@ def test_the_growth_of_the_rpe_tells_noise_from_drift(kind: str, times: float) -
     ("frame", "axes"),
     [("NED", (1, 0)), ("FRD", (1, 0)), ("ENU", (0, 1)), ("camera", (0, 2)), ("unknown", (0, 1))],
 )
-def test_a_flat_path_is_seen_from_above_and_another_from_the_side_too(
-    frame: Frame, axes: tuple[int, int]
-) -> None:
+def test_a_flat_path_is_seen_from_above_and_another_from_the_side_too(frame, axes) -> None:
     spatial = replace(flight(), frame=frame)
     vertical = 3 - sum(axes)
     level = spatial.position_m.copy()
@@ -184,5 +167,5 @@ def test_a_flat_path_is_seen_from_above_and_another_from_the_side_too(
 def test_what_is_not_done_has_no_panel() -> None:
     assert not any("alignment" in title for title in panels(wrong_by(across(np.full(2001, 0.3)))))
     bare = evaluate(replace(flight(), rotation=None, kind="vio"), flight())
-    assert "the estimate has no orientation" in said(bare)
+    assert "the estimate has no orientation" in words(*pages(bare))
     assert not any("RPE" in title for title in panels(bare))

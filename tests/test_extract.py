@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from cli_tools import run, run_main
-from click.testing import Result
+from cli_tools import done, run_main
 from conftest import REPOSITORY
 from exchange import replace
 from flights import Estimator, aisle_flight
@@ -37,16 +36,15 @@ UNITS = {"_m": "m", "_m2": "m^2", "_s": "s", "_m_s": "m/s", "_m_s2": "m/s^2",
          "_m2_s2": "m^2/s^2", "_rad_s": "rad/s"}  # fmt: skip
 
 
-def extract(*arguments: str | Path) -> Result:
-    return run("extract", *arguments)
+def extract(*arguments: object) -> str:
+    return done("extract", *arguments).output
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory, sample_log) -> tuple[Path, str]:
+def written(tmp_path_factory, sample_log) -> Path:
     folder = tmp_path_factory.mktemp("extracted") / "new" / "tables"
-    result = extract(sample_log, "-o", folder)
-    assert result.exit_code == 0, result.output
-    return folder, result.output
+    extract(sample_log, "-o", folder)
+    return folder
 
 
 def read(path: Path) -> pd.DataFrame:
@@ -74,7 +72,6 @@ def rich_flight() -> Flight:
 
 
 def test_csv_reads_back_as_exactly_the_same_floats(written, sample_flight):
-    folder, _ = written
     ekf2 = sample_flight.ekf2
     expected = {
         "imu": sample_flight.imu,
@@ -86,7 +83,7 @@ def test_csv_reads_back_as_exactly_the_same_floats(written, sample_flight):
         "truth": sample_flight.truth.samples,
     } | {f"position_{track.name}": track.samples for track in sample_flight.positions}
     for name, frame in expected.items():
-        table, content = read(folder / f"{name}.csv"), (folder / f"{name}.csv").read_bytes()
+        table, content = read(written / f"{name}.csv"), (written / f"{name}.csv").read_bytes()
         assert content.isascii()  # UTF-8 whatever the spreadsheet guesses
         assert not re.search(rb"\r|nan|inf", content)
         assert table.columns[0] == "time_s"
@@ -95,7 +92,7 @@ def test_csv_reads_back_as_exactly_the_same_floats(written, sample_flight):
 
 
 def test_innovations_are_one_tidy_table(written, sample_flight):
-    table = read(written[0] / "ekf2_innovations.csv")
+    table = read(written / "ekf2_innovations.csv")
     assert table["time_s"].is_monotonic_increasing
     assert set(table["axis"]) == {"north", "east"}
     for axis, rows in table.groupby("axis"):
@@ -107,7 +104,7 @@ def test_innovations_are_one_tidy_table(written, sample_flight):
 def test_those_of_a_flight_on_gnss_are_of_gnss(tmp_path):
     log = tmp_path / "o.ulg"
     log.write_bytes(to_ulog(simulate(scenario_of("outdoor", passes=1, length_m=10.0))))
-    assert "external vision" not in extract(log, "-o", tmp_path / "o").output
+    assert "external vision" not in extract(log, "-o", tmp_path / "o")
     flight = json.loads((tmp_path / "o" / "flight.json").read_text())
     assert flight["streams"]["ekf2_innovations"]["topics"] == ["estimator_aid_src_gnss_pos"]
     assert {*read(tmp_path / "o" / "ekf2_innovations.csv")["axis"]} == {"north", "east"}
@@ -150,13 +147,12 @@ def test_all_that_an_analysis_reads_is_extracted(sample_flight):
 
 
 def test_the_dictionary_and_the_files_agree_both_ways(written, sample_flight):
-    folder, _ = written
-    dictionary = pd.read_csv(folder / "data_dictionary.csv", keep_default_na=False)
+    dictionary = pd.read_csv(written / "data_dictionary.csv", keep_default_na=False)
     described = list(zip(dictionary["table"], dictionary["column"], strict=True))
     assert len(set(described)) == len(described)
     present = [
         (path.stem, column)
-        for path in folder.glob("*.csv")
+        for path in written.glob("*.csv")
         if path.stem != "data_dictionary"
         for column in pd.read_csv(path, nrows=0).columns
     ]
@@ -185,7 +181,7 @@ def test_every_column_of_every_flight_is_described_in_the_unit_of_its_name(fligh
 
 
 def test_flight_json_says_what_the_log_is_and_lacks(written, sample_flight):
-    text = (written[0] / "flight.json").read_text(encoding="utf-8")
+    text = (written / "flight.json").read_text(encoding="utf-8")
     about = json.loads(text, parse_constant=pytest.fail)
     assert about["schema"] == {"name": "px4fuse-flight", "version": "1.0"}
     assert about["log"]["sha256"] == sample_flight.log.sha256
@@ -194,7 +190,7 @@ def test_flight_json_says_what_the_log_is_and_lacks(written, sample_flight):
         part.what for part in sample_flight.missing
     }
     for position in about["positions"]:
-        assert (written[0] / f"{position['table']}.csv").exists()
+        assert (written / f"{position['table']}.csv").exists()
 
 
 # ---- what is not there ------------------------------------------------------------------------
@@ -211,13 +207,12 @@ def test_flight_json_says_what_the_log_is_and_lacks(written, sample_flight):
 def test_what_is_unavailable_has_no_table_and_is_said(tmp_path, dropped, lost):
     whole = set(extraction.tables(read_log(make_log().write(tmp_path / "whole.ulg"))))
     path = make_log().drop(dropped).write(tmp_path / "less.ulg")
-    result = extract(path, "-o", tmp_path / "out")
-    assert result.exit_code == 0
+    said = extract(path, "-o", tmp_path / "out")
     assert {file.stem for file in (tmp_path / "out").glob("*.csv")} == (
         whole - lost | {"data_dictionary"}
     )
     if dropped != "vehicle_visual_odometry":  # others stand in for that one
-        assert "Not in this log: " in result.output
+        assert "Not in this log: " in said
 
 
 # ---- names and folders ------------------------------------------------------------------------
@@ -258,7 +253,7 @@ def test_what_cannot_be_written_is_one_line(
 
 def test_parquet_holds_the_same_tables(tmp_path, sample_log, sample_flight):
     pytest.importorskip("pyarrow", reason="Parquet needs the extra px4fuse[parquet]")
-    assert extract(sample_log, "-o", tmp_path, "--format", "parquet").exit_code == 0
+    extract(sample_log, "-o", tmp_path, "--format", "parquet")
     for name, table in extraction.tables(sample_flight).items():
         back = pd.read_parquet(tmp_path / f"{name}.parquet")
         pd.testing.assert_frame_equal(back, table, check_exact=True)
@@ -273,7 +268,7 @@ def test_the_lesson_by_hand_is_what_compare_does(
 ):
     """The ten lines round every measurement to the DT grid; else they are our filter."""
     monkeypatch.chdir(tmp_path)
-    assert extract(sample_log, "-o", "reports/tables").exit_code == 0
+    extract(sample_log, "-o", "reports/tables")
     exec(compile(LESSON, "python.md", "exec"), {})
     printed = np.array(
         [

@@ -3,8 +3,6 @@
 The limits are written out here, so that one that is changed must be changed here as well.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
@@ -280,9 +278,7 @@ def test_when_the_imu_is_missing(ends: Any, segment: Any, spans: Any) -> None:
     ("imu_hz", "attitude_hz", "expected"),
     [(49.1, 9.9, []), (48.9, 9.9, [100.0]), (49.1, 9.7, [20.0])],
 )
-def test_topics_that_were_logged_too_slowly(
-    imu_hz: float, attitude_hz: float, expected: list[float]
-) -> None:
+def test_topics_that_were_logged_too_slowly(imu_hz, attitude_hz, expected) -> None:
     flight = {"imu": at_rate(imu_hz), "attitude": at_rate(attitude_hz)}
     for info, says in (
         (log(), "into etc/logging/logger_topics.txt"),
@@ -709,9 +705,7 @@ def test_a_scale_and_a_variance_are_told_with_their_side() -> None:
 
 
 @pytest.mark.parametrize(("error_m", "expected"), [(1.41, "error"), (1.42, None)])
-def test_a_variance_that_covers_the_errors_against_the_truth_is_not_too_large(
-    error_m: float, expected: str | None
-) -> None:
+def test_a_variance_that_covers_the_errors_against_the_truth_is_not_too_large(error_m, expected):
     time = np.arange(0.0, 120.0)
     still = pd.DataFrame({"position_m": 0.0 * time}, index=time)
     axes = tuple(axis(name, truth=still) for name in ("north", "east"))
@@ -726,9 +720,7 @@ def test_a_variance_that_covers_the_errors_against_the_truth_is_not_too_large(
     ("jumps", "count", "says"),
     [((), 5, " s and more)"), ((jump(1.0, 0.0, at_s=20.0),), 3, "at 18.9, 26.0, 27.0 s)")],
 )
-def test_what_lies_a_second_before_a_jump_and_six_after_it_is_no_outlier(
-    jumps: Any, count: int, says: str
-) -> None:
+def test_what_lies_a_second_before_a_jump_and_six_after_it_is_no_outlier(jumps, count, says):
     outliers = tuned(outlier_time_s=np.array([18.9, 19.0, 25.9, 26.0, 27.0]), count=100)
     finding = only(source_positions.outliers, jumping(*jumps, tuning=outliers))
     assert (finding.evidence["count"], finding.evidence["first_s"]) == (count, 18.9)
@@ -765,9 +757,7 @@ def test_a_clock_offset_that_changes(p: float | None, there: bool) -> None:
 
 
 @pytest.mark.parametrize(("after_m", "there"), [(1.005, True), (1.0051, False), (0.5, True)])
-def test_a_clock_offset_that_the_truth_contradicts_is_not_told(
-    monkeypatch: pytest.MonkeyPatch, after_m: float, there: bool
-) -> None:
+def test_a_clock_offset_that_the_truth_contradicts_is_not_told(monkeypatch, after_m, there) -> None:
     def errors_m(_: Any, shifted: Settings) -> tuple[float, float]:
         assert shifted.clock_offset_s == 0.123  # as it is typed
         return 1.0, after_m

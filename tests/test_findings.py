@@ -1,7 +1,5 @@
 """Findings on a clean flight, faulty ones, ones without a field, short ones and real logs."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Mapping
@@ -13,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from exchange import replace
-from flights import Estimator, Imu, Uwb, aisle_flight, unexplained, with_noises
+from flights import Estimator, Imu, Uwb, aisle_flight, given_placement, unexplained, with_noises
 from golden_tools import agrees, rounded, value
 
 from px4fuse.comparison.comparison import compare
@@ -22,7 +20,7 @@ from px4fuse.ekf2.model import MODEL_NOTE
 from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import NAMES, Finding, by_root, find
-from px4fuse.flight import AXIS_NAMES, Alignment, Columns, Ekf2, Flight, Reset, Unavailable
+from px4fuse.flight import AXIS_NAMES, Columns, Flight, Reset, Unavailable
 from px4fuse.origin import ALIGNED, KEPT
 from px4fuse.readers import read_log
 from px4fuse.recording import ClockMap, Dropout
@@ -33,6 +31,7 @@ SIDESTEP = Reset(60.0, "position", (3.0, 0.0, 0.0))
 STEP_UP = Reset(60.0, "position", (0.0, 0.0, -0.4))
 NOT_A_NUMBER = re.compile(r"\b(nan|inf|none)\b", re.IGNORECASE)
 Change = Callable[[Flight], Flight]
+pytestmark = pytest.mark.usefixtures("replayed_once")
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,6 @@ def mapped(method: str, distinct: int | None = None, jitter_s: float = 0.02) -> 
 
 def with_ekf2(**changes: Any) -> Change:
     def change(flight: Flight) -> Flight:
-        assert isinstance(flight.ekf2, Ekf2)
         return replace(flight, ekf2=replace(flight.ekf2, **changes))
 
     return change
@@ -116,14 +114,6 @@ def apart(flight: Flight, *, grows: bool) -> Flight:
     return replace(flight, truth=replace(flight.truth, samples=samples))
 
 
-def placed(warning: str) -> Alignment:
-    return Alignment(
-        frame="enu", frame_reason="given", yaw_deg=0.0, yaw_reason="given",
-        origin_m=(0.0, 0.0, 0.0), clock_offset_s=0.0, clock_reason="given",
-        reference="", warnings=(warning,),
-    )  # fmt: skip
-
-
 def about(value: float, rel: float = 0.1) -> Any:
     return pytest.approx(value, rel=rel)
 
@@ -148,7 +138,7 @@ FAULTS = [
     Fault("autopilot_restarted", "warning", change=with_log(restarts=1)),
     Fault("receipt_out_of_order", "info", change=with_log(receipt_went_back=3)),
     Fault("position_file_placement", "warning",
-          change=with_source(alignment=placed("yaw is known to 5° only"))),
+          change=with_source(alignment=given_placement("yaw is known to 5° only"))),
     # the filter's own settings
     Fault("kf_variance_understated", "error", ASKED, settings={"sigma_z_m": 0.01}),
     Fault("kf_variance_overstated", "error", ASKED, settings={"sigma_z_m": 1.0}),
@@ -327,12 +317,10 @@ def test_a_fault_is_named_with_its_evidence_and_no_unrelated_error(at: int, faul
 @pytest.mark.parametrize(
     ("gate", "must"), [(1.0, 0.5340), (1.5, 0.2494), (2.0, 0.0889), (2.8, 0.0102), (3.0, None)]
 )
-def test_a_gate_that_must_reject_is_named_before_what_it_does(
-    gate: float, must: float | None
-) -> None:
+def test_a_gate_that_must_reject_is_named_before_what_it_does(gate, must) -> None:
     """Shares as tables of the normal distribution have them, for two axes."""
-    flight = aisle_flight(**ekf2(rejected_share=0.3))
-    first, *others = found(compare(replace(flight, ekf2=replace(flight.ekf2, gate=gate))))
+    flown = with_ekf2(gate=gate)(aisle_flight(**ekf2(rejected_share=0.3)))
+    first, *others = found(compare(flown))
     if must is None:
         assert "ekf2_gate_small" not in ids((first, *others))
         return
@@ -342,15 +330,14 @@ def test_a_gate_that_must_reject_is_named_before_what_it_does(
     group = by_root((first, *others))[0]
     assert {"ekf2_rejecting", "ekf2_variance_understated"} <= {one.id for one in group}
     # a gate that rejects nothing is nobody's mistake
-    quiet = aisle_flight()
-    assert not found(compare(replace(quiet, ekf2=replace(quiet.ekf2, gate=gate))))
+    assert not found(compare(with_ekf2(gate=gate)(aisle_flight())))
 
 
 @pytest.mark.parametrize(
     ("silent", "flight", "instead"), MISSING_FIELD, ids=lambda value: str(value)[:40]
 )
 def test_a_missing_field_is_not_guessed(silent: str, flight: Any, instead: str | None) -> None:
-    named = ids(found(compare(aisle_flight(**flight))))
+    named = ids(found(compare(aisle_flight(duration_s=60.0, **flight))))
     assert silent not in named
     assert instead is None or instead in named
 

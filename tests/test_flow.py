@@ -1,7 +1,5 @@
 """Optical flow in the model of EKF2, and what the model cannot follow."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,7 +16,7 @@ from px4fuse.ekf2.inputs import read_gnss
 from px4fuse.ekf2.magnetometer import Samples, gather
 from px4fuse.ekf2.model import Model, replay_settings
 from px4fuse.ekf2.whatif import what_if
-from px4fuse.flight import Columns, Ekf2, Flight, FusionRecord, Reset, Truth
+from px4fuse.flight import Columns, Flight, Reset
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_innovations import with_gnss
 from px4fuse.simulation.flights import simulate_flight
@@ -43,7 +41,6 @@ def model() -> Model:
 
 def true_velocity(times: np.ndarray) -> np.ndarray:
     truth = model().flight.truth
-    assert isinstance(truth, Truth)
     return np.column_stack([np.interp(times, truth.samples.index, truth.samples[column])
                             for column in Columns.VELOCITY])  # fmt: skip
 
@@ -92,8 +89,6 @@ def test_what_lies_between_two_rows_is_read_as_the_mean_of_all_samples(tmp_path:
     off_us = at[rows[30]]  # EKF2 gives flow up then, by the flags of the next second
     flags["cs_opt_flow"] = flags["timestamp"] < off_us
     ekf2 = read_log(log.write(tmp_path / "a.ulg")).ekf2
-    assert isinstance(ekf2, Ekf2)
-    assert isinstance(ekf2.record, FusionRecord)
     flow = ekf2.record.flow
     end_s = seconds_of(flags["timestamp"][flags["timestamp"] >= off_us])[0]
     fused = np.flatnonzero(seconds_of(at[rows]) < end_s)[1:]
@@ -116,7 +111,6 @@ def test_flow_tells_the_velocity_at_the_event_after_it(every: int) -> None:
     """Where the body moved since a sample is known from the IMU: corners are no innovations."""
     (stretch,) = model().inputs.stretches
     told = with_flow(stretch, flow_of(every=every), 3.0)
-    assert told.flow is not None
     end = next(iter(model().intervals.values()))[0].events.end
     found = gather(told.flow, end, stretch.gained_m_s)
     seen = found.number > 0.0
@@ -167,8 +161,6 @@ def stretches_s(flight: Flight) -> list[tuple[float, float]]:
 def test_the_model_begins_again_after_resets_of_height_and_where_much_is_clipped() -> None:
     flight = model().flight
     ((start, end),) = stretches_s(flight)
-    assert isinstance(flight.ekf2, Ekf2)
-    assert isinstance(flight.imu, pd.DataFrame)
     for delta, parted in (((0.0, 0.0, 1.0), True), ((1.0, 0.0, 0.0), False)):
         reset = Reset(60.0, "velocity", delta)
         found = stretches_s(replace(flight, ekf2=replace(flight.ekf2, resets=(reset,))))
@@ -192,8 +184,6 @@ def test_the_model_begins_again_after_resets_of_height_and_where_much_is_clipped
 def test_fixes_that_come_while_ekf2_does_without_gnss_are_not_fused() -> None:
     flight = model().flight
     ekf2 = flight.ekf2
-    assert isinstance(ekf2, Ekf2)
-    assert isinstance(ekf2.record, FusionRecord)
     meant = pd.Series([1.0, 0.0, 1.0], index=[0.0, 50.0, 60.0])
     aids = {**ekf2.aids, "gnss_pos": replace(ekf2.aids["gnss_pos"], meant=meant)}
     found = read_gnss(flight, with_gnss(replace(ekf2, aids=aids)), ekf2.record)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shlex
 from pathlib import Path
@@ -16,17 +17,14 @@ from scipy.stats import spearmanr
 from px4fuse.answers import CURES, MISTAKES, PANELS, Answers, Claim
 from px4fuse.assignment.drawing import draw
 from px4fuse.assignment.truth import FormTruth, VerdictTruth, Wrong, truth_of
+from px4fuse.cli.simulate import simulate
 from px4fuse.grading.form_points import PARTS, SHOWS, cures, form_points, panels
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
 from px4fuse.simulation.mistakes import parse
-from px4fuse.simulation.scenario import Scenario
+from px4fuse.simulation.scenario import Scenario, scenario_of
 
 SHA256 = "a" * 64
-OPTIONS = {
-    "--kind": "kind", "--seed": "seed", "--sigma-a": "sigma_a_m_s2", "--speed": "speed_m_s",
-    "--heading": "heading_deg", "--sigma-uwb": "sigma_uwb_m", "--vio-drift": "vio_drift",
-}  # fmt: skip
 LATE = Wrong("clock-offset", 0.2, 0.17, 0.23)
 GAP = Wrong("dropout", 3.0, 2.55, 3.45, 50.0, 53.0)
 TRUTH = FormTruth(
@@ -180,19 +178,11 @@ def test_the_size_of_an_open_end_is_what_the_odometry_measures() -> None:
 
 def simulation_of(typed: str) -> flights.Simulation:
     """The flight that a px4fuse simulate line makes."""
-    words = shlex.split(typed)[2:]
-    values: dict[str, Any] = {}
-    mistakes = []
-    for option, value in zip(words, [*words[1:], ""], strict=True):
-        if option in OPTIONS:
-            kind = {"kind": str, "seed": int}.get(OPTIONS[option], float)
-            values[OPTIONS[option]] = kind(value)
-        elif option == "--mistake":
-            mistakes.append(value)
-        elif option == "--no-truth":
-            values["truth"] = False
-    passes = 1 if values["kind"] == "loop" else 6
-    return flights.simulate(Scenario(passes=passes, **values), parse(mistakes))
+    given = simulate.make_context("simulate", shlex.split(typed)[2:]).params
+    names = {field.name for field in dataclasses.fields(Scenario)} - {"kind", "truth", "ekf2"}
+    chosen = {name: given[name] for name in names if given.get(name) is not None}
+    scenario = scenario_of(given["kind"], truth=not given["no_truth"], **chosen)
+    return flights.simulate(scenario, parse(given["mistake"]))
 
 
 def in_our_units(kind: str, unit: str) -> str:

@@ -12,14 +12,13 @@ from unittest.mock import Mock
 
 import pytest
 from class_tools import in_this_process
-from click.testing import CliRunner
-from conftest import REPOSITORY
+from cli_tools import done, refused, run
+from conftest import LOG, REPORT
 from forgery import forged, with_results
 from pypdf import PdfReader, PdfWriter
 
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.roster import file_names
-from px4fuse.cli import cli
 from px4fuse.cli.outputs import Interrupted
 from px4fuse.grading.entries import Course
 from px4fuse.grading.grade import GradeOutcome, grade
@@ -28,12 +27,10 @@ from px4fuse.grading.rubric import read_rubric
 from px4fuse.reading import files_by_sha256
 from px4fuse.verification import pages
 from px4fuse.verification.model import Verdict
-from px4fuse.verification.workers import Failed
+from px4fuse.workers import Failed
 
 pytestmark = pytest.mark.usefixtures("analysed_once")
 
-REPORT = REPOSITORY / "reports" / "aisle_uwb.pdf"
-LOG = REPOSITORY / "sample_logs" / "aisle_uwb.ulg"
 UNKNOWN = Verdict("cannot verify", (), with_log=False)
 
 
@@ -222,12 +219,11 @@ def test_what_the_command_says(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     shutil.copy(REPORT, "a.pdf")
     monkeypatch.setattr(module, "grade", lambda *_, **__: GradeOutcome((entry,), (), 0, ()))
-    result = CliRunner().invoke(cli, ["grade", "a.pdf", "-o", "out"])
-    assert result.exit_code == 0
-    assert len(result.output) < 3000
-    assert not any(line.lstrip().startswith("Points 120") for line in result.output.splitlines())
+    said = done("grade", "a.pdf", "-o", "out").output
+    assert len(said) < 3000
+    assert not any(line.lstrip().startswith("Points 120") for line in said.splitlines())
     monkeypatch.setattr(module, "grade", Mock(side_effect=KeyboardInterrupt))
-    result = CliRunner().invoke(cli, ["grade", "a.pdf", "-o", "out"])
+    result = run("grade", "a.pdf", "-o", "out")
     assert isinstance(result.exception, Interrupted)
     assert result.exception.exit_code == 130
     assert "goes on from there" in str(result.exception)
@@ -251,8 +247,7 @@ def test_the_options_of_a_term_reach_it(tmp_path, monkeypatch) -> None:
         "grade a.pdf -o out --roster sheet.csv --worksheet sheet.csv --column Grade --attempt best "
         "--late 5%/hour --anonymous --title Lab --jobs 3 --due"
     )
-    result = CliRunner().invoke(cli, [*words.split(), "2026-11-20 23:59 +01:00"])
-    assert result.exit_code == 0, result.exception
+    done(*words.split(), "2026-11-20 23:59 +01:00")
     course, processes = noted.call_args.args[1], noted.call_args.kwargs["processes"]
     assert (course.title, processes) == ("Lab", 3)
     assert [person.student_id for person in course.roster] == ["0042"]
@@ -264,7 +259,6 @@ def test_the_options_of_a_term_reach_it(tmp_path, monkeypatch) -> None:
 
 def test_the_default_rubric_is_written_to_be_edited(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert CliRunner().invoke(cli, ["grade", "--write-rubric", "lab.toml"]).exit_code == 0
+    done("grade", "--write-rubric", "lab.toml")
     assert read_rubric(Path("lab.toml")) == read_rubric(None)
-    again = CliRunner().invoke(cli, ["grade", "--write-rubric", "lab.toml"])
-    assert "not overwritten" in str(again.exception)
+    assert "not overwritten" in refused("grade", "--write-rubric", "lab.toml")

@@ -1,7 +1,5 @@
 """Height in the model of EKF2 on GNSS: closed forms, simulated pairs, and flights of PX4's EKF2."""
 
-from __future__ import annotations
-
 import json
 from functools import cache
 from pathlib import Path
@@ -20,9 +18,9 @@ from px4fuse.ekf2.heights import HeightFilter, barometer_samples, with_heights
 from px4fuse.ekf2.model import Model, run_variants
 from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.stretches import Heights, Stretch
-from px4fuse.ekf2.whatif import HEIGHT_FOLLOWS, HEIGHT_STAYS, WhatIf, what_if
+from px4fuse.ekf2.whatif import HEIGHT_FOLLOWS, HEIGHT_STAYS, what_if
 from px4fuse.errors import SettingsError
-from px4fuse.flight import AidLog, Flight, Unavailable
+from px4fuse.flight import AidLog, Flight
 from px4fuse.readers import read_log
 from px4fuse.report.whatif import rows
 from px4fuse.report.why import agreement_words
@@ -68,11 +66,13 @@ def fusing(
     return HeightFilter(stretch, samples[..., None], time_s, there, on, knob, np.array([gated]))
 
 
-def told(heights: HeightFilter, end: np.ndarray, x: np.ndarray, P: np.ndarray) -> pd.DataFrame:
-    """What the barometer told a state that nobody moves."""
+def standing(of: Heights, count: int = 400, **how: Any) -> tuple[HeightFilter, pd.DataFrame]:
+    """A state that nobody moves, and what the barometer told it at each of its samples."""
+    end = np.unique(of.step)
+    heights = fusing(climbing(of, count), end, **how)
     for e in range(len(end)):
-        heights.fuse(e, x, P, np.zeros(1), np.ones(1))
-    return heights.updates("baro_hgt", 0, end * STEP_S)
+        heights.fuse(e, np.zeros((1, 9)), np.zeros((1, 9, 9)), np.zeros(1), np.ones(1))
+    return heights, heights.updates("baro_hgt", 0, end * STEP_S)
 
 
 def test_the_bias_is_the_scalar_kalman_filters_with_its_steady_variance() -> None:
@@ -81,14 +81,12 @@ def test_the_bias_is_the_scalar_kalman_filters_with_its_steady_variance() -> Non
     Steady: p = (q + √(q² + 4 q R)) / 2 before a sample, with q = 0.13² T (bias_estimator.cpp).
     """
     steps = list(range(10, 4000, 10))
-    stretch = climbing(sampled(steps, [-1.7] * len(steps)), 4000)
-    heights = fusing(stretch, np.array(steps))
-    found = told(heights, np.array(steps), np.zeros((1, 9)), np.zeros((1, 9, 9)))
+    heights, found = standing(sampled(steps, [-1.7] * len(steps)), 4000)
     q, R = 0.13**2 * PERIOD_S, 0.25
     p = (q + np.sqrt(q * q + 4.0 * q * R)) / 2.0
-    assert heights.bias_m2[0] == pytest.approx(p * R / (p + R), rel=1e-6)
+    assert heights.bias.variance_m2[0] == pytest.approx(p * R / (p + R), rel=1e-6)
     assert found["innovation_variance_down_m2"].iloc[-1] == pytest.approx(p + R, rel=1e-6)
-    assert heights.bias_m[0] == pytest.approx(1.7, abs=1e-6)
+    assert heights.bias.value_m[0] == pytest.approx(1.7, abs=1e-6)
     # and on the way there as its recursion has it
     bias, variance, innovations = 0.0, 1.0, []
     for _ in steps:
@@ -102,31 +100,24 @@ def test_the_bias_is_the_scalar_kalman_filters_with_its_steady_variance() -> Non
 
 def test_without_its_reference_the_bias_of_the_other_stays() -> None:
     steps = list(range(10, 400, 10))
-    stretch = climbing(sampled(steps, [-1.0] * len(steps)))
-    heights = fusing(stretch, np.array(steps), reference_until=1.005)
-    found = told(heights, np.array(steps), np.zeros((1, 9)), np.zeros((1, 9, 9)))
+    _, found = standing(sampled(steps, [-1.0] * len(steps)), reference_until=1.005)
     after = found["innovation_down_m"].loc[1.15:]
     assert np.ptp(after) == 0.0
     assert 0.0 < -after.iloc[0] < 0.5 < -found["innovation_down_m"].iloc[0]
 
 
 @pytest.mark.parametrize(("down_m", "learned"), [(-2.0, True), (-2.3, False)])
-def test_beyond_three_standard_deviations_nothing_is_learned_of_a_bias(
-    down_m: float, learned: bool
-) -> None:
+def test_beyond_three_standard_deviations_nothing_is_learned_of_a_bias(down_m, learned) -> None:
     """Of √(0.25 + 0.25) m here."""
-    heights = fusing(climbing(sampled([10], [down_m])), np.array([10]))
-    told(heights, np.array([10]), np.zeros((1, 9)), np.zeros((1, 9, 9)))
-    assert (heights.bias_m[0] > 0.0) == learned
+    heights, _ = standing(sampled([10], [down_m]))
+    assert (heights.bias.value_m[0] > 0.0) == learned
 
 
 @pytest.mark.parametrize("reference", BOTH)
 def test_the_reference_has_no_bias(reference: str) -> None:
     steps = list(range(10, 400, 10))
-    stretch = climbing(sampled(steps, [-1.0] * len(steps), reference=reference))
-    heights = fusing(stretch, np.array(steps))
-    told(heights, np.array(steps), np.zeros((1, 9)), np.zeros((1, 9, 9)))
-    assert (heights.bias_m[0] == 0.0) == (reference == "baro_hgt")
+    heights, _ = standing(sampled(steps, [-1.0] * len(steps), reference=reference))
+    assert (heights.bias.value_m[0] == 0.0) == (reference == "baro_hgt")
 
 
 def test_a_sample_is_judged_by_where_the_vehicle_was_then() -> None:
@@ -166,21 +157,17 @@ def test_one_sample_in_the_log_weighs_as_those_that_ekf2_had() -> None:
 @pytest.mark.parametrize(
     ("innovation", "expected"), [(-0.5, -0.5), (0.5, 0.0), (3.9, 0.0), (4.5, 0.5)]
 )
-def test_in_ground_effect_too_low_a_barometer_is_unheeded(
-    innovation: float, expected: float
-) -> None:
+def test_in_ground_effect_too_low_a_barometer_is_unheeded(innovation, expected) -> None:
     """baro_height_control.cpp: a dead zone of EKF2_GND_EFF_DZ."""
     of = sampled([10], [innovation], fused=("baro_hgt",), reference="baro_hgt", dead_m=4.0)
-    heights = fusing(climbing(of), np.array([10]))
-    found = told(heights, np.array([10]), np.zeros((1, 9)), np.zeros((1, 9, 9)))
+    _, found = standing(of)
     assert found["innovation_down_m"].item() == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(("gated", "fused"), [(True, 0.0), (False, 1.0)])
 def test_beyond_its_gate_a_height_is_rejected(gated: bool, fused: float) -> None:
     of = sampled([10], [2.6], fused=("baro_hgt",), reference="baro_hgt")
-    heights = fusing(climbing(of), np.array([10]), gated=gated)
-    found = told(heights, np.array([10]), np.zeros((1, 9)), np.zeros((1, 9, 9)))
+    _, found = standing(of, gated=gated)
     assert (found["fused"].item(), found["rejected"].item()) == (fused, 1.0 - fused)
 
 
@@ -198,15 +185,18 @@ def outdoors(baro_noise_m: float = 0.4) -> Flight:
         return simulate_flight(scenario_of("outdoor", seed=3, passes=3), parse(()))
 
 
+@cache
+def opened_once() -> Model:
+    return opened(outdoors())
+
+
 def test_what_if_predicts_the_height_of_the_flight_with_the_other_noise() -> None:
-    model = opened(outdoors())
+    model = opened_once()
     assert model.agreement.baro_hgt["down"].innovation_correlation > 0.999
     assert model.agreement.baro_hgt["down"].position_rms_difference_m < 0.02
     other = opened(outdoors(2.0))
     for one, value, then in ((model, 2.0, other), (other, 0.4, model)):
         found, true = what_if(one, [{"EKF2_BARO_NOISE": value}]), what_if(then, [])
-        assert isinstance(found, WhatIf)
-        assert isinstance(true, WhatIf)
         (predicted,), logged = found.whatif, true.logged
         for name in ("nis_mean", "innovation_std_m"):
             expected = getattr(true.replayed.heights["baro_hgt"], name)
@@ -223,11 +213,9 @@ def test_what_if_predicts_the_height_of_the_flight_with_the_other_noise() -> Non
 
 
 def test_without_its_only_sensor_the_height_drifts_and_that_is_told() -> None:
-    found = what_if(opened(outdoors()), [{}], {"baro_hgt": 40.0})
-    assert isinstance(found, WhatIf)
+    found = what_if(opened_once(), [{}], {"baro_hgt": 40.0})
     (lost,) = found.whatif
     assert lost.heights == {}
-    assert not isinstance(lost.height_rmse_to_truth_m, Unavailable)
     assert lost.height_rmse_to_truth_m > 2.0 * found.replayed.height_rmse_to_truth_m
     assert "; its height is " in found.notes[-1]
 
@@ -237,7 +225,7 @@ def test_a_height_that_would_be_rejected_for_long_is_not_predicted() -> None:
     flight = outdoors()
     jump = flight.barometer.copy()
     jump.loc[40.0:50.0, "down_m"] += 3.0
-    model = opened(flight)
+    model = opened_once()
     other = replace(flight, barometer=jump)
     stretches = with_heights(
         other, model.flight.ekf2, model.flight.ekf2.record, model.inputs.stretches
@@ -245,7 +233,6 @@ def test_a_height_that_would_be_rejected_for_long_is_not_predicted() -> None:
     assert not isinstance(stretches, str)
     jumping = replace(model, inputs=replace(model.inputs, stretches=stretches))
     found = what_if(jumping, [{"EKF2_BARO_GATE": gate} for gate in (3.0, 50.0)])
-    assert isinstance(found, WhatIf)
     assert [one.steady for one in found.whatif] == [False, True]
     assert found.whatif[0].heights["baro_hgt"].longest_without_fusion_s > 5.0
 
@@ -260,11 +247,10 @@ def test_a_height_that_does_not_agree_is_named_and_the_rest_stands() -> None:
     assert "correlate by" in agreement.doubtful["baro_hgt"]
     assert agreement.baro_hgt["down"].innovation_correlation < 0.95
     assert ". Not so the barometer, of which nothing is concluded: " in agreement_words(agreement)
-    assert model.flown.heights == {}
+    assert model.flown.besides == {}
     own = np.interp(model.flown.delayed.index, flight.ekf2.state.index, flight.ekf2.state["down_m"])
     assert np.abs(model.flown.delayed["down_m"] - own).max() < 0.5
     found = what_if(model, [{"EKF2_GPS_DELAY": 0.0}])
-    assert isinstance(found, WhatIf)
     assert HEIGHT_STAYS in found.notes
     with pytest.raises(SettingsError, match=r"EKF2_BARO_NOISE changes nothing here: .*barometer: "):
         what_if(model, [{"EKF2_BARO_NOISE": 1.0}])
@@ -274,7 +260,7 @@ def test_a_height_that_does_not_agree_is_named_and_the_rest_stands() -> None:
 
 def test_what_the_log_lacks_of_the_heights_is_said() -> None:
     flight = outdoors()
-    model = opened(flight)
+    model = opened_once()
     ekf2, stretches = model.flight.ekf2, model.inputs.stretches
     record = ekf2.record
 
@@ -304,7 +290,7 @@ def test_what_the_log_lacks_of_the_heights_is_said() -> None:
 
 def test_an_acceleration_that_ekf2_took_to_be_wrong_is_noise_of_4_9() -> None:
     """covariance.cpp, BADACC_BIAS_PNOISE."""
-    inputs = opened(outdoors()).inputs
+    inputs = opened_once().inputs
     (stretch,) = inputs.stretches
     spoilt = replace(stretch, shaken=np.ones(len(stretch.time_s), bool))
     runs = [
@@ -328,14 +314,11 @@ def test_an_acceleration_that_ekf2_took_to_be_wrong_is_noise_of_4_9() -> None:
 
 def test_axes_at_the_end_of_their_range_are_relied_on_less_in_their_step() -> None:
     flight = outdoors()
-    assert isinstance(flight.imu, pd.DataFrame)
-    (plain,) = opened(flight).inputs.stretches
+    (plain,) = opened_once().inputs.stretches
     clipped = pd.Series(0, flight.imu.index)
     at = plain.time_s[[100, 200]] - 1e-4
     clipped.iloc[np.searchsorted(flight.imu.index, at)] = [0b101, 0b111]
     (told,) = opened(replace(flight, imu=flight.imu.assign(clipped=clipped))).inputs.stretches
-    assert told.shaken is not None
-    assert plain.shaken is not None
     assert not plain.shaken.any()
     assert told.shaken[[100, 200]].tolist() == [pytest.approx(2.0 / 3.0), 1.0]
     assert np.flatnonzero(told.shaken).tolist() == [100, 200]
@@ -381,7 +364,6 @@ def test_what_other_settings_of_heights_would_have_done(models: dict[str, Model]
 
     def heights(without: dict[str, float] | None = None, **settings: float) -> Any:
         found = what_if(models["nominal"], [settings], without)
-        assert isinstance(found, WhatIf)
         return found.whatif[0], found.replayed
 
     loose, flown = heights(EKF2_BARO_NOISE=3.5)

@@ -62,10 +62,6 @@ def remedies(inventory: Inventory) -> list[str]:
     return [advice.remedy for advice in inventory.advice]
 
 
-def without_position(log: Log) -> Log:
-    return log.drop(*(n for n in log.names() if "_ev_" in n or n == "vehicle_visual_odometry"))
-
-
 # ---- the sample log ---------------------------------------------------------------------------
 
 
@@ -157,14 +153,6 @@ def test_what_a_topic_is_needed_for(tmp_path, topic_, part, lost):
     assert {can.name for can in inventory.abilities if not can.possible} - {"truth"} == lost
     assert all(f"no topic {topic_}" in ability(inventory, name).reason for name in lost)
     assert remedies(inventory).count("Record with SDLOG_PROFILE bit 0 (default).") == 1
-
-
-def test_no_position(tmp_path):
-    inventory = inventory_of(without_position(make_log()), tmp_path)
-    assert not ability(inventory, "compare").possible
-    assert ability(inventory, "acceleration").possible
-    assert "VISION_POSITION_ESTIMATE" in remedies(inventory)[0]
-    assert source(inventory, "position").unavailable.startswith("no external position")
 
 
 @pytest.mark.parametrize(("profile", "wanted"), [(1, 129), (3, 131)])

@@ -15,13 +15,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from class_tools import in_this_process
-from click.testing import CliRunner
+from cli_tools import done, refused
+from conftest import LOG
 from exchange import replace
 from matplotlib.axes import Axes
 from results_tools import SHIPPED
 
 import px4fuse
-from px4fuse.cli import cli
 from px4fuse.comparison.model import Comparison, UnjudgedFilter
 from px4fuse.display import Shown
 from px4fuse.filter.consistency import Consistency
@@ -117,9 +117,9 @@ def test_dir_shows_the_public_names_alone():
 
 @pytest.mark.usefixtures("no_drawing")
 def test_findings_are_those_of_the_command_line(sample_log, analysis, tmp_path):
-    command = ["compare", str(sample_log), "--sigma-z", "0.2", "--json", "-"]
-    done = CliRunner().invoke(cli, [*command, "-o", str(tmp_path / "r.pdf")])
-    typed = [(f["id"], f["message"], f["remedy"]) for f in json.loads(done.stdout)["findings"]]
+    command = "compare", sample_log, "--sigma-z", "0.2", "--json", "-", "-o", tmp_path / "r.pdf"
+    told = json.loads(done(*command).stdout)["findings"]
+    typed = [(f["id"], f["message"], f["remedy"]) for f in told]
     found = px4fuse.find(analysis)
     assert [(f.id, f.message, f.remedy) for f in found] == typed
     assert "sigma_z" in " ".join(finding.id for finding in found)
@@ -180,7 +180,7 @@ def test_errors_name_arguments_in_python_and_options_on_the_command_line(
     with pytest.raises(px4fuse.Px4FuseError) as raised:
         px4fuse.Settings(**{argument: value})
     assert str(raised.value).startswith(f"`{argument}` {value:g} is out of range")
-    error = str(CliRunner().invoke(cli, ["tune", str(sample_log), option, str(value)]).exception)
+    error = refused("tune", sample_log, option, value)
     assert error.startswith(f"{option} {value:g} is out of range")
     assert "`" not in error
 
@@ -377,10 +377,7 @@ def test_report_and_page_are_written_as_by_the_commands(
     results = read_results((tmp_path / "x.json").read_bytes())
     assert results.request.sigma_z_m == 0.2
     assert results.provenance.command == "px4fuse compare aisle_uwb.ulg --sigma-z 0.2"
-    verified = CliRunner().invoke(
-        cli, ["verify", str(report), str(Path("sample_logs") / analysis.flight.log.name)]
-    )
-    assert verified.exit_code == 0, verified.output
+    done("verify", report, LOG)
 
 
 def test_what_cannot_be_written_is_said(analysis: px4fuse.Analysis, tmp_path: Path) -> None:

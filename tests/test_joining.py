@@ -1,13 +1,11 @@
 """Two recordings of one flight become one; recordings of two flights do not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest
 from exchange import replace
 from flights import aisle_flight
-from mavlink_tools import BOOT_S, Aisle, unix
+from mavlink_tools import BOOT_S, Aisle, boot, track_of, unix
 from ulog_tools import load
 
 from px4fuse.alignment.joining import join, later
@@ -44,14 +42,6 @@ def record(tmp_path):
     return write_and_read
 
 
-def boot(flight: Flight, samples: pd.DataFrame) -> np.ndarray:
-    return samples.index.to_numpy() + flight.log.boot_time_s
-
-
-def track(flight: Flight, name: str):
-    return next(track for track in flight.positions if track.name == name)
-
-
 # ---- the sample -------------------------------------------------------------------------------
 
 
@@ -62,7 +52,7 @@ def test_a_ulog_without_positions_gets_them_back_and_keeps_what_it_has(
     joined = join(stripped, tlog_flight)
     assert joined.positions[0].name == "VISION_POSITION_ESTIMATE"
     mine = joined.positions[0].samples
-    truth = track(sample_flight, "vehicle_visual_odometry").samples
+    truth = track_of(sample_flight, "vehicle_visual_odometry").samples
     ours, theirs = (
         samples[Columns.POSITION].set_axis(pd.Index(boot(flight, samples), name="t"))
         for flight, samples in ((joined, mine), (sample_flight, truth))
@@ -94,7 +84,7 @@ def test_either_way_round_says_the_same_on_the_boot_clock(sample_flight, tlog_fl
         places = [t.origin.preference for t in joined.positions]
         assert places == sorted(places)
     for name in ("vehicle_visual_odometry", "VISION_POSITION_ESTIMATE"):
-        first, second = track(one, name).samples, track(other, name).samples
+        first, second = track_of(one, name).samples, track_of(other, name).samples
         np.testing.assert_allclose(boot(one, first), boot(other, second), atol=1e-6)
     # MAVLink does not carry innovations, and only a lacking estimator is replaced
     assert isinstance(other.ekf2.innovations["north"], Unavailable)

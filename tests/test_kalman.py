@@ -1,7 +1,5 @@
 """The filter and its formulas against a recursion in plain Python, as the lesson writes it."""
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_right
 from collections.abc import Sequence
@@ -82,10 +80,7 @@ def plain_replay(axis: Axis, chosen: Settings) -> tuple[list[list[float]], list[
             nu = z_at[now] - x[0]
             updates.append([z_at[now], nu, s, *k, x[0], P[0][0], P[1][1]])
             x = [x[0] + k[0] * nu, x[1] + k[1] * nu]
-            P = [
-                [r * P[0][0] / s, r * P[0][1] / s],
-                [r * P[1][0] / s, P[1][1] - k[1] * P[0][1]],
-            ]
+            P = [[r * P[0][0] / s, r * P[0][1] / s], [r * P[1][0] / s, P[1][1] - k[1] * P[0][1]]]
         states.append([*x, P[0][0], P[0][1], P[1][1]])
     return states, updates
 
@@ -178,9 +173,7 @@ def test_variance_between_steps_is_predicted_from_the_step_before(dt: float, gap
 
 @settings(max_examples=30)
 @given(axis=any_axis(), chosen=any_settings, data=st.data())
-def test_a_later_measurement_does_not_change_earlier_output(
-    axis: Axis, chosen: Settings, data: st.DataObject
-) -> None:
+def test_a_later_measurement_does_not_change_earlier_output(axis, chosen, data) -> None:
     changed = data.draw(st.integers(1, len(axis.measurement_m) - 1))
     arrival = axis.measurement_time_s[changed]
     measured = axis.measurement_m.copy()
@@ -252,8 +245,3 @@ def test_many_short_steps_add_the_limit() -> None:
         spread, added = model.spread(covariance, dt), model.noise(dt)
         covariance = tuple(a + b for a, b in zip(spread, added, strict=True))
     np.testing.assert_allclose(covariance, model.noise_of_many_steps(total), rtol=1e-7)
-
-
-def test_the_start_is_the_lessons() -> None:
-    np.testing.assert_array_equal(model.matrix(model.INITIAL_COVARIANCE), np.diag([0.5**2, 1.0**2]))
-    np.testing.assert_array_equal(model.H, [[1.0, 0.0]])

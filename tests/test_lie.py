@@ -1,7 +1,5 @@
 """Rigid motions and their tangents, against closed forms, differences and series."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -51,9 +49,7 @@ class TestTangents:
         xi = tangents(dimension, angle)
         np.testing.assert_allclose(lie.log(lie.exp(xi)), xi, atol=3e-11, rtol=0)
 
-    def test_right_jacobian_inverse_is_the_difference_quotient(
-        self, dimension: int, angle: float
-    ) -> None:
+    def test_right_jacobian_inverse_is_the_difference_quotient(self, dimension, angle) -> None:
         xi, step = tangents(dimension, min(angle, 3.0)), 1e-5  # log jumps at a half turn
         jacobian, pose = lie.right_jacobian_inverse(xi), lie.exp(xi)
         for k, axis in enumerate(np.eye(SIZES[dimension][0])):

@@ -1,7 +1,5 @@
 """The vectorised filter against the filterpy replay, and the noise that the data ask for."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest

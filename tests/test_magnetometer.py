@@ -1,7 +1,5 @@
 """The magnetometer in the model of EKF2: against the field that was made, and in what is read."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +11,7 @@ from ulog_tools import Log, gnss_log, seconds_of, stamps, topic
 
 from px4fuse.ekf2.magnetometer import Samples, fuse_field, gather
 from px4fuse.ekf2.stretches import Sensed, _field_s
-from px4fuse.flight import Ekf2, FusionRecord
+from px4fuse.flight import FusionRecord
 from px4fuse.readers import read_log
 
 EARTH = np.array([0.21, 0.015, 0.43])
@@ -138,8 +136,6 @@ def magnetic(generation: str = "v1.16", kept_hz: float = 2.0) -> Log:
 
 def record_of(log: Log, folder: Path) -> FusionRecord:
     ekf2 = read_log(log.write(folder / "a.ulg")).ekf2
-    assert isinstance(ekf2, Ekf2)
-    assert isinstance(ekf2.record, FusionRecord)
     return ekf2.record
 
 

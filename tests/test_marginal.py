@@ -1,7 +1,5 @@
 """The banded likelihood against dense linear algebra, and the noises that it finds."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from exchange import replace
@@ -36,14 +34,7 @@ from px4fuse.filter.likelihood import (
     profile_ends,
     total_over_grid,
 )
-from px4fuse.filter.marginal import (
-    Positions,
-    centred,
-    factorise,
-    fit,
-    paired_products,
-    squares,
-)
+from px4fuse.filter.marginal import Positions, centred, factorise, fit, paired_products, squares
 from px4fuse.filter.model import noise_of_many_steps
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
@@ -440,9 +431,7 @@ def clean() -> list[NoiseFit]:
     ("share", "size_m", "length", "least_found"),
     [(0.05, 2.0, 4, 0.99), (0.12, 2.0, 4, 0.99), (0.06, 0.5, 2, 0.9)],
 )
-def test_outliers_are_found_and_do_not_move_the_noise(
-    clean: list[NoiseFit], share: float, size_m: float, length: int, least_found: float
-) -> None:
+def test_outliers_are_found_and_do_not_move_the_noise(clean, share, size_m, length, least_found):
     hits = wrong = missed = 0
     ratio = []
     for seed in SEEDS:
@@ -464,9 +453,7 @@ def test_outliers_are_found_and_do_not_move_the_noise(
 
 
 @pytest.mark.parametrize(("axes", "share", "width"), [(1, 0.15, 4.0), (2, 0.1, 5.0), (2, 0.3, 3.0)])
-def test_noise_is_as_uncertain_as_the_likelihood_of_the_mixture_is_curved(
-    axes: int, share: float, width: float
-) -> None:
+def test_noise_is_as_uncertain_as_the_likelihood_of_the_mixture_is_curved(axes, share, width):
     """Of measurements without any motion, whose likelihood can be written down."""
     rng = np.random.default_rng(axes)
     wrong = rng.random(4000) < share

@@ -1,7 +1,5 @@
 """Clocks of a recording against closed forms: every made clock is a line of the boot clock."""
 
-from __future__ import annotations
-
 from dataclasses import astuple
 
 import numpy as np
@@ -36,19 +34,6 @@ from px4fuse.readers.mavlink_clocks import Line, least_delay, map_clock
 
 NOTHING = np.zeros(0)
 NO_EXCHANGES = (NOTHING, NOTHING), (NOTHING, NOTHING)
-
-
-@pytest.fixture
-def read(tmp_path):
-    """Write a recording and read it as a flight."""
-
-    def write_and_read(recording, *, stamped: bool = True, system: int | None = None) -> Flight:
-        recorder = recording.record() if isinstance(recording, Aisle) else recording
-        path = tmp_path / "made.tlog"
-        path.write_bytes(recorder.tlog() if stamped else recorder.raw())
-        return read_log(path, system=system)
-
-    return write_and_read
 
 
 def clock_error(flight: Flight, aisle: Aisle, track: int = 0) -> np.ndarray:
@@ -414,13 +399,13 @@ def test_several_vehicles_are_told_apart(read):
             read(recorder, system=system)
 
 
-def test_senders_and_what_they_lost_are_described(read):
+def test_senders_and_what_they_lost_are_described(tmp_path):
     """Of the companion every tenth message is missing, and every twentieth is there twice."""
     aisle = Aisle(seconds=60.0)
     recorder = aisle.record()
     for boot in aisle.times(1.0):
         recorder.hear(unix(boot), GROUND, heartbeat(kind=6, autopilot=8))
-    path = read.__closure__[0].cell_contents / "lossy.tlog"
+    path = tmp_path / "lossy.tlog"
     parts = [stamp(received) + made for received, _, made in recorder.frames()]
     of_companion = [i for i, part in enumerate(parts) if part[13:15] == bytes(COMPANION)]
     for i in of_companion[5::10]:

@@ -1,7 +1,5 @@
 """Frames and columns against pymavlink's own reader, and frames among every kind of damage."""
 
-from __future__ import annotations
-
 import tracemalloc
 from collections import Counter
 from pathlib import Path

@@ -3,8 +3,6 @@
 The limits are written out here, so that one that is changed must be changed here as well.
 """
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 
@@ -250,9 +248,7 @@ def fused(noise_m: float, nis: float = 5.0, name: str = "north", **parts: Any) -
     [({}, 0.1, True), ({"EKF2_EVP_NOISE": 0.1}, 0.1, True), ({"EKF2_EVP_NOISE": 0.11}, 0.1, False),
      ({}, 0.124, True), ({}, 0.126, False), ({}, 0.081, True), ({}, 0.079, False)],
 )  # fmt: skip
-def test_ekf2s_noise_is_the_programs_unless_the_sender_chose_another(
-    flown: dict[str, float], used_m: float, default: bool
-) -> None:
+def test_ekf2s_noise_is_the_programs_unless_the_sender_chose_another(flown, used_m, default):
     assert _is_default(analysis(log=log(parameters=flown)), "ekf2", fused(used_m)) is default
 
 
@@ -278,9 +274,7 @@ def test_ekf2s_noise_is_the_programs_unless_the_sender_chose_another(
          "{EKF2_ACC_NOISE: 0.35 m/s^2|noise_helps}"),
     ],
 )  # fmt: skip
-def test_what_a_cause_asks_for(
-    owner: Any, change: dict[str, float], kind: str, says: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_cause_asks_for(owner, change, kind, says, monkeypatch) -> None:
     def words(_: Any, changes: Any, helps: Any, *, otherwise: str) -> str:
         ((name, value),) = changes.items()
         return f"{{{name}: {value:g} {PARAMETERS[name].unit}|{helps.__name__}}}"
@@ -341,9 +335,7 @@ def test_a_noise_below_what_the_rate_can_show_is_a_bound() -> None:
         (fused(0.1), Noise(None, None, 0.2), {}, "noise is 0.2 m, EKF2 takes it to be 0.1 m: set"),
     ],
 )  # fmt: skip
-def test_what_is_asked_of_an_ekf2_that_cannot_be_replayed(
-    one: Any, asked: Noise, parameters: dict[str, float], says: str
-) -> None:
+def test_what_is_asked_of_an_ekf2_that_cannot_be_replayed(one, asked, parameters, says) -> None:
     tuning = {**tuned(asked), "down": tuned(asked)["horizontal"]}
     flown = analysis(axes=(one,), log=log(parameters=parameters), tuning=tuning)
     assert says in only(noises.variances, flown).remedy

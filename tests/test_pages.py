@@ -1,4 +1,4 @@
-"""Pages that look the same and pages that do not: words, pictures, and files that are none."""
+"""Pages drawn: those that look the same and those that do not, small pictures, and no files."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ import random
 import sys
 
 import pytest
+from conftest import REPORT
 from forgery import saved
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
+from PIL import Image
 from pypdf import PdfReader, PdfWriter
 from pypdf.generic import (
     ArrayObject,
@@ -26,7 +28,15 @@ from px4fuse.flight import Unavailable
 from px4fuse.report.style import report_style
 from px4fuse.verification import pages
 from px4fuse.verification.model import PageDifference
-from px4fuse.verification.pages import DISTANCE, compare_pages, looks
+from px4fuse.verification.pages import (
+    COLOURS,
+    DISTANCE,
+    MAX_PICTURE_BYTES,
+    MAX_PIXELS,
+    compare_pages,
+    looks,
+    pictures,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -96,13 +106,6 @@ def nested_forms(depth: int) -> bytes:
 
 
 BOX = ArrayObject([NumberObject(0), NumberObject(0), NumberObject(595), NumberObject(842)])
-
-
-def test_the_same_and_the_same_saved_again() -> None:
-    pdf = drawn("one 1.25", "two")
-    again = io.BytesIO()
-    PdfWriter(clone_from=io.BytesIO(pdf)).write(again)
-    assert compared(pdf, pdf) == compared(again.getvalue(), pdf) == ()
 
 
 def test_another_word_is_found_on_its_page() -> None:
@@ -198,8 +201,105 @@ def test_what_is_no_pdf_differs(content: bytes) -> None:
     assert "cannot be drawn" in found.what
 
 
-def test_without_pypdfium2_nothing_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pypdfium2_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pypdfium2", None)
-    found = compare_pages(BASE, BASE, exactly)
-    assert isinstance(found, Unavailable)
-    assert 'pip install "px4fuse[grade]"' in str(found)
+    for found in (compare_pages(BASE, BASE, exactly), pictures(BASE, 0)):
+        assert isinstance(found, Unavailable)
+        assert 'pip install "px4fuse[grade]"' in str(found)
+
+
+# -- pictures --------------------------------------------------------------------------------------
+
+
+def picture(pdf: bytes, page: int) -> bytes | Unavailable:
+    made = pictures(pdf, page)
+    if isinstance(made, Unavailable):
+        return made
+    (only,) = made or (b"",)
+    return only
+
+
+def opened(made: bytes | Unavailable) -> Image.Image:
+    assert isinstance(made, bytes), made
+    assert len(made) <= MAX_PICTURE_BYTES
+    image = Image.open(io.BytesIO(made))
+    image.load()
+    assert image.format == "PNG"
+    return image
+
+
+def blank(width: float, height: float) -> bytes:
+    writer = PdfWriter()
+    writer.add_blank_page(width, height)
+    return saved(writer)
+
+
+def test_a_report_s_cover_is_small_and_readable() -> None:
+    made = picture(REPORT.read_bytes(), 0)
+    image = opened(made)
+    assert image.size == (701, 991)
+    colours = image.convert("RGB").getcolors(256)
+    assert colours is not None
+    assert max(colours)[1] == (255, 255, 255)
+    assert min(sum(colour) for _, colour in colours) < 60  # letters are black, not grey
+    # Our blue and EKF2's orange survive the palette
+    assert any(b > r + 60 for _, (r, _, b) in colours)
+    assert any(r > b + 100 for _, (r, _, b) in colours)
+
+
+@pytest.mark.parametrize("page", [-1, 9, 10**9, 2**70])
+def test_a_page_that_is_not_there(page: int) -> None:
+    assert pictures(REPORT.read_bytes(), page) == ()
+
+
+def test_a_photograph_is_made_to_fit() -> None:
+    figure = Figure(figsize=(8.27, 11.69))
+    noise = random.Random(1).randbytes(600 * 800 * 3)
+    figure.figimage(Image.frombytes("RGB", (600, 800), noise))
+    out = io.BytesIO()
+    figure.savefig(out, format="pdf")
+    image = opened(picture(out.getvalue(), 0))
+    assert image.size[0] < 700
+    assert len(image.getcolors(256)) <= COLOURS
+
+
+@pytest.mark.parametrize(
+    "size",
+    # PDFium takes what it cannot believe for a letter
+    [(14_400, 14_400), (1, 14_400), (14_400, 1), (0.001, 0.001), (3, 3), (1e9, 1e9), (1e38, 1.0),
+     (1e300, 1e300)],
+)  # fmt: skip
+def test_odd_pages_are_bounded(size: tuple[float, float]) -> None:
+    made = picture(blank(*size), 0)
+    if not isinstance(made, Unavailable):
+        width, height = opened(made).size
+        assert width * height <= 1.1 * MAX_PIXELS
+
+
+def test_locked_and_broken_files_are_unavailable() -> None:
+    writer = PdfWriter(clone_from=REPORT)
+    writer.encrypt("secret", algorithm="RC4-128")
+    pdf = saved(writer)
+    for content in (pdf, b"", b"%PDF-1.7", b"\0" * 1000, REPORT.read_bytes()[:3000]):
+        made = picture(content, 0)
+        assert isinstance(made, Unavailable)
+        assert made.remedy == "Open the PDF itself."
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**32), st.integers(1, 60))
+@example(0, 1)
+def test_damaged_reports_never_raise(seed: int, count: int) -> None:
+    content = bytearray(REPORT.read_bytes())
+    dice = random.Random(seed)
+    for _ in range(count):
+        content[dice.randrange(len(content))] = dice.randrange(256)
+    made = picture(bytes(content), dice.randrange(9))
+    assert isinstance(made, bytes | Unavailable)
+
+
+def test_every_page_of_a_report_is_drawn() -> None:
+    made = pictures(REPORT.read_bytes())
+    assert len(made) == len(PdfReader(REPORT).pages)
+    assert {opened(one).size for one in made} == {(701, 991)}
+    assert made[0] == picture(REPORT.read_bytes(), 0)

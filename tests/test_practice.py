@@ -16,7 +16,7 @@ import click
 import numpy as np
 import pytest
 from browser import Browser
-from cli_tools import run
+from cli_tools import done
 from explore_tools import ask, axe, serious, settle, show
 from hypothesis import given
 from hypothesis import strategies as st
@@ -311,13 +311,12 @@ def test_the_command_writes_one_page(tmp_path: Path, monkeypatch: pytest.MonkeyP
     opened: list[str] = []
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(click, "launch", opened.append)
-    done = run("practice", "--seed", "3", "--flights", "1")
-    assert done.exit_code == 0, done.output
+    done("practice", "--seed", "3", "--flights", "1")
     page = tmp_path / "reports" / "practice_3.html"
     assert [file for file in tmp_path.rglob("*") if file.is_file()] == [page]
     (told,), (drawn,) = keys(page), draw(3, 1, 1)
     assert told["right"] == drawn.right
     assert opened == []  # nobody sits there
     monkeypatch.setattr("px4fuse.practice.practice_text", lambda *_: "made")
-    run("practice", "--seed", "3", "--flights", "1", "--open", "-o", "a.html")
+    done("practice", "--seed", "3", "--flights", "1", "--open", "-o", "a.html")
     assert opened == [str(tmp_path / "a.html")]

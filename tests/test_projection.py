@@ -1,21 +1,16 @@
 """EKF2 along an axis: every column against its formula, sample by sample."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 import pandas as pd
 import pytest
 from exchange import replace
-from flights import Estimator, Uwb, aisle_flight, table
+from flights import Estimator, Uwb, aisle_flight, given_placement, table
 
-from px4fuse.comparison.projection import (
-    observation_variance,
-    project_innovations,
-)
+from px4fuse.comparison.projection import observation_variance, project_innovations
 from px4fuse.filter.signals import Axis, Segment, make_axes
-from px4fuse.flight import Alignment, Columns, Flight, Unavailable
+from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.origin import MOTION_CAPTURE
 
 WHOLE = Segment(0.0, 40.0, "")
@@ -120,9 +115,7 @@ GONE = Unavailable("innovations", "none logged", "Log them.")
     ],
     ids=["segment", "north", "east", "mocap"],
 )  # fmt: skip
-def test_where_there_are_none_it_says_why(
-    made: Flight, axis: str, segment: Segment, says: str
-) -> None:
+def test_where_there_are_none_it_says_why(made, axis, segment, says) -> None:
     (track,) = made.positions
     got = project_innovations(made, made.ekf2, track, axes_of(made)[axis], segment)
     assert isinstance(got, Unavailable)
@@ -150,11 +143,7 @@ def test_where_no_observation_noise_is_logged_the_parameters_stand_in() -> None:
         ({"EKF2_EVP_NOISE": 0.2, "EKF2_EV_NOISE_MD": 1.0}, (0.3, 0.3, 1.0), 0.2**2),
     ],
 )
-def test_the_observation_noise_is_ekf2s_own_rule(
-    parameters: dict[str, float],
-    reported_m: tuple[float, float, float] | None,
-    expected_m2: float,
-) -> None:
+def test_the_observation_noise_is_ekf2s_own_rule(parameters, reported_m, expected_m2) -> None:
     made = flight(parameters=parameters)
     (track,) = made.positions
     if reported_m is not None:
@@ -165,11 +154,6 @@ def test_the_observation_noise_is_ekf2s_own_rule(
         track = replace(track, samples=samples)
     aisle = axes_of(made)["aisle"]
     assert observation_variance(made, track, aisle, WHOLE) == pytest.approx(expected_m2)
-    placed = Alignment(
-        frame="enu", frame_reason="given", yaw_deg=0.0, yaw_reason="given",
-        origin_m=(0.0, 0.0, 0.0), clock_offset_s=0.0, clock_reason="given",
-        reference="", warnings=(),
-    )  # fmt: skip
-    own_file = replace(track, alignment=placed)
+    own_file = replace(track, alignment=given_placement())
     least = max(parameters["EKF2_EVP_NOISE"], 0.01) ** 2
     assert observation_variance(made, own_file, aisle, WHOLE) == pytest.approx(least)

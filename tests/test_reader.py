@@ -1,7 +1,5 @@
 """The reader against made logs of every PX4 generation, and against flights with known truth."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
@@ -39,16 +37,6 @@ from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S
 HALF_PERIOD_S = 0.005  # of EKF2's update, EKF2_PREDICT_US 10,000
 HOUR_US = 3_600_000_000
 FLOAT32 = {"rtol": 1e-6, "atol": 1e-6}
-
-
-@pytest.fixture
-def read(tmp_path):
-    """Write a made log and read it as a flight."""
-
-    def write_and_read(log):
-        return read_log(log.write(tmp_path / "made.ulg"))
-
-    return write_and_read
 
 
 def missing_reason(flight, what):

@@ -1,7 +1,5 @@
 """Inputs: regular files within a limit, and one line for everything else."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import socket
@@ -13,9 +11,9 @@ from cli_tools import run_main
 from conftest import REPOSITORY
 from patience import patience
 
+from px4fuse import workers
 from px4fuse.errors import LogError, Px4FuseError
 from px4fuse.reading import max_log_bytes, read_text, read_whole, shown
-from px4fuse.verification import workers
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import log_sha256
 
@@ -103,9 +101,7 @@ def test_a_file_of_ten_gigabytes_is_refused_at_once(desk, monkeypatch, capsys, c
 
 
 @posix
-def test_special_and_huge_files_in_a_folder_of_logs_are_passed_over(
-    desk, monkeypatch, capsys
-) -> None:
+def test_special_and_huge_files_in_a_folder_of_logs_are_passed_over(desk, monkeypatch, capsys):
     found = []
 
     def believed(work, reports, **_):
@@ -167,9 +163,7 @@ def test_text_as_every_system_writes_it(tmp_path, encoding) -> None:
 
 @posix
 @pytest.mark.parametrize("command", READERS.values(), ids=READERS)
-def test_a_line_feed_in_a_name_makes_no_second_line(
-    tmp_path, desk, monkeypatch, capsys, command
-) -> None:
+def test_a_line_feed_in_a_name_makes_no_second_line(tmp_path, desk, monkeypatch, capsys, command):
     name = "a\nb\x1b[2J"
     (tmp_path / name).write_bytes(b"\xff\0 junk")
     for other in ("l.ulg", "s.tum", "r.pdf", "roster.csv"):

@@ -1,7 +1,5 @@
 """What a clock offset needs of the IMU that a recording holds."""
 
-from __future__ import annotations
-
 import pytest
 from exchange import replace
 from flights import Imu, aisle_flight

@@ -1,7 +1,5 @@
 """What remedies propose, with their effect: confirmed by a replay or by the truth, or not."""
 
-from __future__ import annotations
-
 import re
 from functools import cache
 
@@ -10,7 +8,7 @@ from exchange import replace
 
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.model import AgainstTruth, Comparison
+from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import (
     asked_of_ekf2,
     delay_change,
@@ -22,9 +20,8 @@ from px4fuse.comparison.remedy import (
     rejects_less,
     remedy_words,
 )
-from px4fuse.ekf2.model import Model, replay_settings
+from px4fuse.ekf2.model import replay_settings
 from px4fuse.ekf2.whatif import AxisSummary, Summary, what_if
-from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding, ekf2_rejecting, find, source_clock
 from px4fuse.flight import Unavailable
@@ -33,11 +30,7 @@ from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
 AXES = ("north", "east", "down")
-FIELDS = {
-    "sigma-z": "sigma_z_m",
-    "sigma-a": "sigma_a_m_s2",
-    "clock-offset": "clock_offset_s",
-}
+FIELDS = {"sigma-z": "sigma_z_m", "sigma-a": "sigma_a_m_s2", "clock-offset": "clock_offset_s"}
 # What rounding to the digits that are printed may do
 ROUNDING = 1.01
 AISLE = Scenario(passes=3, seed=3)
@@ -51,7 +44,6 @@ def flown(scenario: Scenario, settings: Settings, *mistakes: str) -> Analysis:
 
 def errors_m(comparison: Comparison) -> float:
     truths = [result.filters["kf"].truth for result in comparison.axes.values()]
-    assert all(isinstance(truth, AgainstTruth) for truth in truths)
     return sum(truth.position_rmse_m**2 for truth in truths) ** 0.5  # type: ignore[union-attr]
 
 
@@ -91,17 +83,12 @@ def parameters(remedy: str) -> dict[str, float]:
 def test_no_remedy_increases_the_error_to_the_truth(settings, mistakes) -> None:
     analysis = flown(AISLE, Settings(**settings), *mistakes)
     comparison, model = analysis, analysis.ekf2_model
-    assert isinstance(model, Model)
     followed = 0
     for remedy in given(find(analysis)):
         if ours := typed(remedy):
-            again = compare(
-                comparison.flight,
-                replace(comparison.settings, **ours),
-                axes=AXES,
-                start_s=comparison.segment.start_s,
-                end_s=comparison.segment.end_s,
-            )
+            segment = {each: getattr(analysis.segment, each) for each in ("start_s", "end_s")}
+            chosen = replace(analysis.settings, **ours)
+            again = compare(analysis.flight, chosen, axes=AXES, **segment)
             assert errors_m(again) <= ROUNDING * errors_m(comparison), remedy
             followed += 1
         if theirs := parameters(remedy):
@@ -109,8 +96,6 @@ def test_no_remedy_increases_the_error_to_the_truth(settings, mistakes) -> None:
             before, after = (
                 each.position_rmse_to_truth_m for each in (done.replayed, *done.whatif)
             )
-            assert isinstance(before, float)
-            assert isinstance(after, float)
             assert after <= ROUNDING * before, remedy
             followed += 1
     assert followed or mistakes == ("nlos=5%",)
@@ -158,14 +143,9 @@ def test_a_remedy_of_our_filter_that_the_truth_contradicts_is_not_given() -> Non
 NO_TRUTH = Unavailable("truth", "none", "None.")
 
 
-def model_of(analysis: Analysis) -> Model:
-    assert isinstance(analysis.ekf2_model, Model)
-    return analysis.ekf2_model
-
-
 def flown_with(analysis: Analysis, **changes: float) -> Analysis:
     """The same, had EKF2 been flown with other parameters."""
-    model = model_of(analysis)
+    model = analysis.ekf2_model
     (flown,) = replay_settings(model, [changes])
     inputs = replace(model.inputs, settings={**model.inputs.settings, **changes})
     return replace(analysis, ekf2_model=replace(model, inputs=inputs, flown=flown))
@@ -173,7 +153,6 @@ def flown_with(analysis: Analysis, **changes: float) -> Analysis:
 
 def offset(analysis: Analysis, offset_s: float) -> Analysis:
     """The same with stamps that are said to be off."""
-    assert isinstance(analysis.clock, ClockOffset)
     clock = replace(
         analysis.clock, offset_s=offset_s, interval_s=(offset_s - 0.01, offset_s + 0.01),
         sigma_s=0.005, determinable=True, change_p=None,
@@ -204,9 +183,7 @@ def summary(
         (summary(1.0, 0.0, 0.08, 0.11), True, True, False),
     ],
 )  # fmt: skip
-def test_a_remedy_must_help_and_not_harm(
-    after: Summary, noise: bool, fewer: bool, delay: bool
-) -> None:
+def test_a_remedy_must_help_and_not_harm(after, noise, fewer, delay) -> None:
     before = summary(10.0, 0.25, 0.1 if isinstance(axis_error(after), float) else NO_TRUTH, 0.1)
     assert noise_helps(before, after) is noise
     assert rejects_less(before, after) is fewer
@@ -234,7 +211,7 @@ def test_confirmed_refused_and_not_replayed(sample: Analysis) -> None:
     blind = replace(sample, ekf2_model=Unavailable("EKF2 replay", "no IMU", "Record it."))
     said = words(blind, EKF2_EVP_NOISE=0.2)
     assert said == "Because: set EKF2_EVP_NOISE to 0.2 m. Not replayed: no IMU."
-    model = model_of(sample)
+    model = sample.ekf2_model
     agreement = replace(model.agreement, good=False, reason="they part")
     doubtful = replace(sample, ekf2_model=replace(model, agreement=agreement))
     assert "Not replayed: the model does not reproduce what EKF2 logged: they part." in words(
@@ -243,7 +220,7 @@ def test_confirmed_refused_and_not_replayed(sample: Analysis) -> None:
 
 
 def test_what_the_data_ask_for(sample: Analysis) -> None:
-    model, comparison = model_of(sample), sample
+    model, comparison = sample.ekf2_model, sample
 
     def asked(analysis: Analysis) -> dict[str, float]:
         return asked_of_ekf2(comparison, model, analysis.tuning, analysis.clock)
@@ -264,17 +241,14 @@ def test_what_the_data_ask_for(sample: Analysis) -> None:
 
 
 def test_a_noise_that_the_sender_reports_is_overruled(sample: Analysis) -> None:
-    model = model_of(sample)
+    model = sample.ekf2_model
     assert noise_used_m(model) == pytest.approx(0.1)
     flown = model.inputs.aid, model.inputs.settings, noise_used_m(model)
     assert noise_change(*flown, 0.0012345) == {"EKF2_EVP_NOISE": 0.01}
     settings = {**model.inputs.settings, "EKF2_EVP_NOISE": 0.02, "EKF2_EV_NOISE_MD": 0.0}
     reported = replace(model, inputs=replace(model.inputs, settings=settings))
     used = reported.inputs.aid, settings, noise_used_m(reported)
-    assert noise_change(*used, 0.05) == {
-        "EKF2_EVP_NOISE": 0.05,
-        "EKF2_EV_NOISE_MD": 1.0,
-    }
+    assert noise_change(*used, 0.05) == {"EKF2_EVP_NOISE": 0.05, "EKF2_EV_NOISE_MD": 1.0}
     assert noise_change(*used, 0.2) == {"EKF2_EVP_NOISE": 0.2}
     assert delay_change(model.inputs, -40.0) == {}
     assert delay_change(model.inputs, 400.0) == {}

@@ -1,42 +1,140 @@
-"""Class lists as platforms export them, and whose a file is."""
+"""Tables of platforms: class lists, whose a file is, and the grades that are put into them."""
 
 from __future__ import annotations
 
+import csv
+import io
+from pathlib import Path
+
 import pytest
+from class_tools import entry
 
-from px4fuse.assignment.roster import Person, Register, people_of_sheet
-from px4fuse.assignment.sheet import read_sheet
+from px4fuse.assignment.roster import Person, Register, people_of_sheet, read_roster
+from px4fuse.assignment.sheet import Sheet, read_sheet
+from px4fuse.errors import SettingsError
 from px4fuse.grading.model import ExportOrigin
+from px4fuse.grading.outputs import filled, grade_column
 
+SUBMITTED = "Friday, 20 November 2026, 11:58 PM"
+# As mod/assign/gradingtable.php of Moodle writes it
 MOODLE = (
-    'Identifier,"Full name","ID number","Email address",Status,Grade,"Maximum Grade"\r\n'
-    'Participant 4711,"Doe Jane",0042,jane@x.edu,"No submission",,100.00\r\n'
+    'Identifier,"Full name","ID number","Email address",Status,Grade,"Maximum Grade",'
+    '"Grade can be changed","Last modified (submission)","Last modified (grade)",'
+    '"Feedback comments"\r\n'
+    '"Participant 4711","Doe Jane",0042,jane@x.edu,"Submitted for grading",,100.00,Yes,'
+    f'"{SUBMITTED}",-,\r\n'
+    '"Participant 4712","=Roe, ""Max""",,max@x.edu,"No submission",,100.00,Yes,-,-,\r\n'
+    '"Participant 4713","Pending Pat",,pat@x.edu,"No submission",55.00,100.00,Yes,-,-,old\r\n'
 )
 CANVAS = (
-    "Student,ID,SIS User ID,SIS Login ID,Section,Lab 3 (9),Final Score\n"
-    "    Points Possible,,,,,100.00,(read only)\n"
-    '"Doe, Jane",12345,0042,jdoe,A,,90\n'
+    "Student,ID,SIS User ID,SIS Login ID,Section,Quiz (8),Lab 3 (9),Roll (7),Final Score\n"
+    ",,,,,,Manual Posting,,\n"
+    "    Points Possible,,,,,10.00,100.00,(read only),(read only)\n"
+    '"Doe, Jane",12345,0042,jdoe,A,8.00,,1,90\n'
+    '"Roe, Max",12346,43,mroe,A,7.00,,1,80\n'
+    '"Pat, Pending",12347,44,ppat,A,7.00,,1,80\n'
 )
-BLACKBOARD = '"Last Name","First Name","Username","Student ID"\n"Doe","Jane","jdoe","0042"\n'
-ILIAS = "Nachname;Vorname;Benutzername;Matrikelnummer\nDoe;Jane;jdoe;0042\n"
+TITLE = "Lab 3 [Total Pts: 100 Score] |1281892"
+BLACKBOARD = (
+    '"Last Name"\t"First Name"\t"Username"\t"Student ID"\t"Lab 3 [Total Pts: 100 Score] |1281892"\t'
+    '"Grading Notes"\t"Notes Format"\t"Feedback to Learner"\t"Feedback Format"\n'
+    '"Doe"\t"Jane"\t"jdoe"\t"0042"\t""\t""\t""\t""\t""\n'
+    '"Roe"\t"Max"\t"mroe"\t"43"\t""\t""\t""\t""\t""\n'
+    '"Pat"\t"Pending"\t"ppat"\t"44"\t"1"\t""\t""\t""\t""\n'
+)
+PEOPLE = [
+    Person("0042", "Jane Doe", "jane@x.edu", "jdoe"),
+    Person("43", "Max Roe", "max@x.edu", "mroe"),
+    Person("44", "Pending Pat", "pat@x.edu", "ppat"),
+]
+ENTRIES = (
+    entry("0042", "Jane Doe", 87.5, of=120.0),
+    entry("43", "Max Roe", 104.0, of=120.0),
+    entry("44", "Pending Pat", None, of=120.0),
+)
+TEXTS = ("Points 87.5\n  <b>=1+1</b>\n", "Well done.\n", "Pending.\n")
+
+
+def written(tmp_path: Path, content: str | bytes, encoding: str = "utf-8-sig") -> Path:
+    path = tmp_path / "table.csv"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode(encoding))
+    return path
+
+
+def table(tmp_path: Path, text: str, encoding: str = "utf-8-sig") -> Sheet:
+    return read_sheet(written(tmp_path, text, encoding))
+
+
+# -- class lists -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("text", "is_"),
     [
-        (MOODLE, Person("0042", "Doe Jane", "jane@x.edu", "", {"moodle": "4711"})),
+        (MOODLE, Person("0042", "Doe Jane", "jane@x.edu", "", {"moodle": "4711"}, SUBMITTED)),
         (CANVAS, Person("0042", "Doe, Jane", "", "jdoe", {"canvas": "12345"})),
         (BLACKBOARD, Person("0042", "Jane Doe", "", "jdoe")),
-        (ILIAS, Person("0042", "Jane Doe", "", "jdoe")),
+        (
+            "Nachname;Vorname;Benutzername;Matrikelnummer\nDoe;Jane;jdoe;0042\n",
+            Person("0042", "Jane Doe", "", "jdoe"),
+        ),
         ("name\nJane Doe\n", Person("", "Jane Doe")),
         ("Email\njane@x.edu\n", Person("jane@x.edu", "", "jane@x.edu")),
     ],
 )
 def test_columns_are_found_by_the_titles_that_platforms_write(tmp_path, text, is_) -> None:
     for encoding in ("utf-8", "utf-8-sig", "utf-16"):
-        path = tmp_path / "roster.csv"
-        path.write_text(text, encoding)
-        assert people_of_sheet(read_sheet(path)) == (is_,)
+        assert people_of_sheet(table(tmp_path, text, encoding))[0] == is_
+
+
+ROSTERS = {
+    "gradescope": "First Name,Last Name,SID,Email\nAnn,Lee,1001,a@x\nBob,Ray,1002,b@x\n",
+    "id number empty": "Name,ID number,User name\nAnn Lee,,1001\nBob Ray,,1002\n",
+    "semicolons": 'Student ID;Name\r\n1001;"Ann Lee"\r\n1002;Bob Ray\r\n',
+    "comma in a quoted title": '"Student ID","Name, whole"\n1001,x\n1002,y\n',
+    "tabs": "Student-ID\tFull name\n1001\tAnn Lee\n1002\tBob Ray\n",
+    "empty rows": "\n\nid,name\n\n1001,Ann Lee\n,\n 1002 , Bob Ray \n\n",
+    "Windows-1252": "id,naïve,name\n1001,ä,Ann Lee\n1002,ö,Bob Ray\n".encode("cp1252"),
+    "short rows": "name,x,id\nAnn Lee,,1001\nBob Ray,,1002,more,cells\n",
+}
+
+
+@pytest.mark.parametrize("content", ROSTERS.values(), ids=ROSTERS.keys())
+def test_spellings(tmp_path, content) -> None:
+    students = read_roster(written(tmp_path, content))
+    assert [one.student_id for one in students] == ["1001", "1002"]
+    assert [one.file for one in students] == ["1001.ulg", "1002.ulg"]
+    if "whole" not in str(content):
+        assert [one.name for one in students] == ["Ann Lee", "Bob Ray"]
+
+
+BAD_ROSTERS = {
+    "no id column": ("a,b\n1,2\n", "no column tells who"),
+    "empty": ("", "empty"),
+    "header alone": ("id,name\n", "0 students"),
+    "empty id": ("id,name\n1,A\n,B\n", "the id of 'B'"),
+    "same id": ("id\n1\n2\n1\n", "rows 2 and 4 have the same id '1'"),
+    "same but for case": ("id\nab\nAB\n", "rows 2 and 3"),
+    "same file": ("id\na/b\na:b\n", "the id of 'a:b' no file of its own"),
+    "nothing left": ("id\n///\n", "letters or digits"),
+    "binary": (b"\x00\x01\x02id", "not text"),
+    "spreadsheet": (b"PK\x03\x04....", "Save it as CSV"),
+    "too many": ("id\n" + "\n".join(map(str, range(1001))), "1001 students"),
+    "too long": (b"id\n" + b"1" * 20_000_001, "more than the limit"),
+    "quotes never closed": ('id,name\n1,"Ada\n2,Bob\n', "not a CSV file"),
+    "huge cell": ('id,name\n1,"' + "x" * 200_000 + '"\n', "not a CSV file"),
+}
+
+
+@pytest.mark.parametrize(("content", "said"), BAD_ROSTERS.values(), ids=BAD_ROSTERS.keys())
+def test_bad_class_lists(tmp_path, content, said) -> None:
+    with pytest.raises(SettingsError) as error:
+        read_roster(written(tmp_path, content, "utf-8"))
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+# -- whose a file is -------------------------------------------------------------------------------
 
 
 CLASS = Register(
@@ -101,3 +199,87 @@ def test_a_worksheet_adds_what_it_knows() -> None:
     assert register.people == [
         Person("0042", "Jane Doe", "j@x.edu", "jdoe", {"moodle": "7"}), Person("43", "Max Roe"),
     ]  # fmt: skip
+
+
+# -- grades in the platform's table ----------------------------------------------------------------
+
+
+def rows(text: str, separator: str = ",") -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(text, newline=""), delimiter=separator))
+
+
+def register(sheet) -> Register:
+    return Register(PEOPLE, people_of_sheet(sheet))
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+@pytest.mark.parametrize(
+    ("text", "column", "title", "feedback"),
+    [
+        (MOODLE, "", "Grade", "Feedback comments"),
+        (CANVAS, "Lab 3", "Lab 3 (9)", None),
+        (BLACKBOARD, TITLE, TITLE, "Feedback to Learner"),
+    ],
+)
+def test_a_platforms_table_comes_back_with_two_columns_filled(
+    tmp_path, text, column, title, feedback, encoding
+) -> None:
+    sheet = table(tmp_path, text, encoding)
+    made, notes = filled(sheet, ENTRIES, register(sheet), column, TEXTS)
+    content = made.content()
+    assert content[:2] == sheet.path.read_bytes()[:2]
+    separator = "\t" if text is BLACKBOARD else ","
+    before, after = rows(text, separator), rows(content.decode(encoding), separator)
+    assert list(after[0]) == list(before[0])
+    assert len(after) == len(before)
+    people = after[2:] if text is CANVAS else after
+    for old, new in zip(before, after, strict=True):
+        assert {key for key in old if old[key] != new[key]} <= {title, feedback}
+    grades = [row[title] for row in people]
+    assert grades[:2] == ["87.5", "104"]
+    # who has no grade keeps what is there: an empty cell would delete, a zero would count
+    assert after[-1] == before[-1]
+    if text is MOODLE:
+        assert people[0][feedback] == "Points 87.5<br>&nbsp;&nbsp;&lt;b&gt;=1+1&lt;/b&gt;"
+    if text is not BLACKBOARD:
+        assert any("more than the platform's 100" in note for note in notes)
+
+
+def test_a_row_is_found_by_participant_email_id_or_name(tmp_path) -> None:
+    hidden = MOODLE.replace("Doe Jane", "").replace("0042,jane@x.edu", ",")
+    sheet = table(tmp_path, hidden)
+    people = Register([Person("0042", numbers={"moodle": "4711"}), *PEOPLE[1:]])
+    assert filled(sheet, ENTRIES, people, "", TEXTS)[0].rows[0][5] == "87.5"
+
+
+def test_who_is_not_in_the_table_is_said(tmp_path) -> None:
+    sheet = table(tmp_path, "\r\n".join(MOODLE.split("\r\n")[:2]) + "\r\n")
+    _, notes = filled(sheet, ENTRIES, register(sheet), "", TEXTS)
+    assert notes == ("table.csv: it has no row for Max Roe.",)
+
+
+def test_a_german_table_has_its_separator_and_comma(tmp_path) -> None:
+    text = "Matrikelnummer;Name;Punkte;Kommentar\n0042;Jane Doe;;\n"
+    sheet = table(tmp_path, text, "cp1252")
+    made, _ = filled(sheet, ENTRIES, Register(PEOPLE), "", TEXTS)
+    assert made.content() == b"Matrikelnummer;Name;Punkte;Kommentar\r\n0042;Jane Doe;87.5;\r\n"
+    moodle = MOODLE.replace(",100.00,", ',"100,00",')
+    sheet = table(tmp_path, moodle)
+    made, _ = filled(sheet, ENTRIES, register(sheet), "", TEXTS)
+    assert made.rows[0][5] == "87,5"
+
+
+@pytest.mark.parametrize(
+    ("text", "column", "says"),
+    [
+        (CANVAS, "", r"several columns.*--column: Quiz, Lab 3\."),
+        (CANVAS, "Roll", "no column for the grade"),
+        (CANVAS, "Lab 4", "no column for the grade"),
+        (CANVAS, "Final Score", "no column for the grade"),
+        ("id,name\n1,A\n", "", "no column for the grade"),
+    ],
+)
+def test_the_column_of_the_grade_is_named_or_the_only_one(tmp_path, text, column, says) -> None:
+    with pytest.raises(SettingsError, match=says) as caught:
+        grade_column(table(tmp_path, text), column)
+    assert "\n" not in str(caught.value)

@@ -1,22 +1,18 @@
 """Frames, gravity, axes, averages, segments and resets, against closed forms."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np
 import pandas as pd
 import pytest
 from exchange import replace
-from flights import Uwb, aisle_flight
+from filter_tools import attitude_table, imu_table
+from flights import Uwb, aisle_flight, table
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from px4fuse.comparison.preparation import (
-    choose_segment,
-    shift_clock,
-)
+from px4fuse.comparison.preparation import choose_segment, shift_clock
 from px4fuse.comparison.projection import continuous_state
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.signals import (
@@ -37,23 +33,13 @@ ALL = Segment(-np.inf, np.inf, "all")
 ABSENT = Unavailable("thing", "not in this log", "Log it.")
 
 
-def frame(time, values, columns):
-    values = np.broadcast_to(values, (len(time), len(columns))).astype(float)
-    return pd.DataFrame(values.copy(), index=pd.Index(time, name="time_s"), columns=columns)
-
-
 def still_imu(time, force=(0.0, 0.0, -GRAVITY)):
-    values = np.hstack([np.broadcast_to(force, (len(time), 3)), np.zeros((len(time), 3))])
-    return frame(time, values, Columns.SPECIFIC_FORCE + Columns.ANGULAR_RATE)
-
-
-def attitude_of(time, rotations):
-    return frame(time, rotations.as_quat(scalar_first=True), Columns.QUATERNION)
+    return imu_table(time, np.broadcast_to(force, (len(time), 3)), np.zeros((len(time), 3)))
 
 
 def track_of(time, positions, name="vehicle_visual_odometry", origin=RECEIVED):
     values = np.hstack([positions, np.full((len(time), 3), np.nan)])
-    samples = frame(time, values, Columns.POSITION + Columns.POSITION_VARIANCE)
+    samples = table(time, values, Columns.POSITION + Columns.POSITION_VARIANCE)
     return PositionTrack(name, origin, "", samples, "NED", "", (name,))
 
 
@@ -77,7 +63,7 @@ def felt(time, force, attitude):
 def test_a_still_vehicle_does_not_accelerate_whichever_way_it_is_turned(angles_deg):
     time = np.arange(0.0, 5.0, 0.01)
     tilt = Rotation.from_euler("ZYX", angles_deg, degrees=True)
-    attitude = attitude_of(time[::5], Rotation.concatenate([tilt] * len(time[::5])))
+    attitude = attitude_table(time[::5], Rotation.concatenate([tilt] * len(time[::5])))
     acceleration = felt(time, tilt.inv().apply([0.0, 0.0, -GRAVITY]), attitude)
     assert list(acceleration.columns) == list(AXIS_NAMES)
     np.testing.assert_allclose(acceleration, 0, atol=1e-12)
@@ -100,14 +86,14 @@ def test_constant_acceleration_of_a_turning_body(axis, rate_rad_s):
 
     time = np.arange(0.0, 5.0, 0.005)
     force = body_to_ned(time).inv().apply(truth - [0.0, 0.0, GRAVITY])
-    acceleration = felt(time, force, attitude_of(time[::10], body_to_ned(time[::10])))
+    acceleration = felt(time, force, attitude_table(time[::10], body_to_ned(time[::10])))
     assert len(acceleration) > 980
     np.testing.assert_allclose(acceleration, np.tile(truth, (len(acceleration), 1)), atol=1e-9)
 
 
 def test_no_acceleration_without_imu_and_attitude_at_the_same_time():
     time = np.arange(0.0, 1.0, 0.01)
-    level = attitude_of(time, Rotation.identity(len(time)))
+    level = attitude_table(time, Rotation.identity(len(time)))
     assert ned_acceleration(flight_of(attitude=level)) is ABSENT
     assert ned_acceleration(flight_of(imu=still_imu(time))) is ABSENT
     assert "overlap" in felt(time, (0.0, 0.0, 0.0), level.set_axis(time + 100.0)).reason
@@ -117,8 +103,7 @@ def test_no_acceleration_without_imu_and_attitude_at_the_same_time():
 
 
 def acceleration_of(time, values):
-    table = frame(time, np.outer(values, NORTH), list(AXIS_NAMES))
-    return project_acceleration(table, NORTH, ALL)
+    return project_acceleration(table(time, np.outer(values, NORTH), AXIS_NAMES), NORTH, ALL)
 
 
 intervals = st.lists(st.integers(1, 50), min_size=3, max_size=40)
@@ -165,10 +150,10 @@ def test_a_gap_is_the_share_of_the_step_without_imu(time, edges, gaps):
 
 def test_rms_counts_only_the_segment():
     time = np.arange(0.0, 10.0, 0.01)
-    table = frame(time, np.outer(np.where(time < 5.0, 100.0, 2.0), NORTH), list(AXIS_NAMES))
-    inside = project_acceleration(table, NORTH, Segment(5.0, 9.0, ""))
+    pushed = table(time, np.outer(np.where(time < 5.0, 100.0, 2.0), NORTH), AXIS_NAMES)
+    inside = project_acceleration(pushed, NORTH, Segment(5.0, 9.0, ""))
     assert inside.rms_m_s2 == pytest.approx(2.0)
-    assert isinstance(project_acceleration(table, NORTH, Segment(15.0, 19.0, "")), Unavailable)
+    assert isinstance(project_acceleration(pushed, NORTH, Segment(15.0, 19.0, "")), Unavailable)
 
 
 # ---- axes -------------------------------------------------------------------------------------
@@ -210,7 +195,7 @@ def test_positions_and_acceleration_are_projected_on_a_given_heading():
     track, _ = line_track(30.0, count=50)
     flight = flight_of(
         imu=still_imu(time, (3.0, 4.0, -GRAVITY)),
-        attitude=attitude_of(time, Rotation.identity(len(time))),
+        attitude=attitude_table(time, Rotation.identity(len(time))),
     )
     heading = float(np.degrees(np.arctan2(4, 3)))
     (axis,) = make_axes(flight, track, ALL, names=("aisle",), heading_deg=heading)
@@ -298,9 +283,9 @@ def truth_at(time):
 def ekf2_of(offset, resets, velocity=0.0):
     """EKF2 that publishes the truth plus an offset, shape (n, 3), of its own making."""
     state = np.hstack([truth_at(STATE_TIME) + offset, np.full((len(STATE_TIME), 3), velocity)])
-    table = frame(STATE_TIME, state, Columns.POSITION + Columns.VELOCITY)
-    unavailable = dict.fromkeys(AXIS_NAMES, ABSENT)
-    return Ekf2(table, ABSENT, unavailable, (), ABSENT, tuple(resets), ((-np.inf, 0),), 5.0)
+    known = table(STATE_TIME, state, Columns.POSITION + Columns.VELOCITY)
+    absent = dict.fromkeys(AXIS_NAMES, ABSENT)
+    return Ekf2(known, ABSENT, absent, (), ABSENT, tuple(resets), ((-np.inf, 0),), 5.0)
 
 
 def noisy_track():
@@ -385,9 +370,7 @@ def test_resets_outside_the_segment_change_nothing(reset_s, said):
     ("across_m", "heading_deg", "called"),
     [(1.0, None, "the aisle"), (4.0, None, "the longest direction"), (4.0, 30.0, "the aisle")],
 )
-def test_an_aisle_is_what_was_flown_as_one_or_asked_for(
-    across_m: float, heading_deg: float | None, called: str
-) -> None:
+def test_an_aisle_is_what_was_flown_as_one_or_asked_for(across_m, heading_deg, called) -> None:
     """An ellipse of 10 m by so much: what is not three times longer than wide is no aisle."""
     flight = aisle_flight(uwb=Uwb(sigma_m=0.01))
     (track,) = flight.positions

@@ -13,7 +13,6 @@ from flights import unexplained
 from px4fuse.comparison.comparison import compare
 from px4fuse.ekf2.model import MODEL_NOTE, open_model
 from px4fuse.ekf2.replay import Agreement
-from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
@@ -224,23 +223,6 @@ def test_ekf2_that_is_not_told_to_fuse_only_looks(clean: Flight) -> None:
     assert rmse(flight, 10.0, 50.0) > 2.0 > 10.0 * rmse(clean, 10.0, 50.0)
     (finding,) = (one for one in find(compare(flight, RIGHT)) if one.id == "ekf2_not_fusing")
     assert "EKF2_EV_CTRL is 0" in finding.message
-
-
-def test_own_mistakes_leave_everything_else_as_it_was() -> None:
-    plain, own = (
-        {topic.name: topic for topic in simulate(AISLE, parse(texts)).topics}
-        for texts in ([], ["ekf2-noise=0.02", "ekf2-delay=100ms", "ekf2-gate=3"])
-    )
-    without = {topic.name for topic in simulate(replace(AISLE, ekf2=False)).topics}
-    assert set(plain) - without == {
-        "vehicle_local_position", "estimator_states", "estimator_aid_src_ev_pos",
-        "estimator_status_flags",
-    }  # fmt: skip
-    for name in without:
-        for field, values in plain[name].fields.items():
-            assert np.array_equal(values, own[name].fields[field], equal_nan=True)
-    with pytest.raises(SettingsError, match="--no-ekf2"):
-        simulate(replace(AISLE, ekf2=False), parse(["ekf2-noise"]))
 
 
 # --- the log

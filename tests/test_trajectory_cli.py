@@ -1,7 +1,5 @@
 """``px4fuse loop`` and ``px4fuse evaluate`` as a student types them."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path
@@ -92,9 +90,7 @@ def test_loop_writes_report_results_path_and_graph(made, found) -> None:
     assert [each["accepted"] for each in found["loop"]["closures"]] == [True, False]
 
 
-def test_loop_report_names_whom_was_asked_and_no_folder_and_is_the_same_again(
-    made, tmp_path
-) -> None:
+def test_loop_report_names_whom_was_asked_and_no_folder_and_is_the_same_again(made, tmp_path):
     folder, _ = made
     pages = "".join(page.extract_text() for page in pypdf.PdfReader(folder / "r.pdf").pages)
     assert "Ana $x$ Müller" in pages
@@ -174,9 +170,7 @@ def test_evaluate_writes_page_and_results(desk, tmp_path, monkeypatch) -> None:
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_evaluate_with_other_settings_or_files_writes_over_no_page(
-    desk, tmp_path, monkeypatch
-) -> None:
+def test_evaluate_with_other_settings_or_files_writes_over_no_page(desk, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "other").mkdir()
     write(tmp_path / "other" / "s.tum", ROWS[:-50])
@@ -227,11 +221,6 @@ def test_a_loop_is_scored_against_what_is_given(desk) -> None:
 
 
 # ------------------------------------------------------------------ odd files that are right
-
-
-def test_a_colon_in_a_name_parts_nothing(desk, tmp_path) -> None:
-    write(tmp_path / "a:vio", ROWS)
-    assert results("loop", tmp_path / "a:vio")["track"]["name"] == "a:vio"
 
 
 def turned_up(rows: list[str]) -> list[str]:

@@ -1,7 +1,5 @@
 """Trajectory files in every dialect: the same poses, or one line of explanation."""
 
-from __future__ import annotations
-
 import hashlib
 from decimal import Decimal
 from pathlib import Path
@@ -127,9 +125,7 @@ def test_ground_truth_says_so(name: str, tmp_path: Path) -> None:
     ("axes", "tilt_deg", "frame"),
     [("xzy", 15.0, "camera"), ("xzy", 30.0, "unknown"), ("xyz", 0.0, "unknown")],
 )
-def test_the_camera_frame_shows_in_a_level_motion(
-    axes: str, tilt_deg: float, frame: str, tmp_path: Path
-) -> None:
+def test_the_camera_frame_shows_in_a_level_motion(axes, tilt_deg, frame, tmp_path) -> None:
     angle = np.linspace(0.0, 6.0, 200)
     level = np.column_stack((9 * np.sin(angle), 6 - 6 * np.cos(angle), 0.1 * np.sin(7 * angle)))
     position = level[:, ["xyz".index(axis) for axis in axes]]
@@ -218,9 +214,7 @@ def test_what_is_no_trajectory_is_refused_in_one_line(case: str, tmp_path: Path)
     assert message.endswith(".")
 
 
-def test_a_file_that_is_too_large_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_is_too_large_is_refused(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(reader, "MAX_FILE_BYTES", 10)
     with pytest.raises(TrajectoryError, match="more than the limit"):
         read_trajectory(write(tmp_path, text(rows())))
@@ -236,9 +230,7 @@ NUMBER = st.floats(-1e6, 1e6)
     position=hnp.arrays(float, (8, 3), elements=NUMBER),
     quaternion=hnp.arrays(float, (8, 4), elements=st.floats(0.1, 1.0)),
 )
-def test_what_is_written_is_read_back_exactly(
-    steps: np.ndarray, start: float, position: np.ndarray, quaternion: np.ndarray, tmp_path: Path
-) -> None:
+def test_what_is_written_is_read_back_exactly(steps, start, position, quaternion, tmp_path) -> None:
     made = Trajectory(
         "t", "unknown", start + np.cumsum(steps), position, Rotation.from_quat(quaternion)
     )

@@ -1,7 +1,5 @@
 """Tuning against data that the filter's own model made, with noises that are known."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

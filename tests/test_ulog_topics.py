@@ -1,7 +1,5 @@
 """Which time stamps of a log are trusted, and the helper that the other tests write logs with."""
 
-from __future__ import annotations
-
 from itertools import combinations, pairwise
 
 import numpy as np

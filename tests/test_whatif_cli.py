@@ -10,7 +10,7 @@ from typing import Any
 import jsonschema
 import numpy as np
 import pytest
-from cli_tools import run
+from cli_tools import done
 from pypdf import PdfReader
 
 from px4fuse.analysis import Counterfactual, run_what_if
@@ -41,13 +41,11 @@ def swept(sample_log: Path) -> Counterfactual:
 
 
 def test_results_have_the_three_side_by_side(sample_log: Path, tmp_path: Path) -> None:
-    done = run(
-        "whatif", sample_log, "--set", "EKF2_EVP_NOISE=0.3", "-o", tmp_path / "w.pdf", "--json", "-"
-    )
-    assert done.exit_code == 0, done.output
-    said = json.loads(done.output)
+    asked = "--set", "EKF2_EVP_NOISE=0.3", "-o", tmp_path / "w.pdf", "--json", "-"
+    text = done("whatif", sample_log, *asked).stdout
+    said = json.loads(text)
     jsonschema.validate(said, schema())
-    assert isinstance(read_results(done.output.encode()), WhatIfResults)
+    assert isinstance(read_results(text.encode()), WhatIfResults)
     attached = PdfReader(tmp_path / "w.pdf").attachments["results.json"][0]
     assert attached == (tmp_path / "w.json").read_bytes()
     for key in ("logged", "replayed", "whatif"):
@@ -57,9 +55,8 @@ def test_results_have_the_three_side_by_side(sample_log: Path, tmp_path: Path) -
 
 
 def test_without_an_aid_from_a_time_on(sample_log: Path) -> None:
-    done = run("whatif", sample_log, "--without", "ev_pos", "--from", "100", "--json", "-")
-    assert done.exit_code == 0, done.output
-    said = json.loads(done.output)
+    asked = "--without", "ev_pos", "--from", "100", "--json", "-"
+    said = json.loads(done("whatif", sample_log, *asked).stdout)
     jsonschema.validate(said, schema())
     assert said["whatif"]["without"] == {"ev_pos": 100.0}
     assert said["judged_s"][0][0] == 100.0

@@ -1,7 +1,5 @@
 """Why EKF2 differs: what the comparison's steps and words say, and when there is no page."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 
@@ -13,7 +11,6 @@ from flights import unexplained
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.why import why_ekf2_differs, with_words
-from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.walk import SAMPLES, Why
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings
@@ -22,23 +19,14 @@ from px4fuse.report.style import report_style
 from px4fuse.report.why import draw, nothing_concluded
 
 
-def model_of(analysis: Analysis) -> Model:
-    assert isinstance(analysis.ekf2_model, Model)
-    return analysis.ekf2_model
-
-
 def of(analysis: Analysis, name: str = "aisle") -> Why:
-    found = analysis.why[name]
-    assert isinstance(found, Why)
-    return found
+    return analysis.why[name]
 
 
 def again(analysis: Analysis, settings: Settings, **choices: Any) -> Why:
     """The aisle of the same flight, compared otherwise."""
     comparison = compare(analysis.flight, settings, axes=("aisle",), **choices)
-    found = why_ekf2_differs(comparison, analysis.ekf2_model, analysis.clock)["aisle"]
-    assert isinstance(found, Why)
-    return found
+    return why_ekf2_differs(comparison, analysis.ekf2_model, analysis.clock)["aisle"]
 
 
 def test_the_whole_is_our_filter_against_what_ekf2_published(sample: Analysis) -> None:
@@ -92,7 +80,7 @@ def drawn(analysis: Analysis) -> list:
 
 
 def test_doubtful_and_absent_replays_conclude_nothing(sample: Analysis) -> None:
-    model = model_of(sample)
+    model = sample.ekf2_model
     agreement = replace(model.agreement, good=False, reason="they part")
     doubtful = replace(model, agreement=agreement, flown=replace(model.flown, agreement=agreement))
     why = why_ekf2_differs(sample, doubtful, sample.clock)
@@ -115,9 +103,7 @@ def test_doubtful_and_absent_replays_conclude_nothing(sample: Analysis) -> None:
      (0.5, "Most of .* is the {} .50% of the mean square"),
      (1.4, "Most of .* is the {} .all of the mean square and more, which other changes take")],
 )  # fmt: skip
-def test_most_is_at_least_half_and_no_share_above_all(
-    sample: Analysis, share: float, words: str
-) -> None:
+def test_most_is_at_least_half_and_no_share_above_all(sample, share, words) -> None:
     why = of(sample)
     first, whole = why.steps[0], why.position_mean_square_m2
     steps = tuple(

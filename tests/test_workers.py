@@ -12,8 +12,8 @@ from contextlib import closing
 import pytest
 from bad_jobs import act
 
-from px4fuse.verification import workers
-from px4fuse.verification.workers import Failed, run_bounded
+from px4fuse import workers
+from px4fuse.workers import Failed, run_bounded
 
 MEMORY = 1_500_000_000
 
@@ -97,7 +97,7 @@ def test_who_stops_listening_ends_all():
 INTERRUPTED = """
 import os, sys, time
 sys.path.insert(0, {tests!r})
-from px4fuse.verification.workers import run_bounded
+from px4fuse.workers import run_bounded
 from bad_jobs import act
 
 if __name__ == "__main__":

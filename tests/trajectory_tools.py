@@ -1,7 +1,5 @@
 """Trajectories whose truth is known, published ones, and GTSAM's view of a pose graph."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 

@@ -338,10 +338,7 @@ def _aid_sources(
     observation = position(time) + ev_error(time)
     wide = np.dtype(np.float64) if number >= 16 else np.dtype(np.float32)
     topics = []
-    for name, axes in (
-        ("estimator_aid_src_ev_pos", slice(0, 2)),
-        ("estimator_aid_src_ev_hgt", 2),
-    ):
+    for name, axes in (("estimator_aid_src_ev_pos", slice(0, 2)), ("estimator_aid_src_ev_hgt", 2)):
         made = topic(name, measured, {
             "observation_variance": np.tile(EV_VARIANCE, (len(time), 1))[:, axes],
             "innovation": logged[:, axes],

@@ -37,6 +37,7 @@ def compare(
     results as JSON, for example reports/LOG_sigma-z-0.05.pdf and .json.
     """
     from px4fuse.analysis import bad_verdicts, run_or_judge_aids
+    from px4fuse.memory import give_back
     from px4fuse.report.terminal import summary
     from px4fuse.results.build import judged_results
 
@@ -46,6 +47,7 @@ def compare(
     with outputs.progress(json_path) as step:
         found = run_or_judge_aids(request, step)
         results = judged_results(request, found, person)
+        give_back()
         if output is None and json_path != STANDARD_OUTPUT:
             output = outputs.free_report(log.stem, settings_name(request), results)
         contents = outputs.result_files(results, json_path, output, found, step)

@@ -49,7 +49,7 @@ def verify(
     from px4fuse.verification.intake import MAX_BYTES, read_report
     from px4fuse.verification.model import Refused
     from px4fuse.verification.verification import verify as verify_report
-    from px4fuse.verification.workers import Failed, bounded
+    from px4fuse.workers import Failed, bounded
 
     content = read_whole(report, LogError, MAX_BYTES, smaller="Reports are below 2 MB")
     read = read_report(content, shown(report))

@@ -191,6 +191,7 @@ def _reasons(
         ways.FIELD: "EKF2 takes its heading from the magnetometer, ours as EKF2 published it",
         ways.SPEED: "EKF2 fuses the velocity of GNSS too, ours its position alone",
         ways.FLOWING: "EKF2 fuses optical flow too, ours positions alone",
+        ways.VISION: "EKF2 fuses external vision besides GNSS, ours one of the two",
         ways.GATE: f"EKF2's gate rejects {rejected:.1%} of the samples, ours takes all",
         ways.OUTPUT: (
             f"EKF2 filters {inputs.horizon_s * 1e3:.0f} ms behind the present, carries that to now "

@@ -3,7 +3,7 @@
 Samples of the barometer between two events are fused at the later one, as measurements of height
 and vertical velocity then: where the vehicle was before is known from both and the IMU.
 
-Sources: PX4-Autopilot ``EKF/bias_estimator`` (``bias_estimator.cpp``), ``EKF/aid_sources``
+Sources: PX4-Autopilot ``EKF/aid_sources``
 (``barometer/baro_height_control.cpp``, ``gnss/gnss_height_control.cpp``), before v1.16
 ``EKF/baro_height_control.cpp`` and ``EKF/gnss_height_control.cpp``.
 """
@@ -15,7 +15,8 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.ekf2.stretches import Heights, Stretch, steps_of
+from px4fuse.ekf2.bias import Bias
+from px4fuse.ekf2.stretches import Heights, Stretch, by_event, padded, steps_of
 from px4fuse.ekf2_parameters import AIDS, BAROMETER, GNSS_HGT, fuses_by_mask
 from px4fuse.flight import GROUND_EFFECT, Ekf2, Flight, FusionRecord, at_times
 
@@ -30,10 +31,6 @@ BIAS_LATE_S = 1.0
 # in the log stands for several, down to the last rate
 BAROMETER_HZ, OLD_BAROMETER_HZ, LEAST_HZ = 10.0, 15.0, 4.0
 MIN_GATE, MIN_SD = 1.0, 0.01  # the latter of position and height (m), and of a velocity (m/s)
-# Of the bias: noise density (m/s/√Hz; bias_nsd, common.h), least variance, least one of a
-# measurement, gate; where innovations keep to one side its noise is raised (isOffsetDetected)
-BIAS_DENSITY, LEAST_M2, LEAST_NOISE_M2, BIAS_GATE = 0.13, 1e-8, 1e-4, 3.0
-ONE_SIDED, RAISED, FILTER_S = 0.2, 1e3, 10.0
 
 
 def with_heights(
@@ -95,27 +92,10 @@ def barometer_samples(stretch: Stretch, ends: Sequence[IntArray]) -> list[Array]
     Each of shape (5, k, E), for the k that come in one interval at most: height at the event, as if
     the vehicle had stood still since, age then, time, dead zone, and 1; all 0 where there is none.
     """
-    heights, time_s = stretch.heights, stretch.time_s
+    heights = stretch.heights
     assert heights is not None
-    # by the IMU alone, from a standstill
-    speed = stretch.gained_m_s[:, 2]
-    path = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * stretch.step_s)])
-    found = []
-    for end in ends:
-        event = np.searchsorted(end, heights.step)
-        event = event[event < len(end)]
-        step, at = heights.step[: len(event)], end[event]
-        age_s = time_s[at] - time_s[step]
-        down_m, taken_s, dead_m = (
-            each[: len(event)] for each in (heights.down_m, heights.taken_s, heights.dead_m)
-        )
-        down_m = down_m + path[at] - path[step] - speed[at] * age_s
-        place = np.arange(len(event)) - np.searchsorted(event, event)
-        samples = np.zeros((5, place.max(initial=-1) + 1, len(end)))
-        samples[:, place, event] = down_m, age_s, taken_s, dead_m, np.ones(len(event))
-        found.append(samples)
-    most = max(samples.shape[1] for samples in found)
-    return [np.pad(each, ((0, 0), (0, most - each.shape[1]), (0, 0))) for each in found]
+    told = heights.down_m[:, None], slice(2, 3), heights.taken_s, heights.dead_m
+    return padded([by_event(stretch, end, heights.step, *told) for end in ends])
 
 
 class HeightFilter:
@@ -159,10 +139,9 @@ class HeightFilter:
         self.noise_m2 = np.maximum(knob.get(BAROMETER.noise, MIN_SD), MIN_SD) ** 2
         self.biased = [aid.name != heights.reference for aid in SENSORS]
         self.weight, self.learning = (heights.weight, 1.0), on[heights.reference]
-        self.bias_m, self.bias_m2 = (np.full(size, value) for value in heights.bias)
-        self.one_sided, self.last_s = np.zeros(size), np.full(size, stretch.time_s[0])
-        step_s = float(np.median(stretch.step_s))
-        self.share = step_s / (FILTER_S + step_s)
+        value_m, variance_m2 = (np.full(size, part) for part in heights.bias)
+        start_s, step_s = float(stretch.time_s[0]), float(np.median(stretch.step_s))
+        self.bias = Bias(value_m, variance_m2, start_s, step_s)
 
     def updates(self, sensor: str, variant: int, end_s: Array) -> pd.DataFrame:
         """What one variant did with each sample of a sensor; ``end_s`` is the time of each event.
@@ -201,7 +180,10 @@ class HeightFilter:
     ) -> tuple[Array, Array]:  # fmt: skip
         """Fuse an innovation; ``column`` is PH', ``spread`` HPH'."""
         if self.biased[at]:
-            nu, R = self._corrected(e, place, nu, spread, R, self.weight[at])
+            seen, time_s = self.seen[place][e], self.time_s[place][e]
+            nu, R = self.bias.corrected(
+                nu, spread, R, time_s, seen, self.learning[e], self.weight[at]
+            )
         if at == 0 and self.near[place, e]:
             nu = np.where(nu > 0.0, np.maximum(nu - self.dead_m[place, e], 0.0), nu)
         S = spread + R
@@ -209,23 +191,3 @@ class HeightFilter:
         self.told[e, place] = nu, S, taken
         K = column * (taken / (spread + R / self.weight[at]))[:, None]
         return x + K * nu[:, None], P - K[:, :, None] * column[:, None]
-
-    def _corrected(
-        self, e: int, place: int, nu: Array, spread: Array, noise_m2: Array, weight: float
-    ) -> tuple[Array, Array]:
-        """Innovation and R with the bias as it was, which learns of them before they are fused."""
-        seen, time_s = self.seen[place][e], self.time_s[place][e]
-        learns, most = seen & self.learning[e], np.maximum(noise_m2, LEAST_NOISE_M2)
-        raised = np.where(np.abs(self.one_sided) > ONE_SIDED, RAISED, 1.0)
-        gained = BIAS_DENSITY**2 * (time_s - self.last_s) * raised * learns
-        variance = np.minimum(self.bias_m2 + gained, most)
-        nu, R = nu + self.bias_m, noise_m2 + variance
-        S = variance + np.maximum((noise_m2 + spread) / weight, LEAST_NOISE_M2)
-        ratio = nu * nu / (BIAS_GATE**2 * S)
-        K = variance / S * (learns & (ratio < 1.0))
-        self.bias_m = self.bias_m - K * nu
-        self.bias_m2 = np.maximum(variance * (1.0 - K), LEAST_M2)
-        signed = np.minimum(ratio, 1.0) * np.sign(-nu)
-        self.one_sided = self.one_sided + self.share * weight * learns * (signed - self.one_sided)
-        self.last_s = np.where(seen, time_s, self.last_s)
-        return nu, R

@@ -5,7 +5,7 @@ Sources: PX4-Autopilot ``EKF/aid_sources/external_vision/ev_pos_control.cpp`` an
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -154,6 +154,8 @@ class Inputs:
         EKF2_IMU_POS, body FRD.
     max_interval_s : float
         Height and heading are measured at least this often where vision is silent.
+    vision : Received or None
+        Positions of external vision that EKF2 fuses besides GNSS; NaN while it does without.
     imposed : str
         On GNSS, why the height is EKF2's own as flown; empty where it is fused.
     """
@@ -170,6 +172,7 @@ class Inputs:
     aid: Aid = EV_POS
     max_interval_s: float = MAX_INTERVAL_S
     imposed: str = ""
+    vision: Received | None = None
 
     __repr__ = brief
 
@@ -183,7 +186,8 @@ def prepare(  # noqa: PLR0911, PLR0912 (a reason each)
     ----------
     flight : Flight
     doubtful : mapping from PX4's name of an aid to str
-        Why the height is to be EKF2's own as flown, and why optical flow alone carries nothing.
+        Why the height is to be EKF2's own as flown, why optical flow alone carries nothing, and why
+        vision besides GNSS is to be left out.
     """
     imu, attitude, ekf2 = flight.imu, flight.attitude, flight.ekf2
     if isinstance(imu, Unavailable):
@@ -193,7 +197,7 @@ def prepare(  # noqa: PLR0911, PLR0912 (a reason each)
     if isinstance(ekf2, Unavailable):
         return ekf2
     aid = replayed_aid(ekf2)
-    gnss = aid == GNSS_POS
+    gnss, given = aid == GNSS_POS, ekf2
     if gnss:
         ekf2 = with_gnss(ekf2)
     record, horizon_s = ekf2.record, ekf2.horizon_s
@@ -205,13 +209,19 @@ def prepare(  # noqa: PLR0911, PLR0912 (a reason each)
     if more := [one for one in record.other_aiding if one not in modelled]:
         fused = "GNSS" if gnss else "vision position"
         said = f"EKF2 fused more than {fused} horizontally ({', '.join(more)})"
-        remedy = "" if gnss else f", {GNSS_POS.switch} 0 and without bit 2 of {EV_POS.switch}"
-        return Unavailable(WHAT, said, f"Fly with EKF2_OF_CTRL 0{remedy}.")
+        remedy = "" if gnss else f", {GNSS_POS.switch} 0"
+        return Unavailable(
+            WHAT, said, f"Fly with EKF2_OF_CTRL 0{remedy} and without bit 2 of {EV_POS.switch}."
+        )
     if lacking := _imu_lacks(imu.index.to_numpy()):
         return lacking
     read = read_gnss(flight, ekf2, record) if gnss else read_vision(flight, ekf2, record, attitude)
     if isinstance(read, Unavailable):
         return read
+    besides = gnss and EV_POS.name not in doubtful
+    vision = _besides(flight, given, record, attitude) if besides else None
+    if isinstance(vision, Unavailable):
+        return vision
     # since v1.17 each receiver has its own, which its messages carry
     track = _gnss(flight) if gnss else None
     place = {} if track is None else dict(zip(aid.place, track.place_m, strict=True))
@@ -235,12 +245,15 @@ def prepare(  # noqa: PLR0911, PLR0912 (a reason each)
         gate = record.parameters.get(FLOW.gate, FLOW.default_gate)
         stretches = tuple(with_flow(stretch, flow, gate) for stretch in stretches)
     imposed = "; ".join(
-        f"{AIDS[name].label}: {why}" for name, why in doubtful.items() if name != FLOW.name
+        f"{AIDS[name].label}: {why}"
+        for name, why in doubtful.items()
+        if name not in (FLOW.name, EV_POS.name)
     )
     if gnss and not imposed:
         found = with_heights(flight, ekf2, record, stretches)
         stretches, imposed = (stretches, found) if isinstance(found, str) else (found, "")
-    others = [MAG] if any(stretch.field for stretch in stretches) else []
+    others = [EV_POS] if vision else []
+    others += [MAG] if any(stretch.field for stretch in stretches) else []
     heights = stretches[0].heights
     others += [BAROMETER] if heights and BAROMETER.name in heights.fused else []
     return Inputs(
@@ -257,6 +270,7 @@ def prepare(  # noqa: PLR0911, PLR0912 (a reason each)
         imu_offset_m=np.array([record.parameters.get(f"EKF2_IMU_POS_{x}", 0.0) for x in "XYZ"]),
         aid=aid,
         imposed=imposed,
+        vision=vision,
     )
 
 
@@ -302,7 +316,14 @@ def replayed_aid(ekf2: Ekf2) -> Aid:
     """What EKF2's horizontal position rests on: external vision, or GNSS where it fused that."""
     vision = ekf2.aids.get(EV_POS.name)
     used = vision is not None and (vision.meant is None or bool(vision.meant.any()))
-    return GNSS_POS if fuses(ekf2) and not used else EV_POS
+    both = _meant(ekf2, GNSS_POS) is not None
+    return GNSS_POS if fuses(ekf2) and (both or not used) else EV_POS
+
+
+def _meant(ekf2: Ekf2, aid: Aid) -> "pd.Series[float] | None":
+    """When EKF2 meant to fuse an aid; None where it never did, by what the log tells."""
+    log = ekf2.aids.get(aid.name)
+    return log.meant if log is not None and log.meant is not None and log.meant.any() else None
 
 
 def _gnss(flight: Flight) -> PositionTrack | None:
@@ -393,6 +414,22 @@ def read_vision(
         arrival = stamp + np.interp(stamp, age.index.to_numpy(), age.to_numpy())
     decisions = _decisions(ekf2, record, stamp)
     return Received(stamp, arrival, position, variance, *decisions, track.name)
+
+
+def _besides(
+    flight: Flight, ekf2: Ekf2, record: FusionRecord, attitude: pd.DataFrame
+) -> Received | Unavailable | None:
+    """The samples of vision that EKF2 received besides fixes; None where it fused none."""
+    if (meant := _meant(ekf2, EV_POS)) is None:
+        return None
+    if fuses_by_mask(record.parameters):
+        said = f"{flight.log.firmware} fuses the movement of vision besides GNSS"
+        return Unavailable(WHAT, said, "Use PX4 v1.14 or newer, or fly with one of the two.")
+    seen = read_vision(flight, ekf2, record, attitude)
+    if isinstance(seen, Unavailable):
+        return seen
+    off = at_times(meant, seen.stamp_s) == 0.0
+    return replace(seen, position_m=np.where(off[:, None], np.nan, seen.position_m))
 
 
 def _decisions(

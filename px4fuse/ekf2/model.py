@@ -9,8 +9,8 @@ far it can be believed is measured on each log, see :mod:`px4fuse.ekf2.replay`.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -44,6 +44,7 @@ from px4fuse.ekf2.stretches import (
 )
 from px4fuse.ekf2_parameters import (
     BAROMETER,
+    EV_POS,
     FIELD_NOISES,
     FLOW,
     GNSS_POS,
@@ -80,19 +81,17 @@ class Model:
         Of each stretch, for the delay as flown; empty where they are yet to be made.
     flown : Ekf2Replay
         With the parameters of the log.
-    obedient : callable
-        Makes the same, once, rejecting and resetting where EKF2 did, as far as the log tells.
     agreement : Agreement
         Of ``flown`` with what the log holds.
     runs : list of Run
-        Through each stretch, of these inputs: both, and the variants that were asked for besides.
+        Through each stretch, of these inputs: as flown, the same rejecting and resetting where EKF2
+        did, and the variants that were asked for besides. What is not there is run when needed.
     """
 
     flight: Flight
     inputs: Inputs
     intervals: Mapping[Timing, tuple[Intervals, ...]]
     flown: Ekf2Replay
-    obedient: Callable[[], Ekf2Replay]
     agreement: Agreement
     runs: list[Run] = field(default_factory=list, init=False)
 
@@ -140,13 +139,12 @@ def _open(
     known = {timing: intervals}
     runs = run_variants(inputs, variants, known)
     replay = _assemble(inputs, runs, flown, {})
-    obedient = cache(partial(_assemble, inputs, runs, variants[1], {}))
     agreement = agreement_with_log(flight, replay)
     if isinstance(agreement, Unavailable):
         return agreement
     share = max(agreement.rejected_share_logged, agreement.rejected_share_replayed)
     if share > REJECTING_SHARE and np.isfinite(inputs.received.rejected).any():
-        obeyed = agreement_with_log(flight, obedient())
+        obeyed = agreement_with_log(flight, _assemble(inputs, runs, variants[1], {}))
         if isinstance(obeyed, Agreement):
             agreement = with_obedient(agreement, obeyed)
     told = {DOUBTED.get(name, name): name for name in doubted}
@@ -156,9 +154,15 @@ def _open(
         **{of: getattr(doubted[name], of) for of, name in told.items()},
     )
     replay = structs.replace(replay, agreement=agreement)
-    model = Model(flight, inputs, known, replay, obedient, agreement)
+    model = Model(flight, inputs, known, replay, agreement)
     model.runs.extend(runs)
     return model
+
+
+def obedient(model: Model) -> Ekf2Replay:
+    """EKF2 as flown, rejecting and resetting where it did itself, as far as the log tells."""
+    variant = Variant(model.inputs.settings, as_logged=True)
+    return _assemble(model.inputs, _run_model(model, [variant]), variant, {})
 
 
 def replay_settings(
@@ -232,8 +236,10 @@ def aids_of(inputs: Inputs) -> list[str]:
     velocity = [GNSS_VEL.name] if inputs.received.velocity_m_s is not None else []
     magnetic = [MAG.name] if MAG.noise in inputs.settings else []
     flow = [FLOW.name] if inputs.stretches[0].flow is not None else []
+    vision = [EV_POS.name] if inputs.vision is not None else []
     heights = inputs.stretches[0].heights
-    return [inputs.aid.name, *velocity, *magnetic, *flow, *(heights.fused if heights else ())]
+    of_height = heights.fused if heights else ()
+    return [inputs.aid.name, *velocity, *vision, *magnetic, *flow, *of_height]
 
 
 def _without(inputs: Inputs, replay: Ekf2Replay, left_out_s: Array) -> Ekf2Replay:
@@ -254,11 +260,14 @@ def disturbed(model: Model, sigma_m: float, seed: int) -> Model:
         Standard deviation of the noise (m), per axis.
     seed : int
     """
-    received = model.inputs.received
-    noise = np.random.default_rng(seed).normal(scale=sigma_m, size=received.position_m.shape)
-    received = replace(received, position_m=received.position_m + noise)
+    inputs, rng = model.inputs, np.random.default_rng(seed)
+    sent: dict[str, Any] = {}
+    for name, of in {"received": inputs.received, "vision": inputs.vision}.items():
+        if of is not None:
+            noise = rng.normal(scale=sigma_m, size=of.position_m.shape)
+            sent[name] = replace(of, position_m=of.position_m + noise)
     # the intervals between samples hang on their times alone
-    return replace(model, inputs=replace(model.inputs, received=received))
+    return replace(model, inputs=replace(inputs, **sent))
 
 
 def moved(model: Model, turned_deg: float, later_s: float) -> Model:
@@ -341,7 +350,7 @@ def _assemble(
         ),
         delayed=pd.concat([delayed for delayed, _ in tracks]),
         published=pd.concat([published for _, published in tracks]),
-        heights=_heights(runs, at),
+        besides=_besides(runs, at),
         stretches_s=tuple(tuple(part.stretch.time_s[[0, -1]].tolist()) for part in runs),
         source=inputs.received.source,
         late=sum(int(part.events[at].late.sum()) for part in runs),
@@ -356,15 +365,17 @@ def _carried_s(updates: pd.DataFrame, stretch: Stretch) -> list[tuple[float, flo
     return [(a, b) for a, b in pairwise(ends) if b - a > RESTART_GAP_S]
 
 
-def _heights(runs: Sequence[Run], at: int) -> dict[str, pd.DataFrame]:
-    """What was done with each sample of the heights that were fused, by PX4's name."""
-    filters = [
-        (part.heights, part.stretch.time_s[part.events[at].end]) for part in runs if part.heights
-    ]
-    return {
-        name: pd.concat([of.updates(name, at, end_s) for of, end_s in filters])
-        for name in (filters[0][0].fused if filters else ())
-    }
+def _besides(runs: Sequence[Run], at: int) -> dict[str, pd.DataFrame]:
+    """What was done with each sample of what was fused besides, by PX4's name."""
+    told: dict[str, list[pd.DataFrame]] = {}
+    for part in runs:
+        end_s = part.stretch.time_s[part.events[at].end]
+        if (heights := part.heights) is not None:
+            for name in heights.fused:
+                told.setdefault(name, []).append(heights.updates(name, at, end_s))
+        if part.vision is not None:
+            told.setdefault(EV_POS.name, []).append(part.vision.updates(at, end_s))
+    return {name: pd.concat(each) for name, each in told.items()}
 
 
 def _updates(part: Run, at: int) -> pd.DataFrame:
@@ -435,8 +446,7 @@ def delayed_states(part: Run, at: int) -> tuple[Array, Array]:
     speed = state[1:, VELOCITY]
     state[1:, POSITION] += grown(0.5 * dt * (before(speed, VELOCITY) + speed))
     state[end] = kept[1:]
-    reset = np.zeros((count + 1, 3))
-    for e in np.flatnonzero(part.reset[:, at]):
-        # measured position minus the state before: the innovation itself
-        reset[end[e] :, :2] += part.innovation[e, at, LEVEL]
+    reset, moved_m = np.zeros((count + 1, 3)), part.moved_m[:, at]
+    for e in np.flatnonzero(moved_m.any(axis=1)):
+        reset[end[e] :, :2] += moved_m[e]
     return state, reset

@@ -28,7 +28,8 @@ from px4fuse.ekf2.stretches import (
     VELOCITY,
     Stretch,
 )
-from px4fuse.ekf2_parameters import FLOW, GNSS_POS, GNSS_VEL, MAG, Aid
+from px4fuse.ekf2.vision import VisionFilter, set_states, vision_samples
+from px4fuse.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG, Aid
 
 # How long the first pass runs that gives the correlations at the start
 CORRELATING_S = 8.0
@@ -97,11 +98,13 @@ class Variant:
         if self.stamp_offset_s is not None:
             return Timing(-self.stamp_offset_s - 0.5 * inputs.step_s, np.inf)
         delay_s = self.settings[inputs.aid.delay] * 1e-3
+        known = self.settings.keys() & {GNSS_POS.delay, EV_POS.delay}
+        most_ms = max(self.settings[name] for name in known)
         if inputs.rules.horizon_by_delay:  # the longest of the delays makes the buffer
-            length = math.ceil(delay_s / inputs.predict_s)
+            length = math.ceil(most_ms * 1e-3 / inputs.predict_s)
             return Timing(delay_s, max(inputs.horizon_s, (length - 1) * inputs.step_s))
         # EKF2 raises it to the longest delay when it starts (EKF2.cpp)
-        longest_ms = max(self.settings["EKF2_DELAY_MAX"], self.settings[inputs.aid.delay])
+        longest_ms = max(self.settings["EKF2_DELAY_MAX"], most_ms)
         if longest_ms == inputs.settings["EKF2_DELAY_MAX"]:
             return Timing(delay_s, inputs.horizon_s)
         # initialise_interface, estimator_interface.cpp: the length of the IMU buffer
@@ -127,15 +130,19 @@ class Run:
     noise : ndarray, shape (E, S, 6)
         R.
     rejected, fused, reset : ndarray of bool, shape (E, S)
+    moved_m : ndarray, shape (E, S, 2)
+        By how much the position, north and east, was reset.
     state, variance : ndarray, shape (E + 1, S, n)
         At the start and after each event; n is 15, or 21 where the magnetic fields are states.
     covariance : ndarray, shape (S, n, n)
         At the end.
     field : ndarray, shape (E, 3, S, 3)
         Of the magnetometer (body FRD): innovation (gauss), its variance for one sample, and whether
-        it was fused; NaN where there was none.
+        it was fused; NaN where there was none. Without rows where the fields are no states.
     heights : HeightFilter or None
         Where heights are fused, and are not EKF2's own.
+    vision : VisionFilter or None
+        Where vision is fused besides GNSS.
     """
 
     stretch: Stretch
@@ -147,11 +154,13 @@ class Run:
     rejected: BoolArray
     fused: BoolArray
     reset: BoolArray
+    moved_m: Array
     state: Array
     variance: Array
     covariance: Array
     field: Array
     heights: HeightFilter | None = None
+    vision: VisionFilter | None = None
 
     __repr__ = brief
 
@@ -178,7 +187,7 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     end, active = event["end"], action > IDLE
     now_s, sampled = stretch.time_s[end], np.any(active, axis=1).tolist()
     on = {aid.name: now_s < np.array([v.without.get(aid.name, np.inf) for v in variants])
-          for aid in (inputs.aid, GNSS_VEL, MAG, FLOW, *SENSORS)}  # fmt: skip
+          for aid in (inputs.aid, GNSS_VEL, MAG, FLOW, EV_POS, *SENSORS)}  # fmt: skip
     with_velocity = (action == FUSE) & on[GNSS_VEL.name] & fuses_velocity
     sample = np.maximum(intervals[0].events.sample, 0)
     measured, noise = _measurements(inputs, stretch, sample, end, knob, reported)
@@ -189,7 +198,7 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     own = np.stack([stretch.attitude_error_rad[end, HEADING], stretch.down_m[end]], axis=-1)
     own_attitude = stretch.attitude_variance_rad2[end]
     own_variance = np.stack([own_attitude[:, :, HEADING], stretch.down_variance_m2[end]], axis=-1)
-    seen = heights = speeds = None
+    seen = heights = speeds = vision = None
     told_field, told_speeds = np.zeros((2, events), bool)
 
     def means(of: Aid, each: Sequence[Samples]) -> Samples:
@@ -209,6 +218,13 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
         samples = barometer_samples(stretch, ends)
         told = np.stack(samples, axis=-1)[..., pick]
         heights = HeightFilter(stretch, told, event["time_s"], active, on, knob, gated)
+    if inputs.vision is not None:
+        timings = [variant.timing(inputs) for variant in variants]
+        sent = [
+            vision_samples(inputs, stretch, each.events.end, variant.settings, at.horizon_s)
+            for each, variant, at in zip(intervals, variants, timings, strict=True)
+        ]
+        vision = VisionFilter(stretch, sent, on, knob, gated, reported)
     gyro2 = np.where(attitude, knob["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
     drift, drift_limit = _drift(inputs, stretch, knob, biases, attitude)
     steps = np.diff(end, axis=0, prepend=0)[:, :, None]
@@ -224,8 +240,9 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     usable = np.where(used, action, IDLE), event["startable"] & used, now_s, gated, as_logged
     fusion = _Fusion(inputs.rules, stretch.time_s[0], *usable, *logged)
     innovations, variances = np.full((2, events, size, 6), np.nan)
-    of_field = np.full((events, 3, size, 3), np.nan)
+    of_field = np.full((0 if seen is None else events, 3, size, 3), np.nan)
     rejected, fused, reset = np.zeros((3, events, size), bool)
+    moved_m = np.zeros((events, size, 2))
     states, spreads = np.empty((2, events + 1, size, x.shape[1]))
     states[0], spreads[0] = x, _diagonal(P)
     innovation, R = np.empty((2, size, 4))
@@ -256,6 +273,8 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
             x, P, of_field[e] = fuse_field(x, P, field_now, knob[MAG.noise], knob[MAG.gate])
         if speeds is not None and flow is not None and told_speeds[e]:
             x, P = fuse_flow(x, P, Samples(*(part[e] for part in speeds)), flow.gate)
+        if vision is not None:
+            x, P = vision.fuse(e, x, P, False, fusion.last_s)
         if sampled[e]:
             nu = measured[e] - x[:, TOLD]
             S = _diagonal(P)[:, TOLD] + noise[e]
@@ -292,14 +311,22 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
             x[:, HEADING] = heading
         if sampled[e] and reset[e].any():
             after = inputs.rules.reset_scale * noise[e, :, LEVEL]
-            _set(x, P, reset[e], HORIZONTAL, measured[e, :, LEVEL], after)
+            set_states(x, P, reset[e], HORIZONTAL, measured[e, :, LEVEL], after)
             if has_speed and inputs.rules.with_velocity:
-                _set(x, P, reset[e], VELOCITY, measured[e, :, SPEED], noise[e, :, SPEED])
+                set_states(x, P, reset[e], VELOCITY, measured[e, :, SPEED], noise[e, :, SPEED])
+            # measured position minus the state before
+            moved_m[e, reset[e]] = nu[reset[e], LEVEL]
+        if vision is not None:
+            vision.bias.value_m = vision.bias.value_m + moved_m[e]
+            x, P = vision.fuse(e, x, P, True, fusion.last_s)
+            if inputs.rules.with_velocity:  # either of them is a position that is fused
+                fusion.last_s = np.maximum(fusion.last_s, vision.fused_s)
         states[e + 1], spreads[e + 1] = x, _diagonal(P)
     innovations[~active], variances[~active] = np.nan, np.nan
     return Run(
         stretch, tuple(variants), tuple(each.events for each in intervals), innovations, variances,
-        noise, rejected, fused, reset, states, spreads, P, of_field, heights,
+        noise, rejected, fused, reset, moved_m if vision is None else moved_m + vision.moved_m,
+        states, spreads, P, of_field, heights, vision,
     )  # fmt: skip
 
 
@@ -312,14 +339,6 @@ def _together(x: Array, P: Array, innovation: Array, R: Array) -> tuple[Array, A
     x = x + (K @ innovation[:, :, None])[:, :, 0]
     P = P - K @ HP
     return x, 0.5 * (P + np.swapaxes(P, 1, 2))
-
-
-def _set(x: Array, P: Array, which: BoolArray, rows: slice, value: Array, variance: Array) -> None:
-    """Set some states of some variants to what was measured, with its variance."""
-    x[which, rows] = value[which]
-    P[which, :, rows] = 0.0
-    P[which, rows, :] = 0.0
-    P[which, rows, rows] = np.eye(value.shape[1]) * variance[which][:, :, None]
 
 
 def _surer(P: Array, row: int, target: Array) -> tuple[Array, Array]:

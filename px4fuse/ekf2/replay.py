@@ -12,7 +12,7 @@ from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
 from px4fuse.ekf2.inputs import aid_source, replayed_aid, same_sample
 from px4fuse.ekf2.stretches import SETTLING_S
-from px4fuse.ekf2_parameters import AIDS, FLOW, GNSS_POS, MAG, Aid
+from px4fuse.ekf2_parameters import AIDS, EV_POS, FLOW, GNSS_POS, MAG
 from px4fuse.filter import signals
 from px4fuse.filter.heading import heading_rad
 from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Columns, Ekf2, Flight, Truth, Unavailable
@@ -86,7 +86,7 @@ class Agreement(Record, frozen=True, kw_only=True):
     north, east : AxisAgreement
         Of the position that EKF2 fused.
     ev_pos, gnss_pos : mapping from "north" and "east" to AxisAgreement
-        The same by the name of the aid; empty where it is the other one.
+        The same by the name of the aid, and of vision that is fused besides GNSS.
     gnss_vel : mapping from "north" and "east" to AxisAgreement
         Of the velocity that is fused with it.
     gnss_hgt, baro_hgt : mapping from "down" to AxisAgreement
@@ -107,7 +107,8 @@ class Agreement(Record, frozen=True, kw_only=True):
         is said of it otherwise; None where positions never failed for long.
     doubtful : mapping from PX4's name of an aid to str
         Of which nothing may be concluded, and why: heights, instead of which the replay has EKF2's
-        own as flown, and optical flow, without which it begins again where positions do.
+        own as flown, optical flow, without which it begins again where positions do, and vision
+        besides GNSS, which the replay leaves out.
     good : bool
         Whether anything may be concluded from a replay of this log.
     reason : str
@@ -143,7 +144,7 @@ class Agreement(Record, frozen=True, kw_only=True):
             what,
             f"the model does not reproduce what EKF2 logged: {self.reason}",
             "Record without dropouts, with SDLOG_PROFILE "
-            + ("129 (default and vision)." if self.ev_pos else "3 (default and full rates)."),
+            + ("3 (default and full rates)." if self.gnss_pos else "129 (default and vision)."),
         )
 
 
@@ -185,10 +186,11 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
         whether it was rejected by the gate, fused, or the position reset to it; variances of
         position and velocity after it, R, and the end of the step in which that happened; then
         the same innovations of velocity.
-    heights : mapping from PX4's name to DataFrame, shape (k, 5)
-        Per sample of GNSS height and barometer, where they are fused: innovation and S
-        (``innovation_down_m``, ``innovation_variance_down_m2``), ``rejected``, ``fused`` and
-        ``fused_at_s``.
+    besides : mapping from PX4's name to DataFrame, shape (k, 5), (k, 8) of vision
+        Per sample of GNSS height and barometer, and of vision besides GNSS, where they are fused:
+        innovation and S (``innovation_down_m``, ``innovation_variance_down_m2``), ``rejected``,
+        ``fused`` and ``fused_at_s``; and of vision, north and east, ``reset``: whether the position
+        was reset to it. Where only the bias of vision begins anew there is no row.
     carried_s : tuple of (float, float)
         From the last position to the next ones, where optical flow alone carried the filter.
     delayed : DataFrame, shape (n, 7)
@@ -203,7 +205,7 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
     updates: pd.DataFrame
     delayed: pd.DataFrame
     published: pd.DataFrame
-    heights: Mapping[str, pd.DataFrame] = {}
+    besides: Mapping[str, pd.DataFrame] = {}
     carried_s: Spans = ()
 
     __repr__ = brief
@@ -256,7 +258,8 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     shares = float(by_log.mean()), float(by_model.mean())
     good, reason = _verdict(axes, *shares)
     on_gnss = replayed_aid(ekf2) == GNSS_POS
-    heights, doubtful = _heights(ekf2, replay)
+    besides, doubtful = _besides(ekf2, replay)
+    position = {GNSS_POS.name if on_gnss else EV_POS.name: axes}
     apart_m = np.hypot(north.position_rms_difference_m, east.position_rms_difference_m)
     carried_m = _carried_off_m(ekf2, replay)
     if carried_m is not None and carried_m > MAX_CARRIED_OFF_M:
@@ -267,10 +270,8 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     return Agreement(
         north=north,
         east=east,
-        ev_pos={} if on_gnss else axes,
-        gnss_pos=axes if on_gnss else {},
         gnss_vel=_velocity(ekf2, replay, own=own),
-        **heights,
+        **(position | besides),
         doubtful=doubtful,
         samples=len(log),
         rejected_share_logged=shares[0],
@@ -325,18 +326,19 @@ def _velocity(ekf2: Ekf2, replay: Ekf2Replay, *, own: bool) -> dict[str, AxisAgr
     return {axis: _axis(axis, logged, model, ekf2, replay) for axis in HORIZONTAL}
 
 
-def _heights(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, str]]:
-    """Agreement of the heights that were fused, and which of them do not agree, and why."""
+def _besides(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, str]]:
+    """Agreement of what was fused besides, and which of these aids do not agree, and why."""
     found: dict[str, dict[str, AxisAgreement]] = {}
     doubtful = {}
-    for name, updates in replay.heights.items():
-        aid, log = AIDS[name], ekf2.aids[name]
-        own = aid_source(aid) in log.topics
-        logged, model = _matched(replay, updates, logged_height(aid, log), own=own)
+    for name, updates in replay.besides.items():
+        log = ekf2.aids[name]
+        own = aid_source(AIDS[name]) in log.topics
+        rows = logged_besides(name, log)
+        logged, model = _matched(replay, updates, rows, own=own)
         if len(logged) < MIN_SAMPLES:
             doubtful[name] = f"{len(logged)} logged innovations are too few to compare with"
             continue
-        found[name] = {"down": _axis("down", logged, model, ekf2, replay)}
+        found[name] = {axis: _axis(axis, logged, model, ekf2, replay) for axis in axes_of(updates)}
         shares = (float(np.mean(frame["rejected"] > 0.0)) for frame in (logged, model))
         good, reason = _verdict(found[name], *shares)
         if not good:
@@ -344,11 +346,16 @@ def _heights(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, 
     return found, doubtful
 
 
-def logged_height(aid: Aid, log: AidLog) -> pd.DataFrame:
-    """Innovations, variances and rejections of a height, one row per logged sample."""
-    frame = innovations_along(log, "down", log.parameters.get(aid.gate, aid.default_gate))
-    names = {"innovation_m": "innovation_down_m"}
-    return frame.rename(columns=names | {"innovation_variance_m2": "innovation_variance_down_m2"})
+def logged_besides(name: str, log: AidLog) -> pd.DataFrame:
+    """Innovations, variances and rejections of an aid that is fused besides, by PX4's name."""
+    gate = log.parameters.get(AIDS[name].gate, AIDS[name].default_gate)
+    axes = [axis for axis in AXIS_NAMES if axis in log.axes]
+    return _by_axis({axis: innovations_along(log, axis, gate) for axis in axes})
+
+
+def axes_of(updates: pd.DataFrame) -> list[AxisName]:
+    """Along which axes there are innovations of position."""
+    return [axis for axis in AXIS_NAMES if f"innovation_{axis}_m" in updates]
 
 
 def _matched(
@@ -362,9 +369,12 @@ def _matched(
 
 def logged_innovations(ekf2: Ekf2) -> pd.DataFrame:
     """Innovations, variances and rejections of north and east, one row per logged sample."""
+    return _by_axis({axis: ekf2.innovations[axis] for axis in HORIZONTAL})
+
+
+def _by_axis(innovations: Mapping[AxisName, pd.DataFrame | Unavailable]) -> pd.DataFrame:
     parts = {}
-    for axis in HORIZONTAL:
-        frame = ekf2.innovations[axis]
+    for axis, frame in innovations.items():
         if isinstance(frame, Unavailable):
             return pd.DataFrame()
         parts[f"innovation_{axis}_m"] = frame["innovation_m"]

@@ -3,6 +3,7 @@
 Sources: PX4-Autopilot ``EKF/imu_down_sampler/imu_down_sampler.cpp``.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -198,6 +199,56 @@ class Stretch:
         force = np.einsum("nij,nj->ni", self.rotation[1:], self.force_m_s2) + GRAVITY_M_S2
         gained = np.cumsum(force * self.step_s[:, None], axis=0)
         return np.concatenate([np.zeros((1, 3)), gained])
+
+    @cached_property
+    def path_m(self) -> Array:
+        """Way since the start by the IMU alone, from rest, at each step's end, (n + 1, 3)."""
+        speed = self.gained_m_s
+        path = np.cumsum(0.5 * (speed[1:] + speed[:-1]) * self.step_s[:, None], axis=0)
+        return np.concatenate([np.zeros((1, 3)), path])
+
+
+def by_event(
+    stretch: Stretch, end: IntArray, step: IntArray, position_m: Array, axes: slice, *more: Array
+) -> Array:
+    """Positions by the event at which they are fused, for the k that come in one interval at most.
+
+    Parameters
+    ----------
+    stretch : Stretch
+    end : ndarray of int, shape (E,)
+        Step of each event.
+    step : ndarray of int, shape (m,)
+        At the end of which each position is taken; increasing.
+    position_m : ndarray, shape (m, a)
+    axes : slice
+        Which of north, east and down they are.
+    *more : ndarray, shape (m,)
+
+    Returns
+    -------
+    ndarray, shape (a + 2 + len(more), k, E)
+        Position at the event, as if the vehicle had stood still since, age then, ``more``, and 1;
+        all 0 where there is none.
+    """
+    event = np.searchsorted(end, step)
+    event = event[event < len(end)]
+    count = len(event)
+    step, at = step[:count], end[event]
+    age_s = stretch.time_s[at] - stretch.time_s[step]
+    path, speed = stretch.path_m[:, axes], stretch.gained_m_s[:, axes]
+    position_m = position_m[:count] + path[at] - path[step] - speed[at] * age_s[:, None]
+    place = np.arange(count) - np.searchsorted(event, event)
+    told = *position_m.T, age_s, *(each[:count] for each in more), np.ones(count)
+    samples = np.zeros((len(told), place.max(initial=-1) + 1, len(end)))
+    samples[:, place, event] = told
+    return samples
+
+
+def padded(found: Sequence[Array]) -> list[Array]:
+    """The same of :func:`by_event` for several sets of events, with room for as many in each."""
+    most = max(samples.shape[1] for samples in found)
+    return [np.pad(each, ((0, 0), (0, most - each.shape[1]), (0, 0))) for each in found]
 
 
 def find_stretches(

@@ -22,10 +22,10 @@ import pandas as pd
 from px4fuse.arrays import Array
 from px4fuse.display import Shown
 from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.model import Model, aids_of, delayed_variants
+from px4fuse.ekf2.model import Model, aids_of, delayed_variants, obedient
 from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import Ekf2Replay, Spans, along, rms_to_truth, settled
-from px4fuse.ekf2_parameters import FLOW, GNSS_POS, MAG
+from px4fuse.ekf2_parameters import EV_POS, FLOW, GNSS_POS, MAG
 from px4fuse.filter.kalman import Replay, state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
@@ -45,9 +45,10 @@ ATTITUDE = "attitude and gyro bias as states"
 FIELD = "magnetometer"
 SPEED = "velocity of GNSS"
 FLOWING = "optical flow"
+VISION = "external vision"
 GATE = "gate, missed samples, resets"
 OUTPUT = "output predictor"
-# FIELD, SPEED and FLOWING come before GATE, where EKF2 fuses these
+# FIELD, SPEED, FLOWING and VISION come before GATE, where EKF2 fuses these
 STEPS = (SAMPLES, STAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
 COLUMNS = (Columns.POSITION, Columns.VELOCITY)
@@ -59,7 +60,7 @@ class Step(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     name : str
-        One of :data:`STEPS`, :data:`FIELD`, :data:`SPEED` or :data:`FLOWING`.
+        One of :data:`STEPS`, :data:`FIELD`, :data:`SPEED`, :data:`FLOWING` or :data:`VISION`.
     position_mean_square_m2, velocity_mean_square_m2_s2 : float
         By how much it brings the track nearer to the logged one, in mean square; below 0: farther.
     position_moved_m : float
@@ -196,7 +197,7 @@ def walk(
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
     variants = on_the_way(model.inputs, settings or Settings())
-    delayed, flown = delayed_variants(model, list(variants.values())), model.obedient()
+    delayed, flown = delayed_variants(model, list(variants.values())), obedient(model)
     judged, times = model.flown.judged_s, ekf2.state.index.to_numpy()
     inside = settled(times, judged)
     # all stages have the replay's times
@@ -222,7 +223,7 @@ def walk(
                 for direction in directions.values()
             ]
         )
-        if stage in (ATTITUDE, FIELD, SPEED, FLOWING):  # the last without a gate
+        if stage in (ATTITUDE, FIELD, SPEED, FLOWING, VISION):  # the last without a gate
             ungated = track
     spans = Segment(*span, "").cut(judged)
     coast = _coast(flown, ungated, span, judged)
@@ -261,8 +262,9 @@ def walk(
             spans_s=spans,
             coast=coast,
             times_s=times,
-            apart_m=apart[0, 0],
-            left_m=apart[-2, 0],
+            # copies: a view would keep all steps
+            apart_m=apart[0, 0].copy(),
+            left_m=apart[-2, 0].copy(),
         )
     return found
 
@@ -276,9 +278,11 @@ def on_the_way(inputs: Inputs, ours: Settings) -> dict[str, Variant]:
     taken_s = flown[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
     offset_s = ours.clock_offset_s - taken_s
     unmoved = {**own, **dict.fromkeys(aid.place, 0.0)}
+    aids = aids_of(inputs)
+    others = [name for name in (FLOW.name, EV_POS.name) if name in aids[1:]]
     bare = Variant(
         own, biases=False, attitude=False, velocity=False, reported=False, gated=False,
-        without=dict.fromkeys((MAG.name, FLOW.name), 0.0),
+        without=dict.fromkeys((MAG.name, *others), 0.0),
     )  # fmt: skip
     variants = {
         SAMPLES: replace(bare, settings=unmoved, stamp_offset_s=offset_s),
@@ -288,13 +292,13 @@ def on_the_way(inputs: Inputs, ours: Settings) -> dict[str, Variant]:
         PROCESS: replace(noise, settings=flown, biases=True),
         ATTITUDE: (last := replace(noise, settings=flown, biases=True, attitude=True)),
     }
-    aids = aids_of(inputs)
     if MAG.name in aids:
-        variants[FIELD] = last = replace(last, without={FLOW.name: 0.0})
+        variants[FIELD] = last = replace(last, without=dict.fromkeys(others, 0.0))
     if received.velocity_m_s is not None:
         variants[SPEED] = last = replace(last, velocity=True)
-    if FLOW.name in aids:
-        variants[FLOWING] = replace(last, without={})
+    for at, name in enumerate(others, start=1):
+        step = FLOWING if name == FLOW.name else VISION
+        variants[step] = last = replace(last, without=dict.fromkeys(others[at:], 0.0))
     return variants | {GATE: Variant(flown, as_logged=True)}
 
 

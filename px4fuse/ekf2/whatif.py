@@ -3,7 +3,7 @@
 All three are judged over the same times, in the same way.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,12 +21,13 @@ from px4fuse.ekf2.replay import (
     Ekf2Replay,
     Spans,
     along,
-    logged_height,
+    axes_of,
+    logged_besides,
     logged_innovations,
     rms_to_truth,
     settled,
 )
-from px4fuse.ekf2_parameters import AIDS, GNSS_POS, MAG, check
+from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, MAG, check
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.heading import heading_rad
@@ -92,7 +93,7 @@ class AxisSummary(Record, frozen=True):
 
 
 class HeightSummary(Record, frozen=True):
-    """One sensor of height of one EKF2: of all samples that it tried to fuse.
+    """One sensor of height, or vision besides GNSS, of one EKF2: of all that it tried to fuse.
 
     Attributes
     ----------
@@ -135,6 +136,8 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
         Heading minus the truth's, clockwise seen from above.
     heights : mapping from PX4's name of an aid to HeightSummary
         Of the sensors of height that the replay fuses; empty where the height is EKF2's own.
+    others : mapping from PX4's name of an aid to HeightSummary
+        Of vision that is fused besides GNSS, north and east together; empty where there is none.
     height_rmse_to_truth_m : float or Unavailable
     late, lost : int
         Samples that arrived after the fusion horizon had passed them: fused late, and never.
@@ -151,6 +154,7 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     resets: Count
     heading_error_mean_deg: float | Unavailable = OWN_HEADING
     heights: Mapping[str, HeightSummary] = {}
+    others: Mapping[str, HeightSummary] = {}
     height_rmse_to_truth_m: NotNegative | Unavailable = OWN_HEIGHT
     late: Count = 0
     lost: Count = 0
@@ -263,7 +267,7 @@ def what_if(
 def _of_heading_and_height(model: Model) -> tuple[str, str]:
     off_deg = model.agreement.heading_rms_difference_deg
     heading = HEADING_STAYS if off_deg is None else HEADING_FOLLOWS.format(off_deg)
-    return heading, HEIGHT_FOLLOWS if model.flown.heights else HEIGHT_STAYS
+    return heading, HEIGHT_STAYS if model.inputs.imposed else HEIGHT_FOLLOWS
 
 
 def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) -> list[float]:
@@ -310,6 +314,7 @@ def _steadied(
         replace(
             one,
             steady=all(height.steady for height in one.heights.values())
+            and all(other.rejected_share <= MOST_REJECTED for other in one.others.values())
             and (not one.changed or (one.rejected_share <= MOST_REJECTED and _alike(same))),
             without=without,
         )
@@ -339,11 +344,14 @@ def _of_replay(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
         after = updates[f"position_variance_{axis}_m2"]
         variance[f"{axis}_m2"] = np.column_stack([s - r, after]).ravel()
     fused = used["fused_at_s"][(used["fused"] > 0) | (used["reset"] > 0)]
+    resets = used["reset"].sum()
+    if (vision := replay.besides.get(EV_POS.name)) is not None:
+        resets += vision["reset"][settled(vision["fused_at_s"], judged)].sum()
     return _summary(
-        flight, replay, judged, used, replay.published, variance, replay.heights,
+        flight, replay, judged, used, replay.published, variance, replay.besides,
         replay.delayed["heading_rad"],
         changed=replay.changed, longest_without_fusion_s=_longest(fused.to_numpy(), judged),
-        resets=int(used["reset"].sum()), late=replay.late, lost=replay.lost,
+        resets=int(resets), late=replay.late, lost=replay.lost,
     )  # fmt: skip
 
 
@@ -366,9 +374,9 @@ def _of_log(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
         longest = _longest(np.concatenate([fused, resets]), judged)
     assert isinstance(flight.attitude, pd.DataFrame)  # it was replayed
     heading = pd.Series(heading_rad(flight.attitude), flight.attitude.index)
-    heights = {name: logged_height(AIDS[name], ekf2.aids[name]) for name in replay.heights}
+    besides = {name: logged_besides(name, ekf2.aids[name]) for name in replay.besides}
     return _summary(
-        flight, replay, judged, used, ekf2.state, None, heights, heading,
+        flight, replay, judged, used, ekf2.state, None, besides, heading,
         changed={}, longest_without_fusion_s=longest, resets=len(resets),
     )  # fmt: skip
 
@@ -380,7 +388,7 @@ def _summary(
     used: pd.DataFrame,
     published: pd.DataFrame,
     variance: pd.DataFrame | None,
-    heights: Mapping[str, pd.DataFrame],
+    besides: Mapping[str, pd.DataFrame],
     heading: pd.Series,
     **more: Any,
 ) -> Summary:
@@ -408,32 +416,34 @@ def _summary(
             stated = np.interp(at, known.index, known[f"{axis}_m2"])
             sigma = float(np.sqrt(np.median(stated)))
         more[axis] = AxisSummary(*_innovations(used, axis), sigma, error_m(direction))
-    if heights:
-        more["height_rmse_to_truth_m"] = error_m(np.eye(3)[2])
-        more["heights"] = {
-            name: _of_height(kept, judged)
-            for name, each in heights.items()
-            if len(kept := each[settled(each.index, judged)])
-        }
+    heights = {
+        name: _of_besides(kept, judged)
+        for name, each in besides.items()
+        if len(kept := each[settled(each.index, judged)])
+    }
+    if vision := heights.pop(EV_POS.name, None):
+        more["others"] = {EV_POS.name: vision}
+    if besides.keys() - {EV_POS.name}:
+        more["heights"], more["height_rmse_to_truth_m"] = heights, error_m(np.eye(3)[2])
     return Summary(
         samples=len(used), rejected_share=float(used["rejected"].mean()),
         heading_error_mean_deg=_heading_error(flight, replay, heading, judged), **more,
     )  # fmt: skip
 
 
-def _innovations(used: pd.DataFrame, axis: AxisName) -> tuple[float, tuple[float, float], float]:
-    """Mean NIS, its band, and the innovations' standard deviation."""
-    nu = used[f"innovation_{axis}_m"].to_numpy()
-    s = used[f"innovation_variance_{axis}_m2"].to_numpy()
+def _innovations(used: pd.DataFrame, *axes: AxisName) -> tuple[float, tuple[float, float], float]:
+    """Mean NIS, its band, and the innovations' standard deviation, of some axes together."""
+    nu = used[[f"innovation_{axis}_m" for axis in axes]].to_numpy().ravel()
+    s = used[[f"innovation_variance_{axis}_m2" for axis in axes]].to_numpy().ravel()
     return float(np.mean(nu**2 / s)), nis_band(len(nu)), float(np.std(nu))
 
 
-def _of_height(used: pd.DataFrame, judged: Spans) -> HeightSummary:
+def _of_besides(used: pd.DataFrame, judged: Spans) -> HeightSummary:
     rejected = used["rejected"].to_numpy()
     fused_s = used.index.to_numpy()[rejected == 0.0]
     parts = ((fused_s[(fused_s > a) & (fused_s < b)], ((a, b),)) for a, b in judged)
     longest_s = max(_longest(*part) for part in parts)
-    return HeightSummary(*_innovations(used, "down"), float(rejected.mean()), longest_s)
+    return HeightSummary(*_innovations(used, *axes_of(used)), float(rejected.mean()), longest_s)
 
 
 def _heading_error(
@@ -466,7 +476,7 @@ def _carried(model: Model, replay: Ekf2Replay, without: Mapping[str, float], jud
     *level, down = np.abs((found - flown).to_numpy()).T
     apart = np.hypot(*level)
     lost = ", ".join(f"{name} from {since:g} s on" for name, since in without.items())
-    heights = {*model.flown.heights}
+    heights = {*model.flown.besides} - {EV_POS.name}
     position = {*aids_of(model.inputs)} - {MAG.name} - heights
     height = f"; its height is {down.max():.3g} m from it at most" if heights & {*without} else ""
     given_up = (
@@ -480,13 +490,18 @@ def _carried(model: Model, replay: Ekf2Replay, without: Mapping[str, float], jud
     )
 
 
-def _notes(model: Model, replay: Ekf2Replay) -> list[str]:
-    if not replay.late and not replay.lost:
-        return []
-    remedy = "" if model.inputs.rules.horizon_by_delay else ": raise EKF2_DELAY_MAX"
-    change = ", ".join(f"{name}={value:g}" for name, value in replay.changed.items())
-    return [
-        f"{change or 'As flown'}: {replay.late + replay.lost} of "
-        f"{len(replay.updates) + replay.lost} samples would reach EKF2 after its fusion horizon "
-        f"has passed them ({replay.lost} would never be fused){remedy}"
-    ]
+def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
+    least = replay.settings.get(GNSS_POS.noise, 0.0)
+    if least >= replay.changed.get(EV_POS.noise, np.inf):
+        yield (
+            "While EKF2 fuses GNSS it takes no position of vision to be more exact than "
+            f"{GNSS_POS.noise}, {least:g} m"
+        )
+    if replay.late or replay.lost:
+        remedy = "" if model.inputs.rules.horizon_by_delay else ": raise EKF2_DELAY_MAX"
+        change = ", ".join(f"{name}={value:g}" for name, value in replay.changed.items())
+        yield (
+            f"{change or 'As flown'}: {replay.late + replay.lost} of "
+            f"{len(replay.updates) + replay.lost} samples would reach EKF2 after its fusion "
+            f"horizon has passed them ({replay.lost} would never be fused){remedy}"
+        )

@@ -260,7 +260,8 @@ def _step_squares(model: Hypotheses, sigma_a: float, skip: BoolArray, times: Arr
         added = steps(model.time_s, times[few])
         for axis, legs in enumerate(model.legs):
             if axis in (alike[0] for alike in model.alike):
-                alone = _with_signals(legs, 0.0 * added, 0.0 * added, added)
+                still = np.broadcast_to(0.0, added.shape)
+                alone = _with_signals(legs, still, still, added)
                 response = model.whitened(alone, sigma_a, skip)[0][~skip]
             rest, mixed = base.rest[base.axis == axis], columns[axis][~skip].T @ response
             size = np.sum(response**2, axis=0) - np.sum(mixed * (base.covariance @ mixed), axis=0)
@@ -391,7 +392,8 @@ class Hypotheses:
     def whitened(self, legs: Preintegrated, sigma_a: float, skip: BoolArray) -> tuple[Array, float]:
         """Innovations over √S of signals along any axis, (m, k), and Σ ln S of those used."""
         nu, s = innovations(legs, sigma_a, self.sigma_z_m, skip)
-        return nu / np.sqrt(s)[:, None], float(np.sum(np.log(s[~skip])))
+        nu /= np.sqrt(s)[:, None]
+        return nu, float(np.sum(np.log(s[~skip])))
 
     def fit(self, sigma_a: float, skip: BoolArray, scale: float = 1.0) -> HypothesisFit:
         """Fit all columns, with the acceleration (and its noise) scaled.

@@ -48,23 +48,32 @@ class Acceleration:
     Attributes
     ----------
     time_s : ndarray, shape (n,)
-    value_m_s2 : ndarray, shape (n,)
-        Gravity removed.
+    ned_m_s2 : ndarray, shape (n, 3)
+        Gravity removed; all axes share it, as long as the flight is.
+    direction : ndarray, shape (3,)
+        Unit vector in NED.
     integral_m_s : ndarray, shape (n,)
-        Trapezoidal integral from the first sample, for averages over steps.
-    gap_integral_s : ndarray, shape (n,)
-        Seconds of gap passed since the first sample.
+        Along the axis, trapezoidal from the first sample, for averages over steps.
+    gap_time_s, gap_integral_s : ndarray, shape (k,)
+        Ends of the gaps and of all, and seconds of gap passed since the first sample.
     rms_m_s2 : float
         Root mean square of the signal: how wrong the input may be inside a gap.
     """
 
     time_s: Array
-    value_m_s2: Array
+    ned_m_s2: Array
+    direction: Array
     integral_m_s: Array
+    gap_time_s: Array
     gap_integral_s: Array
     rms_m_s2: float
 
     __repr__ = brief
+
+    @property
+    def value_m_s2(self) -> Array:
+        """Along the axis, shape (n,)."""
+        return np.asarray(self.ned_m_s2 @ self.direction)
 
 
 @dataclass(frozen=True)
@@ -276,18 +285,23 @@ def project_acceleration(
     if isinstance(acceleration, Unavailable):
         return acceleration
     time = acceleration.index.to_numpy()
-    value = acceleration.to_numpy() @ direction
+    ned = acceleration.to_numpy()
+    value = ned @ direction
     inside = (time >= segment.start_s) & (time <= segment.end_s)
     if np.count_nonzero(inside) < 2:
         return Unavailable(
             "IMU", "no IMU sample in the analysed segment", "Choose --start and --end inside it."
         )
-    gap_s = np.where(imu_gaps(time), np.diff(time), 0.0)
+    is_gap = imu_gaps(time)
+    gap, passed_s = np.flatnonzero(is_gap), np.cumsum(np.where(is_gap, np.diff(time), 0.0))
+    ends = np.unique([0, *gap, *(gap + 1), len(time) - 1])
     return Acceleration(
         time_s=time,
-        value_m_s2=value,
+        ned_m_s2=ned,
+        direction=direction,
         integral_m_s=cumulative_integral(value, time),
-        gap_integral_s=np.concatenate([[0.0], np.cumsum(gap_s)]),
+        gap_time_s=time[ends],
+        gap_integral_s=np.append(0.0, passed_s)[ends],
         rms_m_s2=float(np.sqrt(np.mean(value[inside] ** 2))),
     )
 
@@ -316,7 +330,7 @@ def step_means(acceleration: Acceleration, edges: ArrayLike) -> tuple[Array, Arr
     edges = np.asarray(edges, dtype=np.float64)
     length = np.diff(edges)
     velocity = np.interp(edges, acceleration.time_s, acceleration.integral_m_s)
-    gap = np.interp(edges, acceleration.time_s, acceleration.gap_integral_s)
+    gap = np.interp(edges, acceleration.gap_time_s, acceleration.gap_integral_s)
     covered = np.clip(edges, acceleration.time_s[0], acceleration.time_s[-1])
     outside = 1.0 - np.diff(covered) / length
     return np.diff(velocity) / length, np.clip(np.diff(gap) / length + outside, 0.0, 1.0)

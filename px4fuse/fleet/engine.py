@@ -1,6 +1,6 @@
 """Jobs in bounded processes of this computer, or spread by Dask over a cluster.
 
-Either way a job runs in a process of :mod:`px4fuse.verification.workers`, which may hang, crash or
+Either way a job runs in a process of :mod:`px4fuse.workers`, which may hang, crash or
 take all memory: a cluster's workers only start these.
 """
 
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from px4fuse.errors import Px4FuseError, SettingsError
 from px4fuse.results.reading import one_line
-from px4fuse.verification.workers import Failed, Job, Result
+from px4fuse.workers import Failed, Job, Result
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -114,7 +114,7 @@ def outcomes(
     client : Client or None
         Of a cluster; None for processes of this computer.
     work : callable
-        :func:`~px4fuse.verification.workers.run_bounded` with its function and bounds.
+        :func:`~px4fuse.workers.run_bounded` with its function and bounds.
     processes : int, optional
         At once on this computer; by default one per core.
 

@@ -26,7 +26,7 @@ from px4fuse.fleet.regressions import marked
 from px4fuse.fleet.rows import FAILED, NOT_JUDGED, Row, csv_bytes, table_of, writable
 from px4fuse.reading import max_log_bytes
 from px4fuse.request import ComparisonRequest, command_line
-from px4fuse.verification.workers import MEMORY_BYTES, Failed, run_bounded
+from px4fuse.workers import MEMORY_BYTES, Failed, run_bounded
 from px4fuse.writing import write_all
 
 # Columns of the files of a log, relative to the folder

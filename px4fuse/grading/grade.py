@@ -17,7 +17,7 @@ from px4fuse.grading.rubric import Rubric, assess, refused
 from px4fuse.reading import files_by_sha256, max_log_bytes
 from px4fuse.results.reading import one_line
 from px4fuse.verification.model import Refused
-from px4fuse.verification.workers import Failed, run_bounded
+from px4fuse.workers import Failed, run_bounded
 
 FAILED = "Do not open it: ask for the report as px4fuse wrote it."
 

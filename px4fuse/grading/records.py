@@ -22,7 +22,7 @@ from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import Refused, Verdict
 from px4fuse.verification.pages import MEMORY_BYTES, TIMEOUT_S, pictures
 from px4fuse.verification.verification import log_sha256, verify
-from px4fuse.verification.workers import bounded
+from px4fuse.workers import bounded
 from px4fuse.writing import write_all
 
 # In the folder of a class

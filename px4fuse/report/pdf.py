@@ -13,6 +13,7 @@ from typing import Any
 
 import typst
 
+from px4fuse.memory import give_back
 from px4fuse.report import (
     aids,
     changes,
@@ -83,15 +84,18 @@ def render(found: Any, results: Any, results_json: str) -> bytes:
     bytes
         The same for the same input and the same versions: no dates, no random identifiers.
     """
+    blocks, written = list[Any](), ""
     with report_style():
-        pages = [page for draw in PAGES[type(results)] for page in draw(found, results)]
-        written = [block for page in pages for block in page.blocks]
-        blocks = data(written)
+        # one at a time: the figures of all pages would be a tenth of all memory
+        for page in (page for draw in PAGES[type(results)] for page in draw(found, results)):
+            written += json.dumps(page.blocks, ensure_ascii=False, default=repr)
+            blocks += data(page.blocks)
     title, name, sha256 = _named(results)
     made_by = f"px4fuse {metadata.version('px4fuse')}"
     student = who(getattr(results, "student", NOBODY), " · ")
+    give_back()  # what drew the figures; Typst takes as much
     # figures have no text of others
-    words = title + name + student + json.dumps(written, ensure_ascii=False, default=repr)
+    words = title + name + student + written
     return compiled(
         {
             "title": title,

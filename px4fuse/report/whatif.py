@@ -18,7 +18,7 @@ from px4fuse.results.contract import WhatIfResults
 SIZE = 8.0
 CHAOTIC = "chaotic"
 Rows = tuple[tuple[str, Callable[[Any], str]], ...]
-# Of each EKF2 along an axis or by a sensor of height
+# Of each EKF2 along an axis or by one of its aids
 NIS_ROWS: Rows = (
     ("{}: mean NIS", lambda one: number_words(one.nis_mean)),
     ("    consistent is", lambda one: "{:.2f} to {:.2f}".format(*one.nis_band)),
@@ -62,21 +62,22 @@ def rows(made_of: Counterfactual) -> list[list[str]]:
         over_all.append(HEADING_ROW)
     if heights:
         over_all.append(HEIGHT_ROW)
+    besides = {**heights, **found.replayed.others}
     tables = dict.fromkeys(HORIZONTAL, AXIS_ROWS) | {"": tuple(over_all)}
     every = [found.logged, found.replayed, *found.whatif[: made_of.first]]
     return [
-        [label.format(AIDS[name].label if name in heights else name),
+        [label.format(AIDS[name].label if name in besides else name),
          *(_cell(summary, name, cell) for summary in every)]
-        for name, table in (tables | dict.fromkeys(heights, HEIGHT_ROWS)).items()
+        for name, table in (tables | dict.fromkeys(besides, HEIGHT_ROWS)).items()
         for label, cell in table
     ]  # fmt: skip
 
 
 def _cell(summary: Summary, name: str, cell: Callable[[Any], str]) -> str:
-    """Of one EKF2: along an axis, by a sensor of height, or over all where the name is empty."""
+    """Of one EKF2: along an axis, by one of its aids, or over all where the name is empty."""
     if not summary.steady:
         return CHAOTIC
-    part = {"": summary, **summary.axes, **summary.heights}.get(name)
+    part = {"": summary, **summary.axes, **summary.heights, **summary.others}.get(name)
     return "n/a" if part is None else cell(part)
 
 

@@ -2,7 +2,7 @@
 
 Nothing in the file is executed, followed or written anywhere. Sizes are bounded here before pypdf
 sees the file, and by pypdf's own limits while it reads; what is left (a file made to be slow
-within every limit) is for the time and memory limits of :mod:`px4fuse.verification.workers`.
+within every limit) is for the time and memory limits of :mod:`px4fuse.workers`.
 
 Of the file only the attached results are read; its pages are only counted, since the report is
 drawn again. A file that another program saved again is therefore as good as the original, as long

@@ -43,7 +43,7 @@ from scipy.ndimage import uniform_filter
 from px4fuse.flight import Unavailable
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification.model import BAD_VALUES, PageDifference
-from px4fuse.verification.workers import Failed, bounded
+from px4fuse.workers import Failed, bounded
 
 # Side of the square over which differences are averaged: about two digits, at a pixel per point
 SQUARE_PX = 8

@@ -41,7 +41,7 @@ from class_tools import in_turn  # noqa: E402
 from conftest import page_of  # noqa: E402
 from made_up_fleet import made_up  # noqa: E402
 
-from px4fuse import answers  # noqa: E402
+from px4fuse import answers, workers  # noqa: E402
 from px4fuse.analysis import run_or_judge_aids  # noqa: E402
 from px4fuse.assignment.key import Answer, AnswerKey, key_text, read_key  # noqa: E402
 from px4fuse.assignment.roster import people_of_sheet, read_roster  # noqa: E402
@@ -60,7 +60,6 @@ from px4fuse.readers.trajectory import read_trajectory  # noqa: E402
 from px4fuse.request import ComparisonRequest  # noqa: E402
 from px4fuse.results.reading import read_results  # noqa: E402
 from px4fuse.trajectory.graph.analysis import analyse_graph  # noqa: E402
-from px4fuse.verification import workers  # noqa: E402
 from px4fuse.verification.intake import Refused, read_report  # noqa: E402
 
 REPOSITORY = TESTS.parent

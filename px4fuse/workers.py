@@ -2,7 +2,8 @@
 
 Neither pool of the standard library can do this. ``concurrent.futures`` cannot end one running
 job: a worker that is killed breaks the whole pool (BrokenProcessPool). ``multiprocessing.Pool``
-waits forever for the result of a worker that died. So: one pipe per process, and a clock.
+waits forever for the result of a worker that died. Pebble's pool (5.2) breaks as a whole, too,
+where a worker dies before it was noted which job it has. So: one pipe per process, and a clock.
 """
 
 import multiprocessing

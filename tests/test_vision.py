@@ -1,0 +1,571 @@
+"""External vision besides GNSS in the model of EKF2.
+
+Oracles are an EKF written down plainly, which fuses both one after the other at their own steps,
+and the scalar equations of PX4's bias estimator.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pandas as pd
+import pytest
+from ekf2_tools import opened, step_matrix, step_noise, step_state
+from exchange import replace
+
+from px4fuse.analysis import explain, run_what_if
+from px4fuse.comparison.comparison import compare
+from px4fuse.ekf2 import walk
+from px4fuse.ekf2.inputs import Inputs, Received
+from px4fuse.ekf2.intervals import Events, make_intervals
+from px4fuse.ekf2.model import Model, aids_of, open_model, replay_settings, run_variants
+from px4fuse.ekf2.recursion import Run, Variant, run
+from px4fuse.ekf2.stretches import Stretch
+from px4fuse.ekf2.vision import STOP_S
+from px4fuse.ekf2.whatif import WhatIf, what_if
+from px4fuse.errors import SettingsError
+from px4fuse.filter.settings import Settings
+from px4fuse.findings import find
+from px4fuse.flight import AidLog, Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable
+from px4fuse.origin import RECEIVED
+from px4fuse.report.whatif import rows
+from px4fuse.report.why import agreement_words
+from px4fuse.request import WhatIfRequest
+from px4fuse.results.build import whatif_results
+from px4fuse.results.contract import schema, to_json
+from px4fuse.simulation import ekf2 as simulated
+from px4fuse.simulation.flights import simulate_flight
+from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.scenario import scenario_of
+
+OUTDOOR = scenario_of("outdoor", seed=3, passes=2)
+OF_VISION = {
+    "EKF2_EV_CTRL": 1.0, "EKF2_EVP_NOISE": 0.1, "EKF2_EVP_GATE": 5.0, "EKF2_EV_DELAY": 0.0,
+    "EKF2_EV_NOISE_MD": 0.0, "EKF2_EV_POS_X": 0.0, "EKF2_EV_POS_Y": 0.0, "EKF2_EV_POS_Z": 0.0,
+}  # fmt: skip
+SETTINGS = {name: value for name, value in OF_VISION.items() if name != "EKF2_EV_CTRL"}
+FRAME_M = np.array([5.0, -3.0, 0.0])  # where vision's origin is
+
+
+@cache
+def on_gnss() -> Model:
+    return opened(simulate_flight(OUTDOOR, parse(())))
+
+
+def sent(
+    rate_hz: float = 15.0, sigma_m: float = 0.3, late_s: float = 0.0, seed: int = 1
+) -> Received:
+    """Positions of vision: the truth in a frame of its own, which wanders."""
+    truth = on_gnss().flight.truth
+    assert isinstance(truth, Truth)
+    rng = np.random.default_rng(seed)
+    stamp = np.arange(1.0, truth.samples.index[-1] - 1.0, 1.0 / rate_hz)
+    position = np.column_stack([
+        np.interp(stamp, truth.samples.index, truth.samples[name]) for name in Columns.POSITION
+    ])  # fmt: skip
+    wander = np.cumsum(rng.normal(0.0, 0.01 / np.sqrt(rate_hz), position.shape), axis=0)
+    position = position + FRAME_M + wander + rng.normal(0.0, sigma_m, position.shape)
+    count = len(stamp)
+    return Received(
+        stamp + late_s, np.full(count, -np.inf), position, np.full((count, 3), 0.01),
+        np.full(count, np.nan), np.zeros(count, bool), "vehicle_visual_odometry",
+    )  # fmt: skip
+
+
+# ---------------------------------------------------------------- the plain filter
+
+
+@dataclass
+class PlainBias:
+    """One axis of PositionBiasEstimator (bias_estimator.cpp), step by step."""
+
+    bias: float
+    variance: float
+    most: float
+    signed: float = 0.0
+
+    def predict(self, dt: float) -> None:
+        boost = 1e3 if abs(self.signed) > 0.2 else 1.0
+        self.variance = min(max(self.variance + boost * 0.13**2 * dt, 1e-8), self.most)
+
+    def fuse(self, measured: float, variance: float, dt: float) -> None:
+        S = self.variance + max(0.01**2, variance)
+        nu, K = measured - self.bias, self.variance / S
+        ratio = nu * nu / (9.0 * S)
+        if ratio < 1.0:
+            self.bias += K * nu
+            self.variance = min(max(self.variance - K * self.variance, 1e-8), self.most)
+        signed = min(max(np.sign(nu) * ratio, -1.0), 1.0)
+        self.signed += dt / (10.0 + dt) * (signed - self.signed)
+
+
+@dataclass
+class Plain:
+    """What the plain filter found: a row per fix, and per sample of vision."""
+
+    fixes: list[np.ndarray] = field(default_factory=list)
+    seen: list[np.ndarray] = field(default_factory=list)
+
+
+def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
+    inputs: Inputs, stretch: Stretch, events: Events
+) -> Plain:
+    """As PX4 has it: a prediction at a time, each fix and then each sample of vision at its step.
+
+    Every axis is fused by innovation and S of before the first (fuseDirectStateMeasurement).
+    """
+    settings, received, vision = inputs.settings, inputs.received, inputs.vision
+    assert vision is not None
+    assert received.velocity_m_s is not None
+    assert received.velocity_variance_m2_s2 is not None
+    drift = np.zeros(15)
+    drift[9:12] = settings["EKF2_GYR_B_NOISE"] ** 2
+    drift[12:15] = settings["EKF2_ACC_B_NOISE"] ** 2
+    noises = settings["EKF2_GYR_NOISE"], settings["EKF2_ACC_NOISE"]
+    deviation = np.sqrt(stretch.variance)
+    x, P = stretch.state.copy(), deviation[:, None] * stretch.correlation * deviation
+    taken_s = vision.stamp_s - 1e-3 * settings["EKF2_EV_DELAY"] - 0.5 * inputs.step_s
+    steps = np.searchsorted(stretch.time_s, taken_s - 1e-9).tolist()
+    seen = {step: row for row, step in enumerate(steps) if step > 0}
+    at = {int(event.end): event for event in events}
+    gps2, found = settings["EKF2_GPS_P_NOISE"] ** 2, Plain()
+    biases: list[PlainBias] = []
+
+    def fuse(i: int, nu: float, S: float, R: float) -> None:
+        nonlocal x, P
+        K = P[:, i] / S
+        x = x + K * nu
+        A = np.eye(15)
+        A[:, i] -= K
+        P = A @ P @ A.T + np.outer(K, K) * R
+
+    for k in range(1, int(events.end[-1]) + 1):
+        F, x = step_matrix(stretch, k - 1, trapezoid=False), step_state(stretch, k - 1, x)
+        P = F @ P @ F.T + step_noise(stretch, k - 1, *noises) + np.diag(drift * inputs.step_s**2)
+        for bias in biases:
+            bias.predict(inputs.step_s)
+        event = at.get(k)
+        if event is not None and event.action:
+            row = event.sample
+            speed = np.maximum(received.velocity_variance_m2_s2[row],
+                               settings["EKF2_GPS_V_NOISE"] ** 2)  # fmt: skip
+            R = np.concatenate([speed * [1.0, 1.0, 2.25],
+                                np.maximum(received.variance_m2[row, :2], gps2)])  # fmt: skip
+            nu = np.concatenate([received.velocity_m_s[row], received.position_m[row, :2]])
+            nu, S = nu - x[3:8], np.diag(P)[3:8] + R
+            found.fixes.append(np.concatenate([nu, S]))
+            for j in range(5):
+                fuse(3 + j, nu[j], S[j], R[j])
+        if event is not None:
+            x[2] = stretch.attitude_error_rad[k, 2]
+        if k not in seen:
+            continue
+        position, off = vision.position_m[seen[k], :2], vision.position_m[seen[k], :2] - x[6:8]
+        R0 = max(vision.variance_m2[seen[k], 0], settings["EKF2_EVP_NOISE"] ** 2, gps2)
+        if not biases:
+            biases = [PlainBias(float(one), 0.5 * R0, R0) for one in off]
+            continue
+        nu = position - [bias.bias for bias in biases] - x[6:8]
+        R = np.array([R0 + bias.variance for bias in biases])
+        S = np.diag(P)[6:8] + R
+        found.seen.append(np.concatenate([[taken_s[seen[k]]], nu, S]))
+        for j, bias in enumerate(biases):
+            bias.fuse(float(off[j]), R0 + P[6 + j, 6 + j], inputs.step_s)
+        if np.all(nu**2 <= settings["EKF2_EVP_GATE"] ** 2 * S):
+            for j in range(2):
+                fuse(6 + j, nu[j], S[j], R[j])
+    return found
+
+
+def flying(vision: Received | None, seconds: float = 40.0, **settings: float) -> Inputs:
+    """The flight's first part, with nothing to tell of tilt and height but GNSS and vision."""
+    inputs = on_gnss().inputs
+    (whole,) = inputs.stretches
+    count = int(np.searchsorted(whole.time_s, whole.time_s[0] + seconds))
+    unknown = np.full((count, 3), np.inf)
+    stretch = replace(
+        whole, time_s=whole.time_s[:count], step_s=whole.step_s[: count - 1],
+        rotation=whole.rotation[:count], correction_rad=whole.correction_rad[: count - 1],
+        force_m_s2=whole.force_m_s2[: count - 1], down_m=whole.down_m[:count], field=None,
+        heights=None, state=whole.state[:15], variance=whole.variance[:15], shaken=None,
+        correlation=np.eye(15), attitude_variance_rad2=unknown, down_variance_m2=unknown[:, 0],
+        attitude_error_rad=whole.attitude_error_rad[:count],
+    )  # fmt: skip
+    known = {**inputs.settings, **SETTINGS, **settings}
+    return replace(inputs, stretches=(stretch,), vision=vision, settings=known)
+
+
+def ran(inputs: Inputs, *variants: Variant) -> Run:
+    (stretch,) = inputs.stretches
+    variants = variants or (Variant(inputs.settings),)
+    made = [make_intervals(inputs, stretch, one.timing(inputs)) for one in variants]
+    return run(inputs, stretch, variants, made)
+
+
+def told(done: Run, at: int = 0) -> pd.DataFrame:
+    assert done.vision is not None
+    return done.vision.updates(at, done.stretch.time_s[done.events[at].end])
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "late_s", "settings"),
+    [(30.0, 0.0, {}), (12.0, 0.1, {"EKF2_EV_DELAY": 100.0}), (30.0, 0.0, {"EKF2_EVP_NOISE": 0.8})],
+)  # fmt: skip
+def test_the_recursion_is_the_plain_filter(
+    rate_hz: float, late_s: float, settings: dict[str, float]
+) -> None:
+    inputs = flying(sent(rate_hz, late_s=late_s), **settings)
+    done, alone = ran(inputs), ran(replace(inputs, vision=None))
+    events = done.events[0]
+    plain = plain_both(inputs, done.stretch, events)
+    fixes, used = np.array(plain.fixes), events.action > 0
+    nu, S = done.innovation[used, 0, :5], done.innovation_variance[used, 0, :5]
+    late = slice(30, None)  # the start of the bias is forgotten
+    apart = np.sqrt(np.mean((nu - fixes[:, :5])[late] ** 2, axis=0))
+    without = np.sqrt(np.mean((alone.innovation[used, 0, :5] - fixes[:, :5])[late] ** 2, axis=0))
+    assert apart.max() < 0.006
+    assert np.all(without[3:] > 8.0 * apart[3:])
+    np.testing.assert_allclose(S[10:], fixes[10:, 5:], rtol=2e-3)
+    rows = np.array(plain.seen)
+    found = told(done)
+    found = found.loc[rows[0, 0] + 3.0 :]
+    rows = rows[np.searchsorted(rows[:, 0], found.index - 1e-6)]
+    assert len(found) > 20.0 * rate_hz
+    np.testing.assert_allclose(found.index, rows[:, 0], atol=1e-9)
+    np.testing.assert_allclose(found.iloc[:, :2], rows[:, 1:3], atol=0.02)
+    assert np.sqrt(np.mean((found.iloc[:, :2] - rows[:, 1:3]) ** 2)) < 0.004
+    np.testing.assert_allclose(found.iloc[:, 2:4], rows[:, 3:5], rtol=3e-3)
+    assert found["fused"].all()
+
+
+def test_while_gnss_is_fused_vision_is_no_more_exact_than_a_fix() -> None:
+    """R is the largest of EKF2_EVP_NOISE, EKF2_GPS_P_NOISE and what the sender states."""
+    inputs = flying(sent(), EKF2_GPS_P_NOISE=0.5)
+    variants = [
+        Variant({**inputs.settings, "EKF2_EVP_NOISE": 0.01}),
+        Variant({**inputs.settings, "EKF2_EVP_NOISE": 0.5}),
+        Variant({**inputs.settings, "EKF2_EVP_NOISE": 0.7}),
+        Variant(inputs.settings, without={"gnss_pos": 0.0}),
+    ]
+    done = ran(inputs, *variants)
+    assert done.vision is not None
+    noise = np.sqrt(np.unique(done.vision.noise_m2[done.vision.seen[0]].round(9), axis=0))
+    assert sorted({*noise[:, 0].round(6)}) == [0.1, 0.5, 0.7]
+    pd.testing.assert_frame_equal(told(done, 0), told(done, 1))
+    assert np.abs(told(done, 2) - told(done, 1)).max(axis=None) > 0.01
+
+
+def test_positions_of_a_sensor_beside_the_imu_are_those_of_the_imu() -> None:
+    """EKF2_EV_POS, in the body, turned by the attitude at each sample."""
+    inputs, vision, place_m = flying(sent()), sent(), np.array([1.5, -0.5, 0.8])
+    (stretch,) = inputs.stretches
+    step = np.searchsorted(stretch.time_s, vision.stamp_s - 0.5 * inputs.step_s - 1e-9)
+    turn = stretch.rotation[np.minimum(step, len(stretch.rotation) - 1)]
+    beside = replace(vision, position_m=vision.position_m + turn @ place_m)
+    settings = {f"EKF2_EV_POS_{axis}": value for axis, value in zip("XYZ", place_m, strict=True)}
+    pd.testing.assert_frame_equal(told(ran(flying(beside, **settings))), told(ran(inputs)))
+
+
+def test_the_bias_follows_visions_frame_and_gnss_says_where_the_vehicle_is() -> None:
+    done = ran(flying(sent(sigma_m=0.05)))
+    assert done.vision is not None
+    np.testing.assert_allclose(-done.vision.bias.value_m[0], FRAME_M[:2], atol=0.5)
+    truth = on_gnss().flight.truth
+    assert isinstance(truth, Truth)
+    end_s = float(done.stretch.time_s[done.events[0].end[-1]])
+    for axis in (0, 1):
+        name = Columns.POSITION[axis]
+        true = np.interp(end_s, truth.samples.index, truth.samples[name])
+        assert done.state[-1, 0, 6 + axis] == pytest.approx(true, abs=0.5)
+
+
+def test_samples_beyond_the_gate_are_rejected_and_after_a_second_the_bias_begins_anew() -> None:
+    """A jump of vision by 20 m moves EKF2 nowhere."""
+    vision = sent(sigma_m=0.05)
+    at_s = float(on_gnss().inputs.stretches[0].time_s[0]) + 20.0
+    jumped = replace(vision, position_m=vision.position_m + 20.0 * (vision.stamp_s > at_s)[:, None])
+    smooth, done = ran(flying(vision)), ran(flying(jumped))
+    found = told(done)
+    rejected = found.index[found["rejected"] > 0.0]
+    assert rejected[0] == pytest.approx(at_s, abs=0.05)
+    assert rejected[-1] - rejected[0] == pytest.approx(1.0, abs=0.1)
+    assert found.loc[rejected[-1] + 0.01 :, "fused"].all()
+    assert not found["reset"].any()
+    assert not done.moved_m.any()
+    apart = done.state[-1, 0, 6:8] - smooth.state[-1, 0, 6:8]
+    assert np.abs(apart).max() < 0.05
+    without_gate = ran(flying(jumped), Variant(flying(jumped).settings, gated=False))
+    assert not told(without_gate)["rejected"].any()
+
+
+def test_after_silence_vision_starts_with_another_bias() -> None:
+    vision = sent(sigma_m=0.05)
+    at_s = float(on_gnss().inputs.stretches[0].time_s[0]) + 20.0
+    for silent_s, anew in ((0.9 * STOP_S, False), (1.5 * STOP_S, True)):
+        kept = (vision.stamp_s < at_s) | (vision.stamp_s > at_s + silent_s)
+        moved = vision.position_m + 20.0 * (vision.stamp_s > at_s)[:, None]
+        fields = ("stamp_s", "arrival_s", "variance_m2", "rejected", "reset")
+        parts = {name: getattr(vision, name)[kept] for name in fields}
+        found = told(ran(flying(replace(vision, position_m=moved[kept], **parts))))
+        after = found.loc[at_s + silent_s :]
+        assert bool(after["rejected"].any()) is not anew
+
+
+def test_without_gnss_ekf2_goes_to_where_vision_says_it_is() -> None:
+    """As ev_pos_control.cpp has it: a reset, without a bias, by vision's own noise."""
+    inputs = flying(sent(sigma_m=0.05))
+    lost_s = float(inputs.stretches[0].time_s[0]) + 20.0
+    lost = dict.fromkeys(("gnss_pos", "gnss_vel"), lost_s)
+    done = ran(inputs, Variant(inputs.settings), Variant(inputs.settings, without=lost))
+    found, flown = told(done, 1), told(done, 0)
+    assert not flown["reset"].any()
+    (reset_s,) = found.index[found["reset"] > 0.0]
+    assert reset_s == pytest.approx(lost_s, abs=0.3)
+    moved = done.moved_m[:, 1]
+    np.testing.assert_allclose(moved.sum(axis=0), FRAME_M[:2], atol=0.6)
+    assert done.vision is not None
+    np.testing.assert_array_equal(done.vision.bias.value_m[1], 0.0)
+    apart = done.state[-1, 1, 6:8] - done.state[-1, 0, 6:8]
+    np.testing.assert_allclose(apart, FRAME_M[:2], atol=0.6)
+    after = found.loc[reset_s + 1.0 :]
+    # 0.1 m are EKF2_EVP_NOISE and what the sender states
+    assert 0.01 < after["innovation_variance_north_m2"].median() < 0.02
+    assert after["fused"].all()
+
+
+def test_a_reset_to_gnss_takes_the_bias_with_it() -> None:
+    """Position and bias move together (resetHorizontalPositionTo): vision goes on as before."""
+    inputs = flying(sent(sigma_m=0.05))
+    for with_velocity in (False, True):
+        rules = replace(inputs.rules, with_velocity=with_velocity)
+        done = ran(replace(inputs, rules=rules, received=off_by(inputs.received, 30.0)))
+        # up to v1.16 a position that is fused, also of vision, holds GNSS off
+        assert int(done.reset.sum()) == (not with_velocity)
+        assert done.moved_m.sum() == pytest.approx(0.0 if with_velocity else 30.0, abs=3.0)
+        assert told(done)["fused"].mean() > 0.999
+
+
+def off_by(received: Received, north_m: float) -> Received:
+    """The same positions, off from 15 s on."""
+    start_s = float(on_gnss().inputs.stretches[0].time_s[0])
+    far = (received.stamp_s > start_s + 15.0)[:, None] * np.array([north_m, 0.0, 0.0])
+    return replace(received, position_m=received.position_m + far)
+
+
+def test_where_both_are_rejected_the_position_is_reset_to_vision_with_its_bias() -> None:
+    inputs = flying(off_by(sent(sigma_m=0.05), 20.0), seconds=20.0)
+    done = ran(replace(inputs, received=off_by(inputs.received, 40.0)))
+    found = told(done)
+    (reset_s,) = found.index[found["reset"] > 0.0]
+    assert reset_s == pytest.approx(float(done.stretch.time_s[0]) + 16.0, abs=0.2)
+    np.testing.assert_allclose(done.moved_m.sum(axis=(0, 1)), [20.0, 0.0], atol=0.7)
+    assert found.loc[reset_s + 0.1 :, "fused"].all()
+    assert done.vision is not None
+    np.testing.assert_allclose(-done.vision.bias.value_m[0], FRAME_M[:2], atol=0.7)
+
+
+def test_the_longest_delay_makes_the_horizon_also_where_it_is_visions() -> None:
+    inputs = flying(sent())
+    settings = inputs.settings
+    flown = Variant(settings).timing(inputs)
+    later = Variant({**settings, "EKF2_EV_DELAY": 290.0}).timing(inputs)
+    assert later.delay_s == flown.delay_s == pytest.approx(1e-3 * settings["EKF2_GPS_DELAY"])
+    assert later.horizon_s == pytest.approx(28 * inputs.step_s)
+    assert flown.horizon_s == inputs.horizon_s < later.horizon_s
+
+
+def test_samples_of_one_step_and_those_that_come_too_late() -> None:
+    vision = sent(rate_hz=25.0)
+    doubled = {
+        name: np.repeat(getattr(vision, name), 2, axis=0)
+        for name in ("arrival_s", "position_m", "variance_m2", "rejected", "reset")
+    }
+    stamps = np.repeat(vision.stamp_s, 2)
+    stamps[::2] -= 0.0005
+    once, twice = (told(ran(flying(one))) for one in (
+        vision, replace(vision, stamp_s=stamps, **doubled)))  # fmt: skip
+    assert len(once) <= len(twice) <= 1.1 * len(once)
+    horizon_s = flying(vision).horizon_s
+    for age_s, kept in ((horizon_s + 0.05, True), (horizon_s + 0.15, False)):
+        late = replace(vision, arrival_s=vision.stamp_s + age_s)
+        assert bool(len(told(ran(flying(late))))) is kept
+
+
+# ---------------------------------------------------------------- a flight with both
+
+
+@cache
+def flown(
+    wrong_m: float = 0.0, flipped: bool = False, off_from_s: float = np.inf, **changed: float
+) -> Flight:
+    """A flight whose EKF2, px4fuse's own model, fused both; its log has two innovations a second.
+
+    ``wrong_m`` is noise that EKF2 was sent and the log does not have; ``flipped`` is vision with
+    the other sign in EKF2; from ``off_from_s`` on EKF2 did without vision.
+    """
+    vision, runs = sent(), []
+    usual, usual_run = simulated.parameters, run_variants
+    noise = np.random.default_rng(9).normal(0.0, 1.0, vision.position_m.shape)
+    heard = replace(vision, position_m=(-1.0 if flipped else 1.0) * vision.position_m
+                    + wrong_m * noise)  # fmt: skip
+
+    def both(inputs: Inputs, variants: list[Variant], known: Any) -> list[Run]:
+        settings = {**inputs.settings, **SETTINGS, **changed}
+        given = replace(inputs, vision=heard, settings=settings)
+        runs.extend(usual_run(given, [Variant(settings, without={"ev_pos": off_from_s})], known))
+        return runs
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simulated, "parameters", lambda *of: usual(*of) | OF_VISION | changed)
+        patch.setattr(simulated, "run_variants", both)
+        flight = simulate_flight(OUTDOOR, parse(()))
+    updates = told(runs[0])
+    assert isinstance(flight.ekf2, Ekf2)
+    meant = pd.Series([1.0, 0.0], index=[0.0, off_from_s])
+    samples = pd.DataFrame({
+        "innovation_north": updates["innovation_north_m"],
+        "innovation_east": updates["innovation_east_m"],
+        "variance_north": updates["innovation_variance_north_m2"],
+        "variance_east": updates["innovation_variance_east_m2"],
+        "noise_north": 0.25, "noise_east": 0.25, "fused": updates["fused"],
+        "rejected": updates["rejected"],
+    }).iloc[::7]  # fmt: skip
+    log = AidLog(
+        ("estimator_aid_src_ev_pos",), ("north", "east"), samples, meant, {**OF_VISION, **changed}
+    )
+    rows = pd.DataFrame(np.hstack([vision.position_m, vision.variance_m2]), vision.stamp_s,
+                        [*Columns.POSITION, *Columns.POSITION_VARIANCE])  # fmt: skip
+    track = PositionTrack(
+        vision.source, RECEIVED, "external vision", rows, "NED", "boot", (vision.source,)
+    )
+    ekf2 = replace(flight.ekf2, aids={**flight.ekf2.aids, "ev_pos": log})
+    return replace(flight, positions=(track, *flight.positions), ekf2=ekf2)
+
+
+@cache
+def model() -> Model:
+    return opened(flown())
+
+
+def test_a_flight_on_both_agrees_aid_by_aid() -> None:
+    agreement = model().agreement
+    assert agreement.good
+    assert agreement.doubtful == {}
+    assert (
+        {*agreement.ev_pos} == {*agreement.gnss_pos} == {*agreement.gnss_vel} == {"north", "east"}
+    )
+    for axes in (agreement.ev_pos, agreement.gnss_pos, agreement.gnss_vel):
+        for axis in axes.values():
+            assert axis.innovation_correlation > 0.998
+            assert 0.99 < axis.s_ratio_p5 < axis.s_ratio_p95 < 1.01
+    assert aids_of(model().inputs)[:3] == ["gnss_pos", "gnss_vel", "ev_pos"]
+    assert model().inputs.settings["EKF2_EVP_NOISE"] == pytest.approx(0.1)
+
+
+def test_what_if_predicts_the_flight_with_the_other_noise_of_vision() -> None:
+    other = opened(flown(EKF2_EVP_NOISE=1.0))
+    for one, value, then in ((model(), 1.0, other), (other, 0.1, model())):
+        found, true = what_if(one, [{"EKF2_EVP_NOISE": value}]), what_if(then, [])
+        assert isinstance(found, WhatIf)
+        assert isinstance(true, WhatIf)
+        (predicted,), replayed = found.whatif, true.replayed
+        of_vision = (one.others["ev_pos"].nis_mean for one in (predicted, replayed))
+        assert next(of_vision) == pytest.approx(next(of_vision), rel=0.01)
+        assert predicted.nis_mean == pytest.approx(replayed.nis_mean, rel=0.01)
+    assert found.logged.others["ev_pos"].nis_mean < 0.5 * predicted.others["ev_pos"].nis_mean
+    # which R is of GNSS, whatever this is
+    told = what_if(model(), [{"EKF2_EVP_NOISE": 0.2}])
+    assert isinstance(told, WhatIf)
+    assert "no position of vision to be more exact than EKF2_GPS_P_NOISE" in told.notes[-1]
+    assert told.whatif[0].others == told.replayed.others
+
+
+def test_a_smaller_gate_rejects_more_of_vision() -> None:
+    request = WhatIfRequest(log="flight.ulg", changes={"EKF2_EVP_GATE": 1.0})
+    made_of = run_what_if(request, flight=flown())
+    found, told = made_of.whatif, {label: cells for label, *cells in rows(made_of)}
+    assert "external vision, position: mean NIS" in told
+    results = json.loads(to_json(whatif_results(request, made_of)))
+    jsonschema.validate(results, schema())
+    assert results["replayed"]["others"]["ev_pos"]["rejected_share"] == 0.0
+    assert found.replayed.others["ev_pos"].rejected_share == 0.0
+    assert found.whatif[0].others["ev_pos"].rejected_share > 0.2
+
+
+def test_without_one_of_both_the_other_goes_on() -> None:
+    gone = what_if(model(), [{}], {"ev_pos": 40.0})
+    assert isinstance(gone, WhatIf)
+    assert gone.whatif[0].others == {}
+    lost = what_if(model(), [{}], dict.fromkeys(("gnss_pos", "gnss_vel"), 40.0))
+    assert isinstance(lost, WhatIf)
+    (after,) = lost.whatif
+    assert after.resets == 1
+    # in vision's frame, 5 m north and 3 m west of the truth
+    assert after.position_rmse_to_truth_m == pytest.approx(np.hypot(5.0, 3.0), abs=0.5)
+    assert "gives its position up" not in lost.notes[-1]
+    none = what_if(model(), [{}], dict.fromkeys(("gnss_pos", "gnss_vel", "ev_pos"), 40.0))
+    assert isinstance(none, WhatIf)
+    assert "gives its position up" in none.notes[-1]
+    with pytest.raises(SettingsError, match="of this log the model fuses gnss_pos, gnss_vel, mag"):
+        what_if(on_gnss(), [{}], {"ev_pos": 40.0})
+
+
+@pytest.mark.parametrize("wrong", [{"wrong_m": 1.0}, {"flipped": True}])
+def test_vision_that_does_not_agree_is_named_and_left_out(wrong: dict[str, Any]) -> None:
+    found = opened(flown(**wrong))
+    assert "external vision" in agreement_words(found.agreement)
+    assert "ev_pos" in found.agreement.doubtful
+    assert found.agreement.ev_pos["north"].innovation_correlation < 0.5
+    # GNSS alone is not what EKF2 had
+    assert not found.agreement.good
+    assert found.inputs.vision is None
+    assert "ev_pos" not in aids_of(found.inputs)
+    with pytest.raises(SettingsError, match="EKF2_EVP_NOISE changes nothing here"):
+        replay_settings(found, [{"EKF2_EVP_NOISE": 0.3}])
+
+
+def test_samples_that_come_while_ekf2_does_without_vision_are_not_fused() -> None:
+    found = opened(flown(off_from_s=60.0))
+    assert found.inputs.vision is not None
+    told = np.isfinite(found.inputs.vision.position_m[:, 0])
+    assert found.inputs.vision.stamp_s[told][-1] == pytest.approx(60.0, abs=0.1)
+    assert found.agreement.good
+    assert found.agreement.doubtful == {}
+
+
+def test_an_older_release_and_a_log_without_all_of_vision_are_refused() -> None:
+    flight = flown()
+    assert isinstance(flight.ekf2, Ekf2)
+    gnss_alone = replace(flight, positions=flight.positions[1:])
+    lacking = open_model(gnss_alone)
+    assert isinstance(lacking, Unavailable)
+    assert "no vehicle_visual_odometry" in lacking.reason
+    record = flight.ekf2.record
+    assert not isinstance(record, Unavailable)
+    kept = {name: v for name, v in record.parameters.items() if name != "EKF2_EV_CTRL"}
+    older = replace(record, parameters={**kept, "EKF2_AID_MASK": 9.0})
+    refused = open_model(replace(flight, ekf2=replace(flight.ekf2, record=older)))
+    assert isinstance(refused, Unavailable)
+    assert "the movement of vision" in refused.reason
+
+
+def test_the_walk_has_a_step_of_vision_and_findings_stay_with_the_source() -> None:
+    found = walk.walk(model())
+    assert not isinstance(found, Unavailable)
+    for why in found.values():
+        names = [step.name for step in why.steps]
+        assert names.index(walk.SPEED) < names.index(walk.VISION) < names.index(walk.GATE)
+        assert why.position_left_share < 0.05
+        (step,) = (one for one in why.steps if one.name == walk.VISION)
+        assert step.position_moved_m > 0.05
+    analysis = explain(compare(flown(), Settings(0.27, 0.4)))
+    assert isinstance(analysis.ekf2_model, Model)
+    # what vision's noise is, is no word on that of the fixes
+    assert analysis.source.name == "vehicle_visual_odometry"
+    assert {one.filter for one in analysis.causes} == {"kf"}
+    assert not [one for one in find(analysis) if "EKF2_GPS_P_NOISE" in one.remedy]
