@@ -129,7 +129,7 @@ def kept_pages(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
         return blocks
 
     def keep(made: list[Any]) -> list[Any]:
-        blocks[:] = made
+        blocks.extend(made)  # page by page
         return []
 
     monkeypatch.setattr(pdf, "data", keep)
