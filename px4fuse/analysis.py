@@ -110,8 +110,9 @@ class Analysis(Comparison):
         """What was changed, each by itself, and what that explains of each discrepancy."""
         model = self.ekf2_model
         tried = interventions(self, self.tuning, self.clock, self.heading, self.explained, model)
-        if isinstance(model, Model):  # the largest part of it, which nothing else asks for
+        if isinstance(model, Model):  # most of its memory; what is asked for later is made again
             model.runs.clear()
+            model.intervals.clear()
         return tried
 
     @cached_property

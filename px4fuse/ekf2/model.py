@@ -86,7 +86,7 @@ class Model:
 
     flight: Flight
     inputs: Inputs
-    intervals: Mapping[Timing, tuple[Intervals, ...]]
+    intervals: dict[Timing, tuple[Intervals, ...]]
     flown: Ekf2Replay
     agreement: Agreement
     runs: list[Run] = field(default_factory=list, init=False)
