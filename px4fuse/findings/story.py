@@ -14,14 +14,16 @@ from px4fuse.comparison import interventions
 from px4fuse.comparison.interventions import Intervention, Of, cause_of, tried_on
 from px4fuse.comparison.model import FILTERS, AgainstTruth, AxisComparison, Difference, FilterName
 from px4fuse.ekf2.walk import Why
+from px4fuse.ekf2_parameters import AIDS
 from px4fuse.filter.kalman import state_at
 from px4fuse.findings.causes import CLOCK, FRAME, PROCESS, SETTINGS, VARIANCES
 from px4fuse.findings.model import Finding
 from px4fuse.findings.since import TOLD_BY, effect_words, kind_of, since_words
 from px4fuse.findings.source_positions import hardly_moved
-from px4fuse.flight import Unavailable
+from px4fuse.flight import Ekf2, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.plain import capital, excess_words, length_words
+from px4fuse.readers.px4_ekf2 import OTHER_AIDING
 
 MOST_SENTENCES = 3
 # What the first sentence tells already
@@ -184,16 +186,29 @@ def _gap(analysis: Analysis, finding: Finding) -> str:
     if isinstance(result.truth, pd.DataFrame):
         true = result.truth["position_m"]
         right, against = float(np.interp(end, true.index, true)), "from the truth"
-    who, off = "the filter", f"ours was {length_words(abs(ours - right))}"
+    who, off = "the filter coasted on the IMU", f"ours was {length_words(abs(ours - right))}"
     if isinstance(ekf2, pd.DataFrame) and len(before := ekf2["position_m"].loc[:end]):
-        who = "both filters"
+        who = "both filters coasted on the IMU"
+        if others := _fused(analysis.flight.ekf2, start, end):
+            who = f"ours coasted on the IMU, EKF2 went on by {' and '.join(others)}"
         off += f" and EKF2 {length_words(abs(float(before.iloc[-1]) - right))}"
     count = len(finding.spans_s)
     more = f" (the longest of {count} times)" if count > 1 else ""
     return (
-        f"From {start:.0f} s to {end:.0f} s the source was silent{more}: {who} coasted on the IMU; "
-        f"at the end {off} {against}."
+        f"From {start:.0f} s to {end:.0f} s the source was silent{more}: {who}; at the end {off} "
+        f"{against}."
     )
+
+
+def _fused(ekf2: Ekf2 | Unavailable, start_s: float, end_s: float) -> list[str]:
+    """What EKF2 fused in most of a span that tells of horizontal motion."""
+    logs = {} if isinstance(ekf2, Unavailable) else ekf2.aids
+    told = {name: logs[name].samples for name in OTHER_AIDING if name in logs}
+    return [
+        AIDS[name].label
+        for name, samples in told.items()
+        if "fused" in samples and samples["fused"].loc[start_s:end_s].mean() > 0.5
+    ]
 
 
 def _closer(analysis: Analysis, causes: Mapping[FilterName, Intervention | None]) -> Iterator[str]:
