@@ -12,7 +12,7 @@ from flights import Estimator, Uwb, aisle_flight, motion, unexplained, with_nois
 
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
-from px4fuse.ekf2_parameters import FLOW
+from px4fuse.ekf2_parameters import EV_POS, FLOW, Aid
 from px4fuse.findings import find
 from px4fuse.findings.story import MOST_SENTENCES, story
 from px4fuse.flight import AidLog, Ekf2
@@ -58,20 +58,28 @@ def test_a_silent_source_is_told_with_how_far_both_filters_coasted() -> None:
     assert f"ours was {off:.1f} m " in gap
 
 
-@pytest.mark.parametrize(("fused", "by"), [
-    (1.0, "ours coasted on the IMU, EKF2 went on by optical flow;"),
-    (0.0, "both filters coasted on the IMU;"),
+COASTED = "both filters coasted on the IMU;"
+
+
+@pytest.mark.parametrize("aid", [FLOW, EV_POS])
+@pytest.mark.parametrize(("fused", "silent_s", "by"), [
+    (1.0, (0.0, 0.0), "ours coasted on the IMU, EKF2 went on by {};"),
+    (0.0, (0.0, 0.0), COASTED),
+    (1.0, (50.5, 57.5), COASTED),  # silent too, but for the ends
 ])  # fmt: skip
-def test_what_carried_ekf2_through_a_silence_is_told(fused: float, by: str) -> None:
+def test_what_carried_ekf2_through_a_silence_is_told(
+    aid: Aid, fused: float, silent_s: tuple[float, float], by: str
+) -> None:
     flight = aisle_flight(uwb=Uwb(gap_s=(50.0, 58.0)), heading_deg=ALONG_DEG)
     times_s = np.arange(45.0, 65.0, 0.2)
     innovation = np.random.default_rng(3).normal(size=len(times_s))
     columns = {"innovation_x": innovation, "variance_x": 1.0, "noise_x": 0.5, "ratio_x": 0.1}
     samples = pd.DataFrame({**columns, "fused": fused, "rejected": 0.0}, times_s)
-    flow = AidLog(("estimator_aid_src_optical_flow",), ("x",), samples, None)
+    samples = samples[(times_s <= silent_s[0]) | (times_s >= silent_s[1])]
+    log = AidLog(("estimator_aid_src",), ("x",), samples, None)
     assert isinstance(flight.ekf2, Ekf2)
-    sentences = told(compare(replace(flight, ekf2=replace(flight.ekf2, aids={FLOW.name: flow}))))
-    assert any(f"silent: {by}" in sentence for sentence in sentences)
+    sentences = told(compare(replace(flight, ekf2=replace(flight.ekf2, aids={aid.name: log}))))
+    assert any(f"silent: {by.format(aid.label)}" in sentence for sentence in sentences)
 
 
 def test_an_ekf2_that_is_too_sure_is_told_by_how_much() -> None:

@@ -47,7 +47,7 @@ def compare(
     with outputs.progress(json_path) as step:
         found = run_or_judge_aids(request, step)
         results = judged_results(request, found, person)
-        give_back()
+        give_back()  # before anything of the report is imported
         if output is None and json_path != STANDARD_OUTPUT:
             output = outputs.free_report(log.stem, settings_name(request), results)
         contents = outputs.result_files(results, json_path, output, found, step)

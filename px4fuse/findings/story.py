@@ -14,7 +14,7 @@ from px4fuse.comparison import interventions
 from px4fuse.comparison.interventions import Intervention, Of, cause_of, tried_on
 from px4fuse.comparison.model import FILTERS, AgainstTruth, AxisComparison, Difference, FilterName
 from px4fuse.ekf2.walk import Why
-from px4fuse.ekf2_parameters import AIDS
+from px4fuse.ekf2_parameters import AIDS, EV_POS
 from px4fuse.filter.kalman import state_at
 from px4fuse.findings.causes import CLOCK, FRAME, PROCESS, SETTINGS, VARIANCES
 from px4fuse.findings.model import Finding
@@ -201,14 +201,16 @@ def _gap(analysis: Analysis, finding: Finding) -> str:
 
 
 def _fused(ekf2: Ekf2 | Unavailable, start_s: float, end_s: float) -> list[str]:
-    """What EKF2 fused in most of a span that tells of horizontal motion."""
-    logs = {} if isinstance(ekf2, Unavailable) else ekf2.aids
-    told = {name: logs[name].samples for name in OTHER_AIDING if name in logs}
-    return [
-        AIDS[name].label
-        for name, samples in told.items()
-        if "fused" in samples and samples["fused"].loc[start_s:end_s].mean() > 0.5
-    ]
+    """What EKF2 fused through a span, without a break of half of it, of what tells of motion."""
+    found = []
+    for name in (EV_POS.name, *OTHER_AIDING):
+        log = None if isinstance(ekf2, Unavailable) else ekf2.aids.get(name)
+        if log is not None and "fused" in log.samples:
+            fused = log.samples["fused"].loc[start_s:end_s]
+            ends = [start_s, *fused.index[fused > 0.0], end_s]
+            if np.diff(ends).max() < 0.5 * (end_s - start_s):
+                found.append(AIDS[name].label)
+    return found
 
 
 def _closer(analysis: Analysis, causes: Mapping[FilterName, Intervention | None]) -> Iterator[str]:
