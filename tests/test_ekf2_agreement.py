@@ -112,9 +112,14 @@ def test_where_much_is_rejected_the_replay_that_obeys_the_log_decides(
         rejected_share_replayed=0.2, decisions_same=0.9, published_rms_difference_m=0.0,
         good=not good, reason="so far",
     )  # fmt: skip
-    found = with_obedient(one, replace(one, north=agreeing(), east=axis))
-    assert found.good is good
-    assert found.reason.startswith("with EKF2's own rejections, ")
+    obedient = replace(one, north=agreeing(), east=axis, decisions_same=1.0,
+                       rejected_share_replayed=0.3)  # fmt: skip
+    for all_told in (False, True):
+        found = with_obedient(one, obedient, all_told=all_told)
+        assert found.good is good
+        assert found.reason.startswith("with EKF2's own rejections, ")
+        assert (found.decisions_same, found.rejected_share_replayed) == (0.9, 0.2)
+        assert found.axes == (obedient if all_told else one).axes
 
 
 def test_what_an_axis_is_compared_by() -> None:

@@ -5,7 +5,7 @@ import pytest
 from findings_tools import made as made_of
 from scipy.spatial.transform import Rotation
 
-from px4fuse.ekf2.output_predictor import follow_attitude, publish
+from px4fuse.ekf2.output_predictor import corrections, follow_attitude, publish
 from px4fuse.ekf2.stretches import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
@@ -68,6 +68,26 @@ def test_the_recursive_filters_are_the_buffer(lag: int) -> None:
     expected = buffered(gain, velocity, position, reset, lag, 0.25, 0.4)
     for found, known in zip(made, expected, strict=True):
         assert found == pytest.approx(known, abs=1e-9)
+
+
+def test_what_the_filter_was_moved_by_is_told_by_what_is_published() -> None:
+    """A tenth of a second between corrections and between rows, as GNSS and the log have it."""
+    lag, tau_s, count = 15, 0.25, 60
+    rng = np.random.default_rng(3)
+    moved = rng.normal(0.0, 0.1, (count, 2)) * (rng.random((count, 1)) < 0.5)
+    n = 10 * count + 100
+    velocity, position = np.tile([1.5, -0.5], (n + 1, 1)), np.zeros((n + 1, 2))
+    at = 12 + 10 * np.arange(count)
+    position[at] = moved
+    position = np.cumsum(position + velocity * STEP_S, axis=0)
+    flat = np.zeros((n, 2))
+    still = np.zeros((n + 1, 2))
+    v, p = buffered(flat, velocity, position, still, lag, tau_s, tau_s)
+    rows = np.arange(0, n + 1, 10)
+    found = corrections(rows * STEP_S, v[rows], p[rows], (at + lag - 1) * STEP_S, tau_s)
+    assert np.abs(moved).max() > 0.2
+    np.testing.assert_allclose(found, moved, atol=0.05)
+    assert np.corrcoef(found.ravel(), moved.ravel())[0, 1] > 0.97
 
 
 def test_the_published_attitude_follows_by_half_a_step_per_horizon() -> None:

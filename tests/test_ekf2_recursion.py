@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ekf2_tools import RULES
+from ekf2_tools import RULES, step_matrix, step_noise
 from exchange import replace
 from findings_tools import log, made
 from scipy.spatial.transform import Rotation
@@ -32,6 +32,7 @@ from px4fuse.ekf2.recursion import (
     _Fusion,
     _in_turn,
     _limit_bias,
+    _settled,
     run,
 )
 from px4fuse.ekf2.recursion import _measurements as measurements
@@ -244,6 +245,50 @@ def test_a_velocity_beyond_its_gate_moves_nothing(speed_m_s: float, moves: bool)
     assert abs(wider.state[11, 0, 3]) > 1e-3
 
 
+@pytest.mark.parametrize(
+    ("north_m", "share", "fused"),
+    [(2.0, 0.6, True), (2.0, 0.4, False), (3.3, 0.6, True), (3.3, 0.4, False),
+     (1.5, 0.4, True), (4.0, 0.6, False)],
+)  # fmt: skip
+def test_on_the_edge_of_the_gate_what_is_published_tells_of_a_fix(
+    north_m: float, share: float, fused: bool
+) -> None:
+    """The gate is at 2.515 m: to which share of a fusion was the position moved thereafter?"""
+    fixes = [0.0] * 10 + [north_m] + [0.0] * 9
+    done = on_gnss(fixes, [0.0] * 20)
+    S, R = done.innovation_variance[10, 0, 3], done.noise[10, 0, 3]
+    assert 5.0 * math.sqrt(S) == pytest.approx(2.515, abs=0.001)
+    moved = np.zeros((20, 2))
+    moved[10, 0] = share * (1.0 - R / S) * done.innovation[10, 0, 3]
+    assert bool(on_gnss(fixes, [0.0] * 20, moved_m=moved).fused[10, 0]) is fused
+    assert bool(done.fused[10, 0]) is (north_m < 2.515)
+
+
+def test_at_rest_tilt_and_bias_are_known_together() -> None:
+    """Against a plain Kalman filter of a vehicle that stood for a minute, facing east."""
+    turn = Rotation.from_euler("z", 110.0, degrees=True).as_matrix()
+    count = 6000
+    stretch = made(
+        Stretch, step_s=np.full(count, 0.01), rotation=np.tile(turn, (count + 1, 1, 1)),
+        force_m_s2=np.zeros((count, 3)) - GRAVITY_M_S2, variance=np.empty(15),
+    )  # fmt: skip
+    P = np.diag(np.repeat([0.1, 0.3, 0.5, 1e-5, 0.2], 3) ** 2)
+    for k in range(count):
+        F = step_matrix(stretch, k)
+        P = F @ P @ F.T + step_noise(stretch, k, 1e-4, 0.35)
+        if k % 10 == 9:
+            for row in (3, 4, 5):
+                P -= np.outer(P[row], P[row]) / (P[row, row] + 0.01)
+    deviation = np.sqrt(np.diag(P))
+    known = (P / deviation[:, None] / deviation)[:2, 12:14]
+    stretch.variance[:] = np.diag(P)
+    found = _settled(stretch)
+    np.testing.assert_allclose(found[:2, 12:14], known, atol=0.03)
+    assert np.abs(known).max() > 0.9
+    np.testing.assert_allclose(np.diag(found), 1.0)
+    assert np.linalg.eigvalsh(found).min() > -1e-9
+
+
 def test_a_reset_to_a_fix_takes_its_velocity_too() -> None:
     """Seven seconds without both: position and velocity are the fix's, with their variances."""
     done = on_gnss([0.0] * 5 + [300.0] * 80, [0.0] * 5 + [40.0] * 80)
@@ -310,7 +355,7 @@ def at_rest(
     measured_m: list[float], logged: float = np.nan, down_m: float = 0.0, aid: Aid = EV_POS,
     rules: Rules = RULES, speed_m_s: Any = None, velocity: bool = True,
     tilt_rad2: float = np.inf, without: Any = None, heading_rad: float = 0.0,
-    field_gauss: Any = None, **settings: float,
+    field_gauss: Any = None, moved_m: Any = None, **settings: float,
 ) -> Run:  # fmt: skip
     """A level vehicle that stands still at the origin, seen at 10 Hz at these places north.
 
@@ -341,6 +386,7 @@ def at_rest(
         np.zeros((len(stamp), 3)), np.full(len(stamp), np.nan), np.zeros(len(stamp), bool), "uwb",
     )  # fmt: skip
     vision.rejected[3] = logged
+    vision = replace(vision, moved_m=moved_m)
     if speed_m_s is not None:
         vision = replace(
             vision, velocity_m_s=speed_m_s, velocity_variance_m2_s2=np.zeros_like(speed_m_s)

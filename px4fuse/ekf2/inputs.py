@@ -16,6 +16,7 @@ from px4fuse.display import brief
 from px4fuse.ekf2.earth import metres_of
 from px4fuse.ekf2.flow import with_flow
 from px4fuse.ekf2.heights import with_heights
+from px4fuse.ekf2.output_predictor import corrections
 from px4fuse.ekf2.stretches import IMU_GAP_S, MIN_STRETCH_S, Stretch, find_stretches, predict_s
 from px4fuse.ekf2_parameters import (
     AID_MASK,
@@ -83,6 +84,9 @@ class Received:
         Name of the track.
     own_times : bool
         Whether EKF2 takes the sender's times of measurement as they are, whatever the delay.
+    moved_m : ndarray, shape (m, 2), or None
+        By how much EKF2 moved its position to each, north and east, as far as what is published
+        tells; where it rejects some, and the log does not tell of each.
     """
 
     stamp_s: Array
@@ -95,6 +99,7 @@ class Received:
     velocity_m_s: Array | None = None
     velocity_variance_m2_s2: Array | None = None
     own_times: bool = False
+    moved_m: Array | None = None
 
     __repr__ = brief
 
@@ -364,17 +369,34 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> Received | Un
     fused = fuses_by_mask(parameters) or switch & GNSS_VELOCITY_BIT
     spread = velocities[Columns.VELOCITY_VARIANCE].fillna(0.0).to_numpy()
     known = bool(fused and np.isfinite(velocity).all())
+    decisions = _decisions(ekf2, record, stamp, GNSS_POS)
     return Received(
         stamp,
         stamp,
         samples[Columns.POSITION].to_numpy() * metres_of(record),
         stated.to_numpy(),
-        *_decisions(ekf2, record, stamp, GNSS_POS),
+        *decisions,
         track.name,
         velocity if known else None,
         spread if known else None,
         own_times=track.age_s == 0.0 != flown_s,
+        moved_m=_moved(ekf2, record, stamp - flown_s - 0.5 * ekf2.step_s, decisions[0]),
     )
+
+
+def _moved(ekf2: Ekf2, record: FusionRecord, taken_s: Array, rejected: Array) -> Array | None:
+    """By how much EKF2 moved its position to each sample; None where that tells nothing more."""
+    if not (rejected > 0.0).any() or np.isfinite(rejected).all():
+        return None
+    if isinstance(ekf2.horizon_s, Unavailable):
+        return None
+    tau_s = record.parameters.get("EKF2_TAU_POS", 0.25)
+    times = ekf2.state.index.to_numpy()
+    velocity, position = (
+        ekf2.state[names[:2]].to_numpy() for names in (Columns.VELOCITY, Columns.POSITION)
+    )
+    known_s = taken_s + ekf2.horizon_s - ekf2.step_s  # the first part of it is there at once
+    return corrections(times, velocity, position, known_s, tau_s)
 
 
 def read_vision(

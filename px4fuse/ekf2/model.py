@@ -142,12 +142,13 @@ def _open(
     if share > REJECTING_SHARE and np.isfinite(inputs.received.rejected).any():
         obeyed = agreement_with_log(flight, _assemble(inputs, runs, variants[1], {}))
         if isinstance(obeyed, Agreement):
-            agreement = with_obedient(agreement, obeyed)
-    told = {DOUBTED.get(name, name): name for name in doubted}
+            told = inputs.received.moved_m is not None
+            agreement = with_obedient(agreement, obeyed, all_told=told)
+    of_doubted = {DOUBTED.get(name, name): name for name in doubted}
     agreement = structs.replace(
         agreement,
         doubtful={**doubtful, **agreement.doubtful},
-        **{of: getattr(doubted[name], of) for of, name in told.items()},
+        **{of: getattr(doubted[name], of) for of, name in of_doubted.items()},
     )
     replay = structs.replace(replay, agreement=agreement)
     model = Model(flight, inputs, known, replay, agreement)
@@ -214,7 +215,9 @@ def replay_settings(
         rejected = np.full(len(inputs.received.stamp_s), np.nan)
         rejected[row[row >= 0]] = 1.0
         never = np.zeros(len(rejected), dtype=bool)
-        inputs = replace(inputs, received=replace(inputs.received, rejected=rejected, reset=never))
+        inputs = replace(
+            inputs, received=replace(inputs.received, rejected=rejected, reset=never, moved_m=None)
+        )
         model = replace(model, inputs=inputs)
     variants = [
         Variant({**inputs.settings, **change}, as_logged=obeys, without=without)

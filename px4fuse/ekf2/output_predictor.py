@@ -9,10 +9,13 @@ filters over the whole stretch.
 Source: PX4-Autopilot ``EKF/output_predictor/output_predictor.cpp`` (``EKF/ekf.cpp`` before v1.14).
 """
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
 from scipy.linalg import lapack
+from scipy.sparse import csr_array, eye_array
+from scipy.sparse.linalg import spsolve
 
 from px4fuse.arrays import Array
 from px4fuse.ekf2.stretches import (
@@ -24,6 +27,10 @@ from px4fuse.ekf2.stretches import (
 )
 
 INTEGRAL_SHARE = 0.1
+# What a correction does is followed for so many time constants
+FOLLOWED = 5.0
+# Against what nothing tells apart: two corrections between the same rows
+NO_CORRECTION = 1e-3
 ATTITUDE_SHARE = 0.5
 
 
@@ -78,6 +85,42 @@ def _followed(offset: Array, lag: int, step_s: float, tau_s: float) -> Array:
     late = later(offset - offset[0], lag)
     corrected = _recursive(np.array([g + h, -g]), np.array([1.0, g + h - 2.0, 1.0 - g]), late)
     return np.asarray(corrected + offset[0])
+
+
+def corrections(
+    time_s: Array, velocity_m_s: Array, position_m: Array, known_s: Array, tau_s: float
+) -> Array:
+    """By how much the filter moved its position at each sample, by what was published after it.
+
+    What is published moves beyond its own velocity by (1 - exp(-t / τ)) of a correction in the time
+    t.
+
+    Parameters
+    ----------
+    time_s : ndarray, shape (n,)
+        Of the rows of what was published.
+    velocity_m_s, position_m : ndarray, shape (n, a)
+    known_s : ndarray, shape (m,)
+        A step before each correction begins to show; increasing.
+    tau_s : float
+        EKF2_TAU_POS.
+
+    Returns
+    -------
+    ndarray, shape (m, a)
+    """
+    carried = 0.5 * (velocity_m_s[1:] + velocity_m_s[:-1]) * np.diff(time_s)[:, None]
+    beyond = np.diff(position_m, axis=0) - carried
+    span = math.ceil(FOLLOWED * tau_s / float(np.median(np.diff(time_s)))) + 1
+    row = np.searchsorted(time_s, known_s, side="right") - 1 + np.arange(span)[:, None]
+    inside = (row >= 0) & (row < len(beyond))
+    row, sample = row[inside], np.nonzero(inside)[1]
+    begun, ended = (
+        np.exp(-np.maximum(time_s[each] - known_s[sample], 0.0) / tau_s) for each in (row, row + 1)
+    )
+    shares = csr_array((begun - ended, (row, sample)), shape=(len(beyond), len(known_s)))
+    normal = shares.T @ shares + NO_CORRECTION * eye_array(len(known_s))
+    return np.reshape(spsolve(normal.tocsc(), shares.T @ beyond), (len(known_s), -1))
 
 
 def later(values: Array, lag: int) -> Array:

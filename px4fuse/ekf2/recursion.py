@@ -10,17 +10,19 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
 from px4fuse.ekf2.flow import fuse_flow
 from px4fuse.ekf2.heights import MIN_GATE, MIN_SD, SENSORS, HeightFilter, barometer_samples
 from px4fuse.ekf2.inputs import Inputs, Rules
-from px4fuse.ekf2.intervals import FUSE, IDLE, START, Events, Intervals, Timing
+from px4fuse.ekf2.intervals import FUSE, IDLE, START, Events, Intervals, Timing, make_intervals
 from px4fuse.ekf2.magnetometer import Samples, fuse_field, gather
 from px4fuse.ekf2.stretches import (
     ACCELEROMETER_BIAS,
     BIASES,
+    GRAVITY_M_S2,
     GYRO_BIAS,
     MOVED,
     STATES,
@@ -34,6 +36,9 @@ from px4fuse.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG, Aid
 # How long the first pass runs that gives the correlations at the start
 CORRELATING_S = 8.0
 LEAST_VARIANCE = 1e-30
+# Of an innovation's square over that of its gate, either way: within, what is published after it
+# tells whether it was rejected, where the log does not
+ON_EDGE = 2.0
 # Events whose intervals are stacked at once
 TOGETHER = 64
 # Variance by which a sample is not taken at all
@@ -48,6 +53,8 @@ HEIGHT_SCALE = 1.5  # of EKF2_GPS_P_NOISE (gnss_height_control.cpp)
 MAX_BIAS_SD = 0.1 * 9.80665
 BIAS_RATIO = 0.01
 HEADING, NORTH, EAST, DOWN = 2, 6, 7, 8
+BIAS_NORTH, BIAS_EAST = 12, 13  # of the accelerometer, turned to the earth
+GRAVITY = float(GRAVITY_M_S2[2])
 MEASURED = np.array([HEADING, DOWN, NORTH, EAST])
 # Slices are views, where indices would be copies
 OWN = slice(HEADING, DOWN + 1, DOWN - HEADING)
@@ -236,7 +243,7 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     floor = inputs.rules.bias_floor
     x, P = _start(stretch, biases, attitude)
     logged = inputs.received.rejected[sample], inputs.received.reset[sample]
-    used = on[inputs.aid.name]
+    used, moved = on[inputs.aid.name], inputs.received.moved_m
     usable = np.where(used, action, IDLE), event["startable"] & used, now_s, gated, as_logged
     fusion = _Fusion(inputs.rules, stretch.time_s[0], *usable, *logged)
     innovations, variances = np.full((2, events, size, 6), np.nan)
@@ -282,6 +289,12 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
             outside = nu * nu > gate2 * S
             moving = with_velocity[e] & ~(outside[:, SPEED].any(axis=1) & gated)
             outside = outside[:, LEVEL].any(axis=1)
+            if moved is not None:
+                ratio = (nu * nu / (gate2 * S))[:, LEVEL].max(axis=1)
+                edge = (ratio > 1.0 / ON_EDGE) & (ratio < ON_EDGE)
+                full = (1.0 - noise[e] / S)[:, LEVEL] * nu[:, LEVEL]
+                kept = full @ moved[sample[e]] < 0.5 * (full * full).sum(axis=1)
+                outside = np.where(as_logged & edge, kept, outside)
             rejected[e], fused[e], reset[e], moving = fusion.decide(e, outside, moving)
             if in_turn:
                 if seen is None:
@@ -453,24 +466,48 @@ def _drift(
 
 
 def with_correlation(inputs: Inputs, stretch: Stretch, intervals: Intervals) -> Stretch:
-    """The same stretch with the correlations that its first seconds bring about.
+    """The same stretch with the correlations at its start; the log holds variances only.
 
-    The log holds variances only. Without correlations the first samples would share out anew
-    between tilt and accelerometer bias what EKF2 had long settled.
+    Without them the first samples would share out anew between tilt and accelerometer bias what
+    EKF2 had long settled. They come of what was before; where the log has nothing of it, of the
+    first seconds.
     """
-    ends_s = stretch.time_s[intervals.events.end]
-    count = int(np.searchsorted(ends_s, stretch.time_s[0] + CORRELATING_S))
-    first = Intervals(*(getattr(intervals, field.name)[:count] for field in fields(intervals)))
-    (covariance,) = run(inputs, stretch, [Variant(inputs.settings)], [first]).covariance
-    # a bias that EKF2 does not learn has no variance
-    deviation = np.sqrt(np.maximum(np.diagonal(covariance), LEAST_VARIANCE))
-    correlation = covariance / deviation[:, None] / deviation
+    flown, inputs = Variant(inputs.settings), replace(inputs, vision=None)
+    if (before := stretch.history) is not None:
+        before = replace(before, correlation=_settled(before))
+        made = make_intervals(inputs, before, flown.timing(inputs))
+        correlation = _correlation(run(inputs, before, [flown], [made]).covariance[0])
+    else:
+        ends_s = stretch.time_s[intervals.events.end]
+        count = int(np.searchsorted(ends_s, stretch.time_s[0] + CORRELATING_S))
+        first = Intervals(*(getattr(intervals, field.name)[:count] for field in fields(intervals)))
+        correlation = _correlation(run(inputs, stretch, [flown], [first]).covariance[0])
     if stretch.field is not None:
         # EKF2 has just reset heading and fields, which parts them from all other states
-        alone = np.array([HEADING, *range(STATES, len(correlation))])
-        correlation[alone], correlation[:, alone] = 0.0, 0.0
-        correlation[alone, alone] = 1.0
+        correlation = block_diag(correlation[:STATES, :STATES], np.eye(len(stretch.state) - STATES))
+        correlation[HEADING], correlation[:, HEADING] = 0.0, 0.0
+        correlation[HEADING, HEADING] = 1.0
     return replace(stretch, correlation=correlation)
+
+
+def _correlation(P: Array) -> Array:
+    # a bias that EKF2 does not learn has no variance
+    deviation = np.sqrt(np.maximum(np.diagonal(P), LEAST_VARIANCE))
+    return np.asarray(P / deviation[:, None] / deviation)
+
+
+def _settled(stretch: Stretch) -> Array:
+    """Correlations of a state whose velocity was measured for long.
+
+    Errors of the tilt and of the accelerometer's bias are known together: what they do to the
+    acceleration cancels, θ x f = Rb, as far as both are as large.
+    """
+    to_earth = np.eye(STATES)
+    to_earth[ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = stretch.rotation[0]
+    P = np.diag(np.diagonal(to_earth @ np.diag(stretch.variance) @ to_earth.T))
+    for tilt, bias, effect in ((1, BIAS_NORTH, -GRAVITY), (0, BIAS_EAST, GRAVITY)):
+        P[tilt, bias] = P[bias, tilt] = min(P[tilt, tilt] * effect**2, P[bias, bias]) / effect
+    return _correlation(to_earth.T @ P @ to_earth)
 
 
 def _diagonal(P: Array) -> Array:

@@ -499,7 +499,7 @@ def _beyond(value: float, most: float) -> str:
     return next(f"{value:.{n}f}" for n in range(2, 17) if round(value, n) > most or n == 16)
 
 
-def with_obedient(agreement: Agreement, obedient: Agreement) -> Agreement:
+def with_obedient(agreement: Agreement, obedient: Agreement, *, all_told: bool) -> Agreement:
     """The verdict where EKF2 rejects much: of a replay that rejects what EKF2 rejected.
 
     By its own gate the replay parts from the log where one sample lies on the edge, and each
@@ -509,6 +509,14 @@ def with_obedient(agreement: Agreement, obedient: Agreement) -> Agreement:
     ----------
     agreement, obedient : Agreement
         Of the replay by its own gate, and of the other.
+    all_told : bool
+        Whether what EKF2 did with every sample is known: then all else is of the other one too.
     """
     good, reason = _verdict(obedient.axes, 0.0, 0.0, REJECTING_LOOSER)
-    return replace(agreement, good=good, reason=f"with EKF2's own rejections, {reason}")
+    return replace(
+        obedient if all_told else agreement,
+        rejected_share_replayed=agreement.rejected_share_replayed,
+        decisions_same=agreement.decisions_same,
+        good=good,
+        reason=f"with EKF2's own rejections, {reason}",
+    )

@@ -40,6 +40,8 @@ AIRBORNE_S = 4.0
 SETTLING_S = 5.0
 # EKF2 resets heading and fields when the vehicle has taken off; what the log has is of after that
 FIELD_AFTER_S = 1.0
+# So long before the start begins what the correlations there come of, where the log has it
+HISTORY_S = 20.0
 # EKF2 fuses 14 samples of the field a second (SENS_MAG_RATE is 15): one of fewer that are in the
 # log stands for several, down to this rate
 FIELD_HZ, LEAST_FIELD_HZ = 14.0, 1.5
@@ -176,6 +178,8 @@ class Stretch:
         What optical flow measured, where EKF2 fused it.
     metres : (float, float, float)
         What a metre of a track is in those of the state's position.
+    history : Stretch or None
+        What came before, up to its start: the correlations at the start come of that.
     """
 
     time_s: Array
@@ -197,6 +201,7 @@ class Stretch:
     shaken: Array | None = None
     flow: Sensed | None = None
     metres: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    history: "Stretch | None" = None
 
     __repr__ = brief
 
@@ -311,14 +316,28 @@ def find_stretches(
         if at == len(states) or high - states[at] < MIN_STRETCH_S:
             continue
         covered = (time[1:] > states[at]) & (time[:-1] < high)
-        if np.all(np.diff(time)[covered] <= IMU_GAP_S):
-            made = _stretch(imu, attitude, ekf2, record, at, high)
-            if gnss:
-                made = _on_earth(made, record)
-                made = replace(made, shaken=_shaken(imu, record, made.time_s))
-            within = of_field and of_field[0] <= states[at] and high <= of_field[1]
-            found.append(_with_field(made, record, at, ekf2.step_s) if within else made)
+        if not np.all(np.diff(time)[covered] <= IMU_GAP_S):
+            continue
+        parts = imu, attitude, ekf2, record
+        if not gnss:
+            found.append(_stretch(*parts, at, high))
+            continue
+        made = _on_gnss(*parts, at, high)
+        before = int(np.searchsorted(states, max(first, states[at] - HISTORY_S)))
+        if before < at:
+            made = replace(made, history=_on_gnss(*parts, before, states[at]))
+        within = of_field and of_field[0] <= states[at] and high <= of_field[1]
+        found.append(_with_field(made, record, at, ekf2.step_s) if within else made)
     return tuple(found)
+
+
+def _on_gnss(
+    imu: pd.DataFrame, attitude: pd.DataFrame, ekf2: Ekf2, record: FusionRecord, at: int,
+    end_s: float,
+) -> Stretch:  # fmt: skip
+    """A stretch on an earth that turns, where bad accelerations are relied on less."""
+    made = _on_earth(_stretch(imu, attitude, ekf2, record, at, end_s), record)
+    return replace(made, shaken=_shaken(imu, record, made.time_s))
 
 
 def _on_earth(stretch: Stretch, record: FusionRecord) -> Stretch:
