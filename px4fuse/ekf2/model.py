@@ -385,7 +385,7 @@ def _updates(part: Run, at: int) -> pd.DataFrame:
     flags = np.stack([part.rejected, part.fused, part.reset], axis=-1)[seen, at]
     told = part.innovation, part.innovation_variance, part.noise
     nu, s, r = (each[seen, at, LEVEL] for each in told)
-    speed = [each[seen, at, :2] for each in told[:2]]
+    speed = [each[seen, at, :3] for each in told[:2]]
     fused_at_s = part.stretch.time_s[events.end[seen], None]
     values = np.hstack([nu, s, flags, after[:, 6:8], after[:, 3:5], r, fused_at_s, *speed])
     index, columns = pd.Index(events.time_s[seen], name="time_s"), UPDATE_COLUMNS

@@ -12,7 +12,7 @@ from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
 from px4fuse.ekf2.inputs import aid_source, replayed_aid, same_sample
 from px4fuse.ekf2.stretches import SETTLING_S
-from px4fuse.ekf2_parameters import AIDS, EV_POS, FLOW, GNSS_POS, MAG
+from px4fuse.ekf2_parameters import AIDS, EV_POS, FLOW, GNSS_HGT, GNSS_POS, MAG
 from px4fuse.filter import signals
 from px4fuse.filter.heading import heading_rad
 from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Columns, Ekf2, Flight, Truth, Unavailable
@@ -28,9 +28,9 @@ UPDATE_COLUMNS = [
     "observation_variance_north_m2", "observation_variance_east_m2", "fused_at_s",
 ]  # fmt: skip
 VELOCITY_UPDATE_COLUMNS = [
-    "innovation_north_m_s", "innovation_east_m_s", "innovation_variance_north_m2_s2",
-    "innovation_variance_east_m2_s2",
-]  # fmt: skip
+    *(f"innovation_{axis}_m_s" for axis in AXIS_NAMES),
+    *(f"innovation_variance_{axis}_m2_s2" for axis in AXIS_NAMES),
+]
 MIN_SAMPLES = 20
 # The older topics repeat a sample until the next fusion, with the time of a later step
 MAX_REPEAT_S = 0.5
@@ -87,8 +87,8 @@ class Agreement(Record, frozen=True, kw_only=True):
         Of the position that EKF2 fused.
     ev_pos, gnss_pos : mapping from "north" and "east" to AxisAgreement
         The same by the name of the aid, and of vision that is fused besides GNSS.
-    gnss_vel : mapping from "north" and "east" to AxisAgreement
-        Of the velocity that is fused with it.
+    gnss_vel : mapping from "north", "east" and "down" to AxisAgreement
+        Of the velocity that is fused with it; "down" where its height is fused too.
     gnss_hgt, baro_hgt : mapping from "down" to AxisAgreement
         Of the heights, where the log holds what EKF2 fused of them.
     samples : int
@@ -180,7 +180,7 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
     ----------
     changed : mapping
         Parameters that differ from the log's on request.
-    updates : DataFrame, shape (m, 14), (m, 18) where velocity is fused too
+    updates : DataFrame, shape (m, 14), (m, 20) where velocity is fused too
         Per sample, by the time of measurement as EKF2 takes it (stamp - delay - half a
         step): innovation (measurement minus state) and its variance S, north and east; 1 or 0
         whether it was rejected by the gate, fused, or the position reset to it; variances of
@@ -319,12 +319,17 @@ def _velocity(ekf2: Ekf2, replay: Ekf2Replay, *, own: bool) -> dict[str, AxisAgr
     logged, model = _matched(replay, replay.updates, log.samples, own=own)
     if len(logged) < MIN_SAMPLES:
         return {}
-    # under the names of a position's
-    names = dict(zip(VELOCITY_UPDATE_COLUMNS, UPDATE_COLUMNS, strict=False))
-    parts = ("innovation_north", "innovation_east", "variance_north", "variance_east")
-    logged = logged.rename(columns=dict(zip(parts, UPDATE_COLUMNS, strict=False)))
-    model = model[VELOCITY_UPDATE_COLUMNS].rename(columns=names)
-    return {axis: _axis(axis, logged, model, ekf2, replay) for axis in HORIZONTAL}
+    names: dict[str, str] = {}  # those of a position
+    for axis in AXIS_NAMES:
+        nu, S = f"innovation_{axis}_m", f"innovation_variance_{axis}_m2"
+        names |= {f"{nu}_s": nu, f"{S}_s2": S, f"innovation_{axis}": nu, f"variance_{axis}": S}
+    logged, model = (
+        logged.rename(columns=names),
+        model[VELOCITY_UPDATE_COLUMNS].rename(columns=names),
+    )
+    # down where the height is no longer EKF2's own
+    axes = AXIS_NAMES if GNSS_HGT.name in replay.besides else HORIZONTAL
+    return {axis: _axis(axis, logged, model, ekf2, replay) for axis in axes}
 
 
 def _besides(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, str]]:
