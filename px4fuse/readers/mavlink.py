@@ -70,6 +70,7 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     truth = read_truth(recording, positions, remedies)
     airborne = _read_airborne(recording, remedies["landed"])
     in_flight = parts.ends_in_flight(airborne, recording.duration_s)
+    pressure = messages.LAYOUTS["pressure"]
     return Flight(
         log=_describe(recording, parameters, autopilot, in_flight),
         imu=imu,
@@ -78,14 +79,14 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
         ekf2=ekf2,
         truth=truth,
         airborne=airborne,
-        barometer=barometer(pressure_altitude(recording.read(messages.PRESSURE)["pressure_hpa"])),
+        barometer=barometer(pressure_altitude(recording.read(pressure)["pressure_hpa"])),
         modes=_read_modes(recording) if autopilot == "PX4" else messages.NO_MODES,
         missing=(*parts.missing_parts(imu, attitude, ekf2, truth), *missing_positions),
         streams=MappingProxyType(recording.streams),
         clocks=senders.clock_maps(recording, mapped),
         unused=tuple(
             Unused(name, count, reason)
-            for name, reason in messages.UNUSED.items()
+            for name, reason in messages.TABLE.unused.items()
             if (count := int(np.count_nonzero(frames.message_id == MESSAGE_IDS[name])))
         ),
     )
@@ -155,7 +156,7 @@ def _read_ekf2(
     found = samples.reindex(columns=VARIANCE_COLUMNS)
     found = found[(found > 0.0).all(axis=1)]
     if found.empty:
-        message, found = messages.ACCURACY.topic, _variance_by_accuracy(recording)
+        message, found = messages.LAYOUTS["accuracy"].topic, _variance_by_accuracy(recording)
         if len(found):
             by = "from ESTIMATOR_STATUS: its horizontal accuracy squared, half to each axis"
             notes.append(f"EKF2's position variances are {by}; velocity variances are not sent")
@@ -190,7 +191,7 @@ def _variance_by_accuracy(recording: Recording) -> pd.DataFrame:
 
     PX4's horizontal accuracy is the root of the sum over both axes (``get_ekf_lpos_accuracy``).
     """
-    accuracy = recording.read(messages.ACCURACY)
+    accuracy = recording.read(messages.LAYOUTS["accuracy"])
     variance = pd.DataFrame(np.nan, index=accuracy.index, columns=VARIANCE_COLUMNS)
     variance["north_m2"] = variance["east_m2"] = accuracy["horizontal_m"] ** 2 / 2.0
     variance["down_m2"] = accuracy["vertical_m"] ** 2
@@ -218,9 +219,9 @@ def _read_modes(recording: Recording) -> tuple[FlightMode, ...] | Unavailable:
         return messages.NO_MODES
     modes = recording.frames.table("HEARTBEAT", rows)["custom_mode"].astype(np.int64)
     names = [
-        messages.AUTO_MODES.get(mode >> 24 & 0xFF, "Auto")
+        messages.TABLE.auto_modes.get(mode >> 24 & 0xFF, "Auto")
         if (main := mode >> 16 & 0xFF) == messages.AUTO_MODE
-        else messages.MAIN_MODES.get(main, f"mode {main}")
+        else messages.TABLE.main_modes.get(main, f"mode {main}")
         for mode in modes.tolist()
     ]
     time_s = recording.receipt_boot_s(rows) - recording.zero_s
@@ -259,7 +260,8 @@ def _describe(
         uid = bytes(version["uid2"]).hex()
         vehicle = uid if uid.strip("0") else ""
     beats = frames.table("HEARTBEAT", recording.rows("HEARTBEAT"))
-    kind = messages.VEHICLE_TYPES.get(int(beats["type"][0]), "vehicle") if len(beats) else "vehicle"
+    first = next(iter(beats["type"].tolist()), -1)
+    kind = messages.TABLE.vehicle_types.get(first, "vehicle")
     why = "zero, go back, or lie outside the recording"
     dropped = [dropped_note(n, message, why) for message, n in sorted(recording.dropped.items())]
     return LogInfo(
