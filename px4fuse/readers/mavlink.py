@@ -21,6 +21,7 @@ from px4fuse.readers.mavlink_positions import pressure_altitude, read_positions,
 from px4fuse.readers.mavlink_recording import RECEIPT_CLOCK, Recording, settle_clocks, unix_of_boot
 from px4fuse.readers.px4_positions import barometer
 from px4fuse.readers.ulog_topics import NO_SELECTOR, dropped_note
+from px4fuse.record import lacking
 from px4fuse.recording import LogInfo, Unused
 
 VARIANCE_COLUMNS = Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE
@@ -107,11 +108,7 @@ def _read_imu(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
     imu = recording.read(layout, rows)
     imu = parts.finite_rows(imu, imu.columns.tolist(), parts.BEYOND_IMU)
     if len(imu) < 2:
-        return Unavailable(
-            "IMU",
-            f"{layout.topic} holds {len(imu)} usable samples",
-            "Check that the sensors ran while the link was recorded.",
-        )
+        return lacking("imu_few", topic=layout.topic, count=len(imu))
     recording.came_from("imu", layout.topic)
     return imu
 
@@ -137,9 +134,7 @@ def _read_ekf2(
     layout = next(dense)
     message = layout.topic
     if counts[message] < 2:
-        return Unavailable(
-            "EKF2", "no ODOMETRY or LOCAL_POSITION_NED of the autopilot", remedies["state"]
-        )
+        return lacking("ekf2_not_sent", remedy=remedies["state"])
     samples = recording.read(layout)
     state = samples[Columns.STATE].dropna()
     if len(state) < 2:
@@ -160,24 +155,20 @@ def _read_ekf2(
         if len(found):
             by = "from ESTIMATOR_STATUS: its horizontal accuracy squared, half to each axis"
             notes.append(f"EKF2's position variances are {by}; velocity variances are not sent")
-    lacking = "no ODOMETRY with covariance and no ESTIMATOR_STATUS of the autopilot"
     variance: pd.DataFrame | Unavailable = found
     if found.empty:
-        variance = Unavailable("EKF2 variances", lacking, remedies["variance"])
+        variance = lacking("variances_not_sent", remedy=remedies["variance"])
     else:
         recording.came_from("ekf2_variance", message)
-    inside = "MAVLink does not carry EKF2's"
     return Ekf2(
         state=state,
         variance=variance,
         innovations={
-            axis: Unavailable(
-                f"EKF2 innovations, {axis}", f"{inside} innovations", remedies["inside"]
-            )
+            axis: lacking("inside_not_sent", axis=axis, remedy=remedies["inside"])
             for axis in AXIS_NAMES
         },
         innovation_topics=(),
-        fusing=Unavailable("EKF2 fusion flags", f"{inside} fusion flags", remedies["inside"]),
+        fusing=lacking("fusion_not_sent", remedy=remedies["inside"]),
         resets=(),
         instances=NO_SELECTOR,
         gate=settings_in_force(parameters)[EV_POS.gate],

@@ -20,6 +20,7 @@ from px4fuse.readers.mavlink_recording import BOOT_CLOCK, RECEIPT_CLOCK, Recordi
 from px4fuse.readers.mavlink_senders import senders_of
 from px4fuse.readers.parts import attitude_of, orientation_of
 from px4fuse.readers.px4_positions import Place, projected, unproject
+from px4fuse.record import lacking
 
 # A boot clock's stamp is no further from its receipt
 OWN_CLOCK_S = 5.0
@@ -198,8 +199,4 @@ def read_truth(
     for track in positions:
         if captured and track.name == captured.name:
             recording.came_from("truth", *track.topics, clock=track.clock)
-    return captured or Unavailable(
-        "ground truth",
-        "neither simulation truth nor motion capture is in the recording",
-        remedies["truth"],
-    )
+    return captured or lacking("truth_not_recorded", remedy=remedies["truth"])

@@ -22,6 +22,7 @@ from px4fuse.readers.layouts import Layout, columns_of
 from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S, intentions, read_aids
 from px4fuse.readers.px4_innovations import innovations_of
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
+from px4fuse.record import lacking
 
 VISION = "vehicle_visual_odometry"
 STATES = 22  # attitude, velocity, position, biases, magnetic fields; the rest is wind and terrain
@@ -33,11 +34,7 @@ HALF = 0.05
 MAX_FLOW_S = 0.5
 # Horizontal aiding besides vision position
 OTHER_AIDING = ("gnss_pos", "gnss_vel", "optical_flow", "ev_vel", "aux_global_position", "airspeed")
-VARIANCES_NOT_LOGGED = Unavailable(
-    "EKF2 variances",
-    "no usable topic estimator_states (estimator_status before v1.12)",
-    "Record with SDLOG_PROFILE bit 0 (default), or EKF2 had not started.",
-)
+VARIANCES_NOT_LOGGED = lacking("variances_not_logged")
 _RESETS: tuple[tuple[Literal["position", "velocity"], str, tuple[str, str, str]], ...] = (
     ("position", "xy_reset_counter", ("delta_north_m", "delta_east_m", "")),
     ("position", "z_reset_counter", ("", "", "delta_down_m")),
@@ -52,19 +49,13 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     if parameters.get("EKF2_EN") == 0.0:
         return Unavailable("EKF2", "EKF2_EN is 0: EKF2 did not run", "Set EKF2_EN to 1.")
     if (group := parameters.get("SYS_MC_EST_GROUP", 2.0)) != 2.0:
-        return Unavailable(
-            "EKF2",
-            f"SYS_MC_EST_GROUP is {group:.0f}: another estimator ran",
-            "Set SYS_MC_EST_GROUP to 2.",
-        )
+        return lacking("other_estimator", group=group)
     local = topics.read(px4.LOCAL_POSITION)
     if topics.find(px4.LOCAL_POSITION) is None:
         return Unavailable("EKF2", "no topic vehicle_local_position", px4.DEFAULT_PROFILE)
     state = local[Columns.STATE].dropna()
     if state.empty:
-        return Unavailable(
-            "EKF2", "vehicle_local_position holds no finite sample", "Wait until EKF2 has started."
-        )
+        return lacking("state_not_finite")
     topics.came_from("ekf2_state", px4.LOCAL_POSITION.topic)
     meant = intentions(topics)
     fusing = _fusing(topics, meant)
@@ -131,11 +122,7 @@ def _read_delayed(topics: Topics, step_s: float) -> pd.DataFrame | Unavailable:
     if not topic:
         return VARIANCES_NOT_LOGGED
     if not attitude:
-        return Unavailable(
-            "EKF2 variances",
-            f"the arrays of {topic} are of lengths unknown here",
-            "Report the PX4 version to the authors of px4fuse.",
-        )
+        return lacking("states_unknown", topic=topic)
     states = [f"states[{i}]" for i in range(STATES)]
     variances = [f"covariances[{i}]" for i in range(STATES - 4 + attitude)]
     raw = topics.of_primary(Layout(topic, {name: name for name in states + variances})).dropna()
@@ -242,11 +229,7 @@ def _fusing(topics: Topics, meant: Mapping[str, pd.Series[float]]) -> pd.DataFra
     """What EKF2 means to fuse of external vision."""
     vision = {"horizontal": "ev_pos", "vertical": "ev_hgt", "yaw": "ev_yaw"}
     if not {*vision.values()} <= meant.keys():
-        return Unavailable(
-            "EKF2 fusion flags",
-            f"neither {px4.STATUS_FLAGS} nor {px4.STATUS} is in the log",
-            px4.DEFAULT_PROFILE,
-        )
+        return lacking("fusion_not_logged")
     frame = pd.DataFrame({group: meant[aid] for group, aid in vision.items()}).dropna()
     topic = px4.STATUS_FLAGS if topics.instances(px4.STATUS_FLAGS) else px4.STATUS
     if frame.empty:

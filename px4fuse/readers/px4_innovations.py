@@ -9,6 +9,7 @@ import pandas as pd
 
 from px4fuse.ekf2_parameters import GNSS_POS, TABLE
 from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Ekf2, Unavailable
+from px4fuse.record import lacking
 
 Innovations = dict[AxisName, pd.DataFrame | Unavailable]
 
@@ -49,9 +50,7 @@ def with_gnss(ekf2: Ekf2, source: Fused = GNSS) -> Ekf2:
         for group, name in (("horizontal", source.horizontal), ("vertical", source.vertical))
         if (log := ekf2.aids.get(name)) is not None and log.meant is not None
     }
-    fusing: pd.DataFrame | Unavailable = Unavailable(
-        "EKF2 fusion flags", "the log does not tell when EKF2 fused GNSS", GNSS.to_log
-    )
+    fusing: pd.DataFrame | Unavailable = lacking("fusion_of_gnss_not_logged", remedy=GNSS.to_log)
     if meant:
         columns = ["horizontal", "vertical", "yaw"]
         fusing = pd.DataFrame(meant).ffill().bfill().reindex(columns=columns, fill_value=0.0)

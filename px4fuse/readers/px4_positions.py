@@ -20,6 +20,7 @@ from px4fuse.readers.px4_ekf2 import target_step_s
 from px4fuse.readers.px4_fixes import left_out_fixes, rebuilt_fixes
 from px4fuse.readers.px4_innovations import fuses
 from px4fuse.readers.ulog_topics import Topics
+from px4fuse.record import lacking
 from px4fuse.recording import ClockMap
 
 MIN_TRACK_SAMPLES = 3
@@ -380,11 +381,7 @@ def read_truth(
         velocity = geo.reindex(columns=Columns.VELOCITY)
         samples = projected(geo, _local_origin(topics)).join(velocity)
         return Truth(px4.LAYOUTS["truth_global"].topic, samples, attitude)
-    return motion_capture(positions, "vehicle_mocap_odometry") or Unavailable(
-        "ground truth",
-        "neither simulation ground truth nor motion capture is in the log",
-        "Real flights have truth only from motion capture (send ATT_POS_MOCAP).",
-    )
+    return motion_capture(positions, "vehicle_mocap_odometry") or lacking("truth_not_logged")
 
 
 def _about_origin(local: pd.DataFrame, there: pd.DataFrame) -> pd.DataFrame:

@@ -12,6 +12,7 @@ from px4fuse.readers.layouts import Layout
 from px4fuse.readers.px4_ekf2 import read_ekf2
 from px4fuse.readers.px4_positions import GPS_3D_FIX, barometer, read_positions, read_truth
 from px4fuse.readers.ulog_topics import Topics, dropped_note, increasing, read_topics
+from px4fuse.record import lacking
 from px4fuse.recording import Unused
 
 ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
@@ -132,11 +133,7 @@ def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavaila
     """Stretches of flight by the land detector, each from take-off to touch-down."""
     detected = topics.read(px4.LAYOUTS["land_detected"], step=True)
     if detected.empty:
-        return Unavailable(
-            "land detector",
-            "no usable topic vehicle_land_detected",
-            "Record with SDLOG_PROFILE bit 0 (default), or give --start and --end.",
-        )
+        return lacking("landing_not_logged")
     topics.came_from("airborne", px4.LAYOUTS["land_detected"].topic)
     return parts.stretches_of_flight(detected["landed"], topics.log.duration_s)
 
