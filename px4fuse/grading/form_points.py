@@ -37,22 +37,10 @@ class _Cure:
     late: bool = False
 
 
-@dataclass(frozen=True)
-class _FormTable:
-    """What ``form_points.toml`` has."""
-
-    weights: dict[str, float]
-    weights_clean: dict[str, float]
-    neighbours: dict[str, frozenset[str]]
-    effects: dict[str, frozenset[str]]
-    shows: dict[str, tuple[str, ...]]
-    cures: tuple[_Cure, ...]
-
-
-TABLE = msgspec.toml.decode(
-    Path(__file__).with_name("form_points.toml").read_bytes(), type=_FormTable
-)
-PARTS = tuple(TABLE.weights)
+TABLE = msgspec.toml.decode(Path(__file__).with_name("form_points.toml").read_bytes())
+CURES = msgspec.convert(TABLE["cures"], tuple[_Cure, ...])
+NEIGHBOURS = msgspec.convert([*TABLE["neighbours"].values()], tuple[frozenset[str], ...])
+PARTS = tuple(TABLE["weights"])
 
 
 @dataclass(frozen=True)
@@ -83,7 +71,7 @@ class FormPoints:
 def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
     """Points for a form about a flight whose truth is known."""
     called_clean = not truth.mistakes and answers.says_none
-    weights = TABLE.weights_clean if called_clean else TABLE.weights
+    weights = TABLE["weights_clean" if called_clean else "weights"]
     shares = dict.fromkeys(PARTS, 0.0)
     matched, false = _matched(answers, truth)
     if truth.mistakes and len(false) < MOST_FALSE:
@@ -146,9 +134,9 @@ def kind_share(kind: str, claimed: str) -> float:
         return 1.0
     if (kind, claimed) == ("r-scale", "ekf2-noise"):
         return SAME_NUMBER
-    if any({kind, claimed} <= group for group in TABLE.neighbours.values()):
+    if any({kind, claimed} <= group for group in NEIGHBOURS):
         return NEIGHBOUR
-    return EFFECT if claimed in TABLE.effects.get(kind, ()) else 0.0
+    return EFFECT if claimed in TABLE["effects"].get(kind, ()) else 0.0
 
 
 def _of_mistakes(matched: list[Match], truth: FormTruth) -> dict[str, float]:
@@ -197,7 +185,7 @@ def when_share(wrong: Wrong, claim: Claim) -> float:
 
 def panels(kind: str) -> list[str]:
     """The panels that can show a kind of mistake."""
-    return [*(panel for panel, kinds in TABLE.shows.items() if kind in kinds), "cover"]
+    return [*(panel for panel, kinds in TABLE["shows"].items() if kind in kinds), "cover"]
 
 
 def cure_share(wrong: Wrong, claim: Claim, truth: FormTruth) -> float:
@@ -243,7 +231,7 @@ def cures(wrong: Wrong, truth: FormTruth) -> tuple[Cure, ...]:
             bounds[row.to] if isinstance(row.to, str) else row.to,
             0.0 if row.late and size <= 0.0 else row.of[wrong.kind],
         )
-        for row in TABLE.cures
+        for row in CURES
         if wrong.kind in row.of
     )
 

@@ -43,7 +43,7 @@ def read_table(file: str, kind: type[Table]) -> Table:
     return msgspec.toml.decode(Path(__file__).with_name(file).read_bytes(), type=kind)
 
 
-def one_by_one(rows: Mapping[str, Layout]) -> dict[str, Layout]:
+def one_by_one(rows: Mapping[str, Any]) -> dict[str, Layout]:
     """Rows as they are written, with every column named."""
     return {
         name: replace(
@@ -52,7 +52,7 @@ def one_by_one(rows: Mapping[str, Layout]) -> dict[str, Layout]:
             optional=columns_of(row.optional),
             scale=columns_of(row.scale),
         )
-        for name, row in rows.items()
+        for name, row in msgspec.convert(rows, dict[str, Layout]).items()
     }
 
 

@@ -87,7 +87,7 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
         clocks=senders.clock_maps(recording, mapped),
         unused=tuple(
             Unused(name, count, reason)
-            for name, reason in messages.TABLE.unused.items()
+            for name, reason in messages.UNUSED.items()
             if (count := int(np.count_nonzero(frames.message_id == MESSAGE_IDS[name])))
         ),
     )
@@ -210,9 +210,9 @@ def _read_modes(recording: Recording) -> tuple[FlightMode, ...] | Unavailable:
         return messages.NO_MODES
     modes = recording.frames.table("HEARTBEAT", rows)["custom_mode"].astype(np.int64)
     names = [
-        messages.TABLE.auto_modes.get(mode >> 24 & 0xFF, "Auto")
+        messages.AUTO_MODES.get(mode >> 24 & 0xFF, "Auto")
         if (main := mode >> 16 & 0xFF) == messages.AUTO_MODE
-        else messages.TABLE.main_modes.get(main, f"mode {main}")
+        else messages.MAIN_MODES.get(main, f"mode {main}")
         for mode in modes.tolist()
     ]
     time_s = recording.receipt_boot_s(rows) - recording.zero_s
@@ -252,7 +252,7 @@ def _describe(
         vehicle = uid if uid.strip("0") else ""
     beats = frames.table("HEARTBEAT", recording.rows("HEARTBEAT"))
     first = next(iter(beats["type"].tolist()), -1)
-    kind = messages.TABLE.vehicle_types.get(first, "vehicle")
+    kind = messages.VEHICLE_TYPES.get(first, "vehicle")
     why = "zero, go back, or lie outside the recording"
     dropped = [dropped_note(n, message, why) for message, n in sorted(recording.dropped.items())]
     return LogInfo(

@@ -5,6 +5,9 @@ A new message with a position is a row of ``mavlink_messages.toml``, and nothing
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
+
+import msgspec
 
 from px4fuse.flight import RECORD_NOT_LOGGED, Unavailable
 from px4fuse.origin import Origin, find_origin
@@ -71,24 +74,16 @@ class FrameOfReference:
     body: bool = False
 
 
-@dataclass(frozen=True)
-class _MessageRows:
-    """What ``mavlink_messages.toml`` has."""
-
-    layouts: dict[str, Layout]
-    positions: dict[str, PositionInput]
-    frames: dict[int, FrameOfReference]
-    autopilots: dict[int, str]
-    vehicle_types: dict[int, str]
-    main_modes: dict[int, str]
-    auto_modes: dict[int, str]
-    remedies: dict[str, dict[str, str]]
-    unused: dict[str, str]
-
-
-TABLE = read_table("mavlink_messages.toml", _MessageRows)
-LAYOUTS = one_by_one(TABLE.layouts)
-POSITION_INPUTS = tuple(replace(row, name=name) for name, row in TABLE.positions.items())
+_ROWS = read_table("mavlink_messages.toml", dict[str, dict[str, Any]])
+LAYOUTS = one_by_one(_ROWS["layouts"])
+_INPUTS = msgspec.convert(_ROWS["positions"], dict[str, PositionInput])
+FRAMES_OF_REFERENCE = msgspec.convert(_ROWS["frames"], dict[int, FrameOfReference], strict=False)
+AUTOPILOTS, VEHICLE_TYPES, MAIN_MODES, AUTO_MODES = (
+    msgspec.convert(_ROWS[name], dict[int, str], strict=False)
+    for name in ("autopilots", "vehicle_types", "main_modes", "auto_modes")
+)
+UNUSED: Mapping[str, str] = _ROWS["unused"]
+POSITION_INPUTS = tuple(replace(row, name=name) for name, row in _INPUTS.items())
 _SCALED_IMU = (replace(LAYOUTS["scaled_imu"], topic=f"SCALED_IMU{n}") for n in ("", "2", "3"))
 IMU = (LAYOUTS["highres_imu"], *_SCALED_IMU)
 # Equally dense ones are taken in this order
@@ -103,5 +98,5 @@ GNSS_INPUTS = (LAYOUTS["gnss"], replace(LAYOUTS["gnss"], topic="GPS2_RAW"))
 def remedies_of(autopilot: str) -> tuple[Mapping[str, str], Unavailable]:
     """What would have recorded each part, and why EKF2 is not replayed; PX4's but for ArduPilot."""
     if autopilot == "ArduPilot":
-        return TABLE.remedies[autopilot], ARDUPILOT_REPLAY
-    return TABLE.remedies["PX4"], RECORD_NOT_LOGGED
+        return _ROWS["remedies"][autopilot], ARDUPILOT_REPLAY
+    return _ROWS["remedies"]["PX4"], RECORD_NOT_LOGGED

@@ -85,7 +85,7 @@ def _read_track(
     frame = "NED"
     if "frame_id" in samples and len(samples):
         # one frame per track: that of the last sample, as PX4 would have used it
-        reference = messages.TABLE.frames.get(int(samples["frame_id"].iloc[-1]))
+        reference = messages.FRAMES_OF_REFERENCE.get(int(samples["frame_id"].iloc[-1]))
         frame = "unknown" if reference is None else reference.name
     if source.drops_covariance:
         samples[Columns.POSITION_VARIANCE + Columns.ROTATION_VARIANCE] = np.nan

@@ -8,6 +8,9 @@ its comments name; those of EKF2's aids stand in ``ekf2_parameters.toml``.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
+
+import msgspec
 
 from px4fuse.ekf2_parameters import AIDS
 from px4fuse.origin import Origin, find_origin
@@ -34,20 +37,12 @@ class TrackSource:
         return find_origin(self.kind, self.passage)
 
 
-@dataclass(frozen=True)
-class _TopicRows:
-    """What ``px4_topics.toml`` has."""
-
-    layouts: dict[str, Layout]
-    tracks: dict[str, TrackSource]
-    frames: dict[str, dict[int, str]]
-    nav_states: dict[int, str]
-    unused: dict[str, str]
-
-
-_ROWS = read_table("px4_topics.toml", _TopicRows)
-LAYOUTS = one_by_one(_ROWS.layouts)
-TRACKS, FRAMES, NAV_STATES, UNUSED = _ROWS.tracks, _ROWS.frames, _ROWS.nav_states, _ROWS.unused
+_ROWS = read_table("px4_topics.toml", dict[str, dict[str, Any]])
+LAYOUTS = one_by_one(_ROWS["layouts"])
+TRACKS = msgspec.convert(_ROWS["tracks"], dict[str, TrackSource])
+FRAMES = msgspec.convert(_ROWS["frames"], dict[str, dict[int, str]], strict=False)
+NAV_STATES = msgspec.convert(_ROWS["nav_states"], dict[int, str], strict=False)
+UNUSED: Mapping[str, str] = _ROWS["unused"]
 IMU, LOCAL_POSITION = LAYOUTS["imu"], LAYOUTS["local_position"]
 HEIGHT_BIAS = {name: LAYOUTS[f"bias_of_{name}"] for name in ("baro_hgt", "gnss_hgt")}
 # What records all that EKF2 and the loggers publish by default
