@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABCMeta
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeAlias, TypeVar, Union
 
 import msgspec
@@ -57,6 +58,23 @@ class Unavailable(Record, frozen=True):
 
     def __str__(self) -> str:
         return f"{self.what}: {self.reason}. {self.remedy}"
+
+
+_LACKING = msgspec.toml.decode(
+    Path(__file__).with_name("lacking.toml").read_bytes(), type=dict[str, Unavailable]
+)
+
+
+def lacking(name: str, /, **told: object) -> Unavailable:
+    """What was looked for and not found, in the words of ``lacking.toml``.
+
+    Examples
+    --------
+    >>> str(lacking("measurements_few", what="tuning", count=3, least=30)).partition(". ")[0]
+    'tuning: 3 measurements are too few (at least 30)'
+    """
+    row = _LACKING[name]
+    return Unavailable(*(text.format(**told) for text in (row.what, row.reason, row.remedy)))
 
 
 T = TypeVar("T")

@@ -18,8 +18,9 @@ from px4fuse.readers.mavlink_clocks import Mapped
 from px4fuse.readers.mavlink_frames import Address
 from px4fuse.readers.mavlink_recording import BOOT_CLOCK, RECEIPT_CLOCK, Recording
 from px4fuse.readers.mavlink_senders import senders_of
-from px4fuse.readers.parts import attitude_of, orientation_of
+from px4fuse.readers.parts import attitude_of, orientation_of, with_nearest
 from px4fuse.readers.px4_positions import Place, projected, unproject
+from px4fuse.record import lacking
 
 # A boot clock's stamp is no further from its receipt
 OWN_CLOCK_S = 5.0
@@ -127,7 +128,7 @@ def _read_gnss(
         return None
     samples = projected(fixes, local_origin(recording))
     accuracy = fixes[["eph_m", "eph_m", "epv_m"]].set_axis(Columns.POSITION_VARIANCE, axis=1) ** 2
-    automatic = bool(recording.read(messages.GLOBAL_STATE)["latitude_deg"].any())
+    automatic = bool(recording.read(messages.LAYOUTS["global_state"])["latitude_deg"].any())
     return px4_positions.make_track(
         layout.topic,
         samples.join(accuracy),
@@ -152,14 +153,12 @@ def local_origin(recording: Recording) -> Place | None:
 
     As it is sent, or else by its global and its local position.
     """
-    sent = recording.read(messages.ORIGIN).dropna()
+    sent = recording.read(messages.LAYOUTS["origin"]).dropna()
     if len(sent):
         return tuple(sent[GLOBAL_COLUMNS].iloc[-1].tolist())
     state = recording.read(messages.STATES[-1])[Columns.POSITION]
-    both = pd.merge_asof(
-        recording.read(messages.GLOBAL_STATE), state, left_index=True, right_index=True,
-        direction="nearest", tolerance=SAME_STATE_S,  # type: ignore[arg-type]
-    ).dropna()  # fmt: skip
+    there = recording.read(messages.LAYOUTS["global_state"])
+    both = with_nearest(there, state, SAME_STATE_S).dropna()
     both = both[both["latitude_deg"] != 0.0]
     if both.empty:
         return None
@@ -198,8 +197,4 @@ def read_truth(
     for track in positions:
         if captured and track.name == captured.name:
             recording.came_from("truth", *track.topics, clock=track.clock)
-    return captured or Unavailable(
-        "ground truth",
-        "neither simulation truth nor motion capture is in the recording",
-        remedies["truth"],
-    )
+    return captured or lacking("truth_not_recorded", remedy=remedies["truth"])

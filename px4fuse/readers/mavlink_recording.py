@@ -176,7 +176,8 @@ def _in_ned(samples: pd.DataFrame) -> pd.DataFrame:
     made[Columns.VELOCITY_VARIANCE + orientation] = np.nan
     used = {*samples["frame_id"].unique(), *samples["child_frame_id"].unique()}
     for number in used & FRAMES_OF_REFERENCE.keys():
-        _, order, signs, turns = FRAMES_OF_REFERENCE[number]
+        frame = FRAMES_OF_REFERENCE[number]
+        order, signs, turns = frame.order, frame.signs, frame.body
         own = samples[(samples["frame_id"] == number) & (not turns)]
         position = own[Columns.POSITION].to_numpy()[:, order]
         variance = own[Columns.POSITION_VARIANCE].to_numpy()[:, order]
