@@ -15,7 +15,7 @@ from px4fuse.arrays import Array, BoolArray
 from px4fuse.ekf2_parameters import AIDS, Aid
 from px4fuse.filter.consistency import SIGMA_OFF, assess, nis_band, verdict_of
 from px4fuse.flight import AidLog, Ekf2, Flight, Unavailable, at_times
-from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
+from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Span, lacking
 
 AidVerdict = Literal[
     "consistent", "variance overstated", "variance understated", "biased", "starved", "idle",
@@ -168,11 +168,7 @@ def judge_aids(flight: Flight) -> dict[str, AidResult] | Unavailable:
     if isinstance(flight.ekf2, Unavailable):
         return flight.ekf2
     if not flight.ekf2.aids:
-        return Unavailable(
-            "aids of EKF2",
-            "no estimator_aid_src topic, estimator_innovations or ekf2_innovations in flight",
-            "Record a ULog with SDLOG_PROFILE bit 0 (default).",
-        )
+        return lacking("aids_not_logged")
     span = flown(flight)
     if isinstance(span, Unavailable):
         return span

@@ -37,6 +37,7 @@ from px4fuse.origin import GIVEN_FILE
 from px4fuse.readers.px4_innovations import fuses, with_gnss
 from px4fuse.readers.px4_positions import THINNED_HZ
 from px4fuse.readers.px4_topics import DEFAULT_PROFILE
+from px4fuse.record import lacking
 from px4fuse.trajectory.rotation import conjugate, interpolate, matrix, multiply
 
 WHAT = "EKF2 replay"
@@ -219,14 +220,12 @@ def prepare(  # noqa: PLR0911, PLR0912 (a reason each)
         return innovations
     modelled = (*OF_GNSS, *([FLOW.label] if len(record.flow) else [])) if gnss else ()
     if more := [one for one in record.other_aiding if one not in modelled]:
-        fused = "GNSS" if gnss else "vision position"
-        said = f"EKF2 fused more than {fused} horizontally ({', '.join(more)})"
-        remedy = "" if gnss else f", {GNSS_POS.switch} 0"
-        return Unavailable(
-            WHAT, said, f"Fly with EKF2_OF_CTRL 0{remedy} and without bit 2 of {EV_POS.switch}."
+        fused, off = ("GNSS", "") if gnss else ("vision position", f", {GNSS_POS.switch} 0")
+        return lacking(
+            "aids_not_modelled", fused=fused, more=", ".join(more), off=off, vision=EV_POS.switch
         )
-    if lacking := _imu_lacks(imu.index.to_numpy()):
-        return lacking
+    if lacks := _imu_lacks(imu.index.to_numpy()):
+        return lacks
     read = read_gnss(flight, ekf2, record) if gnss else read_vision(flight, ekf2, record, attitude)
     if isinstance(read, Unavailable):
         return read
@@ -246,12 +245,8 @@ def prepare(  # noqa: PLR0911, PLR0912 (a reason each)
         carrying_s = np.union1d(carrying_s, flow.index)
     stretches = find_stretches(flight, imu, attitude, ekf2, record, carrying_s, gnss=gnss)
     if not stretches:
-        return Unavailable(
-            WHAT,
-            f"no {MIN_STRETCH_S:g} s in flight of {aid.label.removesuffix(', position')} fused "
-            "without a gap in it or the IMU",
-            "Record without dropouts (a faster SD card, fewer topics), with steady positions.",
-        )
+        fused = aid.label.removesuffix(", position")
+        return lacking("stretch_short", least_s=MIN_STRETCH_S, fused=fused)
     fusing = ekf2.fusing
     if len(flow):
         gate = record.parameters.get(FLOW.gate, FLOW.default_gate)
@@ -291,21 +286,10 @@ def _imu_lacks(time_s: Array) -> Unavailable | None:
     intervals = np.diff(time_s)
     interval = float(np.median(intervals))
     if interval > MAX_IMU_INTERVAL_S:
-        return Unavailable(
-            WHAT,
-            f"the IMU is logged at {1 / interval:.0f} Hz, slower than EKF2 predicts",
-            "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate.",
-        )
+        return lacking("imu_slow", rate_hz=1.0 / interval)
     within = intervals[intervals <= IMU_GAP_S]
     lost = float((np.rint(within / interval) - 1.0).clip(0.0).sum() / len(time_s))
-    if lost <= MAX_LOST_SHARE:
-        return None
-    return Unavailable(
-        WHAT,
-        f"{lost:.0%} of the IMU's samples are missing from the log, one here and there, and with "
-        "them how the vehicle moved",
-        "Use a faster SD card, or log less (SDLOG_PROFILE).",
-    )
+    return None if lost <= MAX_LOST_SHARE else lacking("imu_incomplete", share=lost)
 
 
 def _rules(record: FusionRecord, step_s: float, *, gnss: bool) -> Rules:
@@ -348,11 +332,7 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> Received | Un
     if track is None or track.velocity is None:
         return Unavailable(WHAT, "no vehicle_gps_position in the log", DEFAULT_PROFILE)
     if track.rate_hz < THINNED_HZ:
-        return Unavailable(
-            WHAT,
-            f"the log holds {track.rate_hz:.1f} positions of GNSS a second, fewer than EKF2 fused",
-            "Set bit 1 of SDLOG_PROFILE, which logs them all.",
-        )
+        return lacking("gnss_thinned", rate_hz=track.rate_hz)
     parameters = record.parameters
     switch = int(parameters.get(GNSS_POS.switch, 7.0))
     samples, velocities = track.samples, track.velocity
@@ -424,12 +404,7 @@ def read_vision(
         rotated = bool(int(record.parameters[AID_MASK]) & ROTATE_VISION_BIT)
     if track.frame == "FRD" and rotated:
         if track.orientation is None:
-            return Unavailable(
-                WHAT,
-                f"{track.name} is in a frame of its own (FRD) and gives no orientation by which "
-                "EKF2 turned it north",
-                "Send the position in NED, or with an orientation.",
-            )
+            return lacking("frame_not_turned", name=track.name)
         published, sent = (
             interpolate(stamp, frame.index.to_numpy(), frame[Columns.QUATERNION].to_numpy())
             for frame in (attitude, track.orientation)
@@ -452,8 +427,7 @@ def _besides(
     if (meant := _meant(ekf2, EV_POS)) is None:
         return None
     if fuses_by_mask(record.parameters):
-        said = f"{flight.log.firmware} fuses the movement of vision besides GNSS"
-        return Unavailable(WHAT, said, "Use PX4 v1.14 or newer, or fly with one of the two.")
+        return lacking("vision_moves", firmware=flight.log.firmware)
     seen = read_vision(flight, ekf2, record, attitude)
     if isinstance(seen, Unavailable):
         return seen
@@ -515,8 +489,4 @@ def _source(flight: Flight) -> PositionTrack | Unavailable:
             why.append(
                 f"{track.name} holds one sample in {interval:.2g} s, fewer than EKF2 may have fused"
             )
-    return Unavailable(
-        WHAT,
-        "; ".join(why),
-        "Set SDLOG_PROFILE to 129 (default and vision), or give the MAVLink recording too.",
-    )
+    return lacking("vision_incomplete", why="; ".join(why))

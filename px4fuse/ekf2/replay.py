@@ -17,7 +17,7 @@ from px4fuse.filter import signals
 from px4fuse.filter.heading import heading_rad
 from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Columns, Ekf2, Flight, Truth, Unavailable
 from px4fuse.readers.px4_innovations import along as innovations_along
-from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
+from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Span, lacking
 
 Spans = tuple[Span, ...]
 HORIZONTAL: tuple[AxisName, AxisName] = ("north", "east")
@@ -140,12 +140,8 @@ class Agreement(Record, frozen=True, kw_only=True):
 
     def doubted(self, what: str) -> Unavailable:
         """What stands in for a conclusion where the replay is not good."""
-        return Unavailable(
-            what,
-            f"the model does not reproduce what EKF2 logged: {self.reason}",
-            "Record without dropouts, with SDLOG_PROFILE "
-            + ("3 (default and full rates)." if self.gnss_pos else "129 (default and vision)."),
-        )
+        profile = "3 (default and full rates)" if self.gnss_pos else "129 (default and vision)"
+        return lacking("replay_doubted", what=what, reason=self.reason, profile=profile)
 
 
 class Replayed(Record, frozen=True, kw_only=True, omit_defaults=False):
@@ -239,18 +235,10 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     own = aid_source(replayed_aid(ekf2)) in ekf2.innovation_topics
     log, model = _matched(replay, replay.updates, logged_innovations(ekf2), own=own)
     if len(log) < MIN_SAMPLES:
-        return Unavailable(
-            "EKF2 replay",
-            f"{len(log)} logged innovations to compare with are too few (at least {MIN_SAMPLES})",
-            "Fly longer on external vision, and record with SDLOG_PROFILE bit 0 (default).",
-        )
+        return lacking("compared_few", count=len(log), least=MIN_SAMPLES)
     columns = [f"innovation_{axis}_m" for axis in HORIZONTAL]
     if not (np.ptp(log[columns], axis=0).all() and np.ptp(model[columns], axis=0).all()):
-        return Unavailable(
-            "EKF2 replay",
-            "the innovations do not vary, so that nothing tells whether they agree",
-            "Record a flight with motion and measured positions.",
-        )
+        return lacking("innovations_constant")
     axes: dict[str, AxisAgreement]
     axes = {axis: _axis(axis, log, model, ekf2, replay) for axis in HORIZONTAL}
     north, east = axes["north"], axes["east"]

@@ -30,7 +30,7 @@ from px4fuse.filter.kalman import Replay, state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Columns, Ekf2, Truth, Unavailable
-from px4fuse.record import Count, NotNegative, Record
+from px4fuse.record import Count, NotNegative, Record, lacking
 
 WHAT = "why EKF2 differs"
 OTHER_TIME = Unavailable("RMSE to truth", "the truth is of another time", "Record both together.")
@@ -205,11 +205,7 @@ def walk(
         inside &= (times >= index[0]) & (times <= index[-1])
     times = times[inside]
     if not len(times):
-        return Unavailable(
-            WHAT,
-            "the student's filter and the replay have no time in common",
-            "Analyse the part of the flight in which EKF2 fused the source (--start, --end).",
-        )
+        return lacking("walk_elsewhere", what=WHAT)
     span = float(times[0]), float(times[-1])
     directions = {name: run.axis.direction for name, run in (runs or {}).items()}
     directions = directions or {"north": np.eye(3)[0], "east": np.eye(3)[1]}
@@ -228,7 +224,7 @@ def walk(
     spans = Segment(*span, "").cut(judged)
     coast = _coast(flown, ungated, span, judged)
     truth, found = model.flight.truth, {}
-    lacking = OTHER_TIME if isinstance(truth, Truth) else truth
+    untrue = OTHER_TIME if isinstance(truth, Truth) else truth
     for at, (axis, direction) in enumerate(directions.items()):
         ours = state_at(runs[axis], times) if runs else stages[0][at]
         # ours, after each step, and the logged EKF2, shape (k + 2, 2, n)
@@ -257,7 +253,7 @@ def walk(
             position_left_mean_square_m2=position[-1],
             velocity_left_mean_square_m2_s2=velocity[-1],
             position_rmse_to_truth_m={
-                name: lacking if error is None else error for name, error in ends.items()
+                name: untrue if error is None else error for name, error in ends.items()
             },
             spans_s=spans,
             coast=coast,

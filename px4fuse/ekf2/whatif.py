@@ -32,16 +32,12 @@ from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.heading import heading_rad
 from px4fuse.flight import AxisName, Columns, Ekf2, Flight, Unavailable
-from px4fuse.record import Count, NotNegative, Record, Share
+from px4fuse.record import Count, NotNegative, Record, Share, lacking
 
 WHAT = "EKF2 what-if"
 # Below this share of EKF2's samples in the log, gaps between fusions cannot be told from it
 COMPLETE_SHARE = 0.9
-NO_TRUTH = Unavailable(
-    "RMSE to truth",
-    "the log holds no ground truth",
-    "Record motion capture (ATT_POS_MOCAP) beside the position source, or fly in simulation.",
-)
+NO_TRUTH = lacking("rmse_without_truth")
 # Of a flight on GNSS
 HEADING_FOLLOWS = (
     "The heading follows, with the magnetometer as EKF2 fused it (as flown it is {:.1f}° off the "
@@ -52,10 +48,7 @@ HEADING_STAYS = (
     "fused of a magnetometer, all axes throughout"
 )
 HEIGHT_FOLLOWS, HEIGHT_STAYS = "The height follows too", "The height is EKF2's own as flown"
-OWN_HEADING = Unavailable(
-    "heading error", "on external vision the heading is EKF2's own as flown", "Read it in the log."
-)
-OWN_HEIGHT = Unavailable("height error", "the height is EKF2's own as flown", "Read it in the log.")
+OWN_HEADING, OWN_HEIGHT = lacking("heading_own"), lacking("height_own")
 # What must be left to judge once an aid is taken away
 JUDGED_S = 5.0
 SWEEP_VALUES = 9
@@ -364,11 +357,7 @@ def _of_log(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
     resets = horizontal_resets_s(ekf2) - behind_s
     resets = resets[settled(resets, judged)]
     replayed = int(settled(replay.updates.index, judged).sum())
-    longest: float | Unavailable = Unavailable(
-        "longest time without fusion",
-        f"the log holds {len(used)} of about {replayed} innovations",
-        "Log estimator_aid_src_ev_pos at full rate.",
-    )
+    longest: float | Unavailable = lacking("fusions_few", count=len(used), of=replayed)
     if len(used) > COMPLETE_SHARE * replayed:
         fused = used.index[used["rejected"] == 0].to_numpy()
         longest = _longest(np.concatenate([fused, resets]), judged)
