@@ -27,6 +27,7 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import FILTERS, AxisComparison
 from px4fuse.ekf2.model import replay_settings
 from px4fuse.ekf2.whatif import what_if
+from px4fuse.explore import page as pages
 from px4fuse.explore.page import html_text
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import within
@@ -405,6 +406,13 @@ def test_without_ekf2_truth_and_imu(browser: Browser, tmp_path: Path) -> None:
 # ------------------------------------------------------------------ the command
 
 
+@pytest.fixture
+def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests of where it goes."""
+    monkeypatch.setattr(pages, "html_text", lambda _: "")
+
+
+@pytest.mark.usefixtures("no_page")
 def test_without_a_log_it_is_the_sample_flight(
     sample_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -420,7 +428,7 @@ def test_without_a_log_it_is_the_sample_flight(
     assert (tmp_path / "reports" / "aisle_uwb_start-20_end-40.html").is_file()
 
 
-@pytest.mark.usefixtures("no_drawing")
+@pytest.mark.usefixtures("no_drawing", "no_page")
 def test_open_opens_what_is_looked_at(
     sample_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
