@@ -23,7 +23,7 @@ from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import Flight, Reset, Truth, Unavailable
 
-pytestmark = pytest.mark.usefixtures("replayed_once")
+pytestmark = pytest.mark.usefixtures("quick_filter")
 
 
 @pytest.fixture(scope="module")

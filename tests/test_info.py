@@ -26,6 +26,7 @@ from px4fuse.readers import read_log
 from px4fuse.recording import ClockMap, Dropout, Sender
 
 WIDTH = 80
+pytestmark = pytest.mark.usefixtures("quick_filter")
 
 
 @pytest.fixture(autouse=True)
