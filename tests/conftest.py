@@ -259,5 +259,5 @@ def analysed_once() -> Iterator[None]:
 
 @pytest.fixture
 def quick_filter(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Our filter to 1e-9 in an eighth of the time, see test_likelihood.py; for tests of the rest."""
+    """Our filter to 1e-9 in less time, see test_likelihood.py; for tests of what surrounds it."""
     monkeypatch.setattr(comparison, "replay", quick_replay)

@@ -53,10 +53,6 @@ def chosen(drawn):
     return [CHOICE[typed.partition("=")[0]] for typed in drawn.typed]
 
 
-def size_of(typed):
-    return float(re.search(r"=([-+]?[\d.]+)", typed)[1])
-
-
 @pytest.fixture(autouse=True, scope="module")
 def flown_once():
     """Each flight is made once, but for the test that it is made the same again."""
@@ -133,7 +129,7 @@ class TestDraw:
                 if choice.limit is None:
                     assert text == choice.mistake
                     continue
-                size = size_of(text)
+                size = float(re.search(r"=([-+]?[\d.]+)", text)[1])
                 signs[choice.mistake, size > 0] += 1
                 ratio = choice.limit / abs(size)
                 ratios.append(1.0 / ratio if choice.less_is_plainer else ratio)

@@ -44,12 +44,6 @@ def motion_of(scenario, mistakes=NO_MISTAKES):
     return plan(scenario, mistakes, sensors.stream(scenario, sensors.Stream.WANDER))
 
 
-def position_error(scenario, *texts):
-    """What the source measured beyond the truth at its own true times, and those times."""
-    source = simulate(replace(scenario, ekf2=False), parse(texts)).positions
-    return source.error_m, source.measured_s
-
-
 def stamps_s(simulation):
     source = simulation.positions.topic.fields
     return (source["timestamp_sample"].astype(np.int64) - sensors.START_US) * 1e-6
@@ -256,7 +250,7 @@ class TestMistakes:
         settled = fast & np.roll(fast, 150)  # 3 s, six time constants
         assert np.any(settled)
         assert np.allclose(lag[settled] / along[settled], 0.5, atol=0.02)
-        noisy, _ = position_error(AISLE, "smoothed=1s")
+        noisy = simulate(replace(AISLE, ekf2=False), parse(["smoothed=1s"])).positions.error_m
         assert np.std(noisy[:25]) < 0.07  # on the ground: 0.10 without
 
     def test_no_vvo_leaves_no_source(self):
