@@ -10,12 +10,7 @@ from pyulog import ULog
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.model import (
-    AxisComparison,
-    Comparison,
-    Difference,
-    UnjudgedFilter,
-)
+from px4fuse.comparison.model import AxisComparison, Comparison, Difference, UnjudgedFilter
 from px4fuse.comparison.preparation import prepare
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.settings import Settings

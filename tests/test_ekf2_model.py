@@ -10,19 +10,10 @@ from ekf2_tools import opened, plain_replay, step_matrix, step_noise, step_state
 from exchange import replace
 
 from px4fuse.alignment.joining import join
-from px4fuse.ekf2.model import (
-    Model,
-    delayed_states,
-    open_model,
-    replay_settings,
-    run_variants,
-)
+from px4fuse.ekf2.model import Model, delayed_states, open_model, replay_settings, run_variants
 from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import HORIZONTAL
-from px4fuse.flight import (
-    Flight,
-    Unavailable,
-)
+from px4fuse.flight import Flight, Unavailable
 from px4fuse.origin import RECEIVED
 from px4fuse.readers import read_log
 
@@ -187,8 +178,7 @@ def test_a_mavlink_recording_gives_the_samples_that_the_log_lacks(sample_flight:
     recording = read_log(path)
     assert "estimator_states" in unavailable(recording)
     log = replace(
-        sample_flight,
-        positions=tuple(t for t in sample_flight.positions if t.origin != RECEIVED),
+        sample_flight, positions=tuple(t for t in sample_flight.positions if t.origin != RECEIVED)
     )
     made = opened(join(log, recording))
     assert made.flown.source == "VISION_POSITION_ESTIMATE"
@@ -214,9 +204,7 @@ def test_a_bias_that_ekf2_does_not_learn_is_no_trouble(sample_flight: Flight) ->
     fixed.loc[:, [name for name in fixed if str(name).endswith("m2_s4")]] = 0.0
     made = opened(
         with_record(
-            sample_flight,
-            delayed=fixed,
-            parameters={**record.parameters, "EKF2_ACC_B_NOISE": 0.0},
+            sample_flight, delayed=fixed, parameters={**record.parameters, "EKF2_ACC_B_NOISE": 0.0}
         )
     )
     assert np.isfinite(made.flown.published.to_numpy()).all()

@@ -31,13 +31,7 @@ from px4fuse.ekf2.walk import (
     on_the_way,
     walk,
 )
-from px4fuse.ekf2.whatif import (
-    AxisSummary,
-    Summary,
-    _longest,
-    _notes,
-    what_if,
-)
+from px4fuse.ekf2.whatif import AxisSummary, Summary, _longest, _notes, what_if
 from px4fuse.ekf2_parameters import GNSS_POS
 from px4fuse.filter.kalman import Replay
 from px4fuse.filter.settings import Settings

@@ -134,8 +134,7 @@ def test_a_long_flight_whose_positions_are_thinned_still_has_parts() -> None:
 
 
 @pytest.mark.parametrize(
-    ("spread", "drift_p", "drifts"),
-    [(1.0, 0.0, True), (0.999, 0.0, False), (9.0, 1.0, False)],
+    ("spread", "drift_p", "drifts"), [(1.0, 0.0, True), (0.999, 0.0, False), (9.0, 1.0, False)]
 )
 def test_a_heading_drifts_where_it_turned_far_enough(
     spread: float, drift_p: float, drifts: bool

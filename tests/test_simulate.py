@@ -216,8 +216,7 @@ class TestMistakes:
         assert np.allclose(told["outlier_time_s"], stamps_s(simulation)[outlier])
 
     @pytest.mark.parametrize(
-        ("text", "start", "end"),
-        [("dropout=6s,12s", 12.0, 18.0), ("dropout=6", None, None)],
+        ("text", "start", "end"), [("dropout=6s,12s", 12.0, 18.0), ("dropout=6", None, None)]
     )
     def test_dropout_silences_the_source(self, text, start, end):
         gone = simulate(UNFILTERED, parse([text]))

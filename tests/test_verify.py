@@ -284,8 +284,7 @@ def test_changed_results(aisle: Base, name: str, monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize(
-    "path",
-    [("student", "name"), ("student", "notes"), ("provenance", "libraries", "matplotlib")],
+    "path", [("student", "name"), ("student", "notes"), ("provenance", "libraries", "matplotlib")]
 )
 def test_what_is_printed_from_the_record(loop: Base, path: tuple[str, ...]) -> None:
     results = copy.deepcopy(loop.results)
