@@ -32,6 +32,7 @@ from ulog_tools import Log
 
 import px4fuse
 from px4fuse import analysis
+from px4fuse.assignment import truth
 from px4fuse.comparison import comparison
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.filter.quick import quick_replay
@@ -260,4 +261,5 @@ def analysed_once() -> Iterator[None]:
 @pytest.fixture
 def quick_filter(monkeypatch: pytest.MonkeyPatch) -> None:
     """Our filter to 1e-9 in less time, see test_likelihood.py; for tests of what surrounds it."""
-    monkeypatch.setattr(comparison, "replay", quick_replay)
+    for module in (comparison, truth):
+        monkeypatch.setattr(module, "replay", quick_replay)

@@ -28,6 +28,7 @@ from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.simulation.mistakes import parse
 
+pytestmark = pytest.mark.usefixtures("quick_filter")
 SECRET = b"a secret for tests"
 # What the secret gives student s1: seed, noise and heading, and the mistakes
 PINNED = ((759547191, 0.109, -14.4), ("clock-jump=53ms", "ekf2-off"))
