@@ -13,7 +13,6 @@ from __future__ import annotations
 import gc
 import io
 import os
-import pickle
 import signal
 from collections.abc import Callable, Iterator
 from functools import lru_cache
@@ -33,12 +32,10 @@ from ulog_tools import Log
 
 import px4fuse
 from px4fuse import analysis
+from px4fuse.assignment import truth
 from px4fuse.comparison import comparison
 from px4fuse.ekf2.model import Model, open_model
-from px4fuse.filter import kalman
-from px4fuse.filter.kalman import Replay
-from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis
+from px4fuse.filter.quick import quick_replay
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.notebook import commands
 from px4fuse.readers import read_log
@@ -261,16 +258,8 @@ def analysed_once() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="module")
-def replayed_once() -> Iterator[None]:
-    """The same axis runs through our filter once: of made flights often EKF2 alone is another."""
-    kept: dict[bytes, Replay] = {}
-
-    def once(axis: Axis, chosen: Settings) -> Replay:
-        known = pickle.dumps((axis, chosen))
-        kept[known] = kept.get(known) or kalman.replay(axis, chosen)
-        return kept[known]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(comparison, "replay", once)
-        yield
+@pytest.fixture
+def quick_filter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Our filter to 1e-9 in less time, see test_likelihood.py; for tests of what surrounds it."""
+    for module in (comparison, truth):
+        monkeypatch.setattr(module, "replay", quick_replay)

@@ -56,8 +56,7 @@ def axe() -> str:
 def serious(browser: Browser) -> list[Any]:
     """What axe-core, which is in the page, finds that shuts somebody out."""
     found = ask(
-        browser,
-        "axe.run().then((r) => r.violations.map((v) => [v.impact, v.id, v.nodes[0].html]))",
+        browser, "axe.run().then((r) => r.violations.map((v) => [v.impact, v.id, v.nodes[0].html]))"
     )
     return [one for one in found if one[0] in ("serious", "critical")]
 

@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import re
+import secrets
 import stat
 from collections import Counter
 
@@ -27,6 +28,7 @@ from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.simulation.mistakes import parse
 
+pytestmark = pytest.mark.usefixtures("quick_filter")
 SECRET = b"a secret for tests"
 # What the secret gives student s1: seed, noise and heading, and the mistakes
 PINNED = ((759547191, 0.109, -14.4), ("clock-jump=53ms", "ekf2-off"))
@@ -50,10 +52,6 @@ CHOICE = {choice.mistake: choice for kind in CHOICES.values() for choice in kind
 
 def chosen(drawn):
     return [CHOICE[typed.partition("=")[0]] for typed in drawn.typed]
-
-
-def size_of(typed):
-    return float(re.search(r"=([-+]?[\d.]+)", typed)[1])
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -80,7 +78,8 @@ def files(folder):
 
 class TestDraw:
     def test_same_secret_and_id_same_bytes(self):
-        assert fly(SECRET, Person("s1"), "aisle") == fly(SECRET, Person("s1"), "aisle")
+        given = SECRET, CLASS[0], "aisle", 2, True
+        assert fly(*given) == assignment.fly(*given)
         # as a platform may spell it in another export
         assert draw(SECRET, "S1 ", "aisle") == draw(SECRET, "s1", "aisle")
 
@@ -131,7 +130,7 @@ class TestDraw:
                 if choice.limit is None:
                     assert text == choice.mistake
                     continue
-                size = size_of(text)
+                size = float(re.search(r"=([-+]?[\d.]+)", text)[1])
                 signs[choice.mistake, size > 0] += 1
                 ratio = choice.limit / abs(size)
                 ratios.append(1.0 / ratio if choice.less_is_plainer else ratio)
@@ -182,7 +181,7 @@ class TestDraw:
     ("kind", "number", "count"), [("aisle", 0, 2), ("aisle", 1, 2), ("aisle", 2, 1), ("loop", 0, 1)]
 )
 def test_what_the_key_expects_is_found_in_the_log(tmp_path, kind, number, count):
-    log, answer = assignment.fly(SECRET, CLASS[number], kind, count)
+    log, answer = assignment.fly(SECRET, CLASS[number], kind, count, True)
     path = tmp_path / answer.file
     path.write_bytes(log)
     flight = px4fuse.read_log(path)
@@ -201,9 +200,16 @@ def test_what_the_key_expects_is_found_in_the_log(tmp_path, kind, number, count)
 
 
 class TestAssign:
+    """Two mistakes each, so that the flights are the same everywhere and are made once."""
+
+    @pytest.fixture(autouse=True)
+    def one_secret_is_made_up(self, monkeypatch):
+        made_up = iter([SECRET.decode()])
+        monkeypatch.setattr(secrets, "token_urlsafe", lambda _: next(made_up))
+
     def test_logs_and_key(self, tmp_path):
         folder, key_file = tmp_path / "a" / "flights", tmp_path / "key.json"
-        made, written = assign(CLASS, folder, key_file, SECRET, "aisle", 1)
+        made, written = assign(CLASS, folder, key_file, SECRET, "aisle", 2)
         key = read_key(key_file)
         assert (key, written) == (made, 3)
         assert not key.secret
@@ -212,68 +218,69 @@ class TestAssign:
         assert set(logs) == {f"s0{n}.{end}" for n in range(3) for end in ("ulg", "answers.toml")}
         for answer in key.answers:
             assert hashlib.sha256(logs[answer.file]).hexdigest() == answer.sha256
-            assert len(answer.mistakes) == 1
+            assert len(answer.mistakes) == 2
             assert answer.truth["sigma_z_m"] == answer.scenario["sigma_uwb_m"]
         assert len(set(logs.values())) == 6
         form = read_answers(folder / "s00.answers.toml")
         assert form == Answers(log_sha256=key.answers[0].sha256, quantities=(None,) * 3)
-        assert len(key.answers[0].form.mistakes) == 1
+        assert len(key.answers[0].form.mistakes) == 2
         if os.name == "posix":
             assert stat.S_IMODE(key_file.stat().st_mode) == 0o600
 
     def test_second_run_changes_nothing_and_may_add_students(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
-        assert assign(CLASS[:2], folder, key_file, None, "aisle")[0].secret
+        assert assign(CLASS[:2], folder, key_file, None, "aisle", 2)[0].secret
         before = files(folder) | {"key": key_file.read_bytes()}
-        assert assign(CLASS[:2], folder, key_file, None, "aisle")[1] == 0
+        assert assign(CLASS[:2], folder, key_file, None, "aisle", 2)[1] == 0
         assert files(folder) | {"key": key_file.read_bytes()} == before
-        key, written = assign(CLASS, folder, key_file, None, "aisle")
+        key, written = assign(CLASS, folder, key_file, None, "aisle", 2)
         assert written == 1
         assert files(folder).items() >= {k: v for k, v in before.items() if k != "key"}.items()
         # the secret that was made up serves as one that is given
-        assign(CLASS, folder, key_file, key.secret.encode(), "aisle")
+        assign(CLASS, folder, key_file, key.secret.encode(), "aisle", 2)
         assert read_key(key_file).secret == key.secret
 
     def test_other_flights_and_keys_are_not_replaced(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
-        assign(CLASS[:2], folder, key_file, SECRET, "aisle")
+        assign(CLASS[:2], folder, key_file, SECRET, "aisle", 2)
         before = files(folder) | {"key": key_file.read_bytes()}
         for students, secret in ((CLASS, b"another secret"), (CLASS[1:], SECRET)):
             with pytest.raises(OutputError, match="was not overwritten"):
-                assign(students, folder, key_file, secret, "aisle")
+                assign(students, folder, key_file, secret, "aisle", 2)
         with pytest.raises(OutputError, match="other flights"):
-            assign(CLASS[:2], tmp_path / "new", key_file, b"another secret", "aisle")
+            assign(CLASS[:2], tmp_path / "new", key_file, b"another secret", "aisle", 2)
         assert not (tmp_path / "new").exists()
         key_file.write_text("{}", encoding="utf-8")
         with pytest.raises(SettingsError, match="not an answer key"):
-            assign(CLASS[:2], folder, key_file, SECRET, "aisle")
+            assign(CLASS[:2], folder, key_file, SECRET, "aisle", 2)
         assert files(folder) == {k: v for k, v in before.items() if k != "key"}
 
     def test_an_interrupted_run_can_go_on(self, tmp_path, monkeypatch):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
+        flown = assignment.fly
 
         def stop_at_last(*given):
             if given[1] == CLASS[-1]:
                 raise KeyboardInterrupt
-            return fly(*given)
+            return flown(*given)
 
         monkeypatch.setattr(assignment, "fly", stop_at_last)
         with pytest.raises(KeyboardInterrupt):
-            assign(CLASS, folder, key_file, None, "aisle")
+            assign(CLASS, folder, key_file, None, "aisle", 2)
         monkeypatch.undo()
         assert len(read_key(key_file).answers) == 2
-        assert assign(CLASS, folder, key_file, None, "aisle") == (read_key(key_file), 1)
+        assert assign(CLASS, folder, key_file, None, "aisle", 2) == (read_key(key_file), 1)
 
     def test_what_cannot_be_written_leaves_nothing(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
         key_file.mkdir()
         with pytest.raises(SettingsError):
-            assign(CLASS[:1], folder, key_file, SECRET, "aisle")
+            assign(CLASS[:1], folder, key_file, SECRET, "aisle", 2)
         blocked = tmp_path / "file"
         blocked.write_bytes(b"")
         for where, key in ((folder, blocked / "key.json"), (blocked, tmp_path / "k.json")):
             with pytest.raises(OutputError, match="cannot be written"):
-                assign(CLASS[:1], where, key, SECRET, "aisle")
+                assign(CLASS[:1], where, key, SECRET, "aisle", 2)
         assert not any(path.is_file() for path in folder.rglob("*"))
         assert not (tmp_path / "k.json").exists()
 
@@ -293,7 +300,7 @@ class TestAssign:
 
 class TestKey:
     def key(self):
-        answers = (assignment.fly(SECRET, one, "aisle", 2)[1] for one in CLASS[:2])
+        answers = (assignment.fly(SECRET, one, "aisle", 2, True)[1] for one in CLASS[:2])
         return AnswerKey("aisle", tuple(answers), "s")
 
     def test_round_trip(self, tmp_path):

@@ -242,10 +242,6 @@ HEADS = ("Student", "Id", "Status", "Points", "Handed in", "Flags", "Pages", "No
          "mean NIS", MARKUP)  # fmt: skip
 
 
-def head(title: str) -> str:
-    return f".list > thead th:nth-child({HEADS.index(title) + 1}) button"
-
-
 def test_filters_by_text_and_status_with_a_count(page: Browser) -> None:
     count = "document.querySelector('.count').textContent"
     assert page.ask(count) == f"Showing {len(CLASS)} of {len(CLASS)}"
@@ -283,7 +279,7 @@ def test_a_row_unfolds_with_all_its_pages(page: Browser) -> None:
         "Page 2 of the report of Zoë, drawn again from the log"
     )
     # It moves with its row, and hides with it
-    page.click(head("Points"))
+    page.click(f".list > thead th:nth-child({HEADS.index('Points') + 1}) button")
     before = "document.querySelector('.more').previousElementSibling.querySelector('.name')"
     assert page.ask(f"{before}.textContent") == "Zoë"
     page.click("#text")

@@ -138,8 +138,7 @@ def test_without_the_samples_it_says_what_to_install(monkeypatch, capsys) -> Non
 
 
 @pytest.mark.parametrize(
-    ("words", "loaded"),
-    [(("info", "{log}"), False), (("extract", "{log}", "-o", "{out}"), True)],
+    ("words", "loaded"), [(("info", "{log}"), False), (("extract", "{log}", "-o", "{out}"), True)]
 )
 def test_an_extra_costs_nothing_where_it_is_not_used(
     words: tuple[str, ...], loaded: bool, sample_log: Path, tmp_path: Path

@@ -10,30 +10,18 @@ from pyulog import ULog
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.model import (
-    AxisComparison,
-    Comparison,
-    Difference,
-    FilterSummary,
-    UnjudgedFilter,
-)
+from px4fuse.comparison.model import AxisComparison, Comparison, Difference, UnjudgedFilter
 from px4fuse.comparison.preparation import prepare
 from px4fuse.errors import MissingDataError, SettingsError
-from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import Flight, Reset, Truth, Unavailable
 
-pytestmark = pytest.mark.usefixtures("replayed_once")
+pytestmark = pytest.mark.usefixtures("quick_filter")
 
 
 @pytest.fixture(scope="module")
 def made() -> Comparison:
     return compare(aisle_flight())
-
-
-def consistency(summary: FilterSummary | Unavailable) -> Consistency:
-    assert isinstance(summary, FilterSummary)
-    return summary
 
 
 def rms(values: Array) -> float:
@@ -73,7 +61,7 @@ class TestSample:
         """PX4 publishes innov² / (gate² S): the sign is flipped, the size must not change."""
         segment = sample.segment
         for name in ("north", "east"):
-            kf, ekf2 = (consistency(sample[name].filters[who]) for who in ("kf", "ekf2"))
+            kf, ekf2 = (sample[name].filters[who] for who in ("kf", "ekf2"))
             logged = sample_flight.ekf2.innovations[name].loc[segment.start_s : segment.end_s]
             assert ekf2.count == len(logged)
             assert ekf2.nis_mean == pytest.approx(logged["test_ratio"].mean() * 5.0**2, rel=1e-4)
@@ -198,7 +186,7 @@ class TestMadeFlight:
         for who in ("kf", "ekf2"):
             ours, theirs = aisle.filters[who], same.filters[who]
             assert asdict(ours.truth) == pytest.approx(asdict(theirs.truth))
-            assert consistency(ours).nis_mean == pytest.approx(consistency(theirs).nis_mean)
+            assert ours.nis_mean == pytest.approx(theirs.nis_mean)
             assert ours.sigma_p_after_update_m == pytest.approx(theirs.sigma_p_after_update_m)
 
     def test_settings_and_segment_reach_the_replay(self, made: Comparison) -> None:
@@ -217,7 +205,7 @@ class TestMissingParts:
         assert comparison.horizontal.get("kf").verdict == "consistent"
         assert comparison.horizontal.get("ekf2") is None
         for result in comparison.axes.values():
-            assert consistency(result.filters["kf"]).count == 600
+            assert result.filters["kf"].count == 600
             assert result.filters["kf"].truth.position_rmse_m < 0.09
             ekf2 = result.filters["ekf2"]
             assert isinstance(ekf2, UnjudgedFilter)
@@ -236,7 +224,7 @@ class TestMissingParts:
         assert any("constant velocity was used" in note for note in comparison.notes)
         assert isinstance(comparison.lines[0].acceleration, Unavailable)
         assert comparison.lines[0].acceleration in comparison.missing
-        assert consistency(comparison.main.filters["kf"]).count == 600
+        assert comparison.main.filters["kf"].count == 600
         with pytest.raises(SettingsError, match="`input` imu"):
             prepare(flight, input_required=True)
 

@@ -21,9 +21,7 @@ def white(seed: int, count: int = 200) -> NDArray[np.float64]:
 
 
 def assessed(nu: NDArray[np.float64], s: float | NDArray[np.float64] = 1.0) -> Consistency:
-    result = assess(nu, np.broadcast_to(s, nu.shape).astype(float))
-    assert isinstance(result, Consistency)
-    return result
+    return assess(nu, np.broadcast_to(s, nu.shape).astype(float))
 
 
 def test_the_band_holds_95_percent_of_chi_square() -> None:

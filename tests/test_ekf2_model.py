@@ -10,32 +10,16 @@ from ekf2_tools import opened, plain_replay, step_matrix, step_noise, step_state
 from exchange import replace
 
 from px4fuse.alignment.joining import join
-from px4fuse.ekf2.model import (
-    Model,
-    delayed_states,
-    open_model,
-    replay_settings,
-    run_variants,
-)
+from px4fuse.ekf2.model import Model, delayed_states, open_model, replay_settings, run_variants
 from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import HORIZONTAL
-from px4fuse.flight import (
-    Ekf2,
-    Flight,
-    FusionRecord,
-    Unavailable,
-)
+from px4fuse.flight import Flight, Unavailable
 from px4fuse.origin import RECEIVED
 from px4fuse.readers import read_log
 
 
-def of(flight: Flight) -> tuple[Ekf2, FusionRecord]:
-    assert isinstance(flight.ekf2.record, FusionRecord)
-    return flight.ekf2, flight.ekf2.record
-
-
 def with_record(flight: Flight, **changes: object) -> Flight:
-    ekf2, record = of(flight)
+    ekf2, record = flight.ekf2, flight.ekf2.record
     return replace(flight, ekf2=replace(ekf2, record=replace(record, **changes)))
 
 
@@ -169,7 +153,7 @@ def unavailable(flight: Flight) -> str:
 
 
 def test_a_log_that_cannot_carry_the_model_says_why(sample_flight: Flight) -> None:
-    ekf2, _ = of(sample_flight)
+    ekf2 = sample_flight.ekf2
     missing = Unavailable("IMU", "no topic sensor_combined", "Record it.")
     assert "sensor_combined" in unavailable(replace(sample_flight, imu=missing))
     assert "GPS" in unavailable(with_record(sample_flight, other_aiding=("GPS",)))
@@ -194,8 +178,7 @@ def test_a_mavlink_recording_gives_the_samples_that_the_log_lacks(sample_flight:
     recording = read_log(path)
     assert "estimator_states" in unavailable(recording)
     log = replace(
-        sample_flight,
-        positions=tuple(t for t in sample_flight.positions if t.origin != RECEIVED),
+        sample_flight, positions=tuple(t for t in sample_flight.positions if t.origin != RECEIVED)
     )
     made = opened(join(log, recording))
     assert made.flown.source == "VISION_POSITION_ESTIMATE"
@@ -204,7 +187,7 @@ def test_a_mavlink_recording_gives_the_samples_that_the_log_lacks(sample_flight:
 
 
 def test_height_of_vision_counts_where_ekf2_fused_it(model: Model, sample_flight: Flight) -> None:
-    ekf2, _ = of(sample_flight)
+    ekf2 = sample_flight.ekf2
     samples = vision_of(sample_flight).copy()
     samples["down_m"] += 0.7
     fused = replace(sample_flight, ekf2=replace(ekf2, fusing=ekf2.fusing.assign(vertical=1.0)))
@@ -216,14 +199,12 @@ def test_height_of_vision_counts_where_ekf2_fused_it(model: Model, sample_flight
 
 
 def test_a_bias_that_ekf2_does_not_learn_is_no_trouble(sample_flight: Flight) -> None:
-    _, record = of(sample_flight)
+    record = sample_flight.ekf2.record
     fixed = record.delayed.copy()
     fixed.loc[:, [name for name in fixed if str(name).endswith("m2_s4")]] = 0.0
     made = opened(
         with_record(
-            sample_flight,
-            delayed=fixed,
-            parameters={**record.parameters, "EKF2_ACC_B_NOISE": 0.0},
+            sample_flight, delayed=fixed, parameters={**record.parameters, "EKF2_ACC_B_NOISE": 0.0}
         )
     )
     assert np.isfinite(made.flown.published.to_numpy()).all()

@@ -6,25 +6,13 @@ from scipy.spatial.transform import Rotation
 from ulog_tools import GENERATIONS, covariances, make_log, stamps, topic
 
 from px4fuse.alignment.joining import later
-from px4fuse.flight import Columns, Ekf2, Unavailable
+from px4fuse.flight import Columns, Unavailable
 from px4fuse.readers import read_log
 
 QUATERNION = Rotation.from_euler("ZYX", [40.0, 10.0, -5.0], degrees=True).as_quat(scalar_first=True)
 BIAS = np.array([0.15, -0.10, 0.08])
 STATES = [*QUATERNION, 0.5, -0.2, 0.1, 3.0, 4.0, -1.5, 1e-4, 2e-4, 3e-4, 1e-3, 2e-3, 3e-3,
           0.21, 0.01, 0.43, 0.02, -0.03, 0.04]  # fmt: skip
-
-
-@pytest.fixture
-def record_of(tmp_path):
-    """Write a made log and read the record of EKF2's filter."""
-
-    def read(log):
-        ekf2 = read_log(log.write(tmp_path / "made.ulg")).ekf2
-        assert isinstance(ekf2, Ekf2)
-        return ekf2
-
-    return read
 
 
 def made_log(generation, position=True):
@@ -38,8 +26,8 @@ def made_log(generation, position=True):
 
 
 @pytest.mark.parametrize("generation", ["v1.12", "v1.14", "v1.15", "v1.16"])
-def test_states_and_variances_have_one_layout(record_of, generation):
-    ekf2 = record_of(made_log(generation, position=generation != "v1.16"))
+def test_states_and_variances_have_one_layout(read, generation):
+    ekf2 = read(made_log(generation, position=generation != "v1.16")).ekf2
     record = ekf2.record
     assert list(record.delayed) == Columns.DELAYED_STATE + Columns.DELAYED_VARIANCE
     row = record.delayed.iloc[3]
@@ -68,11 +56,11 @@ def test_states_and_variances_have_one_layout(record_of, generation):
     assert row[Columns.DELAYED_VARIANCE[15:]].to_numpy() == pytest.approx(of_fields)
 
 
-def test_attitude_variance_of_a_quaternion_is_that_of_many_draws(record_of):
+def test_attitude_variance_of_a_quaternion_is_that_of_many_draws(read):
     log = made_log("v1.14")
     variance = np.array([1e-5, 4e-5, 2e-5, 3e-5])
     log["estimator_states"]["covariances"][:, :4] = variance
-    found = record_of(log).record.delayed.iloc[0][Columns.DELAYED_VARIANCE[:3]].to_numpy()
+    found = read(log).ekf2.record.delayed.iloc[0][Columns.DELAYED_VARIANCE[:3]].to_numpy()
     rng = np.random.default_rng(7)
     drawn = QUATERNION + rng.normal(0.0, np.sqrt(variance), (200_000, 4))
     truth = Rotation.from_quat(QUATERNION, scalar_first=True)
@@ -80,9 +68,9 @@ def test_attitude_variance_of_a_quaternion_is_that_of_many_draws(record_of):
     assert found == pytest.approx(errors.var(axis=0), rel=0.02)
 
 
-def test_every_ekf2_parameter_is_kept_and_results_hold_theirs_only(record_of, tmp_path):
+def test_every_ekf2_parameter_is_kept_and_results_hold_theirs_only(read, tmp_path):
     log = made_log("v1.16")
-    assert record_of(log).record.parameters == pytest.approx(
+    assert read(log).ekf2.record.parameters == pytest.approx(
         {name: value for name, value in log.parameters.items() if name.startswith("EKF2_")}
     )
     assert "EKF2_TAU_POS" not in read_log(log.write(tmp_path / "again.ulg")).log.parameters
@@ -96,80 +84,80 @@ def test_every_ekf2_parameter_is_kept_and_results_hold_theirs_only(record_of, tm
         ("cs_ev_vel", ("vision velocity",)),
     ],
 )
-def test_other_horizontal_aiding_is_named(record_of, flag, names):
+def test_other_horizontal_aiding_is_named(read, flag, names):
     log = made_log("v1.16")
     flags = log["estimator_status_flags"]
     used = np.zeros(len(flags["timestamp"]), np.bool_)
     flags[flag] = used.copy()
-    assert record_of(log).record.other_aiding == ()
+    assert read(log).ekf2.record.other_aiding == ()
     used[4] = True
     flags[flag] = used
-    assert record_of(log).record.other_aiding == names
+    assert read(log).ekf2.record.other_aiding == names
 
 
-def test_the_age_of_vision_is_publication_minus_measurement(record_of):
+def test_the_age_of_vision_is_publication_minus_measurement(read):
     log = made_log("v1.16")
     fields = log["vehicle_visual_odometry"]
-    age = record_of(log).record.vision_age_s
+    age = read(log).ekf2.record.vision_age_s
     expected = (fields["timestamp"].astype(float) - fields["timestamp_sample"]) * 1e-6
     assert age.to_numpy() == pytest.approx(expected)
-    moved = later(record_of(log).record, 2.5)
+    moved = later(read(log).ekf2.record, 2.5)
     assert moved.vision_age_s.index[0] == pytest.approx(age.index[0] + 2.5)
-    assert moved.delayed.index[0] == pytest.approx(record_of(log).record.delayed.index[0] + 2.5)
+    assert moved.delayed.index[0] == pytest.approx(read(log).ekf2.record.delayed.index[0] + 2.5)
     assert moved.vision_age_s.to_numpy() == pytest.approx(age.to_numpy())
 
 
-def test_without_quaternions_or_topic_there_is_no_record(record_of):
-    assert isinstance(record_of(make_log("v1.16")).record, Unavailable)  # quaternions of zero
-    assert isinstance(record_of(made_log("v1.16").drop("estimator_states")).record, Unavailable)
-    assert isinstance(record_of(make_log("v1.11")).record, Unavailable)
+def test_without_quaternions_or_topic_there_is_no_record(read):
+    assert isinstance(read(make_log("v1.16")).ekf2.record, Unavailable)  # quaternions of zero
+    assert isinstance(read(made_log("v1.16").drop("estimator_states")).ekf2.record, Unavailable)
+    assert isinstance(read(make_log("v1.11")).ekf2.record, Unavailable)
 
 
 STEP_S = 0.010  # of EKF2 at the made flight's 100 Hz
 
 
 @pytest.mark.parametrize("generation", GENERATIONS)
-def test_bias_is_in_m_s2_whatever_the_state_vector_holds(record_of, generation):
+def test_bias_is_in_m_s2_whatever_the_state_vector_holds(read, generation):
     log = make_log(generation)
     number = int(generation.removeprefix("v1."))
     holder = log["estimator_states" if number >= 12 else "estimator_status"]
     holder["states"][:, 13:16] = BIAS * (STEP_S if number < 15 else 1.0)
-    ekf2 = record_of(log)
+    ekf2 = read(log).ekf2
     assert ekf2.step_s == pytest.approx(STEP_S)
     np.testing.assert_allclose(
         ekf2.accelerometer_bias, np.tile(BIAS, (len(ekf2.accelerometer_bias), 1)), rtol=1e-5
     )
 
 
-def test_its_own_topic_is_preferred(record_of):
+def test_its_own_topic_is_preferred(read):
     log = make_log("v1.14")
     own = {"accel_bias": np.tile(BIAS, (10, 1))}
     log.add(topic("estimator_sensor_bias", stamps(10.0, 1.0), own, sampled=True))
-    bias = record_of(log).accelerometer_bias
+    bias = read(log).ekf2.accelerometer_bias
     np.testing.assert_allclose(bias.iloc[0], BIAS, rtol=1e-6)
     assert bias.index[1] == pytest.approx(1.0)
 
 
-def test_step_is_a_whole_number_of_imu_samples(record_of):
+def test_step_is_a_whole_number_of_imu_samples(read):
     log = make_log("v1.14", imu_hz=1.0 / 0.004)
     log.parameters["EKF2_PREDICT_US"] = 10_000
     log["estimator_states"]["states"][:, 13:16] = BIAS * 0.012
-    ekf2 = record_of(log)
+    ekf2 = read(log).ekf2
     assert ekf2.step_s == pytest.approx(0.012)  # 2.5 samples round to 3: roundf, away from 0
     np.testing.assert_allclose(ekf2.accelerometer_bias.iloc[0], BIAS, rtol=1e-5)
     imu = log["sensor_combined"]
     for name in imu:
         imu[name] = imu[name][:1]
-    assert record_of(log).step_s == STEP_S
+    assert read(log).ekf2.step_s == STEP_S
 
 
-def test_horizon_is_the_age_at_publication_where_that_is_told(record_of):
+def test_horizon_is_the_age_at_publication_where_that_is_told(read):
     log = make_log("v1.16")
-    assert record_of(log).horizon_s == pytest.approx(0.060)
+    assert read(log).ekf2.horizon_s == pytest.approx(0.060)
     states = log["estimator_states"]
     states["timestamp_sample"] = states["timestamp"].copy()
-    assert isinstance(record_of(log).horizon_s, Unavailable)
-    assert isinstance(record_of(make_log("v1.11")).horizon_s, Unavailable)
-    without = record_of(log.drop("estimator_states"))
+    assert isinstance(read(log).ekf2.horizon_s, Unavailable)
+    assert isinstance(read(make_log("v1.11")).ekf2.horizon_s, Unavailable)
+    without = read(log.drop("estimator_states")).ekf2
     assert isinstance(without.accelerometer_bias, Unavailable)
     assert isinstance(without.horizon_s, Unavailable)

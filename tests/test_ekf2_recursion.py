@@ -26,15 +26,7 @@ from px4fuse.ekf2.intervals import (
     make_intervals,
 )
 from px4fuse.ekf2.model import Model, replay_settings
-from px4fuse.ekf2.recursion import (
-    Run,
-    Variant,
-    _Fusion,
-    _in_turn,
-    _limit_bias,
-    _settled,
-    run,
-)
+from px4fuse.ekf2.recursion import Run, Variant, _Fusion, _in_turn, _limit_bias, _settled, run
 from px4fuse.ekf2.recursion import _measurements as measurements
 from px4fuse.ekf2.stretches import GRAVITY_M_S2, Stretch, with_field
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, MAG, Aid, settings_in_force

@@ -31,14 +31,7 @@ from px4fuse.ekf2.walk import (
     on_the_way,
     walk,
 )
-from px4fuse.ekf2.whatif import (
-    AxisSummary,
-    Summary,
-    WhatIf,
-    _longest,
-    _notes,
-    what_if,
-)
+from px4fuse.ekf2.whatif import AxisSummary, Summary, _longest, _notes, what_if
 from px4fuse.ekf2_parameters import GNSS_POS
 from px4fuse.filter.kalman import Replay
 from px4fuse.filter.settings import Settings
@@ -50,13 +43,8 @@ from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
 
-def found(result: WhatIf | Unavailable) -> WhatIf:
-    assert isinstance(result, WhatIf)
-    return result
-
-
 def test_side_by_side(model: Model) -> None:
-    made = found(what_if(model, [{"EKF2_EVP_NOISE": 0.5}, {"EKF2_EVP_NOISE": 0.02}]))
+    made = what_if(model, [{"EKF2_EVP_NOISE": 0.5}, {"EKF2_EVP_NOISE": 0.02}])
     wide, narrow = made.whatif
     for axis in ("north", "east"):
         logged, replayed = made.logged.axes[axis], made.replayed.axes[axis]
@@ -86,14 +74,8 @@ def test_without_agreement_there_is_no_what_if_and_no_why(model: Model) -> None:
         assert "no reason" in result.reason
 
 
-def walked(model: Model, *given: Any) -> dict[str, Why]:
-    result = walk(model, *given)
-    assert isinstance(result, dict)
-    return result
-
-
 def test_the_bars_add_up_and_little_is_left(model: Model) -> None:
-    for axis in walked(model).values():
+    for axis in walk(model).values():
         assert axis.coast is None
         assert tuple(step.name for step in axis.steps) == STEPS
         for quantity in ("position_mean_square_m2", "velocity_mean_square_m2_s2"):
@@ -249,8 +231,8 @@ def test_a_flight_that_rejects_most_tells_what_its_cure_does(
     ill, well = flown(tmp_path, mistake, seed), flown(tmp_path, "", seed)
     assert ill.agreement.rejected_share_logged > 0.35
     assert ill.agreement.good
-    (cured,) = found(what_if(ill, [changes])).whatif
-    truly = found(what_if(well, [{}])).logged
+    (cured,) = what_if(ill, [changes]).whatif
+    truly = what_if(well, [{}]).logged
     assert cured.steady
     assert cured.nis_mean == pytest.approx(truly.nis_mean, rel=0.1)
     assert cured.rejected_share == pytest.approx(truly.rejected_share, abs=0.03)
@@ -258,10 +240,8 @@ def test_a_flight_that_rejects_most_tells_what_its_cure_does(
 
 
 def test_where_most_would_be_rejected_nothing_is_predicted(model: Model) -> None:
-    chaotic, some, none = found(
-        what_if(
-            model, [{"EKF2_EVP_NOISE": 0.02}, {"EKF2_EVP_NOISE": 0.05}, {"EKF2_EVP_NOISE": 0.2}]
-        )
+    chaotic, some, none = what_if(
+        model, [{"EKF2_EVP_NOISE": 0.02}, {"EKF2_EVP_NOISE": 0.05}, {"EKF2_EVP_NOISE": 0.2}]
     ).whatif
     assert chaotic.rejected_share > 0.35
     assert not chaotic.steady

@@ -235,24 +235,22 @@ def test_the_instructors_word_is_the_last(tmp_path) -> None:
     )
 
 
-def test_more_points_than_there_are_are_told_and_not_given(tmp_path) -> None:
-    rows = said(tmp_path, "1,A,95,A slip.", "1,total,200,")
-    (ada, _), notes = laid_out(TWO, overrides=rows)
-    assert ada.total == 10.0
-    assert notes == (
-        "overrides.csv: 1 cannot have more than 10 points of 'A'.",
-        "overrides.csv: 1 cannot have more than 20 points of 'total'.",
-    )
-
-
-def test_a_second_row_on_the_same_is_told_and_not_taken(tmp_path) -> None:
-    rows = said(tmp_path, "1,A,9,", "1,a,2,", "01,total,12,", "1,Total,3,")
-    (ada, _), notes = laid_out(TWO, overrides=rows)
-    assert (ada.counting.points, ada.total) == (15.0, 3.0)
-    assert notes == (
-        "overrides.csv: 1 has 'A' from another row already.",
-        "overrides.csv: 01 has 'total' from another row already.",
-    )
+@pytest.mark.parametrize(
+    ("rows", "points", "told"),
+    [
+        (("1,A,95,A slip.", "1,total,200,"), (10.0, 10.0), (
+            "1 cannot have more than 10 points of 'A'",
+            "1 cannot have more than 20 points of 'total'",
+        )),
+        (("1,A,9,", "1,a,2,", "01,total,12,", "1,Total,3,"), (15.0, 3.0), (
+            "1 has 'A' from another row already", "01 has 'total' from another row already",
+        )),
+    ], ids=["more points than there are", "a second row on the same"],
+)  # fmt: skip
+def test_a_row_that_is_not_taken_is_told(rows, points, told, tmp_path) -> None:
+    (ada, _), notes = laid_out(TWO, overrides=said(tmp_path, *rows))
+    assert (ada.counting.points, ada.total) == points
+    assert notes == tuple(f"overrides.csv: {one}." for one in told)
 
 
 def test_what_was_said_comes_back_from_the_class_page(tmp_path) -> None:

@@ -27,10 +27,11 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import FILTERS, AxisComparison
 from px4fuse.ekf2.model import replay_settings
 from px4fuse.ekf2.whatif import what_if
+from px4fuse.explore import page as pages
 from px4fuse.explore.page import html_text
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import within
-from px4fuse.flight import Flight, Unavailable
+from px4fuse.flight import Flight
 from px4fuse.request import ComparisonRequest
 
 pytestmark = pytest.mark.usefixtures("analysed_once")
@@ -158,7 +159,6 @@ def test_dragging_gives_what_the_command_on_the_page_gives(
     assert request.sigma_a_m_s2 > 2.0
     assert request.sigma_z_m < 0.05
     assert request.dt_s < 0.05
-    assert isinstance(request.clock_offset_s, float)
     assert 0.03 < request.clock_offset_s < 0.09
     # what the stamps decide otherwise is held where it is
     segment = explored[1].segment
@@ -264,7 +264,6 @@ def test_findings_and_buttons_move_all_plots(page: Browser) -> None:
 
 def test_ekf2_at_a_stop_is_what_whatif_says(page: Browser, explored: tuple[Path, Analysis]) -> None:
     model = explored[1].ekf2_model
-    assert not isinstance(model, Unavailable)
     changes = {"EKF2_EVP_NOISE": 0.05, "EKF2_EV_DELAY": 200.0, "EKF2_EVP_GATE": 3.0}
     asked = what_if(model, [changes])
     (told,) = asked.whatif
@@ -405,6 +404,13 @@ def test_without_ekf2_truth_and_imu(browser: Browser, tmp_path: Path) -> None:
 # ------------------------------------------------------------------ the command
 
 
+@pytest.fixture
+def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests of where it goes."""
+    monkeypatch.setattr(pages, "html_text", lambda _: "")
+
+
+@pytest.mark.usefixtures("no_page")
 def test_without_a_log_it_is_the_sample_flight(
     sample_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -420,7 +426,7 @@ def test_without_a_log_it_is_the_sample_flight(
     assert (tmp_path / "reports" / "aisle_uwb_start-20_end-40.html").is_file()
 
 
-@pytest.mark.usefixtures("no_drawing")
+@pytest.mark.usefixtures("no_drawing", "no_page")
 def test_open_opens_what_is_looked_at(
     sample_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

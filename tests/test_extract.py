@@ -221,10 +221,7 @@ def test_what_is_unavailable_has_no_table_and_is_said(tmp_path, dropped, lost):
 def test_table_names_are_file_names_on_every_system(sample_flight):
     track = sample_flight.positions[0]
     names = ["uwb log.csv", "UWB_LOG.csv", 'a/b\\c:d*?"<>|', "CON", "ünï", "x" * 300, "end. "]
-    flight = replace(
-        sample_flight,
-        positions=tuple(replace(track, name=name) for name in names),
-    )
+    flight = replace(sample_flight, positions=tuple(replace(track, name=name) for name in names))
     tables = [name for name in extraction.tables(flight) if name.startswith("position_")]
     assert len(tables) == len(names)
     assert len({name.lower() for name in tables}) == len(names)

@@ -413,11 +413,6 @@ def beside_vision(name: str, first: float) -> Any:
     return analysis(ekf2=steps((0.0, first), (100.0, 0.0)), source=fed)
 
 
-def without_imu(gap_s: float, rate_hz: float) -> Any:
-    axes = (axis(replay=SimpleNamespace(input_gap_s=gap_s)),)
-    return analysis(axes=axes, flight={"imu": at_rate(rate_hz)})
-
-
 def moved(extent_m: float) -> Any:
     samples = positions(10.0 + np.arange(100), np.repeat([0.0, extent_m], 50))
     return analysis(source=source(samples=samples))
@@ -434,7 +429,9 @@ EDGES = [
       for nis, nees, expected in (
           (1.0, 4.0, "warning"), (1.0, 3.99, None), (1.49, 4.0, "warning"), (1.5, 4.0, None),
           (1.0, 15.9, "warning"), (1.0, 16.0, "error"), (1.0, None, None))),
-    *((imu.gaps, without_imu(gap_s, rate_hz), expected) for gap_s, rate_hz, expected in (
+    *((imu.gaps, analysis(axes=(axis(replay=SimpleNamespace(input_gap_s=gap_s)),),
+                          flight={"imu": at_rate(rate_hz)}), expected)
+      for gap_s, rate_hz, expected in (
         (0.2, 100.0, None), (0.201, 100.0, "warning"), (0.499, 4.0, None),
         (0.501, 4.0, "warning"))),
     (source_positions.motion, moved(0.5), None), (source_positions.motion, moved(0.499), "warning"),
@@ -497,10 +494,6 @@ def scaled(value: float, sigma: float = 0.01, imu_hz: float = 49.1, **parts: Any
     found = made(Explained, scale=Estimate(value, sigma), jumps=())
     usual = {"explained": found, "flight": {"imu": at_rate(imu_hz)}, "clock": late(0.0)}
     return analysis(**{**usual, **parts})
-
-
-def outlying(outliers: int, count: int) -> Any:
-    return analysis(tuning=tuned(outlier_time_s=np.arange(outliers) + 20.0, count=count))
 
 
 def stating(reported: float, noise: float, interval: Any = None, **parts: Any) -> Any:
@@ -606,7 +599,8 @@ SOURCE_EDGES = [
       for clock, expected in ((NONE, None), (late(0.0, determinable=False), "error"))),
     (SCALE, scaled(0.5, smoothing=Smoothing(0.5, 1.0, 99.0, 0.1)), None),
     *((source_positions.detect, scaled(0.5, **parts), None) for parts in (ODOMETRY, MADE_OF_EKF2)),
-    *((source_positions.outliers, outlying(outliers, count), expected)
+    *((source_positions.outliers,
+       analysis(tuning=tuned(outlier_time_s=20.0 + np.arange(outliers), count=count)), expected)
       for outliers, count, expected in (
           (3, 600, "warning"), (3, 601, None), (3, 150, "error"), (3, 151, "warning"),
           (2, 100, None))),

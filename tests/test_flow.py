@@ -203,7 +203,6 @@ def test_fixes_that_come_while_ekf2_does_without_gnss_are_not_fused() -> None:
 @pytest.mark.parametrize("name", ["v1.16.1_gps_stock_flow", "main202603_gps_outage_flow"])
 def test_flights_with_flow_are_replayed(name: str, shared_logs: Path, model_of: Any) -> None:
     found = model_of(shared_logs / "gps" / f"{name}.ulg")
-    assert isinstance(found, Model)
     agreement = found.agreement
     assert agreement.good
     assert all(axis.innovation_correlation > 0.997 for axis in agreement.gnss_vel.values())

@@ -25,6 +25,7 @@ from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario, scenario_of
 
 SHA256 = "a" * 64
+pytestmark = pytest.mark.usefixtures("quick_filter")
 LATE = Wrong("clock-offset", 0.2, 0.17, 0.23)
 GAP = Wrong("dropout", 3.0, 2.55, 3.45, 50.0, 53.0)
 TRUTH = FormTruth(
@@ -185,10 +186,6 @@ def simulation_of(typed: str) -> flights.Simulation:
     return flights.simulate(scenario, parse(given["mistake"]))
 
 
-def in_our_units(kind: str, unit: str) -> str:
-    return "" if unit in ("", next(iter(MISTAKES[kind][1]), "")) else unit
-
-
 def answers_of(form: dict[str, Any]) -> Answers:
     claims = []
     for one in form["mistakes"] or []:
@@ -199,7 +196,7 @@ def answers_of(form: dict[str, Any]) -> Answers:
             Claim(
                 one["kind"],
                 one["size"],
-                in_our_units(one["kind"], one["unit"]),
+                "" if one["unit"] == next(iter(MISTAKES[one["kind"]][1]), "") else one["unit"],
                 "whole flight" if when["text"] == "whole flight" else "",
                 when["from_s"],
                 when["until_s"],

@@ -327,11 +327,7 @@ def test_the_truth_lies_about_ekf2_s_origin_where_that_is_a_fix(
     [(2.0, 0.3, True), (0.5, 0.45, False), (0.5, 0.9, False), (None, 0.3, False)],
 )
 def test_a_smaller_r_is_advised_only_where_the_parameter_holds_it_up(
-    least_m: float | None,
-    eph_m: float,
-    said: bool,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    least_m: float | None, eph_m: float, said: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = outdoors(eph_m=eph_m)
     log.parameters.pop("EKF2_GPS_P_NOISE")
@@ -454,7 +450,6 @@ def models(shared_logs: Path, model_of: Any) -> dict[str, Model]:
     found = {}
     for name in REPLAYED:
         model = model_of(shared_logs / "gps" / f"v1.16.1_gps_{name}.ulg")
-        assert isinstance(model, Model)
         assert model.inputs.step_s == pytest.approx(0.008, abs=1e-6)
         found[name] = model
     return found

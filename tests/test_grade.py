@@ -34,11 +34,6 @@ pytestmark = pytest.mark.usefixtures("analysed_once")
 UNKNOWN = Verdict("cannot verify", (), with_log=False)
 
 
-def rows(output: Path) -> list[dict[str, str]]:
-    text = (output / "class.csv").read_text(encoding="utf-8-sig")
-    return list(csv.DictReader(io.StringIO(text)))
-
-
 @pytest.fixture
 def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     in_this_process(monkeypatch)
@@ -70,7 +65,8 @@ def test_everything_that_was_handed_in_stands_in_the_table(handed_in, tmp_path) 
     )
     assert {path for path in tmp_path.rglob("*") if not path.is_relative_to(output)} == before
     assert len(outcome.graded) == 6
-    table = rows(output)
+    text = (output / "class.csv").read_text(encoding="utf-8-sig")
+    table = list(csv.DictReader(io.StringIO(text)))
     assert len(table) == 6
     assert {row["status"] for row in table} == {"cannot verify"}  # no log was given
     scored = [row for row in table if float(row["pending points"] or 0) > 0]

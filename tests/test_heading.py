@@ -45,7 +45,6 @@ def turned(quaternions: pd.DataFrame, turn_deg: np.ndarray) -> pd.DataFrame:
 
 def wandering(flight: Flight) -> tuple[Flight, np.ndarray]:
     """A magnetometer turns the logged attitude more and more; and by how much at each sample."""
-    assert isinstance(flight.attitude, pd.DataFrame)
     turn = WANDER_DEG * np.linspace(0.0, 1.0, len(flight.attitude))
     return replace(flight, attitude=turned(flight.attitude, turn)), turn
 
@@ -53,7 +52,6 @@ def wandering(flight: Flight) -> tuple[Flight, np.ndarray]:
 @pytest.mark.parametrize("turn_deg", [0.0, 20.0, -40.0])
 def test_a_constant_turn_comes_back_and_is_called_constant(turn_deg):
     found = estimated(flown(*([f"yaw={turn_deg:g}"] if turn_deg else [])))
-    assert isinstance(found, HeadingError)
     assert not found.drifts
     assert found.turn_deg == pytest.approx(turn_deg, abs=3.0 * found.sigma_deg)
     assert found.sigma_deg < 3.0
@@ -69,7 +67,6 @@ def test_a_heading_that_wanders_is_followed(by):
         tracks = tuple(replace(track, orientation=oriented) for track in flight.positions)
         flight = replace(flight, positions=tracks)
     found = estimated(flight)
-    assert isinstance(found, HeadingError)
     assert found.by == by
     assert found.drifts
     assert found.drift_p < DRIFT_P
@@ -111,14 +108,12 @@ def test_motion_capture_flights(shared_logs, log, drifts, low, high):
     """Their own orientation says how EKF2's heading, by the magnetometer, lies to the frame."""
     flight = read_log(shared_logs / "real" / f"{log}.ulg")
     found = estimated(flight, 0.001)
-    assert isinstance(found, HeadingError)
     assert found.drifts == drifts
     assert all(low < part.heading_error_deg < high for part in found.parts)
     middles = [(part.start_s + part.end_s) / 2.0 for part in found.parts]
     # and the positions alone say the same
     tracks = tuple(replace(track, orientation=None) for track in flight.positions)
     alone = estimated(replace(flight, positions=tracks), 0.001)
-    assert isinstance(alone, HeadingError)
     for part in alone.parts:
         middle = (part.start_s + part.end_s) / 2.0
         turn = np.interp(middle, middles, [one.heading_error_deg for one in found.parts])
@@ -139,8 +134,7 @@ def test_a_long_flight_whose_positions_are_thinned_still_has_parts() -> None:
 
 
 @pytest.mark.parametrize(
-    ("spread", "drift_p", "drifts"),
-    [(1.0, 0.0, True), (0.999, 0.0, False), (9.0, 1.0, False)],
+    ("spread", "drift_p", "drifts"), [(1.0, 0.0, True), (0.999, 0.0, False), (9.0, 1.0, False)]
 )
 def test_a_heading_drifts_where_it_turned_far_enough(
     spread: float, drift_p: float, drifts: bool

@@ -34,6 +34,7 @@ from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
+pytestmark = pytest.mark.usefixtures("quick_filter")
 RIGHT = Settings(sigma_a_m_s2=0.27, sigma_z_m=0.10)
 OF_CAUSES = (
     imu.bias, source_positions.detect, source_stamps.arrivals, source_intervals.thinning,

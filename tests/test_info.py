@@ -26,6 +26,7 @@ from px4fuse.readers import read_log
 from px4fuse.recording import ClockMap, Dropout, Sender
 
 WIDTH = 80
+pytestmark = pytest.mark.usefixtures("quick_filter")
 
 
 @pytest.fixture(autouse=True)
@@ -165,8 +166,7 @@ def test_a_source_that_was_not_logged_names_the_profile_that_logs_it(tmp_path, p
 
 
 @pytest.mark.parametrize(
-    ("imu_hz", "said"),
-    [(4.0, "sensor_combined was logged at 4.0 Hz"), (49.5, None), (100.0, None)],
+    ("imu_hz", "said"), [(4.0, "sensor_combined was logged at 4.0 Hz"), (49.5, None), (100.0, None)]
 )
 def test_an_imu_or_an_attitude_that_is_too_slow_is_no_acceleration(tmp_path, imu_hz, said):
     inventory = inventory_of(make_log(imu_hz=imu_hz), tmp_path)

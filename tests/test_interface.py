@@ -169,10 +169,7 @@ def test_arguments_that_make_no_sense_are_refused(analysis, arguments, said):
 
 @pytest.mark.parametrize(
     ("argument", "option", "value"),
-    [
-        ("sigma_z_m", "--sigma-z", 0.0),
-        ("clock_offset_s", "--clock-offset", 99.0),
-    ],
+    [("sigma_z_m", "--sigma-z", 0.0), ("clock_offset_s", "--clock-offset", 99.0)],
 )
 def test_errors_name_arguments_in_python_and_options_on_the_command_line(
     argument, option, value, sample_log

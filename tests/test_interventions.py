@@ -2,6 +2,7 @@
 
 import re
 from functools import cache
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,6 @@ from px4fuse.comparison.interventions import (
     to_try,
 )
 from px4fuse.comparison.interventions import RIGHT as TO_RIGHT
-from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.model import disturbed, moved, replay_settings
 from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.whatif import what_if
@@ -154,10 +154,7 @@ def test_a_number_of_ekf2_is_that_of_a_what_if() -> None:
     assert not once.updates.equals(other.updates)
 
 
-def rms_apart(comparison: Comparison) -> float:
-    apart = comparison.main.difference
-    assert not isinstance(apart, Unavailable)
-    return apart.position_rmse_m
+rms_apart = attrgetter("main.difference.position_rmse_m")
 
 
 def test_a_cause_says_how_far_it_keeps_both_filters_apart() -> None:

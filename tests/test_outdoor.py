@@ -20,14 +20,13 @@ from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.interventions import TURN, cause_of
 from px4fuse.comparison.remedy import aid_of
-from px4fuse.ekf2.model import Model
-from px4fuse.ekf2.whatif import HEADING_STAYS, WhatIf, what_if
+from px4fuse.ekf2.whatif import HEADING_STAYS, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find, source_clock
 from px4fuse.findings.story import story
-from px4fuse.flight import Columns, Unavailable
+from px4fuse.flight import Columns
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_positions import project, unproject
 from px4fuse.simulation import sensors
@@ -178,13 +177,9 @@ def test_the_cause_of_ekf2_is_what_was_made_wrong(
 
 def test_what_if_predicts_the_flight_with_the_other_delay() -> None:
     wrong, right = (flown(*texts).ekf2_model for texts in (("ekf2-delay=0",), ()))
-    assert isinstance(wrong, Model)
-    assert isinstance(right, Model)
     asked, other = what_if(wrong, [{"EKF2_GPS_DELAY": 110.0}]), what_if(right, [])
     (predicted,), true = asked.whatif, other.logged
     assert predicted.nis_mean == pytest.approx(true.nis_mean, rel=0.1)
-    for one in (predicted, true, asked.logged):
-        assert not isinstance(one.position_rmse_to_truth_m, Unavailable)
     assert predicted.position_rmse_to_truth_m == pytest.approx(
         true.position_rmse_to_truth_m, rel=0.1
     )
@@ -197,7 +192,6 @@ def test_without_a_magnetometer_the_heading_is_as_flown_and_that_is_told(tmp_pat
     log.write_bytes(to_ulog(simulate(OUTDOOR, parse(["ekf2-delay=0", "heading=3"]))))
     model = opened(read_log(log))
     asked = what_if(model, [{"EKF2_GPS_DELAY": 110.0}])
-    assert isinstance(asked, WhatIf)
     assert asked.notes[0] == HEADING_STAYS
     errors = [one.heading_error_mean_deg for one in (asked.logged, *asked.whatif)]
     assert errors[1] == pytest.approx(errors[0], abs=0.1)

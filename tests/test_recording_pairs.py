@@ -7,13 +7,8 @@ from flights import Imu, aisle_flight
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import noises_and_clock
 from px4fuse.filter.clock import ClockOffset
-from px4fuse.flight import Flight, Unavailable
+from px4fuse.flight import Unavailable
 from px4fuse.recording import Stream
-
-
-def recorded(flight: Flight, topic: str) -> Flight:
-    """The same flight whose IMU came by that topic."""
-    return replace(flight, streams={"imu": Stream((topic,), "boot clock", flight.log.name)})
 
 
 @pytest.mark.parametrize(
@@ -28,7 +23,8 @@ def recorded(flight: Flight, topic: str) -> Flight:
 )
 def test_a_clock_offset_needs_the_whole_imu(topic, imu_hz, needed) -> None:
     """A sample that telemetry picks out of many is no mean over its interval."""
-    flight = recorded(aisle_flight(duration_s=40.0, imu=Imu(rate_hz=imu_hz)), topic)
+    flight = aisle_flight(duration_s=40.0, imu=Imu(rate_hz=imu_hz))
+    flight = replace(flight, streams={"imu": Stream((topic,), "boot clock", flight.log.name)})
     _, found = noises_and_clock(compare(flight, axes=("north", "east")))
     if needed is None:
         assert isinstance(found, ClockOffset)

@@ -132,10 +132,7 @@ def test_what_px4fuse_cannot_have_recorded_is_refused(recorded: object, says: st
 
 @pytest.mark.parametrize(
     ("command", "declared", "kinds"),
-    [
-        (compare, OPTIONS, (ComparisonRequest, PositionFile)),
-        (loop, LOOP_OPTIONS, (LoopRequest,)),
-    ],
+    [(compare, OPTIONS, (ComparisonRequest, PositionFile)), (loop, LOOP_OPTIONS, (LoopRequest,))],
 )
 def test_every_option_of_an_analysis_is_in_the_request(command, declared, kinds) -> None:
     """An option that the request forgets would be missing from every record."""

@@ -55,10 +55,7 @@ BAD = {
     "no check": (ITEM, "Object missing required field `check`"),
     "empty title": (NOTES.replace('"T"', '" "'), "at item 1, title"),
     "title of two lines": (NOTES.replace('"T"', '"a\\nb"'), "at item 1, title"),
-    "negative points": (
-        NOTES.replace("5", "-5"),
-        "Expected `float` >= 0.0 - at item 1, points",
-    ),
+    "negative points": (NOTES.replace("5", "-5"), "Expected `float` >= 0.0 - at item 1, points"),
     "unknown parameter": (NOTES + "min_letters = 3", "unknown field `min_letters` - at item 1"),
     "the third": (NOTES + NOTES.replace("T", "U") + NUMBER + "at_most = 'x'", "at item 3, at_most"),
     "a check of an earlier rubric": (ITEM + 'check = "sections"', "Invalid value 'sections'"),

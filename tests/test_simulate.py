@@ -52,12 +52,6 @@ def motion_of(scenario, mistakes=NO_MISTAKES):
     return plan(scenario, mistakes, sensors.stream(scenario, sensors.Stream.WANDER))
 
 
-def position_error(scenario, *texts):
-    """What the source measured beyond the truth at its own true times, and those times."""
-    source = simulate(replace(scenario, ekf2=False), parse(texts)).positions
-    return source.error_m, source.measured_s
-
-
 def stamps_s(simulation):
     source = simulation.positions.topic.fields
     return (source["timestamp_sample"].astype(np.int64) - sensors.START_US) * 1e-6
@@ -230,8 +224,7 @@ class TestMistakes:
         assert np.allclose(told["outlier_time_s"], stamps_s(simulation)[outlier])
 
     @pytest.mark.parametrize(
-        ("text", "start", "end"),
-        [("dropout=6s,12s", 12.0, 18.0), ("dropout=6", None, None)],
+        ("text", "start", "end"), [("dropout=6s,12s", 12.0, 18.0), ("dropout=6", None, None)]
     )
     def test_dropout_silences_the_source(self, text, start, end):
         gone = simulate(UNFILTERED, parse([text]))
@@ -264,7 +257,7 @@ class TestMistakes:
         settled = fast & np.roll(fast, 150)  # 3 s, six time constants
         assert np.any(settled)
         assert np.allclose(lag[settled] / along[settled], 0.5, atol=0.02)
-        noisy, _ = position_error(AISLE, "smoothed=1s")
+        noisy = simulate(replace(AISLE, ekf2=False), parse(["smoothed=1s"])).positions.error_m
         assert np.std(noisy[:25]) < 0.07  # on the ground: 0.10 without
 
     def test_no_vvo_leaves_no_source(self):

@@ -17,7 +17,7 @@ from px4fuse.ekf2.replay import Agreement
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
-from px4fuse.flight import Ekf2, Flight, Unavailable
+from px4fuse.flight import Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_ekf2 import samples_per_step
 from px4fuse.simulation import ekf2, sensors
@@ -33,14 +33,9 @@ def flown(*texts: str, scenario: Scenario = AISLE) -> Flight:
     return simulate_flight(scenario, parse(texts))
 
 
-def of(flight: Flight) -> Ekf2:
-    assert isinstance(flight.ekf2, Ekf2)
-    return flight.ekf2
-
-
 def fused(flight: Flight, axis: str = "north") -> pd.DataFrame:
     """Innovations while airborne."""
-    frame = of(flight).innovations[axis]
+    frame = flight.ekf2.innovations[axis]
     start, end = flight.airborne[0]
     return frame.loc[start:end]
 
@@ -52,7 +47,7 @@ def agreement(flight: Flight) -> Agreement:
 
 def rmse(flight: Flight, start_s: float, end_s: float, column: str = "north_m") -> float:
     """Of the published position, to the truth."""
-    track, truth = of(flight).state.loc[start_s:end_s, column], flight.truth.samples[column]
+    track, truth = flight.ekf2.state.loc[start_s:end_s, column], flight.truth.samples[column]
     return float(np.sqrt(np.mean((track - np.interp(track.index, truth.index, truth)) ** 2)))
 
 
@@ -110,7 +105,7 @@ def test_clean_flights_are_consistent_and_near_the_truth() -> None:
             values.append(float(nis.mean()))
             inside.append(low < values[-1] < high)
             errors.append(rmse(flight, 10.0, 50.0, f"{axis}_m"))
-        variance = of(flight).variance
+        variance = flight.ekf2.variance
         stated.append(float(np.sqrt(variance["north_m2"].median())))
     # the heading has an error of 1° that EKF2 takes to be white
     assert np.mean(values) == pytest.approx(1.0, abs=0.08)
@@ -121,7 +116,7 @@ def test_clean_flights_are_consistent_and_near_the_truth() -> None:
 
 def test_the_horizon_state_is_as_good_as_it_says(clean: Flight) -> None:
     """Position and velocity at the horizon, their variances, and the biases that it learns."""
-    record, truth = of(clean).record, clean.truth.samples
+    record, truth = clean.ekf2.record, clean.truth.samples
     later = record.delayed[record.delayed.index > 15.0]
     error = later["north_m_s"] - np.interp(later.index, truth.index, truth["north_m_s"])
     assert 0.5 < np.mean(error**2 / later["north_m2_s2"]) < 2.5
@@ -151,20 +146,20 @@ def test_where_it_stands_still_the_attitude_is_levelled() -> None:
 
 def test_fusion_needs_ten_hertz_stops_and_resets_as_ekf2_does() -> None:
     slow = flown("decimate=2Hz")
-    fusing = of(slow).fusing
+    fusing = slow.ekf2.fusing
     assert not fusing["horizontal"].any()
     assert "ekf2_not_fusing" in named(slow)
     # it stays where it is, instead of drifting away on the IMU
-    assert of(slow).state[["north_m", "east_m"]].abs().max().max() < 5.0
+    assert slow.ekf2.state[["north_m", "east_m"]].abs().max().max() < 5.0
     gap = flown("dropout=8s,30s")
-    fusing = of(gap).fusing
+    fusing = gap.ekf2.fusing
     off = fusing[fusing["horizontal"] == 0.0].loc[28.0:39.0]
     assert off.index[0] == pytest.approx(30.4, abs=0.3)
-    resets = [reset for reset in of(gap).resets if reset.time_s > 10.0]
+    resets = [reset for reset in gap.ekf2.resets if reset.time_s > 10.0]
     assert len(resets) == 1
     assert 38.2 < resets[0].time_s < 39.2
     # the step in what is published is the reset that is logged
-    state = of(gap).state["north_m"]
+    state = gap.ekf2.state["north_m"]
     at = int(np.searchsorted(state.index, resets[0].time_s))
     moved = state.iloc[at] - state.iloc[at - 1]
     assert moved == pytest.approx(resets[0].delta[0], abs=0.3)
@@ -215,10 +210,10 @@ def test_samples_with_older_stamps_than_the_last_are_not_taken() -> None:
 def test_ekf2_that_is_not_told_to_fuse_only_looks(clean: Flight) -> None:
     flight = flown("ekf2-off")
     assert flight.log.parameters["EKF2_EV_CTRL"] == 0.0
-    assert of(flight).fusing["horizontal"].max() == 0.0
-    assert of(clean).fusing["horizontal"].max() == 1.0
+    assert flight.ekf2.fusing["horizontal"].max() == 0.0
+    assert clean.ekf2.fusing["horizontal"].max() == 1.0
     # as in PX4 samples are compared with the state all the same, and nothing comes of it
-    record, plain = of(flight).record, of(clean).record
+    record, plain = flight.ekf2.record, clean.ekf2.record
     assert len(record.vision_age_s) == len(plain.vision_age_s)
     # told nothing for 5 s it stays where it is, while the vehicle flies to and fro over 12 m
     assert rmse(flight, 10.0, 50.0) > 2.0 > 10.0 * rmse(clean, 10.0, 50.0)

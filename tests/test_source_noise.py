@@ -1,7 +1,6 @@
 """Noise of positions that is not white, equal and the same throughout: told apart, and by size."""
 
 from functools import cache, partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -191,24 +190,20 @@ def test_a_low_pass_lags_by_less_than_its_time_constant() -> None:
 
 
 @pytest.mark.reallogs
-def test_a_low_pass_is_no_slow_error_of_late_stamps(shared_logs: Path) -> None:
-    """Both fit this flight as well, and the second has two numbers more."""
-    log = shared_logs / "simulated" / "v1.16.1_aisle_nominal.ulg"
+@pytest.mark.parametrize(
+    ("name", "model", "seed", "finding"),
+    [
+        # no slow error of late stamps, which fits as well and has two numbers more
+        ("nominal", partial(errors.low_pass, tau_s=0.3), 8, "source_smoothed"),
+        # no jump of 0.5 m, for which the larger noise passed where one was for both axes
+        ("10hz", UNEQUAL, 1107, "source_axes_unequal"),
+    ],
+)
+def test_flights_of_ekf2s_own_have_no_other(shared_logs, name, model, seed, finding) -> None:
+    log = shared_logs / "simulated" / f"v1.16.1_aisle_{name}.ulg"
     flight = read_log(log)
-    smooth = partial(errors.low_pass, tau_s=0.3)
-    flight = errors.laid_over(flight, errors.truth_of(log, flight), smooth, 5.0, 8)
-    found = told(explain(compare(flight, RIGHT, axes=("north", "east"))))
-    assert set(found) == {"source_smoothed"}
-
-
-@pytest.mark.reallogs
-def test_the_noise_of_one_axis_is_no_jump_along_it(shared_logs: Path) -> None:
-    """Judged by one noise for both axes, the larger one passed for a jump of 0.5 m."""
-    log = shared_logs / "simulated" / "v1.16.1_aisle_10hz.ulg"
-    flight = read_log(log)
-    flight = errors.laid_over(flight, errors.truth_of(log, flight), UNEQUAL, 5.0, 1107)
-    found = told(explain(compare(flight, RIGHT, axes=("north", "east"))))
-    assert set(found) == {"source_axes_unequal"}
+    flight = errors.laid_over(flight, errors.truth_of(log, flight), model, 5.0, seed)
+    assert set(told(explain(compare(flight, RIGHT, axes=("north", "east"))))) == {finding}
 
 
 def test_a_filter_that_outliers_pull_is_no_noisy_part() -> None:

@@ -15,7 +15,7 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2_parameters import EV_POS, FLOW, Aid
 from px4fuse.findings import find
 from px4fuse.findings.story import MOST_SENTENCES, story
-from px4fuse.flight import AidLog, Ekf2
+from px4fuse.flight import AidLog
 
 ALONG_DEG = 30.0
 
@@ -77,7 +77,6 @@ def test_what_carried_ekf2_through_a_silence_is_told(
     samples = pd.DataFrame({**columns, "fused": fused, "rejected": 0.0}, times_s)
     samples = samples[(times_s <= silent_s[0]) | (times_s >= silent_s[1])]
     log = AidLog(("estimator_aid_src",), ("x",), samples, None)
-    assert isinstance(flight.ekf2, Ekf2)
     sentences = told(compare(replace(flight, ekf2=replace(flight.ekf2, aids={aid.name: log}))))
     assert any(f"silent: {by.format(aid.label)}" in sentence for sentence in sentences)
 

@@ -22,12 +22,7 @@ from px4fuse.cli.outputs import free_report, progress, terminal
 from px4fuse.report import screen
 from px4fuse.report.screen import runnable, say
 from px4fuse.report.terminal import summary
-from px4fuse.request import (
-    ComparisonRequest,
-    PositionFile,
-    command_line,
-    settings_name,
-)
+from px4fuse.request import ComparisonRequest, PositionFile, command_line, settings_name
 from px4fuse.results.build import results
 from px4fuse.results.contract import ComparisonResults, to_json
 from px4fuse.results.model import Student

@@ -30,9 +30,7 @@ SIGMA_A, SIGMA_Z, SEEDS = TRUE.sigma_a_m_s2, TRUE.sigma_z_m, 40
 
 
 def tuned(*axes: Axis, chosen: Settings = TRUE) -> AxisTuning:
-    found = tune_axes("north", axes, chosen)
-    assert isinstance(found, AxisTuning)
-    return found
+    return tune_axes("north", axes, chosen)
 
 
 @cache

@@ -284,8 +284,7 @@ def test_changed_results(aisle: Base, name: str, monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize(
-    "path",
-    [("student", "name"), ("student", "notes"), ("provenance", "libraries", "matplotlib")],
+    "path", [("student", "name"), ("student", "notes"), ("provenance", "libraries", "matplotlib")]
 )
 def test_what_is_printed_from_the_record(loop: Base, path: tuple[str, ...]) -> None:
     results = copy.deepcopy(loop.results)
@@ -404,10 +403,6 @@ def script(words: str) -> DictionaryObject:
     return dictionary(S=NameObject("/JavaScript"), JS=TextStringObject(words))
 
 
-def descendant(writer: PdfWriter) -> Any:
-    return font("/f0")(writer)["/DescendantFonts"][0].get_object()
-
-
 def exchanged_glyphs(writer: PdfWriter) -> None:
     """A font that draws a 9 where the text has a 1: all texts stay, the page reads otherwise."""
     numbers = list(range(max(LETTERS.values()) + 1))
@@ -415,7 +410,8 @@ def exchanged_glyphs(writer: PdfWriter) -> None:
     numbers[one], numbers[nine] = nine, one
     held = DecodedStreamObject()
     held.set_data(b"".join(number.to_bytes(2, "big") for number in numbers))
-    descendant(writer)[NameObject("/CIDToGIDMap")] = writer._add_object(held)
+    descendant = font("/f0")(writer)["/DescendantFonts"][0].get_object()
+    descendant[NameObject("/CIDToGIDMap")] = writer._add_object(held)
 
 
 def titled(**entries: str) -> Forge:

@@ -222,10 +222,10 @@ def _class_list(path: Path) -> object:
 
 
 TARGETS = (
-    Target("ULog", _ulogs, read_log, ".ulg", False, 120, 0.5),
-    Target("MAVLink", _recordings, read_log, ".tlog", False, 120, 0.5),
+    Target("ULog", _ulogs, read_log, ".ulg", False, 60, 0.5),
+    Target("MAVLink", _recordings, read_log, ".tlog", False, 60, 0.5),
     Target("trajectory", _text(_TRACK, _EUROC, _KITTI), read_trajectory, ".txt", True, 1800, 20.0),
-    Target("position file", _text(*_POSITIONS), read_position_csv, ".csv", True, 900, 5.0),
+    Target("position file", _text(*_POSITIONS), read_position_csv, ".csv", True, 300, 5.0),
     Target("g2o", _text(_GRAPH_2D, _GRAPH_3D), read_g2o, ".g2o", True, 1800, 20.0),
     Target("pose graph", _text(_GRAPH_2D, _GRAPH_3D), _graph, ".g2o", True, 180, 2.0),
     Target(
@@ -236,7 +236,7 @@ TARGETS = (
         "results", lambda: [(REPOSITORY / "reports/aisle_uwb.json").read_bytes()],
         lambda path: read_results(path.read_bytes()), ".json", True, 100, 2.0,
     ),
-    Target("report", _reports, _report, ".pdf", False, 120, 0.2),
+    Target("report", _reports, _report, ".pdf", False, 60, 0.2),
     Target("rubric", lambda: [rubric_text().encode()], read_rubric, ".toml", True, 900, 8.0),
     Target("overrides", _text(_OVERRIDES), read_overrides, ".csv", True, 900, 6.0),
     Target("roster", _text(_ROSTER, _MOODLE), read_roster, ".csv", True, 900, 6.0),
