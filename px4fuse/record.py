@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABCMeta
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeAlias, TypeVar, Union
 
 import msgspec
@@ -110,3 +111,18 @@ def written(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: written(part) for key, part in value.items()}
     return tuple(map(written, value)) if isinstance(value, tuple) else value
+
+
+def table(beside: str, name: str, kind: type[T]) -> T:
+    """A table of the package, in a TOML file beside a module.
+
+    Parameters
+    ----------
+    beside : str
+        ``__file__`` of the module.
+    name : str
+        Of the table's file.
+    kind : type
+        What it holds.
+    """
+    return msgspec.toml.decode(Path(beside).with_name(name).read_bytes(), type=kind)

@@ -186,7 +186,7 @@ def simulation_of(typed: str) -> flights.Simulation:
 
 
 def in_our_units(kind: str, unit: str) -> str:
-    return "" if unit in ("", next(iter(MISTAKES[kind][1]), "")) else unit
+    return "" if unit in ("", next(iter(MISTAKES[kind].units), "")) else unit
 
 
 def answers_of(form: dict[str, Any]) -> Answers:
