@@ -11,6 +11,7 @@ from pathlib import Path
 
 from px4fuse.assignment.sheet import Sheet, read_sheet
 from px4fuse.errors import SettingsError
+from px4fuse.record import table
 from px4fuse.results.reading import one_line
 
 MAX_NAME = 200
@@ -18,20 +19,7 @@ MAX_STUDENTS = 1000
 # A file system takes 255 bytes, and a character up to 4
 MAX_STEM = 48
 RESERVED = {"con", "prn", "aux", "nul"} | {f"{n}{i}" for n in ("com", "lpt") for i in range(10)}
-# Column titles, letters and digits only, best first. The university's own id; Canvas's "ID",
-# Moodle's "Identifier" and ILIAS's "User ID" are the platform's
-COLUMNS = {
-    "student_id": (
-        "studentid", "studentnumber", "studentno", "idnumber", "matriculationnumber",
-        "matriculation", "matrikelnummer", "matrikelnr", "orgdefinedid", "sisuserid", "sid", "id",
-        "number",
-    ),
-    "login": ("username", "login", "sisloginid", "loginid", "user", "benutzername"),
-    "email": ("emailaddress", "email", "mail", "emailadresse"),
-    "name": ("name", "fullname", "studentname", "displayname", "student"),
-    "first": ("firstname", "givenname", "forename", "vorname"),
-    "last": ("lastname", "surname", "familyname", "nachname"),
-}  # fmt: skip
+COLUMNS = table(__file__, "columns.toml", dict[str, tuple[str, ...]])
 # What another list may know besides
 ADDED = ("name", "email", "login", "submitted")
 # Of Canvas, above the students
