@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
+from px4fuse.comparison import say
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.comparison.remedy import noise_used_m
 from px4fuse.ekf2 import walk as ways
@@ -118,10 +119,7 @@ def with_words(why: Why, called: str, because: dict[str, str]) -> Why:
     sentences += [_velocity(why), *_truth(why)]
     far_m = max(FAR_M, FAR_TIMES * float(np.max(np.abs(why.apart_m))))
     if why.outside is not None and why.outside.maximum_m > far_m:
-        sentences.append(
-            f"Elsewhere in the flight, where EKF2 started or did not fuse the source, both are up "
-            f"to {why.outside.maximum_m:.1f} m apart (at {why.outside.at_s:.0f} s)."
-        )
+        sentences.append(say("elsewhere", why=why))
     return structs.replace(why, sentences=tuple(sentences), cause=f"{cause}.")
 
 
@@ -133,10 +131,7 @@ def _share(part: Step, why: Why) -> str:
 
 
 def _moment(part: Step) -> str:
-    return (
-        f"; most at {part.moved_at_s:.1f} s, where it moves the position by "
-        f"{part.position_moved_m:.2f} m"
-    )
+    return say("moment", part=part)
 
 
 def _coasted(why: Why) -> str:
@@ -144,10 +139,7 @@ def _coasted(why: Why) -> str:
     if coast is None:
         return ""
     samples = f"{coast.samples} samples in a row" if coast.samples > 1 else "a sample"
-    return (
-        f": at {coast.start_s:.0f} s it rejected {samples} and coasted {coast.distance_m:.2g} m "
-        f"away in {coast.duration_s:.1f} s"
-    )
+    return say("coasted", coast=coast, samples=samples)
 
 
 def _reasons(
