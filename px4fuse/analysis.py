@@ -49,6 +49,7 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.reading import shown
+from px4fuse.record import lacking
 from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest
 
 if TYPE_CHECKING:
@@ -182,11 +183,7 @@ class Analysis(Comparison):
             tuned = self.tuning.get(name)
             if isinstance(tuned, AxisTuning) and self.axes.keys() >= set(group):
                 return tuple(self.axes[each].axis for each in group), tuned, offset_s
-        return Unavailable(
-            "causes beyond noise",
-            "the noises of the horizontal axes are not known",
-            "Analyse north and east, or the aisle (--axis).",
-        )
+        return lacking("causes")
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from px4fuse.arrays import Array, BoolArray
 from px4fuse.display import Shown, brief
 from px4fuse.ekf2_parameters import BAROMETER, Aid
 from px4fuse.origin import Origin
-from px4fuse.record import NotNegative, Record, Vector
+from px4fuse.record import NotNegative, Record, Vector, lacking
 from px4fuse.record import Unavailable as Unavailable  # noqa: PLC0414 - for everybody
 from px4fuse.recording import ClockMap, InputFile, LogInfo, Stream, Unused
 
@@ -230,23 +230,11 @@ class Reset:
 
 # EKF2_PREDICT_US, ekf2_params.c
 EKF2_STEP_S = 0.010
-BIAS_NOT_LOGGED = Unavailable(
-    "EKF2 accelerometer bias",
-    "no estimator_sensor_bias and no estimator_states",
-    "Record a ULog with SDLOG_PROFILE bit 0 (default).",
-)
-HORIZON_NOT_LOGGED = Unavailable(
-    "EKF2 fusion horizon",
-    "the log does not tell times of fusion from times of publication",
-    "Record a ULog with PX4 v1.13 or newer.",
-)
+BIAS_NOT_LOGGED = lacking("bias")
+HORIZON_NOT_LOGGED = lacking("horizon")
 
 
-RECORD_NOT_LOGGED = Unavailable(
-    "EKF2 fusion record",
-    "no estimator_states, EKF2's state at its fusion horizon",
-    "Record a ULog of PX4 v1.12 or newer with SDLOG_PROFILE bit 0 (default), and give it too.",
-)
+RECORD_NOT_LOGGED = lacking("record")
 
 
 GROUND_EFFECT, BAD_ACCELERATION = "gnd_effect", "bad_acc_vertical"
@@ -437,9 +425,7 @@ class Truth:
     __repr__ = brief
 
 
-MODES_NOT_LOGGED = Unavailable(
-    "flight modes", "no usable vehicle_status", "Record with SDLOG_PROFILE bit 0 (default)."
-)
+MODES_NOT_LOGGED = lacking("modes")
 
 
 # equal to itself only: what is made of it is kept by it

@@ -126,3 +126,12 @@ def table(beside: str, name: str, kind: type[T]) -> T:
         What it holds.
     """
     return msgspec.toml.decode(Path(beside).with_name(name).read_bytes(), type=kind)
+
+
+_MISSING = table(__file__, "missing.toml", dict[str, Unavailable])
+
+
+def lacking(which: str, /, **facts: object) -> Unavailable:
+    """What ``missing.toml`` has of something that is missing, with facts of the log in it."""
+    said = msgspec.structs.asdict(_MISSING[which])
+    return Unavailable(**{part: text.format_map(facts) for part, text in said.items()})

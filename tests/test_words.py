@@ -1,8 +1,9 @@
-"""The sentences of a room's ``words.toml`` against the facts that the room's code gives them."""
+"""Tables of sentences against the facts that the code gives them."""
 
 import ast
 import re
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from string import Formatter
 
@@ -10,30 +11,41 @@ import pytest
 
 import px4fuse
 
-ROOMS = [path.parent for path in Path(px4fuse.__file__).parent.glob("*/words.toml")
+PACKAGE = Path(px4fuse.__file__).parent
+ROOMS = [path.parent for path in PACKAGE.glob("*/words.toml")
          if "sentences(" in (path.parent / "__init__.py").read_text("utf-8")]  # fmt: skip
 
 
-def needed(text: str) -> set[str]:
-    """Names of the facts of a sentence, without their fields."""
-    return {re.split(r"[.\[]", name)[0] for _, name, *_ in Formatter().parse(text) if name}
+def needed(*texts: str) -> set[str]:
+    """Names of the facts of sentences, without their fields."""
+    names = [name for text in texts for _, name, *_ in Formatter().parse(text) if name]
+    return {re.split(r"[.\[]", name)[0] for name in names}
+
+
+def calls(folder: Path, function: str) -> Iterator[tuple[str, set[str | None]]]:
+    """The name and the facts of every call of a function in a folder's modules."""
+    for path in folder.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == function:
+                yield ast.literal_eval(node.args[0]), {word.arg for word in node.keywords}
 
 
 @pytest.mark.parametrize("room", ROOMS, ids=lambda room: room.name)
 def test_every_sentence_is_said_with_its_facts_and_no_others(room: Path) -> None:
     texts = tomllib.loads((room / "words.toml").read_text("utf-8"))
-    trees = [ast.parse(path.read_text("utf-8")) for path in room.glob("*.py")]
-    said = [
-        node
-        for tree in trees
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "say"
-    ]
-    assert {ast.literal_eval(call.args[0]) for call in said} == texts.keys()
-    for call in said:
-        facts = {word.arg for word in call.keywords}
-        assert facts == needed(texts[ast.literal_eval(call.args[0])]), ast.unparse(call)
+    said = list(calls(room, "say"))
+    assert {name for name, _ in said} == texts.keys()
+    for name, facts in said:
+        assert facts == needed(texts[name]), name
+
+
+def test_what_is_missing_is_told_with_its_facts_and_no_others() -> None:
+    rows = tomllib.loads((PACKAGE / "missing.toml").read_text("utf-8"))
+    said = list(calls(PACKAGE, "lacking"))
+    assert {name for name, _ in said} == rows.keys()
+    for name, facts in said:
+        assert facts == needed(*rows[name].values()), name
 
 
 def test_there_are_such_rooms() -> None:
-    assert "report" in {room.name for room in ROOMS}
+    assert {"report", "comparison"} <= {room.name for room in ROOMS}

@@ -25,6 +25,7 @@ from px4fuse.filter.consistency import GATE_SIGMA, HorizontalNis, assess, assess
 from px4fuse.filter.kalman import Replay, replay, state_at, variance_at
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import RECORD_NOT_LOGGED, Ekf2, Flight, Unavailable, sample_rate
+from px4fuse.record import lacking
 
 STATE = ("position_m", "velocity_m_s")
 VARIANCES = ("position_variance_m2", "velocity_variance_m2_s2")
@@ -160,11 +161,7 @@ def difference(run: Replay, ekf2_state: pd.DataFrame) -> Difference | Unavailabl
     apart = np.array(state_at(run, ekf2_state.index.to_numpy())) - ekf2_state[[*STATE]].to_numpy().T
     position, velocity = apart[:, np.isfinite(apart).all(axis=0)]
     if len(position) < projection.MIN_COMMON_SAMPLES:
-        return Unavailable(
-            "difference to EKF2",
-            f"{len(position)} common samples in the segment",
-            "Choose a segment in which EKF2 runs.",
-        )
+        return lacking("difference", count=len(position))
     return Difference(
         count=len(position),
         position_rmse_m=_rmse(position),
@@ -209,9 +206,7 @@ def against_truth(
     ]
     position, velocity = (error[np.isfinite(error)] for error in errors)
     if len(position) < projection.MIN_COMMON_SAMPLES:
-        return Unavailable(
-            "difference to truth", "no common samples", "Choose a segment that the truth covers."
-        )
+        return lacking("difference_to_truth")
     # EKF2's variances are logged at a tenth of the state's rate: NEES at their own times
     nees = {
         stated: _nees(at_s, error, variance[stated])

@@ -19,16 +19,13 @@ from px4fuse.plain import capital
 from px4fuse.readers.mavlink_messages import POSITION_INPUTS
 from px4fuse.readers.px4_innovations import GNSS, GNSS_AND_BAROMETER, fuses, with_gnss
 from px4fuse.readers.px4_topics import TOPIC_ORIGINS
+from px4fuse.record import lacking
 from px4fuse.request import HeightName
 from px4fuse.trajectory.rotation import interpolate, matrix
 
 # Of the names under which logs have external positions, PX4's topics and MAVLink's messages
 LOGGED_ORIGINS = TOPIC_ORIGINS | {source.name: source.origin for source in POSITION_INPUTS}
-NOT_ITS_OWN_TRUTH = Unavailable(
-    "ground truth",
-    "the position source is the only reference in the log, and it is what our filter was given",
-    "Choose another --position-source to have it as the truth.",
-)
+NOT_ITS_OWN_TRUTH = lacking("own_truth")
 
 
 # A receiver's height is much noisier than its position, and SIGMA_Z is one number
