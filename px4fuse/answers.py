@@ -48,6 +48,7 @@ class Form(Record, frozen=True):
     units: dict[str, dict[str, float]]
     mistakes: dict[str, Mistake]
     cures: dict[str, str]
+    questions: dict[str, str]
 
 
 _FORM = table(__file__, "form.toml", Form)
@@ -166,16 +167,7 @@ class AskedNumber(Record, frozen=True):
     @property
     def words(self) -> str:
         """The question."""
-        what = {
-            "gain": f"position gain of update {self.update}",
-            "variance": f"position variance after update {self.update} (m²)",
-            "innovation": f"innovation of update {self.update} (m)",
-            "nis": f"NIS of update {self.update}",
-            "silence": f"sigma of the position {self.extra:g} s after update {self.update}, "
-            "without a further measurement (m)",
-            "gate": f"which of the updates {self.update} to {self.update + GATED} lie outside "
-            f"{self.extra:g} sqrt(S), as a list; the filter takes them all the same",
-        }[self.kind]
+        what = _FORM.questions[self.kind].format(asked=self, last=self.update + GATED)
         return f"{what}; with SIGMA_A {self.sigma_a_m_s2:g} and SIGMA_Z {self.sigma_z_m:g}"
 
 
