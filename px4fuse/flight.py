@@ -232,11 +232,7 @@ class Reset:
 EKF2_STEP_S = 0.010
 BIAS_NOT_LOGGED = lacking("bias")
 HORIZON_NOT_LOGGED = lacking("horizon")
-
-
 RECORD_NOT_LOGGED = lacking("record")
-
-
 GROUND_EFFECT, BAD_ACCELERATION = "gnd_effect", "bad_acc_vertical"
 # Of a sample of optical flow in EKF2's low pass of them (_flow_vel_body_lpf, ekf.h)
 FLOW_SHARE = 0.1
