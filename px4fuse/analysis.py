@@ -183,7 +183,7 @@ class Analysis(Comparison):
             tuned = self.tuning.get(name)
             if isinstance(tuned, AxisTuning) and self.axes.keys() >= set(group):
                 return tuple(self.axes[each].axis for each in group), tuned, offset_s
-        return lacking("causes")
+        return lacking("noises_unknown")
 
 
 @dataclass(frozen=True)

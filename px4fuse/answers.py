@@ -27,7 +27,7 @@ NONE = "none"
 BLANK = "\u2013"
 
 
-class Mistake(Record, frozen=True, rename={"sized_in": "in"}):
+class NamedMistake(Record, frozen=True, rename={"sized_in": "in"}):
     """What may be wrong, in words; sizes beyond ``range``, in the first unit, are nonsense."""
 
     words: str
@@ -46,7 +46,7 @@ class Form(Record, frozen=True):
     did: tuple[str, ...]
     panels: tuple[str, ...]
     units: dict[str, dict[str, float]]
-    mistakes: dict[str, Mistake]
+    mistakes: dict[str, NamedMistake]
     cures: dict[str, str]
     questions: dict[str, str]
 
@@ -318,7 +318,7 @@ def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
         ends = (("from", claim.from_s), ("until", claim.until_s))
         value = _number_words(claim.value, claim.value_unit, CURES.get(claim.parameter, {}))
         said = (
-            _number_words(claim.size, claim.unit, MISTAKES.get(claim.kind, Mistake("")).units),
+            _number_words(claim.size, claim.unit, MISTAKES.get(claim.kind, NamedMistake("")).units),
             claim.when or " ".join(f"{name} {at:g} s" for name, at in ends if at is not None),
             f"seen in {claim.panel}" if claim.panel else "",
             f"{claim.parameter} {value}".strip(),

@@ -1,17 +1,22 @@
 """EKF2's parameters: PX4's names by what they are for, with defaults, units and ranges.
 
-They are rows of ``ekf2_parameters.toml``. Nothing else in the package spells the name of a
-parameter of external vision or GNSS: who needs one asks the aid for it (``EV_POS.noise``).
+``ekf2_parameters.toml`` has a row for every aid and every parameter. Nothing else in the package
+spells the name of a parameter of external vision or GNSS: who needs one asks the aid for it
+(``EV_POS.noise``).
 """
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
 
 from px4fuse.errors import SettingsError, did_you_mean
-from px4fuse.record import Record, table
 
 
-class Aid(Record, frozen=True):
+@dataclass(frozen=True)
+class Aid:
     """One kind of measurement that EKF2 takes, and the names of its parameters.
 
     Attributes
@@ -32,6 +37,17 @@ class Aid(Record, frozen=True):
         What forms its variance where ``noise`` alone does not; empty where it always does.
     default_gate : float
         In force where a log has no ``gate``.
+    axes : tuple of str
+        Of its innovations, in PX4's order.
+    fields : tuple of str
+        Of ``estimator_innovations`` and ``_variances``, by axis; empty where they have none.
+    before : tuple of str
+        Of ``ekf2_innovations`` (v1.8 to v1.10), to which ``_var`` is added for the variance.
+    flags : tuple of tuple of str
+        Of ``estimator_status_flags``: the first group that the log has tells, by any of its flags,
+        whether EKF2 means to fuse the aid.
+    bit : int or None
+        The same of ``estimator_status.control_mode_flags``.
     """
 
     name: str
@@ -45,6 +61,11 @@ class Aid(Record, frozen=True):
     unit: str = "m"
     reported: str = ""
     default_gate: float = 5.0
+    axes: tuple[str, ...] = ()
+    fields: tuple[str, ...] = ()
+    before: tuple[str, ...] = ()
+    flags: tuple[tuple[str, ...], ...] = ()
+    bit: int | None = None
 
     @property
     def own(self) -> frozenset[str]:
@@ -57,45 +78,47 @@ class Aid(Record, frozen=True):
         return {name: float(logged[name]) for name in names if name in logged}
 
 
-class Parameter(Record, frozen=True):
-    """One parameter of EKF2.
-
-    Attributes
-    ----------
-    default : float
-        PX4's, from v1.14 on.
-    unit : str
-    minimum, maximum : float
-        PX4's range, both ends included.
-    """
-
-    default: float
-    unit: str = ""
-    minimum: float = -math.inf
-    maximum: float = math.inf
-
-
-class Tables(Record, frozen=True):
-    """Those of ``ekf2_parameters.toml``."""
-
-    reported: tuple[str, ...]
-    aids: tuple[Aid, ...]
-    parameters: dict[str, Parameter]
-
-
-_TABLES = table(__file__, "ekf2_parameters.toml", Tables)
-REPORTED, PARAMETERS = _TABLES.reported, _TABLES.parameters
-AIDS: Mapping[str, Aid] = {aid.name: aid for aid in _TABLES.aids}
-EV_POS, BAROMETER, FLOW, MAG = (AIDS[n] for n in ("ev_pos", "baro_hgt", "optical_flow", "mag"))
-GNSS_POS, GNSS_HGT, GNSS_VEL = (AIDS[f"gnss_{what}"] for what in ("pos", "hgt", "vel"))
 AID_MASK = "EKF2_AID_MASK"
 # Since main of 2026 EKF2 takes a fix's own time of measurement, where the driver knows it
 GNSS_MODE = "EKF2_GPS_MODE"
 # Age of a fix since v1.17, of the first receiver: EKF2 then takes the stamp with it taken off
 RECEIVER_DELAYS = ("SENS_GNSS0_DELAY", "SENS_GPS0_DELAY")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of EKF2.
+
+    Attributes
+    ----------
+    unit : str
+    default : float
+        PX4's, from v1.14 on.
+    minimum, maximum : float
+        PX4's range, both ends included.
+    """
+
+    unit: str
+    default: float
+    minimum: float
+    maximum: float
+
+
+TABLE = msgspec.toml.decode(Path(__file__).with_name("ekf2_parameters.toml").read_bytes())
+AIDS, DISTURBANCES = (
+    msgspec.convert({name: {"name": name, **row} for name, row in rows.items()}, dict[str, Aid])
+    for rows in (TABLE["aids"], TABLE["disturbances"])
+)
+EV_POS, GNSS_POS, GNSS_VEL, GNSS_HGT, BAROMETER, FLOW, MAG = map(
+    AIDS.__getitem__,
+    ("ev_pos", "gnss_pos", "gnss_vel", "gnss_hgt", "baro_hgt", "optical_flow", "mag"),
+)
+PARAMETERS = msgspec.convert(TABLE["parameters"], dict[str, Parameter])
 FIELD_NOISES = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
 # Up to v1.13, ekf2_params.c
 OLD_DEFAULTS: Mapping[str, float] = {EV_POS.delay: 175.0}
+# Only these enter the results
+REPORTED: tuple[str, ...] = tuple(TABLE["reported"])
 
 
 def settings_in_force(

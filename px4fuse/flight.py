@@ -230,9 +230,13 @@ class Reset:
 
 # EKF2_PREDICT_US, ekf2_params.c
 EKF2_STEP_S = 0.010
-BIAS_NOT_LOGGED = lacking("bias")
-HORIZON_NOT_LOGGED = lacking("horizon")
-RECORD_NOT_LOGGED = lacking("record")
+BIAS_NOT_LOGGED = lacking("bias_not_logged")
+HORIZON_NOT_LOGGED = lacking("horizon_not_logged")
+
+
+RECORD_NOT_LOGGED = lacking("record_not_logged")
+
+
 GROUND_EFFECT, BAD_ACCELERATION = "gnd_effect", "bad_acc_vertical"
 # Of a sample of optical flow in EKF2's low pass of them (_flow_vel_body_lpf, ekf.h)
 FLOW_SHARE = 0.1
@@ -421,7 +425,7 @@ class Truth:
     __repr__ = brief
 
 
-MODES_NOT_LOGGED = lacking("modes")
+MODES_NOT_LOGGED = lacking("modes_not_logged")
 
 
 # equal to itself only: what is made of it is kept by it

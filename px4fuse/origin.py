@@ -90,6 +90,11 @@ GNSS = Origin("gnss", "as it arrived", GNSS_POS, automatic=False)
 ORIGINS = (GIVEN_FILE, RECEIVED, MOTION_CAPTURE, ALIGNED, KEPT, REBUILT, GNSS)
 
 
+def find_origin(kind: str, passage: str) -> Origin:
+    """The origin of this kind that got here in this way."""
+    return next(one for one in ORIGINS if (one.kind, one.passage) == (kind, passage))
+
+
 def with_orientation(origin: Origin, *, turns: bool) -> Origin:
     """The same, as an odometry where the external vision has an orientation that turns."""
     return replace(origin, kind="vio") if origin.kind == "uwb" and turns else origin

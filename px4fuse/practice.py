@@ -70,14 +70,14 @@ class Trick(Record, frozen=True):
     either_sign: bool = False
 
 
-class Hidden(Record, frozen=True):
+class Tricks(Record, frozen=True):
     """What may be chosen, with what it stands for, and what may be hidden."""
 
     choices: dict[str, str]
     tricks: tuple[Trick, ...]
 
 
-_HIDDEN = table(__file__, "practice.toml", Hidden)
+_HIDDEN = table(__file__, "practice.toml", Tricks)
 CHOICES, TRICKS = _HIDDEN.choices, _HIDDEN.tricks
 
 

@@ -128,10 +128,16 @@ def table(beside: str, name: str, kind: type[T]) -> T:
     return msgspec.toml.decode(Path(beside).with_name(name).read_bytes(), type=kind)
 
 
-_MISSING = table(__file__, "missing.toml", dict[str, Unavailable])
+_LACKING = table(__file__, "lacking.toml", dict[str, Unavailable])
 
 
-def lacking(which: str, /, **facts: object) -> Unavailable:
-    """What ``missing.toml`` has of something that is missing, with facts of the log in it."""
-    said = msgspec.structs.asdict(_MISSING[which])
-    return Unavailable(**{part: text.format_map(facts) for part, text in said.items()})
+def lacking(name: str, /, **told: object) -> Unavailable:
+    """What was looked for and not found, in the words of ``lacking.toml``.
+
+    Examples
+    --------
+    >>> str(lacking("measurements_few", what="tuning", count=3, least=30)).partition(". ")[0]
+    'tuning: 3 measurements are too few (at least 30)'
+    """
+    row = _LACKING[name]
+    return Unavailable(*(text.format(**told) for text in (row.what, row.reason, row.remedy)))

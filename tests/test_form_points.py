@@ -18,7 +18,7 @@ from px4fuse.answers import CURES, MISTAKES, PANELS, Answers, Claim
 from px4fuse.assignment.drawing import draw
 from px4fuse.assignment.truth import FormTruth, VerdictTruth, Wrong, truth_of
 from px4fuse.cli.simulate import simulate
-from px4fuse.grading.form_points import PARTS, SHOWS, cures, form_points, panels
+from px4fuse.grading.form_points import PARTS, TABLE, cures, form_points, panels
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
 from px4fuse.simulation.mistakes import parse
@@ -72,7 +72,7 @@ def parts(answers: Answers, truth: FormTruth = TRUTH) -> list[float]:
 
 def test_every_mistake_that_a_flight_can_have_can_be_named_seen_and_cured() -> None:
     assert set(SIMULATED) == set(MISTAKES) - {"none", "vio-drift"}
-    assert set(SHOWS) | {"cover"} == set(PANELS)
+    assert set(TABLE.shows) | {"cover"} == set(PANELS)
     for name in SIMULATED:
         offered = cures(Wrong(name, 1.0, 0.85, 1.15, 10.0, 20.0), TRUTH)
         assert {cure for cure, _, _ in offered} <= set(CURES)

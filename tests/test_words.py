@@ -11,8 +11,7 @@ import pytest
 
 import px4fuse
 
-PACKAGE = Path(px4fuse.__file__).parent
-ROOMS = [path.parent for path in PACKAGE.glob("*/words.toml")
+ROOMS = [path.parent for path in Path(px4fuse.__file__).parent.glob("*/words.toml")
          if "sentences(" in (path.parent / "__init__.py").read_text("utf-8")]  # fmt: skip
 
 
@@ -37,14 +36,6 @@ def test_every_sentence_is_said_with_its_facts_and_no_others(room: Path) -> None
     assert {name for name, _ in said} == texts.keys()
     for name, facts in said:
         assert facts == needed(texts[name]), name
-
-
-def test_what_is_missing_is_told_with_its_facts_and_no_others() -> None:
-    rows = tomllib.loads((PACKAGE / "missing.toml").read_text("utf-8"))
-    said = list(calls(PACKAGE, "lacking"))
-    assert {name for name, _ in said} == rows.keys()
-    for name, facts in said:
-        assert facts == needed(*rows[name].values()), name
 
 
 def test_there_are_such_rooms() -> None:

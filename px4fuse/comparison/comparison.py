@@ -161,7 +161,7 @@ def difference(run: Replay, ekf2_state: pd.DataFrame) -> Difference | Unavailabl
     apart = np.array(state_at(run, ekf2_state.index.to_numpy())) - ekf2_state[[*STATE]].to_numpy().T
     position, velocity = apart[:, np.isfinite(apart).all(axis=0)]
     if len(position) < projection.MIN_COMMON_SAMPLES:
-        return lacking("difference", count=len(position))
+        return lacking("difference_few", count=len(position))
     return Difference(
         count=len(position),
         position_rmse_m=_rmse(position),
@@ -206,7 +206,7 @@ def against_truth(
     ]
     position, velocity = (error[np.isfinite(error)] for error in errors)
     if len(position) < projection.MIN_COMMON_SAMPLES:
-        return lacking("difference_to_truth")
+        return lacking("truth_not_common")
     # EKF2's variances are logged at a tenth of the state's rate: NEES at their own times
     nees = {
         stated: _nees(at_s, error, variance[stated])

@@ -120,7 +120,7 @@ def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame |
         return ekf2.variance
     projected = project(ekf2.variance, axis, segment)
     if projected.empty:
-        return lacking("variances")
+        return lacking("variances_outside_segment")
     return projected
 
 
@@ -159,7 +159,7 @@ def project_innovations(
     ``posterior_variance_m2`` (P⁺ = P⁻R/S, or P⁻ where rejected), NaN where R is unknown.
     """
     if track.aid(axis.name) is None:
-        return lacking("innovations_of_source", name=track.name)
+        return lacking("innovations_of_another", name=track.name)
     frames = []
     for name in ("north", "east") if axis.name == AISLE else (axis.name,):
         frame = next(frame for key, frame in ekf2.innovations.items() if key == name)
@@ -170,7 +170,7 @@ def project_innovations(
     if axis.name == AISLE:
         cut = _innovations_along(cut, frames[1], axis.direction)
     if cut.empty:
-        return lacking("innovations")
+        return lacking("innovations_outside_segment")
     r = cut["observation_variance_m2"].fillna(observation_variance(flight, track, axis, segment))
     s_total = cut["innovation_variance_m2"]
     prior = (s_total - r).where(s_total > r)
@@ -235,5 +235,5 @@ def project_truth(
         return truth
     projected = project(truth.samples, axis, segment)
     if len(projected) < MIN_COMMON_SAMPLES:
-        return lacking("truth", name=truth.name)
+        return lacking("truth_outside_segment", name=truth.name)
     return projected

@@ -11,7 +11,16 @@ from scipy.special import chdtrc, gammaincinv, stdtr
 
 from px4fuse.arrays import Array
 from px4fuse.display import Shown
-from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Unavailable
+from px4fuse.record import (
+    Correlation,
+    Count,
+    NotNegative,
+    Positive,
+    Record,
+    Share,
+    Unavailable,
+    lacking,
+)
 
 Verdict = Literal["consistent", "variance overstated", "variance understated"]
 
@@ -158,14 +167,10 @@ def assess(
     finite = np.isfinite(innovation_m) & (innovation_variance_m2 > 0)
     nu, s = innovation_m[finite], innovation_variance_m2[finite]
     count = len(nu)
-    if count < MIN_INNOVATIONS or np.ptp(nu) == 0.0:
-        return Unavailable(
-            "consistency",
-            f"{count} innovations are too few for a statement (at least {MIN_INNOVATIONS})"
-            if count < MIN_INNOVATIONS
-            else "every innovation is the same",
-            "Analyse a longer segment, or log the source at a higher rate.",
-        )
+    if count < MIN_INNOVATIONS:
+        return lacking("innovations_few", count=count, least=MIN_INNOVATIONS)
+    if np.ptp(nu) == 0.0:
+        return lacking("innovations_alike")
     normalised = nu / np.sqrt(s)
     std = float(np.std(nu, ddof=1))
     bias_t = float(np.sqrt(count) * np.mean(nu) / std)

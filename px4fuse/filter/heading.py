@@ -25,7 +25,7 @@ from px4fuse.filter.motion import MAX_IMU_INTERVAL_S
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import IMU_GAP_S, Segment, ned_acceleration, within
 from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
-from px4fuse.record import NotNegative, Record, Share
+from px4fuse.record import NotNegative, Record, Share, lacking
 
 PART_S = 2.0
 MIN_PARTS = 3
@@ -160,11 +160,8 @@ def heading_error(
     samples = samples[(samples.index >= low) & (samples.index <= high)]
     slow = np.median(np.diff(acceleration.index.to_numpy())) > MAX_IMU_INTERVAL_S
     if slow or len(samples) < MIN_MEASUREMENTS:
-        return Unavailable(
-            "heading error",
-            "the IMU is too slow" if slow else f"{len(samples)} measurements are too few",
-            "Log sensor_combined at its full rate, and analyse a longer segment.",
-        )
+        few = lacking("heading_few", count=len(samples))
+        return lacking("heading_slow_imu") if slow else few
     samples = samples.iloc[:: int(np.ceil(len(samples) / MAX_MEASUREMENTS))]
     found = _by_positions(acceleration, samples, settings.dt_s, sigma_z_m)
     # how the source's own axes lie in the vehicle is not known, but that they do not turn is

@@ -26,6 +26,7 @@ from px4fuse.filter.marginal import Positions, centred
 from px4fuse.filter.model import noise_of_many_steps
 from px4fuse.filter.signals import imu_gaps
 from px4fuse.flight import Columns, Flight, Unavailable
+from px4fuse.record import lacking
 from px4fuse.trajectory.rotation import from_vector, matrix, multiply, running_product
 
 # Standard deviations of the constants, wide for consumer sensors: tilt and heading (rad), gyro
@@ -254,12 +255,7 @@ def motion(
                 of_stretch.append(signals[around])
     row = np.concatenate([np.zeros(0, dtype=np.intp), *rows])
     if len(row) < MIN_MEASUREMENTS:
-        return Unavailable(
-            "clock offset",
-            f"{len(row)} measurements with IMU and attitude are too few "
-            f"(at least {MIN_MEASUREMENTS})",
-            "Analyse a longer segment.",
-        )
+        return lacking("motion_few", count=len(row), least=MIN_MEASUREMENTS)
     edges = np.cumsum([0, *map(len, rows)])
     # from the first of each stretch, whose place nothing says: numbers stay small
     measured = pd.DataFrame(measurement_m[row])

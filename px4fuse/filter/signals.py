@@ -17,6 +17,7 @@ from px4fuse.arrays import Array, BoolArray, cumulative_integral
 from px4fuse.display import brief
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import AXIS_NAMES, Columns, Flight, PositionTrack, Unavailable
+from px4fuse.record import lacking
 
 AISLE = "aisle"
 # A track that is so many times longer than wide was flown along an aisle
@@ -144,11 +145,7 @@ def _ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     known = flight.attitude.index.to_numpy()
     imu = flight.imu[(flight.imu.index >= known[0]) & (flight.imu.index <= known[-1])]
     if len(imu) < 2:
-        return Unavailable(
-            "acceleration in NED",
-            "IMU and attitude do not overlap in time",
-            "Record both from boot (SDLOG_MODE 1).",
-        )
+        return lacking("no_overlap")
     quaternions = flight.attitude[Columns.QUATERNION].to_numpy(copy=True)
     rotations = Rotation.from_quat(quaternions, scalar_first=True)
     body_to_ned = Slerp(known, rotations)(imu.index.to_numpy())
@@ -235,11 +232,7 @@ def make_axes(
 
 def too_few(what: str, count: int, least: int) -> Unavailable:
     """What stands in for an estimate from so few measurements."""
-    return Unavailable(
-        what,
-        f"{count} measurements are too few (at least {least})",
-        "Analyse a longer segment, or log the source at a higher rate.",
-    )
+    return lacking("measurements_few", what=what, count=count, least=least)
 
 
 def along(frame: pd.DataFrame, columns: list[str], weights: Array) -> Array:
@@ -286,9 +279,7 @@ def project_acceleration(
     value = ned @ direction
     inside = (time >= segment.start_s) & (time <= segment.end_s)
     if np.count_nonzero(inside) < 2:
-        return Unavailable(
-            "IMU", "no IMU sample in the analysed segment", "Choose --start and --end inside it."
-        )
+        return lacking("imu_outside_segment")
     is_gap = imu_gaps(time)
     gap, passed_s = np.flatnonzero(is_gap), np.cumsum(np.where(is_gap, np.diff(time), 0.0))
     ends = np.unique([0, *gap, *(gap + 1), len(time) - 1])

@@ -38,7 +38,7 @@ from px4fuse.filter.motion import SignalCache, motion
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, too_few
 from px4fuse.flight import Flight, Unavailable
-from px4fuse.record import Count, Maybe, NotNegative, Record
+from px4fuse.record import Count, Maybe, NotNegative, Record, lacking
 
 HORIZONTAL = "horizontal"
 NoiseInterval = tuple[NotNegative, NotNegative | None]
@@ -289,11 +289,7 @@ def tune_axes(
     best = alone if found is None else found
     skip = alone.outlier > 0.5
     if np.mean(skip) > MAX_OUTLIER_SHARE:
-        return Unavailable(
-            f"tuning, {name}",
-            f"{np.mean(skip):.0%} of the measurements look like outliers",
-            "Fix the source first; noises cannot be told from outliers.",
-        )
+        return lacking("tuning_outliers", name=name, share=np.mean(skip))
     sigma_a, sigma_z = (_noise(best, which) for which in (0, 1))
     at_z = sigma_z.value or sigma_z.high or best.noises.sigma_z_m
     needed = sigma_a if found is None else _needed(alone, at_z)
@@ -388,11 +384,7 @@ def _hold_out(
     """Tune on the first half, score on the second."""
     half = len(found.weight) // 2
     if half < MIN_MEASUREMENTS:
-        return Unavailable(
-            f"held-out check, {name}",
-            f"half of the segment holds {half} measurements (at least {MIN_MEASUREMENTS})",
-            "Analyse a longer segment.",
-        )
+        return lacking("held_out_few", name=name, half=half, least=MIN_MEASUREMENTS)
     part = [filter_part(leg.first(half)) for leg in legs]
     first = most_likely(part, found.noises, found.weight[:half], outliers=False)
     tuned = first.noises

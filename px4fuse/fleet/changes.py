@@ -20,21 +20,8 @@ from px4fuse.results.model import provenance, schema_of
 _ORDER: tuple[contract.Judgement, ...] = ("worse", "better", "changed", "")
 _CAUSES = ("tuning", "clock", "heading")
 # What is compared as text, and where it stands in the results; the segment of one flight alone
-_SETTINGS = {
-    "SIGMA_A (m/s²)": "settings.sigma_a_m_s2",
-    "SIGMA_Z (m)": "settings.sigma_z_m",
-    "DT (s)": "settings.dt_s",
-    "input": "settings.input",
-    "clock offset added (s)": "settings.clock_offset_s",
-}
-_SEGMENT = {"start (s)": "settings.start_s", "end (s)": "settings.end_s"}
-_FLIGHT = {
-    "firmware": "log.firmware",
-    "firmware hash": "log.firmware_hash",
-    "hardware": "log.hardware",
-    "position source": "source.name",
-    "px4fuse": "provenance.px4fuse",
-}
+_TEXTS = measures.read_rows("texts.csv")
+
 Results = contract.ComparisonResults | contract.AidsResults
 
 
@@ -173,12 +160,14 @@ def _compared(side: DiffInput) -> contract.Compared:
 
 def _texts(a: Results, b: Results, *, paired: bool) -> Iterator[contract.TextChange]:
     """Settings, parameters of PX4 and facts about the flight that are not the same."""
-    places = {**_SETTINGS, **(_SEGMENT if paired else {}), **_FLIGHT}
-    for what, place in places.items():
-        if (first := at(a, place)) != (second := at(b, place)):
+    for row in _TEXTS:
+        place = row["place"]
+        if (first := at(a, place)) != (second := at(b, place)) and (
+            paired or row["of"] != "segment"
+        ):
             kind: Literal["setting", "flight"]
-            kind = "setting" if place.startswith("settings.") else "flight"
-            yield contract.TextChange(kind, what, _plain(first), _plain(second))
+            kind = "flight" if row["of"] == "flight" else "setting"
+            yield contract.TextChange(kind, row["what"], _plain(first), _plain(second))
     one, other = _parameters(a), _parameters(b)
     for name in sorted(one.keys() | other.keys()):
         if (first := one.get(name)) != (second := other.get(name)):
@@ -247,7 +236,8 @@ def _notes(a: DiffInput, b: DiffInput, *, paired: bool) -> Iterator[str]:
             f"another flight would show it too. Less than {LEAST_RATIO:.0%} counts as the same."
         )
         return
-    if any(at(a.results, place) != at(b.results, place) for place in _SETTINGS.values()):
+    settings = [row["place"] for row in _TEXTS if row["of"] == "settings"]
+    if any(at(a.results, place) != at(b.results, place) for place in settings):
         yield "The filter's settings are not the same: numbers of ours differ by them too."
     yield (
         f"Of the changes that are called significant, {FALSE_DISCOVERY_RATE:.0%} are expected to "

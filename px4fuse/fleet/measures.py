@@ -7,6 +7,7 @@ innovations comes from chi-square with so many of them as are independent, and t
 known.
 """
 
+import csv
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,6 +15,7 @@ from functools import cache, reduce
 from importlib.resources import files
 from typing import Any, Literal
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
@@ -51,7 +53,7 @@ LEAST_DIFFERENCE = {"": 0.001, "m": 0.001, "s": 0.001, "°": 0.1}
 
 @dataclass(frozen=True)
 class Measure:
-    """A kind of number that flights are compared by.
+    """A kind of number that flights are compared by: a row of ``measures.csv``.
 
     Attributes
     ----------
@@ -93,43 +95,17 @@ class Measure:
         return now - before if self.aim == "low" else abs(now) - abs(before)
 
 
-def _of_filter(key: str, name: str) -> tuple[Measure, ...]:
-    path = f"axes.*.filters.{key}"
-    return (
-        Measure(f"{path}.nis_mean", f"NIS of {name}", aim="one"),
-        Measure(f"{path}.innovation_std_m", f"innovation std of {name}", "m"),
-        Measure(f"{path}.outside_gate", f"beyond the gate of {name}", scale="difference"),
-        Measure(f"{path}.truth.position_rmse_m", f"error of {name}", "m"),
-        Measure(f"{path}.truth.velocity_rmse_m_s", f"velocity error of {name}", "m/s"),
-        Measure(f"{path}.truth.nees_position_mean", f"NEES of {name}", aim="one"),
-        Measure(f"{path}.innovation_mean_m", f"innovation mean of {name}", "m", "zero",
-                "difference"),
-        Measure(f"{path}.sigma_p_median_m", f"σ_p of {name}", "m", ""),
-        Measure(f"{path}.sigma_v_median_m_s", f"σ_v of {name}", "m/s", ""),
-    )  # fmt: skip
-
-
 APART = "axes.*.difference."
 REJECTED = "axes.*.rejected_share"
-MEASURES = {
-    measure.path: measure
-    for measure in (
-        Measure("tuning.*.sigma_z_m", "SIGMA_Z found", "m"),
-        Measure("tuning.*.filter_sigma_a_m_s2", "SIGMA_A found", "m/s²"),
-        Measure("clock.offset_s", "clock offset", "s", "zero", "difference"),
-        Measure("heading.turn_deg", "turn of the source's frame", "°", "zero", "difference"),
-        Measure(REJECTED, "share that EKF2 rejected", scale="difference"),
-        Measure("loop.closure_error_m", "closure error of the loop", "m"),
-        Measure("source.rate_hz", "rate of the source", "Hz", ""),
-        Measure("log.duration_s", "duration of the log", "s", ""),
-        *_of_filter("ekf2", "EKF2"),
-        *_of_filter("kf", "ours"),
-        Measure(f"{APART}position_rmse_m", "ours - EKF2", "m"),
-        Measure(f"{APART}velocity_rmse_m_s", "ours - EKF2, velocity", "m/s"),
-        Measure("aids.*.axes.*.nis_mean", "NIS", aim="one"),
-        Measure("aids.*.rejected_share", "share rejected", scale="difference"),
-    )
-}
+
+
+def read_rows(name: str) -> list[dict[str, str]]:
+    """Rows of a table of this folder, by the titles of its columns."""
+    with files("px4fuse.fleet").joinpath(name).open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+MEASURES = {row["path"]: msgspec.convert(row, Measure) for row in read_rows("measures.csv")}
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import pandas as pd
 
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.findings import Finding
-from px4fuse.fleet.measures import at
+from px4fuse.fleet.measures import at, read_rows
 from px4fuse.record import Unavailable
 from px4fuse.results.contract import ComparisonResults, Log
 from px4fuse.spreadsheet import neutral
@@ -17,50 +17,11 @@ DONE, NOT_JUDGED, FAILED = "done", "not judged", "failed"
 BETWEEN_FINDINGS = ";"
 # Which tuning speaks for an axis
 _TUNED_AS = {"north": "horizontal", "east": "horizontal"}
+_COLUMNS = read_rows("columns.csv")
 #: Columns of the table and where each stands in the results; empty where it is put together
-PLACES = {
-    **dict.fromkeys(("log", "name"), "log.name"),
-    "log_sha256": "log.sha256",
-    "px4fuse": "provenance.px4fuse",
-    **dict.fromkeys(("settings", "status", "reason", "remedy"), ""),
-    "vehicle": "log.vehicle",
-    "firmware": "log.firmware",
-    "firmware_hash": "log.firmware_hash",
-    "airframe": "",
-    "hardware": "log.hardware",
-    "date": "",
-    "duration_s": "log.duration_s",
-    "source": "source.name",
-    "source_rate_hz": "source.rate_hz",
-    "axis": "",
-    "updates": "axes.{axis}.updates.count",
-    "kf_nis_mean": "axes.{axis}.filters.kf.nis_mean",
-    "kf_factor": "axes.{axis}.filters.kf.sigma_factor",
-    "kf_verdict": "axes.{axis}.filters.kf.verdict",
-    "ekf2_nis_mean": "axes.{axis}.filters.ekf2.nis_mean",
-    "ekf2_factor": "axes.{axis}.filters.ekf2.sigma_factor",
-    "ekf2_verdict": "axes.{axis}.filters.ekf2.verdict",
-    "position_rmse_m": "axes.{axis}.difference.position_rmse_m",
-    "velocity_rmse_m_s": "axes.{axis}.difference.velocity_rmse_m_s",
-    "kf_position_rmse_to_truth_m": "axes.{axis}.filters.kf.truth.position_rmse_m",
-    "ekf2_position_rmse_to_truth_m": "axes.{axis}.filters.ekf2.truth.position_rmse_m",
-    "sigma_z_m": "tuning.{tuned}.sigma_z_m",
-    "sigma_z_low_m": "tuning.{tuned}.sigma_z_m_interval.0",
-    "sigma_z_high_m": "tuning.{tuned}.sigma_z_m_interval.1",
-    "sigma_a_m_s2": "tuning.{tuned}.filter_sigma_a_m_s2",
-    "sigma_a_low_m_s2": "tuning.{tuned}.filter_sigma_a_m_s2_interval.0",
-    "sigma_a_high_m_s2": "tuning.{tuned}.filter_sigma_a_m_s2_interval.1",
-    "clock_offset_s": "clock.offset_s",
-    "clock_offset_low_s": "clock.interval_s.0",
-    "clock_offset_high_s": "clock.interval_s.1",
-    "rejected_share": "axes.{axis}.rejected_share",
-    "model_correlation": "ekf2_replay.agreement.{axis}.innovation_correlation",
-    **dict.fromkeys(("aids", "story", "findings", "results", "report", "change"), ""),
-}
-_NUMBERS = ("_m", "_s", "_s2", "_hz", "_mean", "_factor", "_share", "_correlation")
+PLACES = {row["column"]: row["place"] for row in _COLUMNS}
 #: Types of the columns; absent numbers are NA, absent texts are empty
-COLUMNS = {name: "float64" if name.endswith(_NUMBERS) else "str" for name in PLACES}
-COLUMNS["updates"] = "Int64"
+COLUMNS = {row["column"]: row["type"] for row in _COLUMNS}
 
 Row = dict[str, Any]
 

@@ -2,55 +2,22 @@
 
 The weights and shares are those by which forms were judged by hand. A guess does not pay: each
 claim that is not true costs, and what needs no measurement counts only with the size.
+``form_points.toml`` has the rows.
 """
 
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
+
+import msgspec
 
 from px4fuse.answers import MISTAKES, Answers, Claim, Quantified
 from px4fuse.assignment.truth import FormTruth, Wrong
 from px4fuse.filter.consistency import SIGMA_OFF
 
-PARTS = ("kinds", "sizes", "when", "cure", "verdicts", "quantities")
-WEIGHTS = dict(zip(PARTS, (30.0, 15.0, 10.0, 15.0, 15.0, 15.0), strict=True))
-# Of a clean flight that is called clean: there is nothing to size, date or cure
-WEIGHTS_CLEAN = dict(zip(PARTS, (40.0, 0.0, 0.0, 0.0, 30.0, 30.0), strict=True))
 FALSE_CLAIM, MOST_FALSE = 10.0, 3
-# What is the same thing from the other side earns part of the kind
-NEIGHBOURS = (
-    frozenset(("clock-offset", "ekf2-delay", "clock-jump", "clock-drift")),
-    frozenset(("ekf2-noise", "r-scale", "ekf2-gate")),
-    frozenset(("dropout", "decimate")),
-)
 NEIGHBOUR, SAME_NUMBER, EFFECT = 0.4, 2.0 / 3.0, 0.15
-# What only follows from a mistake, named in its place
-EFFECTS: Mapping[str, frozenset[str]] = {
-    "nlos": frozenset(("ekf2-noise", "r-scale", "ekf2-gate")),
-    "dropout": frozenset(("jump", "ekf2-gate")),
-    "open-end": frozenset(("vio-drift",)),
-    "clock-offset": frozenset(("smoothed", "scale")),
-    "jump": frozenset(("nlos",)),
-    "ekf2-noise": frozenset(("nlos", "jump")),
-    "ekf2-gate": frozenset(("nlos", "jump", "dropout")),
-    "ekf2-delay": frozenset(("smoothed",)),
-}
-# What each panel shows; the cover shows that there is something
-SHOWS: Mapping[str, tuple[str, ...]] = {
-    "clock": ("clock-offset", "clock-drift", "clock-jump", "smoothed"),
-    "innovations": ("nlos", "dropout", "decimate", "r-scale", "jump", "smoothed", "slow-error",
-                    "accel-bias", "vibration", "ekf2-noise", "ekf2-gate", "ekf2-off", "mag"),
-    "map": ("yaw", "heading", "scale", "jump", "no-motion", "open-end"),
-    "parameters": ("decimate", "r-scale", "imu-rate", "no-vvo", "ekf2-noise", "ekf2-delay",
-                   "ekf2-gate", "ekf2-off"),
-    "sigma": ("dropout", "imu-dropout", "decimate", "vibration", "ekf2-noise"),
-    "position along the aisle": ("dropout", "jump", "no-motion"),
-    "velocity": ("imu-dropout", "accel-bias", "vibration", "imu-rate", "no-motion"),
-    "why EKF2 differs": ("ekf2-delay", "ekf2-gate", "ekf2-off"),
-    "error to truth": ("clock-offset", "yaw", "heading", "slow-error", "scale", "jump", "smoothed",
-                       "accel-bias", "ekf2-delay"),
-    "loop": ("jump", "open-end"),
-}  # fmt: skip
 # What needs no measurement: it counts only where the size is right, and close is not enough, since
 # the sizes that are drawn lie close to each other
 GUESSABLE = frozenset(("open-end",))
@@ -58,6 +25,34 @@ ANY = (-math.inf, math.inf)
 CLOSE_S, CLOSE_SHARE = 2.0, 0.05
 FULL_WITHIN, HALF_WITHIN = 0.02, 0.10
 HALF_SIZE = 0.4
+
+
+@dataclass(frozen=True)
+class _Cure:
+    """A row of the cures: ``to`` are bounds, or how they follow from the mistake."""
+
+    parameter: str
+    of: Mapping[str, float]
+    to: tuple[float, float] | str = ANY
+    late: bool = False
+
+
+@dataclass(frozen=True)
+class _FormTable:
+    """What ``form_points.toml`` has."""
+
+    weights: dict[str, float]
+    weights_clean: dict[str, float]
+    neighbours: dict[str, frozenset[str]]
+    effects: dict[str, frozenset[str]]
+    shows: dict[str, tuple[str, ...]]
+    cures: tuple[_Cure, ...]
+
+
+TABLE = msgspec.toml.decode(
+    Path(__file__).with_name("form_points.toml").read_bytes(), type=_FormTable
+)
+PARTS = tuple(TABLE.weights)
 
 
 @dataclass(frozen=True)
@@ -88,7 +83,7 @@ class FormPoints:
 def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
     """Points for a form about a flight whose truth is known."""
     called_clean = not truth.mistakes and answers.says_none
-    weights = WEIGHTS_CLEAN if called_clean else WEIGHTS
+    weights = TABLE.weights_clean if called_clean else TABLE.weights
     shares = dict.fromkeys(PARTS, 0.0)
     matched, false = _matched(answers, truth)
     if truth.mistakes and len(false) < MOST_FALSE:
@@ -151,9 +146,9 @@ def kind_share(kind: str, claimed: str) -> float:
         return 1.0
     if (kind, claimed) == ("r-scale", "ekf2-noise"):
         return SAME_NUMBER
-    if any({kind, claimed} <= group for group in NEIGHBOURS):
+    if any({kind, claimed} <= group for group in TABLE.neighbours.values()):
         return NEIGHBOUR
-    return EFFECT if claimed in EFFECTS.get(kind, ()) else 0.0
+    return EFFECT if claimed in TABLE.effects.get(kind, ()) else 0.0
 
 
 def _of_mistakes(matched: list[Match], truth: FormTruth) -> dict[str, float]:
@@ -202,7 +197,7 @@ def when_share(wrong: Wrong, claim: Claim) -> float:
 
 def panels(kind: str) -> list[str]:
     """The panels that can show a kind of mistake."""
-    return [*(panel for panel, kinds in SHOWS.items() if kind in kinds), "cover"]
+    return [*(panel for panel, kinds in TABLE.shows.items() if kind in kinds), "cover"]
 
 
 def cure_share(wrong: Wrong, claim: Claim, truth: FormTruth) -> float:
@@ -228,56 +223,29 @@ Cure = tuple[str, tuple[float, float], float]
 
 
 def cures(wrong: Wrong, truth: FormTruth) -> tuple[Cure, ...]:
-    """Parameters that act on a mistake, from which value to which they cure it, and their share.
-
-    A half acts on the right thing without effect, a third hides the mistake.
-    """
+    """Parameters that act on a mistake, from which value to which they cure it, and their share."""
     size, low, high = (0.0 if one is None else one for one in (wrong.size, wrong.low, wrong.high))
     from_s = 0.0 if wrong.from_s is None else wrong.from_s
     until_s = from_s if wrong.until_s is None else wrong.until_s
-    noise = 0.8 * truth.sigma_z_m, 1.25 * truth.sigma_z_m
-    back = -high, -low
-    factors = 100.0 / (100.0 + high), 100.0 / (100.0 + low)
-    after, before = (until_s - 1.0, until_s + 15.0), (from_s - 15.0, from_s + 1.0)
-    # of each kind what cures it best stands first
-    rows: tuple[tuple[str, tuple[float, float], Mapping[str, float]], ...] = (
-        ("synchronise the clocks before take-off", ANY, {"clock-drift": 1.0, "clock-jump": 1.0}),
-        ("switch the smoothing off", ANY, {"smoothed": 1.0}),
-        ("--clock-offset", back, {"clock-offset": 1.0, "smoothed": 1.0 / 3.0}),
-        ("--clock-offset", ANY, {"clock-drift": 0.5}),
-        ("correct the stamps at the sender", back, {"clock-offset": 1.0}),
-        ("EKF2_EV_DELAY", (1e3 * low, 1e3 * high), {"clock-offset": float(size > 0.0)}),
-        ("EKF2_EV_DELAY", (0.0, 20.0), {"ekf2-delay": 1.0}),
-        ("send positions more often", (5.0, 1e3), {"decimate": 1.0}),
-        ("line of sight and link", ANY, dict.fromkeys(("nlos", "dropout", "slow-error"), 1.0)),
-        ("line of sight and link", ANY, {"decimate": 0.5}),
-        ("one set of anchors", ANY, {"jump": 1.0}),
-        ("--start", after, dict.fromkeys(("clock-jump", "dropout", "imu-dropout", "jump"), 1.0)),
-        ("--end", before, dict.fromkeys(("dropout", "imu-dropout", "jump"), 1.0)),
-        ("log at a higher rate", (2.0 * size, 1e4), {"imu-rate": 1.0}),
-        ("log at a higher rate", ANY, {"imu-dropout": 0.5}),
-        ("EKF2_EVP_GATE", (3.0, 10.0), {"ekf2-gate": 1.0}),
-        ("EKF2_EVP_GATE", ANY, {"nlos": 0.5}),
-        ("EKF2_EVP_NOISE", noise, {"ekf2-noise": 1.0, "r-scale": 1.0}),
-        ("EKF2_EVP_NOISE", ANY, {"ekf2-gate": 1.0 / 3.0}),
-        ("report the true variance", noise, {"r-scale": 1.0}),
-        ("report the true variance", ANY, {"slow-error": 0.5}),
-        ("calibrate the compass", ANY, {"heading": 1.0, "mag": 1.0}),
-        ("--position-yaw", back, {"yaw": 1.0, "heading": 0.5}),
-        ("turn the positions at the sender", back, {"yaw": 1.0}),
-        ("multiply the positions at the sender", factors, {"scale": 1.0}),
-        ("survey the anchors", ANY, {"yaw": 1.0, "scale": 1.0}),
-        ("calibrate the accelerometer", ANY, {"accel-bias": 1.0}),
-        ("balance the propellers", ANY, {"vibration": 1.0}),
-        ("--sigma-a", ANY, {"vibration": 0.5}),
-        ("SDLOG_PROFILE", (129.0, 255.0), {"no-vvo": 1.0}),
-        ("SDLOG_PROFILE", ANY, {"imu-rate": 0.5}),
-        ("fly several passes", ANY, {"no-motion": 1.0}),
-        ("--open", ANY, {"open-end": 1.0}),
-        ("--landed-at", (low, high), {"open-end": 1.0}),
-        ("EKF2_EV_CTRL", (1.0, 15.0), {"ekf2-off": 1.0}),
-    )  # fmt: skip
-    return tuple((name, to, of[wrong.kind]) for name, to, of in rows if wrong.kind in of)
+    bounds = {
+        "back": (-high, -low),
+        "size": (low, high),
+        "milliseconds": (1e3 * low, 1e3 * high),
+        "twice": (2.0 * size, 1e4),
+        "factors": (100.0 / (100.0 + high), 100.0 / (100.0 + low)),
+        "noise": (0.8 * truth.sigma_z_m, 1.25 * truth.sigma_z_m),
+        "after": (until_s - 1.0, until_s + 15.0),
+        "before": (from_s - 15.0, from_s + 1.0),
+    }
+    return tuple(
+        (
+            row.parameter,
+            bounds[row.to] if isinstance(row.to, str) else row.to,
+            0.0 if row.late and size <= 0.0 else row.of[wrong.kind],
+        )
+        for row in TABLE.cures
+        if wrong.kind in row.of
+    )
 
 
 def _verdicts(answers: Answers, truth: FormTruth) -> float:

@@ -33,6 +33,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO
 
+import msgspec
+
 from px4fuse.assignment.roster import Person, distinct
 from px4fuse.errors import SettingsError
 from px4fuse.grading.model import NOBODY, ExportOrigin, Submission
@@ -58,21 +60,10 @@ _UTF8 = 0x800
 METADATA = "submission_metadata.yml"
 # By platform: how its exports name files
 PLATFORMS = {
-    "moodle": re.compile(
-        r"(?P<name>[^/]+?)_(?P<number>\d+)_assignsubmission_[a-z]+(?P<rest>_?(?:/|$)|_[^/]*$)"
-    ),
-    "canvas": re.compile(
-        r"(?P<name>[^\W\d_][^/_]*)(?P<late>_LATE)?_(?P<number>\d+)_\d+_[^/]+(?:/|$)"
-    ),
-    "blackboard": re.compile(
-        r"[^/]*?_(?P<login>[^/_]+)_attempt_(?P<time>\d{4}-\d\d-\d\d-\d\d-\d\d-\d\d)(?:_[^/]*|\.[^/.]+)$"
-    ),
-    "gradescope": re.compile(r"submission_(?P<number>\d+)(?:/|\.pdf$)"),
-    # a login has a letter, and a number is not a year: "flight_lab_reports_2026/" is a folder
-    "ilias": re.compile(
-        r"(?P<last>[^\W\d_][^/_]*)_(?P<first>[^\W\d_][^/_]*)_(?P<login>[^/]*[^\W\d_][^/]*)"
-        r"_(?P<number>(?!(?:19|20)\d\d/)\d+)/(?P<late>Late Submission - )?"
-    ),
+    name: re.compile(pattern)
+    for name, pattern in msgspec.toml.decode(
+        Path(__file__).with_name("platforms.toml").read_bytes(), type=dict[str, str]
+    ).items()
 }
 # What a platform writes into a name once, and nobody else by chance
 _PARTS = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")

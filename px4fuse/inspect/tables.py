@@ -24,7 +24,7 @@ DICTIONARY_COLUMNS = ["table", "column", "unit", "frame", "meaning", "source_top
 # What a file name may not hold on some system, or what is awkward in a shell
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
 MAX_NAME = 80
-NO_POSITION = lacking("position")
+NO_POSITION = lacking("no_track")
 
 
 @dataclass(frozen=True)

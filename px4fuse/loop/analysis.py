@@ -13,6 +13,7 @@ from px4fuse.loop.corrections import by_distance, judge, score_all, solve_all
 from px4fuse.loop.model import LANDING, KnownEnd, Loop, OdometryNoise
 from px4fuse.loop.odometry import Claim, pose_graph
 from px4fuse.loop.tracks import LoopSource, odometry_of, trajectory_of
+from px4fuse.record import lacking
 from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Trajectory, by_axis, cumulative_distance
@@ -135,9 +136,7 @@ def _known_end(
             raise SettingsError("`landed_at` and `came_back` exclude each other", "Leave one out.")
         return part.measured_end(path, request.landed_at)
     if not request.came_back:
-        return Unavailable(
-            "misclosure", "the vehicle is not said to have come back", "Leave out --open."
-        )
+        return lacking("open_end")
     return by_truth if isinstance(by_truth, KnownEnd) else part.assumed_end(path)
 
 
@@ -188,12 +187,7 @@ def _heading_error(end: KnownEnd | Unavailable, heading_deg: float | None) -> fl
     if heading_deg is None:
         return Unavailable(what, "the trajectory has no orientations", "None needed.")
     if end.heading_change_deg is None:
-        return Unavailable(
-            what,
-            f"the vehicle ends turned by {heading_deg:+.0f}°, and how far it was really turned is "
-            "not known",
-            "Give it as the third number of --landed-at FORWARD,RIGHT,DEG.",
-        )
+        return lacking("turn_unknown", what=what, heading_deg=heading_deg)
     return float(np.degrees(lie.wrap(np.radians(heading_deg - end.heading_change_deg))))
 
 
@@ -225,9 +219,5 @@ def loop_in(flight: Flight, progress: Callable[[str], None] = lambda _: None) ->
         extent = float(np.linalg.norm(np.ptp(inside, axis=0)))
         gap = float(np.linalg.norm(inside[-1] - inside[0]))
     if 2.0 * extent < LOOP_MIN_PATH_M or gap > LOOP_MAX_GAP_SHARE * 2.0 * extent:
-        return Unavailable(
-            "loop closure",
-            f"the odometry ends {gap:.1f} m from where it began and spans {extent:.1f} m: no loop",
-            "Fly back to the place of take-off, or use px4fuse loop with --closure.",
-        )
+        return lacking("no_loop", gap=gap, extent=extent)
     return analyse(LoopSource(trajectory, flight), progress=progress)

@@ -13,7 +13,7 @@ from px4fuse.flight import Unavailable
 from px4fuse.loop.closure import correct_by_distance, distribute_by_distance
 from px4fuse.loop.model import LANDING, Closure, CorrectedPath, Way
 from px4fuse.loop.odometry import Claim
-from px4fuse.record import written
+from px4fuse.record import lacking, written
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
 from px4fuse.trajectory.graph.analysis import ROBUST, SOLUTIONS
 from px4fuse.trajectory.graph.covariance import gate
@@ -58,13 +58,7 @@ def by_distance(
 
 
 def _refused(what: str, closure: Closure) -> Unavailable:
-    return Unavailable(
-        what,
-        f"the gate rejects {closure} (d² {closure.d2:.1f}, p {closure.p:.1g}): forcing it would "
-        "warp the whole path",
-        "Measure where the vehicle landed (--landed-at), leave the landing out (--open), or say "
-        "with --drift that this odometry drifts more.",
-    )
+    return lacking("closure_rejected", what=what, closure=closure, d2=closure.d2, p=closure.p)
 
 
 def judge(graph: PoseGraph | Unavailable, claims: Sequence[Claim]) -> tuple[Closure, ...]:

@@ -19,6 +19,7 @@ from px4fuse.readers.parts import finite_rows
 from px4fuse.readers.text_table import text_of
 from px4fuse.readers.trajectory import read_trajectory
 from px4fuse.reading import read_head, shown
+from px4fuse.record import lacking
 from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
 
 Part = Literal["vio", "ekf2", "kf", "truth"]
@@ -36,11 +37,7 @@ def odometry_of(flight: Flight) -> PositionTrack | Unavailable:
         if track.origin.is_vision and track.orientation is not None:
             return track
     have = ", ".join(track.name for track in flight.positions) or "none"
-    return Unavailable(
-        "visual-inertial odometry",
-        "no external vision with orientation is in the log (position sources: " + have + ")",
-        "Send the odometry to PX4 as ODOMETRY and set SDLOG_PROFILE to 129 to log it.",
-    )
+    return lacking("no_odometry", have=have)
 
 
 def trajectory_of(flight: Flight, part: Part) -> Trajectory:

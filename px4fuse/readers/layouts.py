@@ -1,9 +1,19 @@
-"""How a topic or message holds a quantity: the rows of which the tables of both formats consist."""
+"""How a topic or message holds a quantity: the rows of the tables of both formats.
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+The tables are ``px4_topics.toml`` and ``mavlink_messages.toml``.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
 
 from px4fuse.flight import Columns
+
+GLOBAL_COLUMNS = ["latitude_deg", "longitude_deg", "altitude_m"]
+Table = TypeVar("Table")
 
 
 @dataclass(frozen=True)
@@ -13,7 +23,7 @@ class Layout:
     Attributes
     ----------
     topic : str
-        A PX4 topic or a MAVLink message.
+        A PX4 topic or a MAVLink message; empty where the table names it elsewhere.
     columns : mapping
         Our column name to the field's name, ``name[i]`` for an element; all must be present.
     optional : mapping
@@ -22,35 +32,55 @@ class Layout:
         Our unit per unit of the field, by our column name; 1 where there is none.
     """
 
-    topic: str
-    columns: Mapping[str, str]
+    topic: str = ""
+    columns: Mapping[str, str] = field(default_factory=dict)
     optional: Mapping[str, str] = field(default_factory=dict)
     scale: Mapping[str, float] = field(default_factory=dict)
 
 
-def elements(names: list[str], of: str, at: Iterable[int] = range(100)) -> dict[str, str]:
-    """Columns that are elements of one field; all from the first on by default.
+def read_table(file: str, kind: type[Table]) -> Table:
+    """A table of this folder, as a record of this kind."""
+    return msgspec.toml.decode(Path(__file__).with_name(file).read_bytes(), type=kind)
 
-    >>> elements(["north_m", "east_m"], "position")
+
+def one_by_one(rows: Mapping[str, Layout]) -> dict[str, Layout]:
+    """Rows as they are written, with every column named."""
+    return {
+        name: replace(
+            row,
+            columns=columns_of(row.columns),
+            optional=columns_of(row.optional),
+            scale=columns_of(row.scale),
+        )
+        for name, row in rows.items()
+    }
+
+
+def columns_of(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Columns one by one, of which a row names several at once.
+
+    Parameters
+    ----------
+    fields : mapping
+        Names of columns with blanks between them, or of a list of :class:`Columns`; and their
+        fields with blanks between them, elements of one field (``name[]`` from the first on,
+        ``name[0 6 11]``), or a number for all of them.
+
+    Examples
+    --------
+    >>> columns_of({"POSITION": "x y z"})
+    {'north_m': 'x', 'east_m': 'y', 'down_m': 'z'}
+    >>> columns_of({"north_m east_m": "position[]"})
     {'north_m': 'position[0]', 'east_m': 'position[1]'}
     """
-    return {name: f"{of}[{index}]" for name, index in zip(names, at, strict=False)}
-
-
-def fields(columns: list[str], names: str) -> dict[str, str]:
-    """Columns of some fields, whose names are separated by blanks.
-
-    >>> fields(["north_m", "east_m"], "x y")
-    {'north_m': 'x', 'east_m': 'y'}
-    """
-    return dict(zip(columns, names.split(), strict=True))
-
-
-XYZ, VELOCITY = fields(Columns.POSITION, "x y z"), fields(Columns.VELOCITY, "vx vy vz")
-POSITION_AND_VELOCITY = XYZ | VELOCITY
-GLOBAL_COLUMNS = ["latitude_deg", "longitude_deg", "altitude_m"]
-GLOBAL = fields(GLOBAL_COLUMNS, "lat lon alt")
-# As integers
-GLOBAL_SCALE = dict(zip(GLOBAL_COLUMNS, (1e-7, 1e-7, 1e-3), strict=True))
-# Where the diagonal stands in the row-major upper triangle of a 6×6 matrix: x, y, z, and rotations
-POSE_DIAGONAL, ROTATION_DIAGONAL = (0, 6, 11), (15, 18, 20)
+    found: dict[str, Any] = {}
+    for ours, theirs in fields.items():
+        names: list[str] = getattr(Columns, ours) if ours.isupper() else ours.split()
+        if isinstance(theirs, float):
+            found |= dict.fromkeys(names, theirs)
+            continue
+        name, of_field, at = theirs.removesuffix("]").partition("[")
+        places = at.split() or range(len(names))
+        each = [f"{name}[{place}]" for place in places] if of_field else theirs.split()
+        found |= zip(names, each, strict=True)
+    return found

@@ -21,6 +21,7 @@ from px4fuse.readers.mavlink_positions import pressure_altitude, read_positions,
 from px4fuse.readers.mavlink_recording import RECEIPT_CLOCK, Recording, settle_clocks, unix_of_boot
 from px4fuse.readers.px4_positions import barometer
 from px4fuse.readers.ulog_topics import NO_SELECTOR, dropped_note
+from px4fuse.record import lacking
 from px4fuse.recording import LogInfo, Unused
 
 VARIANCE_COLUMNS = Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE
@@ -70,6 +71,7 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     truth = read_truth(recording, positions, remedies)
     airborne = _read_airborne(recording, remedies["landed"])
     in_flight = parts.ends_in_flight(airborne, recording.duration_s)
+    pressure = messages.LAYOUTS["pressure"]
     return Flight(
         log=_describe(recording, parameters, autopilot, in_flight),
         imu=imu,
@@ -78,14 +80,14 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
         ekf2=ekf2,
         truth=truth,
         airborne=airborne,
-        barometer=barometer(pressure_altitude(recording.read(messages.PRESSURE)["pressure_hpa"])),
+        barometer=barometer(pressure_altitude(recording.read(pressure)["pressure_hpa"])),
         modes=_read_modes(recording) if autopilot == "PX4" else messages.NO_MODES,
         missing=(*parts.missing_parts(imu, attitude, ekf2, truth), *missing_positions),
         streams=MappingProxyType(recording.streams),
         clocks=senders.clock_maps(recording, mapped),
         unused=tuple(
             Unused(name, count, reason)
-            for name, reason in messages.UNUSED.items()
+            for name, reason in messages.TABLE.unused.items()
             if (count := int(np.count_nonzero(frames.message_id == MESSAGE_IDS[name])))
         ),
     )
@@ -106,11 +108,7 @@ def _read_imu(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
     imu = recording.read(layout, rows)
     imu = parts.finite_rows(imu, imu.columns.tolist(), parts.BEYOND_IMU)
     if len(imu) < 2:
-        return Unavailable(
-            "IMU",
-            f"{layout.topic} holds {len(imu)} usable samples",
-            "Check that the sensors ran while the link was recorded.",
-        )
+        return lacking("imu_few", topic=layout.topic, count=len(imu))
     recording.came_from("imu", layout.topic)
     return imu
 
@@ -136,9 +134,7 @@ def _read_ekf2(
     layout = next(dense)
     message = layout.topic
     if counts[message] < 2:
-        return Unavailable(
-            "EKF2", "no ODOMETRY or LOCAL_POSITION_NED of the autopilot", remedies["state"]
-        )
+        return lacking("ekf2_not_sent", remedy=remedies["state"])
     samples = recording.read(layout)
     state = samples[Columns.STATE].dropna()
     if len(state) < 2:
@@ -155,28 +151,24 @@ def _read_ekf2(
     found = samples.reindex(columns=VARIANCE_COLUMNS)
     found = found[(found > 0.0).all(axis=1)]
     if found.empty:
-        message, found = messages.ACCURACY.topic, _variance_by_accuracy(recording)
+        message, found = messages.LAYOUTS["accuracy"].topic, _variance_by_accuracy(recording)
         if len(found):
             by = "from ESTIMATOR_STATUS: its horizontal accuracy squared, half to each axis"
             notes.append(f"EKF2's position variances are {by}; velocity variances are not sent")
-    lacking = "no ODOMETRY with covariance and no ESTIMATOR_STATUS of the autopilot"
     variance: pd.DataFrame | Unavailable = found
     if found.empty:
-        variance = Unavailable("EKF2 variances", lacking, remedies["variance"])
+        variance = lacking("variances_not_sent", remedy=remedies["variance"])
     else:
         recording.came_from("ekf2_variance", message)
-    inside = "MAVLink does not carry EKF2's"
     return Ekf2(
         state=state,
         variance=variance,
         innovations={
-            axis: Unavailable(
-                f"EKF2 innovations, {axis}", f"{inside} innovations", remedies["inside"]
-            )
+            axis: lacking("inside_not_sent", axis=axis, remedy=remedies["inside"])
             for axis in AXIS_NAMES
         },
         innovation_topics=(),
-        fusing=Unavailable("EKF2 fusion flags", f"{inside} fusion flags", remedies["inside"]),
+        fusing=lacking("fusion_not_sent", remedy=remedies["inside"]),
         resets=(),
         instances=NO_SELECTOR,
         gate=settings_in_force(parameters)[EV_POS.gate],
@@ -190,7 +182,7 @@ def _variance_by_accuracy(recording: Recording) -> pd.DataFrame:
 
     PX4's horizontal accuracy is the root of the sum over both axes (``get_ekf_lpos_accuracy``).
     """
-    accuracy = recording.read(messages.ACCURACY)
+    accuracy = recording.read(messages.LAYOUTS["accuracy"])
     variance = pd.DataFrame(np.nan, index=accuracy.index, columns=VARIANCE_COLUMNS)
     variance["north_m2"] = variance["east_m2"] = accuracy["horizontal_m"] ** 2 / 2.0
     variance["down_m2"] = accuracy["vertical_m"] ** 2
@@ -218,9 +210,9 @@ def _read_modes(recording: Recording) -> tuple[FlightMode, ...] | Unavailable:
         return messages.NO_MODES
     modes = recording.frames.table("HEARTBEAT", rows)["custom_mode"].astype(np.int64)
     names = [
-        messages.AUTO_MODES.get(mode >> 24 & 0xFF, "Auto")
+        messages.TABLE.auto_modes.get(mode >> 24 & 0xFF, "Auto")
         if (main := mode >> 16 & 0xFF) == messages.AUTO_MODE
-        else messages.MAIN_MODES.get(main, f"mode {main}")
+        else messages.TABLE.main_modes.get(main, f"mode {main}")
         for mode in modes.tolist()
     ]
     time_s = recording.receipt_boot_s(rows) - recording.zero_s
@@ -259,7 +251,8 @@ def _describe(
         uid = bytes(version["uid2"]).hex()
         vehicle = uid if uid.strip("0") else ""
     beats = frames.table("HEARTBEAT", recording.rows("HEARTBEAT"))
-    kind = messages.VEHICLE_TYPES.get(int(beats["type"][0]), "vehicle") if len(beats) else "vehicle"
+    first = next(iter(beats["type"].tolist()), -1)
+    kind = messages.TABLE.vehicle_types.get(first, "vehicle")
     why = "zero, go back, or lie outside the recording"
     dropped = [dropped_note(n, message, why) for message, n in sorted(recording.dropped.items())]
     return LogInfo(

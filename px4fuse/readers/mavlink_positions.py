@@ -20,6 +20,7 @@ from px4fuse.readers.mavlink_recording import BOOT_CLOCK, RECEIPT_CLOCK, Recordi
 from px4fuse.readers.mavlink_senders import senders_of
 from px4fuse.readers.parts import attitude_of, orientation_of
 from px4fuse.readers.px4_positions import Place, projected, unproject
+from px4fuse.record import lacking
 
 # A boot clock's stamp is no further from its receipt
 OWN_CLOCK_S = 5.0
@@ -84,7 +85,7 @@ def _read_track(
     frame = "NED"
     if "frame_id" in samples and len(samples):
         # one frame per track: that of the last sample, as PX4 would have used it
-        reference = messages.FRAMES_OF_REFERENCE.get(int(samples["frame_id"].iloc[-1]))
+        reference = messages.TABLE.frames.get(int(samples["frame_id"].iloc[-1]))
         frame = "unknown" if reference is None else reference.name
     if source.drops_covariance:
         samples[Columns.POSITION_VARIANCE + Columns.ROTATION_VARIANCE] = np.nan
@@ -127,7 +128,7 @@ def _read_gnss(
         return None
     samples = projected(fixes, local_origin(recording))
     accuracy = fixes[["eph_m", "eph_m", "epv_m"]].set_axis(Columns.POSITION_VARIANCE, axis=1) ** 2
-    automatic = bool(recording.read(messages.GLOBAL_STATE)["latitude_deg"].any())
+    automatic = bool(recording.read(messages.LAYOUTS["global_state"])["latitude_deg"].any())
     return px4_positions.make_track(
         layout.topic,
         samples.join(accuracy),
@@ -152,12 +153,12 @@ def local_origin(recording: Recording) -> Place | None:
 
     As it is sent, or else by its global and its local position.
     """
-    sent = recording.read(messages.ORIGIN).dropna()
+    sent = recording.read(messages.LAYOUTS["origin"]).dropna()
     if len(sent):
         return tuple(sent[GLOBAL_COLUMNS].iloc[-1].tolist())
     state = recording.read(messages.STATES[-1])[Columns.POSITION]
     both = pd.merge_asof(
-        recording.read(messages.GLOBAL_STATE), state, left_index=True, right_index=True,
+        recording.read(messages.LAYOUTS["global_state"]), state, left_index=True, right_index=True,
         direction="nearest", tolerance=SAME_STATE_S,  # type: ignore[arg-type]
     ).dropna()  # fmt: skip
     both = both[both["latitude_deg"] != 0.0]
@@ -198,8 +199,4 @@ def read_truth(
     for track in positions:
         if captured and track.name == captured.name:
             recording.came_from("truth", *track.topics, clock=track.clock)
-    return captured or Unavailable(
-        "ground truth",
-        "neither simulation truth nor motion capture is in the recording",
-        remedies["truth"],
-    )
+    return captured or lacking("truth_not_recorded", remedy=remedies["truth"])

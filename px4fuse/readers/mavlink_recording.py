@@ -13,7 +13,7 @@ from px4fuse.flight import Columns
 from px4fuse.readers.layouts import Layout
 from px4fuse.readers.mavlink_clocks import UNIX_FROM_S, Line, least_delay, tells_time
 from px4fuse.readers.mavlink_frames import LONGEST_FRAME, Address, Frames, message_name, wire_layout
-from px4fuse.readers.mavlink_messages import FRAMES_OF_REFERENCE, STAMPED_BY_BOOT_CLOCK
+from px4fuse.readers.mavlink_messages import STAMPED_BY_BOOT_CLOCK, TABLE
 from px4fuse.readers.parts import MIN_NORM
 from px4fuse.readers.ulog_topics import increasing
 from px4fuse.recording import Stream
@@ -175,8 +175,9 @@ def _in_ned(samples: pd.DataFrame) -> pd.DataFrame:
     made[Columns.STATE + Columns.POSITION_VARIANCE] = np.nan
     made[Columns.VELOCITY_VARIANCE + orientation] = np.nan
     used = {*samples["frame_id"].unique(), *samples["child_frame_id"].unique()}
-    for number in used & FRAMES_OF_REFERENCE.keys():
-        _, order, signs, turns = FRAMES_OF_REFERENCE[number]
+    for number in used & TABLE.frames.keys():
+        frame = TABLE.frames[number]
+        order, signs, turns = frame.order, frame.signs, frame.body
         own = samples[(samples["frame_id"] == number) & (not turns)]
         position = own[Columns.POSITION].to_numpy()[:, order]
         variance = own[Columns.POSITION_VARIANCE].to_numpy()[:, order]

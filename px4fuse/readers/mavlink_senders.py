@@ -76,7 +76,7 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
                 f"in the file: {have}."
             )
     best = max(candidates, key=lambda address: counts.get(address, 0))
-    name = messages.AUTOPILOTS.get(vehicles[best][1]) if best in vehicles else None
+    name = messages.TABLE.autopilots.get(vehicles[best][1]) if best in vehicles else None
     return best, name or "unknown autopilot"
 
 
@@ -161,9 +161,9 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
         word = "no heartbeat"
         if address in vehicles:
             kind, autopilot = vehicles[address]
-            word = messages.VEHICLE_TYPES.get(kind, f"type {kind}")
+            word = messages.TABLE.vehicle_types.get(kind, f"type {kind}")
             if autopilot != messages.NO_AUTOPILOT:
-                word = f"{messages.AUTOPILOTS.get(autopilot, 'autopilot')} {word}"
+                word = f"{messages.TABLE.autopilots.get(autopilot, 'autopilot')} {word}"
         lost, chosen = _lost_share(frames, address), address == recording.address
         described.append(Sender(*address, word, count, lost, chosen))
     return tuple(described)

@@ -2,8 +2,10 @@
 
 import re
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+from px4fuse.readers.layouts import read_table
 
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
@@ -11,44 +13,12 @@ LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 Position = tuple[int, int, int | None]
 
 
-def _words(table: Mapping[str, str]) -> dict[str, str]:
-    """Turn a table of meaning to words into one of word to meaning."""
-    return {word: meaning for meaning, words in table.items() for word in words.split()}
-
-
-# Names are read in lower case and as words: "position.x_m" is position, x, m
-_UNITS = _words(
-    {
-        "s": "s sec secs seconds",
-        "ms": "ms msec msecs millis milliseconds",
-        "us": "us usec usecs micros microseconds",
-        "ns": "ns nsec nsecs nanos nanoseconds",
-        "m": "m meter meters metre metres",
-        "cm": "cm centimeters centimetres",
-        "mm": "mm millimeters millimetres",
-    }
+_WORDS = read_table("position_names.toml", dict[str, dict[str, str]])
+_UNITS, _AXES = (
+    {word: meaning for meaning, words in _WORDS[table].items() for word in words.split()}
+    for table in ("units", "axes")
 )
-_AXES = _words(
-    {
-        "x": "x v0",
-        "y": "y v1",
-        "z": "z v2",
-        "north": "n north northing",
-        "east": "e east easting",
-        "down": "d down",
-        "up": "u up height altitude alt",
-    }
-)
-_TEXTS = {
-    "time": "time timestamp stamp t ts unix unixtime epoch utc elapsed boot",
-    "measured": "header measurement sample sensor",
-    "recorded": "bag rosbag recv receive received rx arrival log record host",
-    "sigma": "sigma std stdev stddev sd s accuracy uncertainty",
-    "tag": "tag tagid id node address serial",
-    "context": "p t pos position pose point translation transform location coord coordinate field "
-    "msg data uwb rtls tag est estimate estimated measured raw filtered local world map",
-}
-_ROLES = {role: {*words.split()} for role, words in _TEXTS.items()}
+_ROLES = {role: {*words.split()} for role, words in _WORDS["roles"].items()}
 _TIME_ROLES = _ROLES["time"] | _ROLES["measured"] | _ROLES["recorded"] | _ROLES["context"]
 # Whose time it is, in order of preference
 TIME_KINDS = ["time of measurement", "time", "time of recording"]

@@ -1,7 +1,7 @@
 """What a ULog has of every aid that EKF2 can fuse: innovations, their variance, what was fused.
 
 Source: PX4-Autopilot ``EKF2.cpp`` (PublishInnovations, PublishAidSourceStatus), v1.8 to main; the
-topics and fields are rows of :data:`px4fuse.readers.px4_topics.SOURCES`.
+fields are in ``ekf2_parameters.toml``.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from px4fuse.ekf2_parameters import AIDS
+from px4fuse.ekf2_parameters import AIDS, DISTURBANCES, Aid
 from px4fuse.flight import AidLog, at_times
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.layouts import Layout
@@ -32,14 +32,14 @@ def read_aids(topics: Topics, meant: Mapping[str, pd.Series[float]]) -> dict[str
     came of it. The others repeat a value until the next one, which counts once.
     """
     found = {}
-    for name, source in px4.SOURCES.items():
+    for name, aid in AIDS.items():
         told = meant.get(name)
-        log = _own_topic(topics, name, source, told)
+        log = _own_topic(topics, aid, told)
         # an aid that was never meant to be fused stands at its last value, or is another's
         if log is None and (name.startswith("ev_") if told is None else told.any()):
-            log = _snapshots(topics, name, source, told)
+            log = _snapshots(topics, aid, told)
         if log is not None:
-            found[name] = replace(log, parameters=AIDS[name].in_log(topics.ekf2_parameters))
+            found[name] = replace(log, parameters=aid.in_log(topics.ekf2_parameters))
     return found
 
 
@@ -49,64 +49,63 @@ def intentions(topics: Topics) -> dict[str, pd.Series[float]]:
     By its flags, or else by the bits of the older topic.
     """
     meant, tables = {}, topics.of(px4.STATUS_FLAGS)
-    named = {flag for source in px4.SOURCES.values() for group in source.flags for flag in group}
+    every = (*AIDS.values(), *DISTURBANCES.values())
+    named = {flag for aid in every for group in aid.flags for flag in group}
     known = sorted(named.intersection(*tables)) if tables else []
     if known:
         flags = topics.of_primary(Layout(px4.STATUS_FLAGS, dict(zip(known, known, strict=True))),
                                   step=True)  # fmt: skip
-        for name, source in px4.SOURCES.items():
-            group = next((group for group in source.flags if {*group} <= {*known}), None)
+        for aid in every:
+            group = next((group for group in aid.flags if {*group} <= {*known}), None)
             if group is not None:
-                meant[name] = flags[list(group)].max(axis=1)
-    if not known and topics.find(px4.CONTROL_BITS) is not None:
-        bits = topics.of_primary(px4.CONTROL_BITS, step=True)["bits"].dropna()
-        for name, source in px4.SOURCES.items():
-            if source.bit is not None:
-                on = bits.to_numpy().astype(np.int64) >> source.bit & 1
-                meant[name] = pd.Series(on.astype(float), index=bits.index)
+                meant[aid.name] = flags[list(group)].max(axis=1)
+    if not known and topics.find(px4.LAYOUTS["control_bits"]) is not None:
+        bits = topics.of_primary(px4.LAYOUTS["control_bits"], step=True)["bits"].dropna()
+        for aid in every:
+            if aid.bit is not None:
+                on = bits.to_numpy().astype(np.int64) >> aid.bit & 1
+                meant[aid.name] = pd.Series(on.astype(float), index=bits.index)
     return meant
 
 
-def _own_topic(
-    topics: Topics, name: str, source: px4.AidSource, meant: pd.Series[float] | None
-) -> AidLog | None:
+def _own_topic(topics: Topics, aid: Aid, meant: pd.Series[float] | None) -> AidLog | None:
     """An aid by its ``estimator_aid_src`` topic."""
-    count = len(source.axes)
+    count = len(aid.axes)
     at = [""] if count == 1 else [f"[{number}]" for number in range(count)]
     columns = {
         f"{ours}_{axis}": theirs + element
-        for axis, element in zip(source.axes, at, strict=True)
+        for axis, element in zip(aid.axes, at, strict=True)
         for ours, theirs in (
-            *((("observation", "observation"),) if name in px4.WITH_OBSERVATION else ()),
+            *((("observation", "observation"),) if aid.name in px4.WITH_OBSERVATION else ()),
             ("innovation", "innovation"), ("variance", "innovation_variance"),
             ("noise", "observation_variance"), ("ratio", "test_ratio"),
         )
     }  # fmt: skip
     columns |= {"fused": "fused", "rejected": "innovation_rejected"}
-    layout = Layout(f"estimator_aid_src_{name}", columns)
+    layout = Layout(f"estimator_aid_src_{aid.name}", columns)
     if topics.find(layout) is None:  # most aids of most logs: an empty table takes its time
         return None
     frame = topics.of_primary(layout).dropna()
-    if meant is not None and name in px4.FLAG_ALWAYS_SET:
+    if meant is not None and aid.name in px4.FLAG_ALWAYS_SET:
         frame["fused"] = at_times(meant, frame.index)
-    return _log((layout.topic,), source, frame, meant)
+    return _log((layout.topic,), aid, frame, meant)
 
 
-def _snapshots(
-    topics: Topics, name: str, source: px4.AidSource, meant: pd.Series[float] | None
-) -> AidLog | None:
+def _snapshots(topics: Topics, aid: Aid, meant: pd.Series[float] | None) -> AidLog | None:
     """An aid by the topics that hold the last value of every aid."""
-    gauss = name == "mag_heading" and any("cs_mag" in one for one in topics.of(px4.STATUS_FLAGS))
-    layouts = [] if gauss or not source.fields else [
+    gauss = aid.name == "mag_heading" and any(
+        "cs_mag" in one for one in topics.of(px4.STATUS_FLAGS)
+    )
+    layouts = [] if gauss or not aid.fields else [
         tuple(
-            Layout(topic, _columns(what, source, source.fields))
+            Layout(topic, _columns(what, aid, aid.fields))
             for topic, what in zip(px4.INNOVATIONS, ("innovation", "variance"), strict=True)
         )
     ]  # fmt: skip
-    if source.before:
-        both = _columns("innovation", source, source.before)
-        squares = (field.replace("innov", "innov_var") for field in source.before)
-        both |= _columns("variance", source, squares)
+    if aid.before:
+        both = _columns("innovation", aid, aid.before)
+        squares = (field.replace("innov", "innov_var") for field in aid.before)
+        both |= _columns("variance", aid, squares)
         layouts.append((Layout(px4.OLD_INNOVATIONS, both),) * 2)
     for values, variances in layouts:
         frame = topics.of_primary(values, select=_fresh)
@@ -120,7 +119,7 @@ def _snapshots(
         if meant is not None:
             frame = frame[at_times(meant, frame.index) > 0.0]
         used = tuple(dict.fromkeys((values.topic, variances.topic)))
-        if (log := _log(used, source, frame, meant, left_out)) is not None:
+        if (log := _log(used, aid, frame, meant, left_out)) is not None:
             return log
     return None
 
@@ -132,19 +131,19 @@ def _fresh(frame: pd.DataFrame) -> pd.DataFrame:
     return known[first.ne(first.shift()) & (first != 0.0)]
 
 
-def _columns(name: str, source: px4.AidSource, fields: Iterable[str]) -> dict[str, str]:
-    return {f"{name}_{axis}": field for axis, field in zip(source.axes, fields, strict=True)}
+def _columns(name: str, aid: Aid, fields: Iterable[str]) -> dict[str, str]:
+    return {f"{name}_{axis}": field for axis, field in zip(aid.axes, fields, strict=True)}
 
 
 def _log(
     topics: tuple[str, ...],
-    source: px4.AidSource,
+    aid: Aid,
     frame: pd.DataFrame,
     meant: pd.Series[float] | None,
     left_out: int = 0,
 ) -> AidLog | None:
     """The record of what has a variance, with the sign that everyone else gives an innovation."""
-    frame = frame[(frame[[f"variance_{axis}" for axis in source.axes]] > 0.0).all(axis=1)]
-    turned = {one: -frame[one] for one in _columns("innovation", source, source.axes)}
-    made = AidLog(topics, source.axes, frame.assign(**turned), meant, left_out=left_out)
+    frame = frame[(frame[[f"variance_{axis}" for axis in aid.axes]] > 0.0).all(axis=1)]
+    turned = {one: -frame[one] for one in _columns("innovation", aid, aid.axes)}
+    made = AidLog(topics, aid.axes, frame.assign(**turned), meant, left_out=left_out)
     return made if len(frame) else None

@@ -15,30 +15,26 @@ from numpy.typing import ArrayLike
 
 from px4fuse import flight
 from px4fuse.arrays import Array, IntArray
-from px4fuse.ekf2_parameters import AIDS, EV_POS, FLOW, settings_in_force
+from px4fuse.ekf2_parameters import AIDS, DISTURBANCES, EV_POS, FLOW, settings_in_force
 from px4fuse.flight import Columns, Ekf2, FusionRecord, Reset, Unavailable, at_times
 from px4fuse.readers import px4_topics as px4
-from px4fuse.readers.layouts import Layout, elements
+from px4fuse.readers.layouts import Layout, columns_of
 from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S, intentions, read_aids
 from px4fuse.readers.px4_innovations import innovations_of
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
+from px4fuse.record import lacking
 
 VISION = "vehicle_visual_odometry"
 STATES = 22  # attitude, velocity, position, biases, magnetic fields; the rest is wind and terrain
 MAG_3D_BIT = 5  # filter_control_status_u, common.h
 ALL_FIELD_HZ = 10.0  # EKF2 has 14 samples a second
-FIELD_COLUMNS = ("forward_gauss", "right_gauss", "down_gauss")
 # So near to a half, IMU samples per step may be rounded either way
 HALF = 0.05
 # Between two rows of optical flow
 MAX_FLOW_S = 0.5
 # Horizontal aiding besides vision position
 OTHER_AIDING = ("gnss_pos", "gnss_vel", "optical_flow", "ev_vel", "aux_global_position", "airspeed")
-VARIANCES_NOT_LOGGED = Unavailable(
-    "EKF2 variances",
-    "no usable topic estimator_states (estimator_status before v1.12)",
-    "Record with SDLOG_PROFILE bit 0 (default), or EKF2 had not started.",
-)
+VARIANCES_NOT_LOGGED = lacking("variances_not_logged")
 _RESETS: tuple[tuple[Literal["position", "velocity"], str, tuple[str, str, str]], ...] = (
     ("position", "xy_reset_counter", ("delta_north_m", "delta_east_m", "")),
     ("position", "z_reset_counter", ("", "", "delta_down_m")),
@@ -53,19 +49,13 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     if parameters.get("EKF2_EN") == 0.0:
         return Unavailable("EKF2", "EKF2_EN is 0: EKF2 did not run", "Set EKF2_EN to 1.")
     if (group := parameters.get("SYS_MC_EST_GROUP", 2.0)) != 2.0:
-        return Unavailable(
-            "EKF2",
-            f"SYS_MC_EST_GROUP is {group:.0f}: another estimator ran",
-            "Set SYS_MC_EST_GROUP to 2.",
-        )
+        return lacking("other_estimator", group=group)
     local = topics.read(px4.LOCAL_POSITION)
     if topics.find(px4.LOCAL_POSITION) is None:
         return Unavailable("EKF2", "no topic vehicle_local_position", px4.DEFAULT_PROFILE)
     state = local[Columns.STATE].dropna()
     if state.empty:
-        return Unavailable(
-            "EKF2", "vehicle_local_position holds no finite sample", "Wait until EKF2 has started."
-        )
+        return lacking("state_not_finite")
     topics.came_from("ekf2_state", px4.LOCAL_POSITION.topic)
     meant = intentions(topics)
     fusing = _fusing(topics, meant)
@@ -132,11 +122,7 @@ def _read_delayed(topics: Topics, step_s: float) -> pd.DataFrame | Unavailable:
     if not topic:
         return VARIANCES_NOT_LOGGED
     if not attitude:
-        return Unavailable(
-            "EKF2 variances",
-            f"the arrays of {topic} are of lengths unknown here",
-            "Report the PX4 version to the authors of px4fuse.",
-        )
+        return lacking("states_unknown", topic=topic)
     states = [f"states[{i}]" for i in range(STATES)]
     variances = [f"covariances[{i}]" for i in range(STATES - 4 + attitude)]
     raw = topics.of_primary(Layout(topic, {name: name for name in states + variances})).dropna()
@@ -209,7 +195,7 @@ def _accelerometer_bias(
     topics: Topics, delayed: pd.DataFrame | Unavailable
 ) -> pd.DataFrame | Unavailable:
     """Accelerometer bias from its own topic, or else from the state vector."""
-    if len(own := topics.of_primary(px4.SENSOR_BIAS).dropna()):
+    if len(own := topics.of_primary(px4.LAYOUTS["sensor_bias"]).dropna()):
         return own
     if isinstance(delayed, Unavailable) or delayed.empty:
         return flight.BIAS_NOT_LOGGED
@@ -243,11 +229,7 @@ def _fusing(topics: Topics, meant: Mapping[str, pd.Series[float]]) -> pd.DataFra
     """What EKF2 means to fuse of external vision."""
     vision = {"horizontal": "ev_pos", "vertical": "ev_hgt", "yaw": "ev_yaw"}
     if not {*vision.values()} <= meant.keys():
-        return Unavailable(
-            "EKF2 fusion flags",
-            f"neither {px4.STATUS_FLAGS} nor {px4.STATUS} is in the log",
-            px4.DEFAULT_PROFILE,
-        )
+        return lacking("fusion_not_logged")
     frame = pd.DataFrame({group: meant[aid] for group, aid in vision.items()}).dropna()
     topic = px4.STATUS_FLAGS if topics.instances(px4.STATUS_FLAGS) else px4.STATUS
     if frame.empty:
@@ -307,7 +289,7 @@ def _read_record(
         flow=_read_flow(topics, meant),
         latitude_deg=_last(local, "ref_lat", np.nan),
         altitude_m=altitude_m,
-        states={one: meant[one] for one in px4.DISTURBANCES if one in meant},
+        states={one: meant[one] for one in DISTURBANCES if one in meant},
         height_bias={
             name: topics.of_primary(layout).dropna()
             for name, layout in px4.HEIGHT_BIAS.items()
@@ -329,8 +311,9 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
     """
     found = []
     for topic, name in px4.MAGNETOMETER:
-        own = elements(Columns.FIELD_INNOVATION, "innovation_filtered")
-        frame = topics.of_primary(Layout(topic, elements(list(FIELD_COLUMNS), name), own)).dropna()
+        measured = columns_of({"forward_gauss right_gauss down_gauss": f"{name}[]"})
+        own = columns_of({"FIELD_INNOVATION": "innovation_filtered[]"})
+        frame = topics.of_primary(Layout(topic, measured, own)).dropna()
         if name == "observation":  # by the time that EKF2 takes it to be of
             delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3
             frame = frame.set_axis(frame.index + delay_s + 0.5 * step_s)
@@ -338,7 +321,7 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
     all_of_it = [one for one in found if len(one) > ALL_FIELD_HZ * topics.log.duration_s]
     means = [one for one in found if Columns.FIELD_INNOVATION[0] in one]
     used = max(all_of_it or means or found, key=len)
-    bits = topics.read(px4.CONTROL_BITS, step=True)["bits"].dropna()
+    bits = topics.read(px4.LAYOUTS["control_bits"], step=True)["bits"].dropna()
     if used.empty or bits.empty:
         return pd.DataFrame()
     flags = at_times(bits, used.index).astype(np.int64)
@@ -347,7 +330,10 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
 
 def _read_flow(topics: Topics, meant: Mapping[str, pd.Series[float]]) -> pd.DataFrame:
     """What optical flow measured: of the samples between two rows the mean, by the low pass."""
-    speed, interval, noise = (topics.of_primary(layout).dropna() for layout in px4.FLOW)
+    speed, interval, noise = (
+        topics.of_primary(px4.LAYOUTS[f"flow_{part}"]).dropna()
+        for part in ("velocity", "interval", "noise")
+    )
     interval_s = float(interval["interval_us"].median()) * 1e-6
     if not interval_s > 0.0 or noise.empty:
         return pd.DataFrame()

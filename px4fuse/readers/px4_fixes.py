@@ -29,17 +29,19 @@ def left_out_fixes(topics: Topics, gps: pd.DataFrame, ekf2: Ekf2 | Unavailable) 
 
     The logger keeps every fix only where it comes slower than its limit of 10 a second.
     """
-    if isinstance(ekf2, Unavailable) or not all(map(topics.find, px4.FUSED_FIXES)):
+    layouts = px4.LAYOUTS["fused_position"], px4.LAYOUTS["fused_velocity"]
+    if isinstance(ekf2, Unavailable) or not all(map(topics.find, layouts)):
         return pd.DataFrame()
-    position, velocity = (topics.of_primary(layout) for layout in px4.FUSED_FIXES)
+    position, velocity = map(topics.of_primary, layouts)
     # what a receiver sends without a fix has a row too
     taken = position[["fused", "rejected"]].any(axis=1)
     position = position.loc[taken].drop(columns=["fused", "rejected"])
     # rows are of half a prediction step before (estimator_interface.cpp)
     fixes = position.join(velocity, how="inner").dropna()
     # of the reference; else it has EKF2's bias in it
-    if topics.find(px4.FUSED_HEIGHT) and topics.ekf2_parameters.get("EKF2_HGT_REF", 1.0) == 1.0:
-        fixes = fixes.join(topics.of_primary(px4.FUSED_HEIGHT))
+    height, reference = px4.LAYOUTS["fused_height"], topics.ekf2_parameters.get("EKF2_HGT_REF", 1.0)
+    if topics.find(height) and reference == 1.0:
+        fixes = fixes.join(topics.of_primary(height))
     fixes = fixes.set_axis(fixes.index + 0.5 * ekf2.step_s)
     at = np.clip(np.searchsorted(gps.index, fixes.index), 1, len(gps) - 1)
     apart = np.minimum(*(np.abs(gps.index.to_numpy()[at - k] - fixes.index) for k in (0, 1)))

@@ -3,12 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 import pandas as pd
 
-from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS
+from px4fuse.ekf2_parameters import GNSS_POS, TABLE
 from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Ekf2, Unavailable
-from px4fuse.readers.px4_topics import HOW_TO_FUSE
+from px4fuse.record import lacking
 
 Innovations = dict[AxisName, pd.DataFrame | Unavailable]
 
@@ -28,23 +29,10 @@ class Fused:
     height: str = ""
 
 
-VISION = Fused(
-    "external vision", "ev_pos", "ev_hgt", HOW_TO_FUSE,
-    "Record with SDLOG_PROFILE 129 (default and vision).",
-)  # fmt: skip
-_GNSS_SWITCH = f"{GNSS_POS.switch} (bit 0 of EKF2_AID_MASK before v1.14)"
-GNSS = Fused(
-    "GNSS", "gnss_pos", "gnss_hgt",
-    {"horizontal": f"Set bit 0 of {_GNSS_SWITCH}, and wait for a fix that passes EKF2's checks.",
-     "vertical": f"Set bit 1 of {GNSS_POS.switch} (EKF2_HGT_MODE 1 before v1.14) if EKF2 is to "
-                 "fuse its height."},
-    "Record with SDLOG_PROFILE bit 0 (default).",
-)  # fmt: skip
-GNSS_AND_BAROMETER = replace(
-    GNSS, vertical=BAROMETER.name, height="the barometer",
-    remedies={**GNSS.remedies, "vertical": f"Set {BAROMETER.switch} to 1 (EKF2_HGT_MODE to 0 "
-              "before v1.14) if EKF2 is to fuse its height."},
-)  # fmt: skip
+VISION, GNSS, GNSS_AND_BAROMETER = (
+    msgspec.convert(TABLE["sources"][name], Fused)
+    for name in ("vision", "gnss", "gnss_and_barometer")
+)
 
 
 def fuses(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
@@ -62,9 +50,7 @@ def with_gnss(ekf2: Ekf2, source: Fused = GNSS) -> Ekf2:
         for group, name in (("horizontal", source.horizontal), ("vertical", source.vertical))
         if (log := ekf2.aids.get(name)) is not None and log.meant is not None
     }
-    fusing: pd.DataFrame | Unavailable = Unavailable(
-        "EKF2 fusion flags", "the log does not tell when EKF2 fused GNSS", GNSS.to_log
-    )
+    fusing: pd.DataFrame | Unavailable = lacking("fusion_of_gnss_not_logged", remedy=GNSS.to_log)
     if meant:
         columns = ["horizontal", "vertical", "yaw"]
         fusing = pd.DataFrame(meant).ffill().bfill().reindex(columns=columns, fill_value=0.0)

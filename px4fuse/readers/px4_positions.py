@@ -20,6 +20,7 @@ from px4fuse.readers.px4_ekf2 import target_step_s
 from px4fuse.readers.px4_fixes import left_out_fixes, rebuilt_fixes
 from px4fuse.readers.px4_innovations import fuses
 from px4fuse.readers.ulog_topics import Topics
+from px4fuse.record import lacking
 from px4fuse.recording import ClockMap
 
 MIN_TRACK_SAMPLES = 3
@@ -115,7 +116,7 @@ def _track(
 
 
 def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
-    layout = topics.find(*px4.TRACKS[name].layouts)
+    layout = topics.find(*px4.layouts_of(name))
     if layout is None:
         return unavailable(name, f"no topic {name} in the log")
     is_ekf2 = layout.topic.startswith("estimator_")  # only EKF2's own topics have its instances
@@ -151,12 +152,12 @@ def _arrival(topics: Topics, topic: str) -> ClockMap | None:
 
 
 def _read_kept(topics: Topics, turns: bool) -> PositionTrack | Unavailable:
-    layout = topics.find(px4.AID_OBSERVATION_HORIZONTAL)
+    layout = topics.find(px4.LAYOUTS["kept_horizontal"])
     if layout is None:
         return unavailable(px4.KEPT_OBSERVATION, f"no topic {px4.KEPT_OBSERVATION} in the log")
     samples, used = topics.of_primary(layout), [layout.topic]
     notes: tuple[str, ...] = ()
-    vertical = topics.find(px4.AID_OBSERVATION_VERTICAL)
+    vertical = topics.find(px4.LAYOUTS["kept_vertical"])
     if vertical is not None:
         samples, notes = _with_height(samples, topics.of_primary(vertical))
         used.append(vertical.topic)
@@ -287,7 +288,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     Those are the stamps less EKF2_GPS_DELAY, and since main of 2026 the driver's own times of
     measurement where those differ (EKF2.cpp UpdateGpsSample, estimator_interface.cpp).
     """
-    layout = topics.find(*px4.GPS)
+    layout = topics.find(*px4.layouts_of(px4.GPS_POSITION))
     if layout is None:
         return unavailable(px4.GPS_POSITION, f"no topic {px4.GPS_POSITION} in the log")
     gps = topics.frame(layout)
@@ -369,22 +370,18 @@ def read_truth(
     home. Where EKF2 fused GNSS, its origin is where its first fix put it, which the simulation's
     is not: the truth is moved there.
     """
-    attitude = attitude_of(topics.read(px4.TRUTH_ATTITUDE))
-    local = topics.read(px4.TRUTH_LOCAL).dropna()
-    geo = finite_rows(topics.read(px4.TRUTH_GLOBAL), GLOBAL_COLUMNS[:2])
+    attitude = attitude_of(topics.read(px4.LAYOUTS["truth_attitude"]))
+    local = topics.read(px4.LAYOUTS["truth_local"]).dropna()
+    geo = finite_rows(topics.read(px4.LAYOUTS["truth_global"]), GLOBAL_COLUMNS[:2])
     if len(local):
         if len(geo) and fuses(ekf2):
             local = _about_origin(local, projected(geo, _local_origin(topics)))
-        return Truth(px4.TRUTH_LOCAL.topic, local, attitude)
+        return Truth(px4.LAYOUTS["truth_local"].topic, local, attitude)
     if len(geo):
         velocity = geo.reindex(columns=Columns.VELOCITY)
         samples = projected(geo, _local_origin(topics)).join(velocity)
-        return Truth(px4.TRUTH_GLOBAL.topic, samples, attitude)
-    return motion_capture(positions, "vehicle_mocap_odometry") or Unavailable(
-        "ground truth",
-        "neither simulation ground truth nor motion capture is in the log",
-        "Real flights have truth only from motion capture (send ATT_POS_MOCAP).",
-    )
+        return Truth(px4.LAYOUTS["truth_global"].topic, samples, attitude)
+    return motion_capture(positions, "vehicle_mocap_odometry") or lacking("truth_not_logged")
 
 
 def _about_origin(local: pd.DataFrame, there: pd.DataFrame) -> pd.DataFrame:

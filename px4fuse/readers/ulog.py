@@ -12,6 +12,7 @@ from px4fuse.readers.layouts import Layout
 from px4fuse.readers.px4_ekf2 import read_ekf2
 from px4fuse.readers.px4_positions import GPS_3D_FIX, barometer, read_positions, read_truth
 from px4fuse.readers.ulog_topics import Topics, dropped_note, increasing, read_topics
+from px4fuse.record import lacking
 from px4fuse.recording import Unused
 
 ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
@@ -32,16 +33,16 @@ def read_ulog(name: str, content: bytes) -> Flight:
     topics = read_topics(name, content)
     running = "Check that the logger ran while the sensors did."
     imu = _enough(topics, _read_imu(topics), "IMU", px4.IMU, running)
-    logged = parts.with_attitude(topics.read(px4.ATTITUDE))
+    logged = parts.with_attitude(topics.read(px4.LAYOUTS["attitude"]))
     running = "Check that the estimator ran while the logger did."
-    attitude = _enough(topics, logged, "attitude", px4.ATTITUDE, running)
+    attitude = _enough(topics, logged, "attitude", px4.LAYOUTS["attitude"], running)
     ekf2 = read_ekf2(topics)
     positions, missing_positions = read_positions(topics, ekf2)
     truth = read_truth(topics, positions, ekf2)
     if isinstance(truth, Truth):
         topics.came_from("truth", truth.name)
     airborne = _read_airborne(topics)
-    altitude_m = topics.read(px4.BAROMETER)["altitude_m"]
+    altitude_m = topics.read(px4.LAYOUTS["barometer"])["altitude_m"]
     delay_s = topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3
     in_flight = parts.ends_in_flight(airborne, topics.log.duration_s)
     dropped = [(topic, count) for (topic, _), count in sorted(topics.dropped.items())]
@@ -93,7 +94,7 @@ def _lost(topics: Topics, imu: pd.DataFrame | Unavailable, in_flight: bool) -> t
 
 def _start_unix(topics: Topics) -> float | None:
     """UNIX time (s) of time zero by the GPS receiver, the median over its fixes."""
-    gps = topics.read(*px4.GPS)
+    gps = topics.read(*px4.layouts_of(px4.GPS_POSITION))
     if "utc_us" not in gps:
         return None
     utc_s = gps["utc_us"] * 1e-6
@@ -130,25 +131,21 @@ def _read_imu(topics: Topics) -> pd.DataFrame:
 
 def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavailable:
     """Stretches of flight by the land detector, each from take-off to touch-down."""
-    detected = topics.read(px4.LAND_DETECTED, step=True)
+    detected = topics.read(px4.LAYOUTS["land_detected"], step=True)
     if detected.empty:
-        return Unavailable(
-            "land detector",
-            "no usable topic vehicle_land_detected",
-            "Record with SDLOG_PROFILE bit 0 (default), or give --start and --end.",
-        )
-    topics.came_from("airborne", px4.LAND_DETECTED.topic)
+        return lacking("landing_not_logged")
+    topics.came_from("airborne", px4.LAYOUTS["land_detected"].topic)
     return parts.stretches_of_flight(detected["landed"], topics.log.duration_s)
 
 
 def _read_tumbled(topics: Topics) -> tuple[tuple[float, float], ...]:
     """Stretches in which PX4's failure detector finds roll or pitch beyond their limits."""
-    upright = topics.read(px4.FAILURE, step=True)[["roll", "pitch"]].max(axis=1) == 0.0
+    upright = topics.read(px4.LAYOUTS["failure"], step=True)[["roll", "pitch"]].max(axis=1) == 0.0
     return parts.stretches_of_flight(upright, topics.log.duration_s)
 
 
 def _read_modes(topics: Topics) -> tuple[FlightMode, ...] | Unavailable:
-    states = topics.read(px4.FLIGHT_MODE, step=True)["nav_state"].dropna()
+    states = topics.read(px4.LAYOUTS["flight_mode"], step=True)["nav_state"].dropna()
     if states.empty:
         return MODES_NOT_LOGGED
     names = states.map(lambda state: px4.NAV_STATES.get(int(state), f"mode {state:.0f}"))

@@ -26,7 +26,7 @@ from px4fuse.ekf2_parameters import REPORTED
 from px4fuse.errors import LogError
 from px4fuse.plain import few_words
 from px4fuse.readers.layouts import Layout
-from px4fuse.readers.px4_topics import IMU, SELECTOR, topics
+from px4fuse.readers.px4_topics import IMU, LAYOUTS, topics
 from px4fuse.readers.ulog_framing import Framing, whole_messages
 from px4fuse.recording import Dropout, LogInfo, Stream
 
@@ -95,7 +95,7 @@ class Topics:
     @cached_property
     def primary(self) -> Instances:
         """Primary EKF2 instance from each time on (``EKF2Selector.cpp``)."""
-        selected = self.read(SELECTOR, step=True)["instance"]
+        selected = self.read(LAYOUTS["selector"], step=True)["instance"]
         selected = selected[selected < 255]  # 255: none selected yet
         if selected.empty:
             return NO_SELECTOR

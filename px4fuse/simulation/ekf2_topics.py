@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.ekf2.inputs import Inputs
@@ -15,7 +14,7 @@ from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid
 from px4fuse.readers.px4_ekf2 import MAG_3D_BIT
 from px4fuse.readers.px4_positions import unproject
 from px4fuse.simulation import sensors
-from px4fuse.simulation.ulog_writer import Topic
+from px4fuse.simulation.ulog_writer import Topic, topic
 
 # Rates (Hz) of v1.16 (logged_topics.cpp). PX4's own simulation logs estimator_aid_src_ev_pos at
 # full rate, a vehicle only at this one
@@ -56,7 +55,7 @@ class TopicTrack:
     resets: tuple[tuple[int, Array], ...]
     aided: BoolArray
 
-    def stamps(self, rows: IntArray, taken_s: Array | None = None) -> dict[str, NDArray[Any]]:
+    def stamps(self, rows: IntArray, taken_s: Array | None = None) -> dict[str, Any]:
         """The stamps of what the filter did in some steps, with samples that were taken then."""
         sampled_us = self.time_us[rows]
         if taken_s is not None:
@@ -100,23 +99,12 @@ def _local_position(track: TopicTrack, *, gnss: bool) -> Topic:
     count = np.searchsorted(steps, rows, side="right")
     fields = sensors.stamps(track.time_us[rows], PUBLISHED_LATER_US)
     fields |= sensors.vectors({"": track.position_m[rows], "v": track.velocity_m_s[rows]})
-    fields["delta_xy"] = jumps[count].astype(np.float32)
-    fields["delta_z"] = np.zeros(len(rows), np.float32)
-    fields["delta_vxy"] = np.zeros((len(rows), 2), np.float32)
-    fields["delta_vz"] = np.zeros(len(rows), np.float32)
-    latitude, longitude, altitude = (
-        np.full(len(rows), value if gnss else np.nan) for value in sensors.HOME
-    )
-    fields |= {"ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude.astype(np.float32)}
     aided = track.aided[np.maximum(rows - track.lag, 0)]
-    for name in ("xy_valid", "v_xy_valid"):
-        fields[name] = aided
-    for name in ("z_valid", "v_z_valid"):
-        fields[name] = np.ones(len(rows), np.bool_)
-    fields["xy_reset_counter"] = (count % 256).astype(np.uint8)
-    for name in ("z_reset_counter", "vxy_reset_counter", "vz_reset_counter"):
-        fields[name] = np.zeros(len(rows), np.uint8)
-    return Topic("vehicle_local_position", fields)
+    fields |= {"delta_xy": jumps[count], "xy_reset_counter": count % 256}
+    fields |= dict.fromkeys(("xy_valid", "v_xy_valid"), aided)
+    if gnss:
+        fields |= dict(zip(("ref_lat", "ref_lon", "ref_alt"), sensors.HOME, strict=True))
+    return topic("vehicle_local_position", fields)
 
 
 def _states(done: Run, track: TopicTrack, *, gnss: bool) -> Topic:
@@ -134,15 +122,8 @@ def _states(done: Run, track: TopicTrack, *, gnss: bool) -> Topic:
         states[:, 9] -= sensors.HOME[2]  # and downwards as altitude, where there is an origin
     covariances = np.zeros((len(rows), 24), np.float32)
     covariances[:, : done.variance.shape[2]] = done.variance[events + 1, 0]
-    return Topic(
-        "estimator_states",
-        {
-            **track.stamps(rows),
-            "states": states,
-            "covariances": covariances,
-            "n_states": np.full(len(rows), 24, np.uint8),
-        },
-    )
+    fields = track.stamps(rows) | {"states": states, "covariances": covariances}
+    return topic("estimator_states", fields)
 
 
 def _aid_sources(inputs: Inputs, done: Run, track: TopicTrack, rate_hz: float) -> tuple[Topic, ...]:
@@ -162,14 +143,14 @@ def _aid_sources(inputs: Inputs, done: Run, track: TopicTrack, rate_hz: float) -
     variance = np.where(idle, run.variance[seen + 1, 0, NORTH : EAST + 1] + noise, variance)
     used = np.where(run.fused[seen, 0] | run.reset[seen, 0], track.time_us[rows], -1)
     last = np.maximum.accumulate(used)
-    last_us = np.where(last >= 0, sensors.START_US + last, 0).astype(np.uint64)
+    last_us = np.where(last >= 0, sensors.START_US + last, 0)
     gnss = received.velocity_m_s is not None
     observed = unproject(north, east, sensors.HOME[:2]) if gnss else (north, east)
     position = _aid_source(
         aid,
         inputs.settings,
         shown | {"time_last_fuse": last_us},
-        np.stack(observed, axis=1).astype(np.float64 if gnss else np.float32),
+        np.stack(observed, axis=1),
         (innovation, variance, noise),
         (run.rejected[seen, 0], run.fused[seen, 0]),
     )
@@ -181,7 +162,7 @@ def _aid_sources(inputs: Inputs, done: Run, track: TopicTrack, rate_hz: float) -
         GNSS_VEL,
         inputs.settings,
         shown,
-        received.velocity_m_s[sample].astype(np.float32),
+        received.velocity_m_s[sample],
         (moving, spread, speed_noise),
         (outside, ~outside & np.isfinite(moving).all(axis=1)),
     )
@@ -202,7 +183,7 @@ def _barometer(inputs: Inputs, done: Run, track: TopicTrack) -> list[Topic]:
     return [
         _aid_source(
             BAROMETER, inputs.settings, track.stamps(step, taken_s),
-            measured.astype(np.float32), (innovation, variance, noise), (rejected > 0, fused > 0),
+            measured, (innovation, variance, noise), (rejected > 0, fused > 0),
         )
     ]  # fmt: skip
 
@@ -227,15 +208,11 @@ def _of_field(inputs: Inputs, done: Run, track: TopicTrack, attitude_hz: float) 
             track.attitude[published],
         ),
         _aid_source(
-            MAG, settings, track.stamps(rows), last.astype(np.float32),
+            MAG, settings, track.stamps(rows), last,
             (innovation, variance, noise), (~taken, taken),
         ),
-        Topic(
-            "estimator_status",
-            {
-                **track.stamps(told),
-                "control_mode_flags": np.full(len(told), 1 << MAG_3D_BIT, np.uint64),
-            },
+        topic(
+            "estimator_status", track.stamps(told) | {"control_mode_flags": 1 << MAG_3D_BIT}
         ),
     ]  # fmt: skip
 
@@ -243,7 +220,7 @@ def _of_field(inputs: Inputs, done: Run, track: TopicTrack, attitude_hz: float) 
 def _aid_source(
     aid: Aid,
     settings: Mapping[str, float],
-    stamps: Mapping[str, NDArray[Any]],
+    stamps: Mapping[str, Any],
     observation: Array,
     judged: tuple[Array, Array, Array],
     decided: tuple[BoolArray, BoolArray],
@@ -251,19 +228,18 @@ def _aid_source(
     """An aid's message; ``judged`` are innovation, S and R, ``decided`` rejected and fused."""
     innovation, variance, noise = judged
     ratio = innovation**2 / (max(settings[aid.gate], 1.0) ** 2 * variance)
-    return Topic(
-        f"estimator_aid_src_{aid.name}",
-        {
-            **stamps,
-            "observation": observation,
-            "observation_variance": noise.astype(np.float32),
-            "innovation": (-innovation).astype(np.float32),
-            "innovation_variance": variance.astype(np.float32),
-            "test_ratio": ratio.astype(np.float32),
-            "innovation_rejected": decided[0],
-            "fused": decided[1],
-        },
-    )
+    fields = {
+        **stamps,
+        "observation": observation,
+        "observation_variance": noise,
+        "innovation": -innovation,
+        "innovation_variance": variance,
+        "test_ratio": ratio,
+        "innovation_rejected": decided[0],
+        "fused": decided[1],
+    }
+    name = f"estimator_aid_src_{aid.name}"
+    return topic(name, fields, name if aid == GNSS_POS else "estimator_aid_src")
 
 
 def _flags(inputs: Inputs, done: Run, track: TopicTrack) -> Topic:
@@ -278,23 +254,11 @@ def _flags(inputs: Inputs, done: Run, track: TopicTrack) -> Topic:
     changed = np.diff(on.astype(int), prepend=0) != 0
     kept = changed | sensors.thinned(time, FLAGS_HZ)
     rows = np.flatnonzero(kept[: len(time) - track.lag])
-    always, never = np.ones(len(rows), np.bool_), np.zeros(len(rows), np.bool_)
-    gnss = np.bool_(inputs.aid == GNSS_POS)
-    return Topic(
-        "estimator_status_flags",
-        {
-            **track.stamps(rows),
-            "control_status_changes": np.cumsum(changed)[rows].astype(np.uint32),
-            "cs_tilt_align": always,
-            "cs_yaw_align": always,
-            "cs_gnss_pos": on[rows] & gnss,
-            "cs_opt_flow": never,
-            **({"cs_mag_hdg": always} if done.stretch.field is None else {"cs_mag_3d": always}),
-            "cs_baro_hgt": always,
-            "cs_ev_pos": on[rows] & ~gnss,
-            "cs_ev_yaw": never,
-            "cs_ev_hgt": never,
-            "cs_ev_vel": never,
-            **({"cs_gnss_vel": on[rows]} if gnss else {}),
-        },
-    )
+    gnss = inputs.aid == GNSS_POS
+    fields = track.stamps(rows) | {
+        "control_status_changes": np.cumsum(changed)[rows],
+        "cs_gnss_pos": on[rows] & gnss,
+        "cs_ev_pos": on[rows] & (not gnss),
+        "cs_mag_hdg" if done.stretch.field is None else "cs_mag_3d": True,
+    }
+    return topic("estimator_status_flags", fields | ({"cs_gnss_vel": on[rows]} if gnss else {}))

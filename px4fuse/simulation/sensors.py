@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS
-from px4fuse.readers.px4_positions import GPS_3D_FIX, unproject
+from px4fuse.readers.px4_positions import unproject
 from px4fuse.readers.px4_topics import GPS_POSITION
 from px4fuse.simulation.mistakes import Mistakes
 from px4fuse.simulation.motion import Motion, Sines, attitude, direction
 from px4fuse.simulation.scenario import DT_S, Scenario
-from px4fuse.simulation.ulog_writer import Topic
+from px4fuse.simulation.ulog_writer import Topic, topic
 
 # Boot time of the first data: an autopilot takes a while to start
 START_US = 12_000_000
@@ -47,7 +47,6 @@ ATTITUDE_PERIODS_S = (20.0, 60.0)
 ATTITUDE_SINES = 4
 ATTITUDE_LATENCY_US = 200
 LANDED_INTERVAL_US = 1_000_000
-POSE_FRAME_NED = 1  # msg/VehicleOdometry.msg
 
 
 # Streams of random numbers: a mistake in one sensor leaves the others' noise as it was
@@ -117,21 +116,14 @@ def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
     if mistakes.vibration_m_s2:
         sigma = mistakes.vibration_m_s2 * np.sqrt(DT_S * scenario.imu_rate_hz)
         force += sigma * stream(scenario, Stream.VIBRATION).standard_normal(shape)
-    count = len(time_us)
     interval_us = round(1e6 / scenario.imu_rate_hz)
-    return Topic(
-        "sensor_combined",
-        {
-            "timestamp": _boot(time_us),
-            "gyro_rad": rate.astype(np.float32),
-            "gyro_integral_dt": np.full(count, interval_us, np.uint32),
-            "accelerometer_timestamp_relative": np.zeros(count, np.int32),
-            "accelerometer_m_s2": force.astype(np.float32),
-            "accelerometer_integral_dt": np.full(count, interval_us, np.uint32),
-            "accelerometer_clipping": np.zeros(count, np.uint8),
-            "gyro_clipping": np.zeros(count, np.uint8),
-        },
-    )
+    of_both = dict.fromkeys(("gyro_integral_dt", "accelerometer_integral_dt"), interval_us)
+    sampled: dict[str, Any] = {
+        "timestamp": _boot(time_us),
+        "gyro_rad": rate,
+        "accelerometer_m_s2": force,
+    }
+    return topic("sensor_combined", sampled | of_both)
 
 
 def magnetometer(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
@@ -144,9 +136,7 @@ def magnetometer(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topi
     field += SIGMA_FIELD_GAUSS * stream(scenario, Stream.FIELD).standard_normal(field.shape)
     at_s = motion.duration_s / 2.0 if mistakes.mag_at_s is None else mistakes.mag_at_s
     field[seconds(time_us) >= at_s, 1] += mistakes.mag_gauss
-    return Topic(
-        "vehicle_magnetometer", stamps(time_us) | {"magnetometer_ga": field.astype(np.float32)}
-    )
+    return topic("vehicle_magnetometer", stamps(time_us) | {"magnetometer_ga": field})
 
 
 def barometer(scenario: Scenario, motion: Motion) -> Topic:
@@ -156,9 +146,7 @@ def barometer(scenario: Scenario, motion: Motion) -> Topic:
     height_m -= height_error(scenario, seconds(time_us))
     noise = stream(scenario, Stream.BAROMETER).standard_normal(len(time_us))
     height_m += SIGMA_BAROMETER_M * noise
-    return Topic(
-        "vehicle_air_data", stamps(time_us) | {"baro_alt_meter": height_m.astype(np.float32)}
-    )
+    return topic("vehicle_air_data", stamps(time_us) | {"baro_alt_meter": height_m})
 
 
 def height_error(scenario: Scenario, time_s: Array) -> Array:
@@ -227,7 +215,7 @@ def quaternions(body_to_ned: Array) -> Array:
 
 def attitude_topic(name: str, time_us: NDArray[np.int64], late_us: int, quaternion: Array) -> Topic:
     """An attitude, published so much later."""
-    return Topic(name, stamps(time_us, late_us) | {"q": quaternion.astype(np.float32)})
+    return topic(name, stamps(time_us, late_us) | {"q": quaternion})
 
 
 def attitude_error(scenario: Scenario, mistakes: Mistakes, time_s: Array) -> Rotation:
@@ -250,16 +238,8 @@ def land_detector(motion: Motion) -> Topic:
     changes_us = np.rint(np.array([motion.take_off_s, motion.touch_down_s]) * 1e6).astype(np.int64)
     time_us = np.union1d(np.arange(0, int(motion.duration_s * 1e6), LANDED_INTERVAL_US), changes_us)
     landed = (time_us < changes_us[0]) | (time_us >= changes_us[1])
-    return Topic(
-        "vehicle_land_detected",
-        {
-            "timestamp": _boot(time_us),
-            "freefall": np.zeros(len(time_us), np.bool_),
-            "ground_contact": landed,
-            "maybe_landed": landed,
-            "landed": landed,
-        },
-    )
+    said = dict.fromkeys(("ground_contact", "maybe_landed", "landed"), landed)
+    return topic("vehicle_land_detected", {"timestamp": _boot(time_us), **said})
 
 
 def ground_truth(scenario: Scenario, motion: Motion) -> Topic:
@@ -269,11 +249,8 @@ def ground_truth(scenario: Scenario, motion: Motion) -> Topic:
     fields = stamps(time_us) | vectors(
         {"": state.position_m, "v": state.velocity_m_s, "a": state.acceleration_m_s2}
     )
-    heading = np.angle(np.exp(1j * state.yaw_rad))
-    fields["heading"] = heading.astype(np.float32)
-    for name in ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"):
-        fields[name] = np.ones(len(time_us), np.bool_)
-    return Topic("vehicle_local_position_groundtruth", fields)
+    fields["heading"] = np.angle(np.exp(1j * state.yaw_rad))
+    return topic("vehicle_local_position_groundtruth", fields)
 
 
 def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> SensedPositions:
@@ -415,28 +392,12 @@ def _odometry(
     sigma_m: float,
     body_to_ned: Array | None,
 ) -> Topic:
-    count = len(arrival_us)
-    unknown = np.full((count, 3), np.nan, np.float32)
-    quaternion = np.full((count, 4), np.nan)
+    variance = np.full(position_m.shape, sigma_m**2)
+    fields = stamps(stamp_us, arrival_us - stamp_us)
+    fields |= {"position": position_m, "position_variance": variance}
     if body_to_ned is not None:
-        quaternion = quaternions(body_to_ned)
-    return Topic(
-        "vehicle_visual_odometry",
-        {
-            **stamps(stamp_us, arrival_us - stamp_us),
-            "position": position_m.astype(np.float32),
-            "q": quaternion.astype(np.float32),
-            "velocity": unknown,
-            "angular_velocity": unknown,
-            "position_variance": np.full((count, 3), sigma_m**2, np.float32),
-            "orientation_variance": unknown,
-            "velocity_variance": unknown,
-            "pose_frame": np.full(count, POSE_FRAME_NED, np.uint8),
-            "velocity_frame": np.zeros(count, np.uint8),
-            "reset_counter": np.zeros(count, np.uint8),
-            "quality": np.zeros(count, np.int8),
-        },
-    )
+        fields["q"] = quaternions(body_to_ned)
+    return topic("vehicle_visual_odometry", fields)
 
 
 def _fixes(
@@ -448,26 +409,18 @@ def _fixes(
 ) -> Topic:
     """vehicle_gps_position (msg/SensorGps.msg), with EKF2's own origin."""
     latitude, longitude = unproject(position_m[:, 0], position_m[:, 1], HOME[:2])
-    size = np.ones(len(stamp_us), np.float32)
-    return Topic(
-        GPS_POSITION,
-        {
-            **stamps(stamp_us),
-            "latitude_deg": latitude,
-            "longitude_deg": longitude,
-            "altitude_msl_m": HOME[2] - position_m[:, 2],
-            "eph": size * np.float32(sigma_m),
-            "epv": size * np.float32(sigma_m * OF_GNSS[2]),
-            "s_variance_m_s": size * np.float32(scenario.sigma_gnss_m_s),
-            **{
-                f"vel_{axis}_m_s": velocity_m_s[:, i].astype(np.float32)
-                for i, axis in enumerate("ned")
-            },
-            "vel_ned_valid": size.astype(np.bool_),
-            "fix_type": (size * GPS_3D_FIX).astype(np.uint8),
-            "satellites_used": (size * 16).astype(np.uint8),
-        },
-    )
+    accuracies = {
+        "eph": sigma_m,
+        "epv": sigma_m * OF_GNSS[2],
+        "s_variance_m_s": scenario.sigma_gnss_m_s,
+    }
+    place = {
+        "latitude_deg": latitude,
+        "longitude_deg": longitude,
+        "altitude_msl_m": HOME[2] - position_m[:, 2],
+    }
+    velocity = {f"vel_{axis}_m_s": velocity_m_s[:, i] for i, axis in enumerate("ned")}
+    return topic(GPS_POSITION, stamps(stamp_us) | place | accuracies | velocity)
 
 
 def _low_pass(position_m: Array, interval_s: float, constant_s: float) -> Array:
@@ -495,17 +448,15 @@ def seconds(time_us: NDArray[np.int64]) -> Array:
     return np.asarray(time_us * 1e-6, dtype=np.float64)
 
 
-def stamps(
-    time_us: NDArray[np.int64], later_us: int | NDArray[np.int64] = 0
-) -> dict[str, NDArray[Any]]:
+def stamps(time_us: NDArray[np.int64], later_us: int | NDArray[np.int64] = 0) -> dict[str, Any]:
     """The two stamps of what was sampled then and published so much later, µs since boot."""
     return {"timestamp": _boot(time_us + later_us), "timestamp_sample": _boot(time_us)}
 
 
-def vectors(values: Mapping[str, Array]) -> dict[str, NDArray[Any]]:
+def vectors(values: Mapping[str, Array]) -> dict[str, Any]:
     """Vectors, shape (n, 3), as PX4 names their parts: ``vx``, ``vy``, ``vz`` of "v"."""
     return {
-        f"{name}{axis}": vector[:, i].astype(np.float32)
+        f"{name}{axis}": vector[:, i]
         for name, vector in values.items()
         for i, axis in enumerate("xyz")
     }

@@ -6,20 +6,23 @@ Source: ULog file format, version 1, https://docs.px4.io/main/en/dev_log/ulog_fi
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from px4fuse.readers import ULOG_MAGIC
 
 _VERSION = b"\x01"
-_TYPES = {
-    "<u8": "uint64_t", "<u4": "uint32_t", "<u2": "uint16_t", "|u1": "uint8_t",
-    "<i8": "int64_t", "<i4": "int32_t", "<i2": "int16_t", "|i1": "int8_t",
-    "<f8": "double", "<f4": "float", "|b1": "bool",
-}  # fmt: skip
+# By numpy's names, where they are not the same but for the "_t" of integers
+_TYPES = {"float64": "double", "float32": "float", "bool": "bool"}
 _FLAG_BITS = bytes(40)
+# By topic and field: its type, and what it holds where that is not given
+FIELDS = msgspec.toml.decode(
+    Path(__file__).with_name("topics.toml").read_bytes(), type=dict[str, dict[str, list[Any]]]
+)
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,29 @@ class Topic:
     name: str
     fields: Mapping[str, NDArray[Any]]
     instance: int = 0
+
+
+def topic(name: str, given: Mapping[str, ArrayLike], like: str = "") -> Topic:
+    """A topic with the fields of PX4 in their types.
+
+    Parameters
+    ----------
+    name : str
+    given : mapping
+        Fields, a row per message; one number stands for all of them.
+    like : str
+        Of which row of the table the topic is, where that is not its name.
+    """
+    rows, count = FIELDS[like or name], np.size(given["timestamp"])
+    assert given.keys() <= rows.keys(), f"{name} has no {given.keys() - rows.keys()}"
+    fields = {}
+    for field, (kind, *still) in rows.items():
+        values = given[field] if field in given else still[0] if len(still) == 1 else still
+        if field in given or still:
+            if field not in given or not np.ndim(values):
+                values = np.broadcast_to(values, (count, *np.shape(values)))
+            fields[field] = np.asarray(values).astype(kind)
+    return Topic(name, fields)
 
 
 def encode(
@@ -97,7 +123,8 @@ def _format(topic: Topic) -> str:
     parts = []
     for name, values in topic.fields.items():
         size = f"[{values.shape[1]}]" if values.ndim == 2 else ""
-        parts.append(f"{_TYPES[values.dtype.newbyteorder('<').str]}{size} {name};")
+        kind = _TYPES.get(values.dtype.name, f"{values.dtype.name}_t")
+        parts.append(f"{kind}{size} {name};")
     return f"{topic.name}:{''.join(parts)}"
 
 
