@@ -77,8 +77,8 @@ class Tricks(Record, frozen=True):
     tricks: tuple[Trick, ...]
 
 
-_HIDDEN = table(__file__, "practice.toml", Tricks)
-CHOICES, TRICKS = _HIDDEN.choices, _HIDDEN.tricks
+_TABLES = table(__file__, "practice.toml", Tricks)
+CHOICES, TRICKS = _TABLES.choices, _TABLES.tricks
 
 
 @dataclass(frozen=True)
