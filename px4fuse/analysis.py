@@ -237,10 +237,7 @@ def run_or_judge_aids(
     lacking, aids = no_source(flight), judge_aids(flight)
     if isinstance(aids, Unavailable):
         if flight.airborne == ():
-            raise MissingDataError(
-                f"{flight.log.name}: not flown, nothing to judge: {aids.reason}",
-                f"px4fuse info {flight.log.name} says what is logged.",
-            )
+            raise MissingDataError.of("not_flown", log=flight.log.name, reason=aids.reason)
         neither = f"{lacking.reason}, and the aids of EKF2 cannot be judged: {aids.reason}"
         raise MissingDataError(f"{flight.log.name}: {neither}", lacking.remedy)
     return AidsAlone(flight, aids, lacking)
@@ -284,11 +281,7 @@ def read_flight(request: ComparisonRequest, progress: Progress = silent) -> Flig
 
         other = read_log(Path(request.mavlink), system=request.system)
         if not other.log.format.startswith("MAVLink"):
-            raise LogError(
-                f"`mavlink` {other.log.name}: this is a {other.log.format}, not a MAVLink "
-                "recording",
-                "Give the ULog as LOG, and the recording (.tlog) with `mavlink`.",
-            )
+            raise LogError.of("not_mavlink", other=other)
         flight = join(flight, other)
     position, offset = request.position, request.clock_offset_s
     if position is None:
@@ -345,10 +338,7 @@ def run_preparation(
         return prepared
     _, clock = noises_and_clock(prepared, progress)
     if isinstance(clock, Unavailable) or not clock.determinable:
-        raise MissingDataError(
-            f"{flight.log.name}: `clock_offset_s` auto: not determinable: {clock.reason}",
-            "Give the seconds to add, or leave it out.",
-        )
+        raise MissingDataError.of("offset_unknown", flight=flight, clock=clock)
     low, high = clock.interval_s
     if low <= 0.0 <= high:
         note = (

@@ -11,7 +11,8 @@ import pytest
 
 import px4fuse
 
-ROOMS = [path.parent for path in Path(px4fuse.__file__).parent.glob("*/words.toml")
+PACKAGE = Path(px4fuse.__file__).parent
+ROOMS = [path.parent for path in PACKAGE.glob("*/words.toml")
          if "sentences(" in (path.parent / "__init__.py").read_text("utf-8")]  # fmt: skip
 
 
@@ -22,10 +23,10 @@ def needed(*texts: str) -> set[str]:
 
 
 def calls(folder: Path, function: str) -> Iterator[tuple[str, set[str | None]]]:
-    """The name and the facts of every call of a function in a folder's modules."""
+    """The name and the facts of every call of a function (a pattern) in a folder's modules."""
     for path in folder.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-            if isinstance(node, ast.Call) and ast.unparse(node.func) == function:
+            if isinstance(node, ast.Call) and re.fullmatch(function, ast.unparse(node.func)):
                 yield ast.literal_eval(node.args[0]), {word.arg for word in node.keywords}
 
 
@@ -36,6 +37,14 @@ def test_every_sentence_is_said_with_its_facts_and_no_others(room: Path) -> None
     assert {name for name, _ in said} == texts.keys()
     for name, facts in said:
         assert facts == needed(texts[name]), name
+
+
+def test_what_is_refused_is_told_with_its_facts_and_no_others() -> None:
+    rows = tomllib.loads((PACKAGE / "refusals.toml").read_text("utf-8"))
+    said = list(calls(PACKAGE, r"\w+Error\.of"))
+    assert {name for name, _ in said} == rows.keys()
+    for name, facts in said:
+        assert facts == needed(*rows[name]), name
 
 
 def test_there_are_such_rooms() -> None:

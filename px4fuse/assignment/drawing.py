@@ -149,10 +149,7 @@ def draw(
     """
     most = min(len(COUNTS[one]) for one in (COUNTS if kind == "mixed" else (kind,))) - 1
     if count is not None and not 0 <= count <= most:
-        raise SettingsError(
-            f"--mistakes {count}: a flight of kind {kind} can have 0 to {most}, of which each is "
-            "still found beside the others."
-        )
+        raise SettingsError.of("mistakes_many", count=count, kind=kind, most=most)
     if kind == "mixed":
         kind = "loop" if uniform(secret, student_id, kind, "kind") < LOOPS else "aisle"
     one = partial(uniform, secret, student_id, kind)
@@ -186,8 +183,5 @@ def secret_of(text: str, where: str) -> bytes:
     """
     stripped = text.strip()
     if len(stripped) < MIN_SECRET:
-        raise SettingsError(
-            f"{where}: a secret of {len(stripped)} characters can be guessed",
-            f"Give {MIN_SECRET} or more, or leave it out: one is made up, and kept in the answers.",
-        )
+        raise SettingsError.of("secret_short", where=where, length=len(stripped), least=MIN_SECRET)
     return stripped.encode(errors="replace")

@@ -68,10 +68,7 @@ def people_of_sheet(sheet: Sheet) -> tuple[Person, ...]:
         No column tells who somebody is, or two rows have the same id.
     """
     if all(sheet.column(titles) is None for titles in COLUMNS.values()):
-        raise SettingsError(
-            f"{sheet.path}: no column tells who a student is",
-            "Give one a title such as id, email or name.",
-        )
+        raise SettingsError.of("no_column", path=sheet.path)
     rows: dict[str, int] = {}
     people = []
     for number, row in enumerate(sheet.rows, start=2):
@@ -80,10 +77,12 @@ def people_of_sheet(sheet: Sheet) -> tuple[Person, ...]:
             continue
         wanted = folded(person.student_id)
         if wanted and rows.setdefault(wanted, number) != number:
-            raise SettingsError(
-                f"{sheet.path}: rows {rows[wanted]} and {number} have the same id "
-                f"{one_line(person.student_id, 40)!r}",
-                "Give every student one of its own.",
+            raise SettingsError.of(
+                "id_twice",
+                sheet=sheet,
+                before=rows[wanted],
+                number=number,
+                student_id=one_line(person.student_id, 40),
             )
         people.append(person)
     return tuple(people)
@@ -106,10 +105,7 @@ def read_roster(path: Path) -> tuple[Person, ...]:
         stem = file_stem(person.student_id)
         if stem is None or stems.setdefault(stem.casefold(), person) is not person:
             who = one_line(person.student_id or person.name, 40)
-            raise SettingsError(
-                f"{path}: after the id of {who!r} no file of its own can be named",
-                "Give every student an id of its own, with letters or digits.",
-            )
+            raise SettingsError.of("id_without_file", path=path, who=who)
     return people
 
 
