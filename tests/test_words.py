@@ -41,7 +41,7 @@ def test_every_sentence_is_said_with_its_facts_and_no_others(room: Path) -> None
 
 def test_what_is_refused_is_told_with_its_facts_and_no_others() -> None:
     rows = tomllib.loads((PACKAGE / "refusals.toml").read_text("utf-8"))
-    said = list(calls(PACKAGE, r"\w+Error\.of"))
+    said = list(calls(PACKAGE, r"(\w+Error|refuse)\.of"))
     assert {name for name, _ in said} == rows.keys()
     for name, facts in said:
         assert facts == needed(*rows[name]), name
