@@ -209,8 +209,7 @@ def loop_in(flight: Flight, progress: Callable[[str], None] = lambda _: None) ->
         trajectory = trajectory_of(flight, "vio")
     except MissingDataError as error:  # too few poses, or none
         reason = odometry.reason if isinstance(odometry, Unavailable) else str(error).rstrip(".")
-        remedy = "A loop is measured on visual-inertial odometry, sent as ODOMETRY."
-        return Unavailable("loop closure", reason, remedy)
+        return lacking("no_odometry_for_loop", reason=reason)
     segment, _ = part.chosen_part(flight, trajectory, None, None)
     time = trajectory.time_s
     inside = trajectory.position_m[(time >= segment.start_s) & (time <= segment.end_s)]

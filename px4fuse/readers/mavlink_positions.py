@@ -18,7 +18,7 @@ from px4fuse.readers.mavlink_clocks import Mapped
 from px4fuse.readers.mavlink_frames import Address
 from px4fuse.readers.mavlink_recording import BOOT_CLOCK, RECEIPT_CLOCK, Recording
 from px4fuse.readers.mavlink_senders import senders_of
-from px4fuse.readers.parts import attitude_of, orientation_of
+from px4fuse.readers.parts import attitude_of, orientation_of, with_nearest
 from px4fuse.readers.px4_positions import Place, projected, unproject
 from px4fuse.record import lacking
 
@@ -157,10 +157,8 @@ def local_origin(recording: Recording) -> Place | None:
     if len(sent):
         return tuple(sent[GLOBAL_COLUMNS].iloc[-1].tolist())
     state = recording.read(messages.STATES[-1])[Columns.POSITION]
-    both = pd.merge_asof(
-        recording.read(messages.LAYOUTS["global_state"]), state, left_index=True, right_index=True,
-        direction="nearest", tolerance=SAME_STATE_S,  # type: ignore[arg-type]
-    ).dropna()  # fmt: skip
+    there = recording.read(messages.LAYOUTS["global_state"])
+    both = with_nearest(there, state, SAME_STATE_S).dropna()
     both = both[both["latitude_deg"] != 0.0]
     if both.empty:
         return None

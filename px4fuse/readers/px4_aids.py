@@ -16,6 +16,7 @@ from px4fuse.ekf2_parameters import AIDS, DISTURBANCES, Aid
 from px4fuse.flight import AidLog, at_times
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.layouts import Layout
+from px4fuse.readers.parts import with_nearest
 from px4fuse.readers.ulog_topics import Topics
 
 # innovations and variances are logged by separate rate limiters, up to one interval of the default
@@ -111,10 +112,8 @@ def _snapshots(topics: Topics, aid: Aid, meant: pd.Series[float] | None) -> AidL
         frame = topics.of_primary(values, select=_fresh)
         if variances is not values:
             # each topic is thinned by itself; S changes slowly
-            frame = pd.merge_asof(
-                frame, topics.of_primary(variances).dropna(), left_index=True, right_index=True,
-                direction="nearest", tolerance=JOIN_TOLERANCE_S,  # type: ignore[arg-type]
-            )  # fmt: skip
+            known = topics.of_primary(variances).dropna()
+            frame = with_nearest(frame, known, JOIN_TOLERANCE_S)
         left_out = len(frame) - len(frame := frame.dropna())
         if meant is not None:
             frame = frame[at_times(meant, frame.index) > 0.0]

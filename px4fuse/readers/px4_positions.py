@@ -15,7 +15,7 @@ from px4fuse.flight import Columns, Ekf2, PositionTrack, Truth, Unavailable, bes
 from px4fuse.origin import Origin, with_orientation
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.layouts import GLOBAL_COLUMNS
-from px4fuse.readers.parts import attitude_of, finite_rows, orientation_of
+from px4fuse.readers.parts import attitude_of, finite_rows, orientation_of, with_nearest
 from px4fuse.readers.px4_ekf2 import target_step_s
 from px4fuse.readers.px4_fixes import left_out_fixes, rebuilt_fixes
 from px4fuse.readers.px4_innovations import fuses
@@ -181,14 +181,11 @@ def _with_height(
 
     EKF2 stamps both with one external vision sample, but the logger thins each topic by itself.
     """
-    joined = pd.merge_asof(
-        samples, height.assign(_found=True), left_index=True, right_index=True,
-        direction="nearest", tolerance=HEIGHT_TOLERANCE_S,  # type: ignore[arg-type]
-    )  # fmt: skip
-    lacking = int(joined.pop("_found").isna().sum())
+    joined = with_nearest(samples, height.assign(_found=True), HEIGHT_TOLERANCE_S)
+    without = int(joined.pop("_found").isna().sum())
     within = f"within {1e3 * HEIGHT_TOLERANCE_S:.0f} ms"
-    note = f"{lacking} of {len(joined)} positions of external vision have no height {within}"
-    return joined, (note,) if lacking else ()
+    note = f"{without} of {len(joined)} positions of external vision have no height {within}"
+    return joined, (note,) if without else ()
 
 
 def _delay_s(topics: Topics) -> float:

@@ -41,6 +41,7 @@ from PIL import Image
 from scipy.ndimage import uniform_filter
 
 from px4fuse.flight import Unavailable
+from px4fuse.record import lacking
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification.model import BAD_VALUES, PageDifference
 from px4fuse.workers import Failed, bounded
@@ -65,7 +66,6 @@ MAX_PIXELS = 2_000_000
 MAX_DRAWN_COLOURS = 20_000
 # PDF's own limit is 14,400 points, or 200 inches
 MAX_POINTS = 14_400.0
-WHAT = "picture of the page"
 # PDFium's own errors are RuntimeErrors; the others come from ctypes and Pillow
 FAILURES = (*BAD_VALUES, MemoryError, ImportError)
 
@@ -219,10 +219,8 @@ def pictures(pdf: bytes, page: int | None = None) -> tuple[bytes, ...] | Unavail
 def undrawn(error: BaseException) -> Unavailable:
     """What stands for a page or file that raised one of FAILURES."""
     if isinstance(error, ImportError):
-        install = 'Install it: pip install "px4fuse[grade]".'
-        return Unavailable(WHAT, "pypdfium2 is not installed", install)
-    reason = f"it cannot be drawn ({one_line(str(error), 80)})"
-    return Unavailable(WHAT, reason, "Open the PDF itself.")
+        return lacking("no_pdfium")
+    return lacking("page_not_drawn", why=one_line(str(error), 80))
 
 
 def rendered(sheet: Any, width_px: float) -> Image.Image:
