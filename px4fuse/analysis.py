@@ -49,6 +49,7 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.reading import shown
+from px4fuse.record import lacking
 from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest
 
 if TYPE_CHECKING:
@@ -182,11 +183,7 @@ class Analysis(Comparison):
             tuned = self.tuning.get(name)
             if isinstance(tuned, AxisTuning) and self.axes.keys() >= set(group):
                 return tuple(self.axes[each].axis for each in group), tuned, offset_s
-        return Unavailable(
-            "causes beyond noise",
-            "the noises of the horizontal axes are not known",
-            "Analyse north and east, or the aisle (--axis).",
-        )
+        return lacking("noises_unknown")
 
 
 @dataclass(frozen=True)
@@ -240,10 +237,7 @@ def run_or_judge_aids(
     lacking, aids = no_source(flight), judge_aids(flight)
     if isinstance(aids, Unavailable):
         if flight.airborne == ():
-            raise MissingDataError(
-                f"{flight.log.name}: not flown, nothing to judge: {aids.reason}",
-                f"px4fuse info {flight.log.name} says what is logged.",
-            )
+            raise MissingDataError.of("not_flown", log=flight.log.name, reason=aids.reason)
         neither = f"{lacking.reason}, and the aids of EKF2 cannot be judged: {aids.reason}"
         raise MissingDataError(f"{flight.log.name}: {neither}", lacking.remedy)
     return AidsAlone(flight, aids, lacking)
@@ -287,11 +281,7 @@ def read_flight(request: ComparisonRequest, progress: Progress = silent) -> Flig
 
         other = read_log(Path(request.mavlink), system=request.system)
         if not other.log.format.startswith("MAVLink"):
-            raise LogError(
-                f"`mavlink` {other.log.name}: this is a {other.log.format}, not a MAVLink "
-                "recording",
-                "Give the ULog as LOG, and the recording (.tlog) with `mavlink`.",
-            )
+            raise LogError.of("not_mavlink", other=other)
         flight = join(flight, other)
     position, offset = request.position, request.clock_offset_s
     if position is None:
@@ -348,10 +338,7 @@ def run_preparation(
         return prepared
     _, clock = noises_and_clock(prepared, progress)
     if isinstance(clock, Unavailable) or not clock.determinable:
-        raise MissingDataError(
-            f"{flight.log.name}: `clock_offset_s` auto: not determinable: {clock.reason}",
-            "Give the seconds to add, or leave it out.",
-        )
+        raise MissingDataError.of("offset_unknown", flight=flight, clock=clock)
     low, high = clock.interval_s
     if low <= 0.0 <= high:
         note = (

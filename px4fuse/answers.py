@@ -1,6 +1,6 @@
 """The form that a student fills in about a flight: ``answers.toml``.
 
-What it asks stands in tables here: the mistakes a flight can have, with the units of their sizes;
+What it asks stands in ``form.toml``: the mistakes a flight can have, with the units of their sizes;
 what EKF2 can have done; the panels that show something; what can be done about it. Reading checks
 the form's grammar, never whether it is right.
 """
@@ -18,7 +18,7 @@ from msgspec import Meta
 
 from px4fuse.errors import SettingsError
 from px4fuse.reading import read_text
-from px4fuse.record import Record, Sha256
+from px4fuse.record import Record, Sha256, table
 
 # tomllib takes seconds and gigabytes for one dotted key of 64 kB
 MAX_BYTES, MAX_LINE = 20_000, 500
@@ -26,87 +26,36 @@ MOST_MISTAKES = 20
 NONE = "none"
 BLANK = "\u2013"
 
-_S, _M = {"s": 1.0, "ms": 1e-3}, {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-_PERCENT = {"%": 1.0, "factor": 100.0}
-_DEG = {"deg": 1.0, "rad": 57.29577951308232}
-_HZ, _A = {"Hz": 1.0}, {"m/s2": 1.0, "m/s²": 1.0}
-_FACTOR, _SD = {"factor": 1.0}, {"sd": 1.0}
-# What may be wrong: in words, and the units of its size (none: it has no size). The first unit is
-# the one that sizes are compared in; a factor of 1.05 on a length is 5 %
-MISTAKES: Mapping[str, tuple[str, Mapping[str, float]]] = {
-    NONE: ("nothing is wrong with the flight", {}),
-    "clock-offset": ("position stamps are late by this (negative: early), the whole flight", _S),
-    "clock-drift": ("the clock of the positions runs fast", {"ppm": 1.0}),
-    "clock-jump": ("stamps are late by this until the clocks are synchronised", _S),
-    "nlos": ("this share of the positions are outliers: no line of sight", {"%": 1.0}),
-    "dropout": ("the positions are silent that long", _S),
-    "imu-dropout": ("the IMU is missing that long", _S),
-    "decimate": ("positions come at this rate only", _HZ),
-    "r-scale": ("the variance that the source reports is this factor times the truth", _FACTOR),
-    "yaw": ("the position frame is turned against north (positive: clockwise)", _DEG),
-    "scale": ("distances of the positions are too long by this (negative: short)", _PERCENT),
-    "jump": ("the positions jump by this and stay there", _M),
-    "smoothed": ("the positions are low-pass filtered with this time constant", _S),
-    "slow-error": ("a further error of the positions changes slowly: multipath", _M),
-    "heading": ("EKF2's heading is too large by this: a disturbed compass", _DEG),
-    "mag": ("the field at the magnetometer changes in flight by this: a current", {"gauss": 1.0}),
-    "accel-bias": ("the accelerometer's forward axis reads too much by this", _A),
-    "vibration": ("the accelerometer is this much noisier", _A),
-    "imu-rate": ("the IMU is logged at this rate only", _HZ),
-    "no-motion": ("the vehicle hovered where it took off", {}),
-    "open-end": ("the loop ends this far from its start by the odometry: a false closure", _M),
-    "vio-drift": ("the odometry drifts by this share of the path, more than usual", {"%": 1.0}),
-    "no-vvo": ("the positions that EKF2 was sent are not logged", {}),
-    "ekf2-noise": ("EKF2_EVP_NOISE or EKF2_GPS_P_NOISE is this, and the data ask for another", _M),
-    "ekf2-delay": ("EKF2_EV_DELAY or EKF2_GPS_DELAY is this, and the stamps are right", _S),
-    "ekf2-gate": ("EKF2_EVP_GATE or EKF2_GPS_P_GATE is this, too small", _SD),
-    "ekf2-off": ("EKF2 was told not to fuse the positions", {}),
-}
-EKF2_DID = (
-    "nothing unusual", "followed the positions", "followed the wrong positions",
-    "fused at the wrong time", "rejected the bad samples", "rejected good samples",
-    "coasted, then reset", "trusted the positions too little", "never fused",
-)  # fmt: skip
-PANELS = (
-    "cover", "map", "position along the aisle", "velocity", "error to truth", "innovations",
-    "sigma", "why EKF2 differs", "parameters", "clock", "loop",
-)  # fmt: skip
+
+class NamedMistake(Record, frozen=True, rename={"sized_in": "in"}):
+    """What may be wrong, in words; sizes beyond ``range``, in the first unit, are nonsense."""
+
+    words: str
+    sized_in: str = ""
+    range: tuple[float, float] = (-1e6, 1e6)
+
+    @property
+    def units(self) -> Mapping[str, float]:
+        """Of its size, with what one of each is in the first of them; none: it has no size."""
+        return _UNITS[self.sized_in]
+
+
+class Form(Record, frozen=True):
+    """The tables of ``form.toml``."""
+
+    did: tuple[str, ...]
+    panels: tuple[str, ...]
+    units: dict[str, dict[str, float]]
+    mistakes: dict[str, NamedMistake]
+    cures: dict[str, str]
+    questions: dict[str, str]
+
+
+_FORM = table(__file__, "form.toml", Form)
+_UNITS: Mapping[str, Mapping[str, float]] = {"": {}, **_FORM.units}
+MISTAKES, EKF2_DID, PANELS = _FORM.mistakes, _FORM.did, _FORM.panels
 # What can be done about a mistake, with the units of its value (none: it takes no number)
-CURES: Mapping[str, Mapping[str, float]] = {
-    "--clock-offset": _S,
-    "--start": _S,
-    "--end": _S,
-    "--position-yaw": _DEG,
-    "--sigma-a": _A,
-    "--sigma-z": _M,
-    "--open": {},
-    "--landed-at": _M,
-    "--drift": _M,
-    "EKF2_EVP_NOISE": _M,
-    "EKF2_EVP_GATE": _SD,
-    "EKF2_EV_DELAY": {"ms": 1.0, "s": 1e3},
-    "EKF2_EV_CTRL": {"": 1.0},
-    "EKF2_GPS_P_NOISE": _M,
-    "EKF2_GPS_P_GATE": _SD,
-    "EKF2_GPS_DELAY": {"ms": 1.0, "s": 1e3},
-    "EKF2_GPS_CTRL": {"": 1.0},
-    "SDLOG_PROFILE": {"": 1.0},
-    "correct the stamps at the sender": _S,
-    "synchronise the clocks before take-off": {},
-    "multiply the positions at the sender": _FACTOR,
-    "turn the positions at the sender": _DEG,
-    "survey the anchors": {},
-    "one set of anchors": {},
-    "line of sight and link": {},
-    "switch the smoothing off": {},
-    "calibrate the compass": {},
-    "send positions more often": _HZ,
-    "report the true variance": _M,
-    "calibrate the accelerometer": {},
-    "balance the propellers": {},
-    "log at a higher rate": _HZ,
-    "fly several passes": {},
-}
+CURES = {name: _UNITS[units] for name, units in _FORM.cures.items()}
 VERDICTS = ("consistent", "overstated", "understated")
 
 Number = Annotated[float, Meta(gt=-1e9, lt=1e9)]
@@ -146,7 +95,7 @@ class Claim(Record, frozen=True):
 
     def size_in_first_unit(self) -> float | None:
         """The size in the kind's first unit; a length's factor as what it is beyond 1."""
-        units = MISTAKES[self.kind][1]
+        units = MISTAKES[self.kind].units
         if self.size is None or not units:
             return None
         if self.unit == "factor" and self.kind == "scale":
@@ -218,16 +167,7 @@ class AskedNumber(Record, frozen=True):
     @property
     def words(self) -> str:
         """The question."""
-        what = {
-            "gain": f"position gain of update {self.update}",
-            "variance": f"position variance after update {self.update} (m²)",
-            "innovation": f"innovation of update {self.update} (m)",
-            "nis": f"NIS of update {self.update}",
-            "silence": f"sigma of the position {self.extra:g} s after update {self.update}, "
-            "without a further measurement (m)",
-            "gate": f"which of the updates {self.update} to {self.update + GATED} lie outside "
-            f"{self.extra:g} sqrt(S), as a list; the filter takes them all the same",
-        }[self.kind]
+        what = _FORM.questions[self.kind].format(asked=self, last=self.update + GATED)
         return f"{what}; with SIGMA_A {self.sigma_a_m_s2:g} and SIGMA_Z {self.sigma_z_m:g}"
 
 
@@ -315,34 +255,22 @@ def check(answers: Answers) -> None:
     for said in answers.ekf2_did:
         _one_of("ekf2_did", said, EKF2_DID)
     for claim in answers.mistakes:
-        units = MISTAKES[claim.kind][1]
+        mistake = MISTAKES[claim.kind]
         for field, known in (
             ("parameter", CURES),
             ("panel", PANELS),
-            ("unit", units),
+            ("unit", mistake.units),
             ("value_unit", CURES.get(claim.parameter)),
         ):
             value = getattr(claim, field)
             if value and known is not None:
                 _one_of(f"of {claim.kind}: {field}", value, known)
-        low, high = RANGES.get(claim.kind, (-1e6, 1e6))
+        low, high = mistake.range
         size = claim.size_in_first_unit()
         if size is not None and not low <= size <= high:
-            unit = next(iter(units))
+            unit = next(iter(mistake.units))
             raise ValueError(f"of {claim.kind}: size {size:g} {unit} is none that it can have: "
                              f"{low:g} to {high:g} {unit}")  # fmt: skip
-
-
-# Sizes beyond which a number is a slip or nonsense, in the kind's first unit
-RANGES: Mapping[str, tuple[float, float]] = {
-    "clock-offset": (-5.0, 5.0), "clock-jump": (-5.0, 5.0), "nlos": (0.0, 100.0),
-    "dropout": (0.0, 600.0), "imu-dropout": (0.0, 600.0), "yaw": (-180.0, 180.0),
-    "scale": (-90.0, 400.0), "jump": (-100.0, 100.0), "smoothed": (0.0, 10.0),
-    "accel-bias": (-20.0, 20.0), "vibration": (0.0, 50.0), "imu-rate": (0.0, 8000.0),
-    "decimate": (0.0, 1000.0), "r-scale": (0.0, 1e6), "open-end": (0.0, 1000.0),
-    "vio-drift": (0.0, 100.0), "ekf2-noise": (0.0, 100.0), "ekf2-delay": (-5.0, 5.0),
-    "ekf2-gate": (0.0, 1000.0), "clock-drift": (-1e5, 1e5), "mag": (-10.0, 10.0),
-}  # fmt: skip
 
 
 def _one_of(field: str, value: str, known: Any) -> None:
@@ -367,7 +295,7 @@ def form_text(log_name: str, log_sha256: str) -> str:
         f'# {one.words}\nq{number} = ""{"    # such as [61, 64]" * (one.kind == "gate")}'
         for number, one in enumerate(asked(log_sha256), start=1)
     ]
-    kinds = (f"{name:13} {words}{_units(units)}" for name, (words, units) in MISTAKES.items())
+    kinds = (f"{name:13} {one.words}{_units(one.units)}" for name, one in MISTAKES.items())
     return template.substitute(
         log=log_name,
         form=form_name(log_name),
@@ -390,7 +318,7 @@ def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
         ends = (("from", claim.from_s), ("until", claim.until_s))
         value = _number_words(claim.value, claim.value_unit, CURES.get(claim.parameter, {}))
         said = (
-            _number_words(claim.size, claim.unit, MISTAKES.get(claim.kind, ("", {}))[1]),
+            _number_words(claim.size, claim.unit, MISTAKES.get(claim.kind, NamedMistake("")).units),
             claim.when or " ".join(f"{name} {at:g} s" for name, at in ends if at is not None),
             f"seen in {claim.panel}" if claim.panel else "",
             f"{claim.parameter} {value}".strip(),

@@ -1,12 +1,14 @@
 """Results as plain data: what JSON can hold, without NaN; and numbers as people read them."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from decimal import Decimal
 from typing import Any
 
 import msgspec
+
+from px4fuse.record import table
 
 
 def plain(value: object) -> Any:
@@ -94,3 +96,24 @@ def excess_words(factor: float) -> str:
     return f"{factor - 1.0:.0%}".replace("%", " %") if factor < 2.0 else (
         f"{factor_words(factor)} times"
     )  # fmt: skip
+
+
+def sentences(beside: str) -> Callable[..., str]:
+    """What says the sentences of the ``words.toml`` beside a module.
+
+    Parameters
+    ----------
+    beside : str
+        ``__file__`` of the module.
+
+    Returns
+    -------
+    callable
+        Takes the name of a sentence, and by name the facts that it is filled with.
+    """
+    texts = table(beside, "words.toml", dict[str, str])
+
+    def say(which: str, /, **facts: Any) -> str:
+        return texts[which].format_map(facts)
+
+    return say

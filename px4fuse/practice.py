@@ -18,20 +18,12 @@ from px4fuse.explore.packing import Packer
 from px4fuse.explore.page import data_scripts, page_text
 from px4fuse.findings import Finding, find
 from px4fuse.findings.story import story
+from px4fuse.record import Record, table
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
-# What may be chosen, with what it stands for
-CHOICES = {
-    "source": "the positions: outliers, a jump, a silence",
-    "clock": "the clock of the positions",
-    "noise": "a noise: SIGMA_A, SIGMA_Z or EKF2_EVP_NOISE does not fit the data",
-    "gate": "EKF2's gate",
-    "frame": "the frame of the positions is turned",
-    "nothing": "nothing",
-}
 # Of two mistakes: that of the motion and one of single samples; a noise would hide another
 BOTH_SEEN = ({"clock", "source"}, {"clock", "gate"}, {"frame", "source"}, {"frame", "gate"})
 HARDEST = 3
@@ -49,8 +41,7 @@ MOMENTS = {"nlos": "source_outliers", "jump": "source_jumps", "dropout": "source
 NOISY_UWB = "noisy-uwb"  # not a mistake of the log: the filter's SIGMA_Z does not fit
 
 
-@dataclass(frozen=True)
-class Trick:
+class Trick(Record, frozen=True):
     """A mistake that may be hidden in a flight.
 
     Attributes
@@ -79,44 +70,15 @@ class Trick:
     either_sign: bool = False
 
 
-TRICKS = (
-    Trick("source", "nlos", ("5%,2m", "4%,1.5m", "3%,1.5m"), "innovation",
-          "Some positions are off (share, mean size: {size}), in bursts.",
-          "A few innovations lie far outside ±2√S, in bursts (look at north and east too), while "
-        "most fit: a SIGMA_Z that covers them is far too large for the rest."),
-    Trick("source", "jump", ("2m", "1.2m", "0.8m"), "innovation",
-          "The positions jump by {size} at two thirds of the flight, and stay.",
-          "From one moment on the innovations stand on one side until the filter has followed: "
-          "the positions jumped, and no knob takes that away."),
-    Trick("source", "dropout", ("12s", "8s", "5s"), "sigma_p",
-          "The source was silent for {size}.",
-          "σ of position grows for seconds without a measurement: the source was silent."),
-    Trick("clock", "clock-offset", ("400ms", "300ms", "250ms"), "innovation",
-          "The stamps of the positions are {size} late (with a minus: early).",
-          "The innovations grow at every start and stop and are small in between; the clock offset "
-        "that undoes it makes them small again.", either_sign=True),
-    Trick("noise", NOISY_UWB, ("0.3", "0.22", "0.18"), "innovation",
-          "The noise of the positions is {size} m, and SIGMA_Z says 0.1 m.",
-          "Far more than one innovation in twenty lies outside ±2√S all the time, without order: "
-          "a larger SIGMA_Z brings the needle into its band."),
-    Trick("noise", "ekf2-noise", ("0.03", "0.04", "0.05"), "innovation",
-          "The noise of the positions is 0.1 m, and EKF2_EVP_NOISE says {size} m.",
-          "EKF2's own limits lie close to zero while its innovations are as large as ours: its "
-          "EKF2_EVP_NOISE is too small. Our needle is in its band."),
-    Trick("noise", "vibration", ("1.5", "1", "0.6"), "innovation",
-          "The accelerometer's noise is {size} m/s² (mean over 0.1 s), and SIGMA_A says 0.1.",
-          "The innovations are too large all the time and follow each other: a larger SIGMA_A, "
-          "not a larger SIGMA_Z, brings the needle into its band."),
-    Trick("gate", "ekf2-gate", ("1", "1.2", "1.4"), "innovation",
-          "EKF2_EVP_GATE is {size}.",
-          "EKF2 rejects samples (hollow squares) that are no larger than others and fit ours: its "
-          "gate is too small."),
-    Trick("frame", "yaw", ("45deg", "35deg", "25deg"), "innovation",
-          "The axes of the positions are turned by {size} against north, clockwise.",
-          "Along north or east the innovations grow at every start and stop, and no clock offset "
-        "makes them small.",
-          either_sign=True),
-)  # fmt: skip
+class Tricks(Record, frozen=True):
+    """What may be chosen, with what it stands for, and what may be hidden."""
+
+    choices: dict[str, str]
+    tricks: tuple[Trick, ...]
+
+
+_TABLES = table(__file__, "practice.toml", Tricks)
+CHOICES, TRICKS = _TABLES.choices, _TABLES.tricks
 
 
 @dataclass(frozen=True)

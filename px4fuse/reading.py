@@ -58,9 +58,7 @@ def size_of(path: Path, refuse: type[Px4FuseError], name: str = "") -> int:
     if stat.S_ISDIR(status.st_mode):
         raise refuse(f"{name}: is a folder", "Give a file.")
     if not stat.S_ISREG(status.st_mode):
-        raise refuse(
-            f"{name}: not a regular file (a device, pipe or socket)", "Save it to a file first."
-        )
+        raise refuse.of("not_regular", name=name)
     return status.st_size
 
 
@@ -153,9 +151,7 @@ def read_text(
     try:
         return content.decode("utf-16" if is_utf16 else "utf-8-sig")
     except UnicodeDecodeError as error:
-        raise refuse(
-            f"{name}: not a text file in UTF-8 (byte {error.start})", "Save it as UTF-8."
-        ) from error
+        raise refuse.of("not_utf8", name=name, error=error) from error
 
 
 def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:

@@ -60,23 +60,6 @@ class Unavailable(Record, frozen=True):
         return f"{self.what}: {self.reason}. {self.remedy}"
 
 
-_LACKING = msgspec.toml.decode(
-    Path(__file__).with_name("lacking.toml").read_bytes(), type=dict[str, Unavailable]
-)
-
-
-def lacking(name: str, /, **told: object) -> Unavailable:
-    """What was looked for and not found, in the words of ``lacking.toml``.
-
-    Examples
-    --------
-    >>> str(lacking("measurements_few", what="tuning", count=3, least=30)).partition(". ")[0]
-    'tuning: 3 measurements are too few (at least 30)'
-    """
-    row = _LACKING[name]
-    return Unavailable(*(text.format(**told) for text in (row.what, row.reason, row.remedy)))
-
-
 T = TypeVar("T")
 A = TypeVar("A")
 if TYPE_CHECKING:
@@ -128,3 +111,33 @@ def written(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: written(part) for key, part in value.items()}
     return tuple(map(written, value)) if isinstance(value, tuple) else value
+
+
+def table(beside: str, name: str, kind: type[T]) -> T:
+    """A table of the package, in a TOML file beside a module.
+
+    Parameters
+    ----------
+    beside : str
+        ``__file__`` of the module.
+    name : str
+        Of the table's file.
+    kind : type
+        What it holds.
+    """
+    return msgspec.toml.decode(Path(beside).with_name(name).read_bytes(), type=kind)
+
+
+_LACKING = table(__file__, "lacking.toml", dict[str, Unavailable])
+
+
+def lacking(name: str, /, **told: object) -> Unavailable:
+    """What was looked for and not found, in the words of ``lacking.toml``.
+
+    Examples
+    --------
+    >>> str(lacking("measurements_few", what="tuning", count=3, least=30)).partition(". ")[0]
+    'tuning: 3 measurements are too few (at least 30)'
+    """
+    row = _LACKING[name]
+    return Unavailable(*(text.format(**told) for text in (row.what, row.reason, row.remedy)))

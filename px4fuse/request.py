@@ -9,10 +9,12 @@ import re
 import shlex
 import subprocess
 from collections.abc import Iterator, Mapping
-from pathlib import Path, PurePath
+from pathlib import PurePath
 from typing import Annotated, Any, Literal, Self
 
 import msgspec
+
+from px4fuse.record import table
 
 AUTO: Literal["auto"] = "auto"
 # The filter's settings where nobody chooses
@@ -272,9 +274,7 @@ class Option(msgspec.Struct, frozen=True):
     metavar: str | None = None
 
 
-_TABLES = msgspec.toml.decode(
-    Path(__file__).with_name("options.toml").read_bytes(), type=dict[str, dict[str, Option]]
-)
+_TABLES = table(__file__, "options.toml", dict[str, dict[str, Option]])
 # Which recordings of one flight are read, and what the filter does, for one flight or many
 RECORDINGS, FILTER_OPTIONS = _TABLES["recordings"], _TABLES["filter"]
 POSITION_OPTIONS, CLOCK_OPTION = _TABLES["position"], _TABLES["clock"]

@@ -190,9 +190,7 @@ def _explained(path: Path) -> Iterator[None]:
         why = "nobody reads this pipe" if error.errno == errno.ENXIO else error.strerror
         locked = LOCKS and isinstance(error, PermissionError)
         remedy = "Close the program that has it open, or choose" if locked else "Choose"
-        raise OutputError(
-            f"{name}: cannot be written ({why}). {remedy} another place for it."
-        ) from error
+        raise OutputError.of("not_written", name=name, why=why, remedy=remedy) from error
 
 
 @contextmanager

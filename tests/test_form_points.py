@@ -196,7 +196,7 @@ def answers_of(form: dict[str, Any]) -> Answers:
             Claim(
                 one["kind"],
                 one["size"],
-                "" if one["unit"] == next(iter(MISTAKES[one["kind"]][1]), "") else one["unit"],
+                "" if one["unit"] == next(iter(MISTAKES[one["kind"]].units), "") else one["unit"],
                 "whole flight" if when["text"] == "whole flight" else "",
                 when["from_s"],
                 when["until_s"],

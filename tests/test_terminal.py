@@ -20,7 +20,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.analysis import run as analyse
 from px4fuse.cli.outputs import free_report, progress, terminal
 from px4fuse.report import screen
-from px4fuse.report.screen import runnable, say
+from px4fuse.report.screen import paragraph, runnable
 from px4fuse.report.terminal import summary
 from px4fuse.request import ComparisonRequest, PositionFile, command_line, settings_name
 from px4fuse.results.build import results
@@ -105,7 +105,7 @@ def test_nothing_is_cut_and_words_are_whole(summaries, document) -> None:
 
 def test_a_paragraph_hangs_beside_its_label(capsys) -> None:
     console = Console(width=30, highlight=False)
-    say(console, "one two three four five six seven", "Label", 9)
+    paragraph(console, "one two three four five six seven", "Label", 9)
     lines = ["Label    one two three four", "         five six seven"]
     assert capsys.readouterr().out.splitlines() == lines
 

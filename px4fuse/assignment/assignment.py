@@ -55,10 +55,7 @@ def key_path(folder: Path, given: Path | None) -> Path:
     whole = folder.resolve()
     path = given or whole.parent / f"{whole.name}_answers.json"
     if whole in (path.resolve(), *path.resolve().parents):
-        raise OutputError(
-            f"{path}: is in the students' folder, where they would find it. Give another place "
-            "with --answer."
-        )
+        raise OutputError.of("key_among_students", path=path)
     return path
 
 
@@ -149,10 +146,7 @@ def preview(
     if secret is None:
         before = read_key(key_file) if key_file.exists() else None
         if before is None or not before.secret:
-            raise SettingsError(
-                "--preview requires --secret-file or --secret: one that is made up is not kept, "
-                "and would give others each time."
-            )
+            raise SettingsError.of("preview_without_secret")
         secret = before.secret.encode()
     return [draw(secret, student.student_id, kind, count) for student in students]
 
@@ -163,17 +157,10 @@ def _there(target: Path, log: bytes) -> bool:
         return False
     if target.is_file() and target.stat().st_size == len(log) and target.read_bytes() == log:
         return True
-    raise OutputError(
-        f"{target}: is there already and is another flight; it was not overwritten. Give the same "
-        "secret and options as before, or another folder with -o."
-    )
+    raise OutputError.of("flight_there", target=target)
 
 
 def _check_extends(key_file: Path, same: bool) -> None:
     """A key that is there already must be part of the new one."""
     if not same:
-        raise OutputError(
-            f"{key_file}: is the answer key of other flights; it was not overwritten. Give the "
-            "same secret, options and students as before (more are welcome), or another place with "
-            "--answer."
-        )
+        raise OutputError.of("key_of_others", key_file=key_file)

@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 from px4fuse.assignment.roster import folded
 from px4fuse.errors import SettingsError
+from px4fuse.record import Record, table
 from px4fuse.simulation.scenario import Kind, Scenario, scenario_of
 
 # Of a class: one kind of flight for all, or drawn for each
@@ -25,17 +26,6 @@ Kinds = Literal["aisle", "loop", "mixed"]
 MIN_SECRET = 8
 # Named in every draw: another text gives other flights, and keys of another text cannot be extended
 DRAWN = "px4fuse assignment 2"
-# What is drawn, and from where to where, with the decimals that are kept
-EITHER = {"sigma_a_m_s2": (0.15, 0.30, 3), "heading_deg": (-180.0, 180.0, 1)}
-NOISES: dict[Kind, dict[str, tuple[float, float, int]]] = {
-    "aisle": {"sigma_uwb_m": (0.07, 0.12, 3), "speed_m_s": (0.9, 1.3, 2), **EITHER},
-    "loop": {
-        "vio_drift": (0.008, 0.02, 4),
-        "sigma_vio_m": (0.008, 0.015, 4),
-        "speed_m_s": (0.8, 1.2, 2),
-        **EITHER,
-    },
-}
 # Shares of flights with so many mistakes, where the number is not given. The loop has one mistake
 # to offer; with fewer flights without it, "false closure" would be a safe guess.
 COUNTS: dict[Kind, tuple[float, ...]] = {"aisle": (0.1, 0.5, 0.4), "loop": (0.4, 0.6)}
@@ -46,8 +36,7 @@ LOOPS = 1 / 3
 EASIEST, HARDEST = 0.6, 1.0
 
 
-@dataclass(frozen=True)
-class AssignableMistake:
+class AssignableMistake(Record, frozen=True):
     """A mistake that may be drawn, at sizes at which it is found.
 
     Attributes
@@ -99,25 +88,18 @@ class AssignableMistake:
         return f"{text},{first + at * (last - first):.0f}s"
 
 
-# Clock and heading are estimated from the IMU. A gap of the IMU is not among the choices: it passes
-# for a change of the clock in every second flight. Outliers make EKF2 reject and its NIS grow too,
-# and pull the heading; a delay is seen by what EKF2 does with good samples.
-NEED_IMU = ("clock", "frame")
-CHOICES: dict[Kind, tuple[AssignableMistake, ...]] = {
-    "aisle": (
-        AssignableMistake("clock-offset", "clock", 150, "ms", either_sign=True),
-        AssignableMistake("clock-jump", "clock", 50, "ms", hides=("frame", "gap")),
-        AssignableMistake("yaw", "frame", 15, "deg", either_sign=True),
-        AssignableMistake("nlos", "outliers", 1, "%", hides=("frame",)),
-        AssignableMistake("dropout", "gap", 2, "s", at_s=(30, 70)),
-        AssignableMistake("imu-rate", "rate", 40, "Hz", less_is_plainer=True, hides=NEED_IMU),
-        AssignableMistake("ekf2-noise", "ekf2", 4, "cm", less_is_plainer=True, hides=("outliers",)),
-        AssignableMistake("ekf2-gate", "ekf2", 2, less_is_plainer=True, hides=("outliers",)),
-        AssignableMistake("ekf2-delay", "clock", 150, "ms", hides=("ekf2",)),
-        AssignableMistake("ekf2-off", "ekf2"),
-    ),
-    "loop": (AssignableMistake("open-end", "end", 4, "m"),),
-}
+class OfKind(Record, frozen=True):
+    """What may be drawn for a kind of flight: numbers of the scenario, and mistakes.
+
+    Numbers are (low, high, decimals), by field.
+    """
+
+    mistakes: tuple[AssignableMistake, ...]
+    numbers: dict[str, tuple[float, float, int]]
+
+
+_OF_KIND = table(__file__, "drawn.toml", dict[Kind, OfKind])
+CHOICES = {kind: of.mistakes for kind, of in _OF_KIND.items()}
 
 
 @dataclass(frozen=True)
@@ -167,10 +149,7 @@ def draw(
     """
     most = min(len(COUNTS[one]) for one in (COUNTS if kind == "mixed" else (kind,))) - 1
     if count is not None and not 0 <= count <= most:
-        raise SettingsError(
-            f"--mistakes {count}: a flight of kind {kind} can have 0 to {most}, of which each is "
-            "still found beside the others."
-        )
+        raise SettingsError.of("mistakes_many", count=count, kind=kind, most=most)
     if kind == "mixed":
         kind = "loop" if uniform(secret, student_id, kind, "kind") < LOOPS else "aisle"
     one = partial(uniform, secret, student_id, kind)
@@ -186,7 +165,7 @@ def draw(
             made.append((choice, hard, choice.typed(hard, sign, one(f"at {name}"))))
     numbers: dict[str, Any] = {
         name: round(low + (high - low) * one(name), decimals)
-        for name, (low, high, decimals) in NOISES[kind].items()
+        for name, (low, high, decimals) in _OF_KIND[kind].numbers.items()
     }
     told, seed = truth and kind == "aisle", int(one("seed") * 2**32)
     scenario = scenario_of(kind, truth=told, seed=seed, **numbers)
@@ -204,8 +183,5 @@ def secret_of(text: str, where: str) -> bytes:
     """
     stripped = text.strip()
     if len(stripped) < MIN_SECRET:
-        raise SettingsError(
-            f"{where}: a secret of {len(stripped)} characters can be guessed",
-            f"Give {MIN_SECRET} or more, or leave it out: one is made up, and kept in the answers.",
-        )
+        raise SettingsError.of("secret_short", where=where, length=len(stripped), least=MIN_SECRET)
     return stripped.encode(errors="replace")

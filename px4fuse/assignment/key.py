@@ -113,8 +113,5 @@ def read_key(path: Path) -> AnswerKey:
         if len({folded(answer.student_id) for answer in key.answers}) < len(key.answers):
             raise ValueError("two students have the same id")
     except (msgspec.MsgspecError, RecursionError, ValueError) as error:
-        raise SettingsError(
-            f"{path}: not an answer key that this px4fuse reads ({error})",
-            "Give it as px4fuse simulate --assignment wrote it.",
-        ) from error
+        raise SettingsError.of("no_key", path=path, error=error) from error
     return key

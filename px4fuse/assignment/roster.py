@@ -11,6 +11,7 @@ from pathlib import Path
 
 from px4fuse.assignment.sheet import Sheet, read_sheet
 from px4fuse.errors import SettingsError
+from px4fuse.record import table
 from px4fuse.results.reading import one_line
 
 MAX_NAME = 200
@@ -18,20 +19,7 @@ MAX_STUDENTS = 1000
 # A file system takes 255 bytes, and a character up to 4
 MAX_STEM = 48
 RESERVED = {"con", "prn", "aux", "nul"} | {f"{n}{i}" for n in ("com", "lpt") for i in range(10)}
-# Column titles, letters and digits only, best first. The university's own id; Canvas's "ID",
-# Moodle's "Identifier" and ILIAS's "User ID" are the platform's
-COLUMNS = {
-    "student_id": (
-        "studentid", "studentnumber", "studentno", "idnumber", "matriculationnumber",
-        "matriculation", "matrikelnummer", "matrikelnr", "orgdefinedid", "sisuserid", "sid", "id",
-        "number",
-    ),
-    "login": ("username", "login", "sisloginid", "loginid", "user", "benutzername"),
-    "email": ("emailaddress", "email", "mail", "emailadresse"),
-    "name": ("name", "fullname", "studentname", "displayname", "student"),
-    "first": ("firstname", "givenname", "forename", "vorname"),
-    "last": ("lastname", "surname", "familyname", "nachname"),
-}  # fmt: skip
+COLUMNS = table(__file__, "columns.toml", dict[str, tuple[str, ...]])
 # What another list may know besides
 ADDED = ("name", "email", "login", "submitted")
 # Of Canvas, above the students
@@ -80,10 +68,7 @@ def people_of_sheet(sheet: Sheet) -> tuple[Person, ...]:
         No column tells who somebody is, or two rows have the same id.
     """
     if all(sheet.column(titles) is None for titles in COLUMNS.values()):
-        raise SettingsError(
-            f"{sheet.path}: no column tells who a student is",
-            "Give one a title such as id, email or name.",
-        )
+        raise SettingsError.of("no_column", path=sheet.path)
     rows: dict[str, int] = {}
     people = []
     for number, row in enumerate(sheet.rows, start=2):
@@ -92,10 +77,12 @@ def people_of_sheet(sheet: Sheet) -> tuple[Person, ...]:
             continue
         wanted = folded(person.student_id)
         if wanted and rows.setdefault(wanted, number) != number:
-            raise SettingsError(
-                f"{sheet.path}: rows {rows[wanted]} and {number} have the same id "
-                f"{one_line(person.student_id, 40)!r}",
-                "Give every student one of its own.",
+            raise SettingsError.of(
+                "id_twice",
+                sheet=sheet,
+                before=rows[wanted],
+                number=number,
+                student_id=one_line(person.student_id, 40),
             )
         people.append(person)
     return tuple(people)
@@ -118,10 +105,7 @@ def read_roster(path: Path) -> tuple[Person, ...]:
         stem = file_stem(person.student_id)
         if stem is None or stems.setdefault(stem.casefold(), person) is not person:
             who = one_line(person.student_id or person.name, 40)
-            raise SettingsError(
-                f"{path}: after the id of {who!r} no file of its own can be named",
-                "Give every student an id of its own, with letters or digits.",
-            )
+            raise SettingsError.of("id_without_file", path=path, who=who)
     return people
 
 

@@ -17,7 +17,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.flight import Ekf2, Unavailable
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
-from px4fuse.record import Record
+from px4fuse.record import Record, table
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
 from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
@@ -30,22 +30,7 @@ CLOSURE_WITHIN_M = 0.3
 REJECTED = 0.005
 # A reset of position that is seen, after EKF2 has found its first position
 RESET_M, SETTLED_S = 0.2, 5.0
-# What EKF2 does in flights that have one of these, and what may be said as well
-DOES: Mapping[str, set[str]] = {
-    "followed the wrong positions": {
-        "clock-offset", "clock-drift", "yaw", "scale", "smoothed", "slow-error",
-    },
-    "fused at the wrong time": {"ekf2-delay"},
-    "never fused": {"ekf2-off"},
-}  # fmt: skip
-MAY_DO: Mapping[str, set[str]] = {
-    "fused at the wrong time": {"clock-offset", "clock-drift", "clock-jump", "smoothed"},
-    "followed the wrong positions": {"clock-jump", "nlos", "jump"},
-    "coasted, then reset": {"dropout"},
-    "never fused": {"decimate"},
-    "followed the positions": {"heading", "mag"},
-    "rejected the bad samples": {"mag"},
-}
+DID = table(__file__, "did.toml", dict[str, dict[str, set[str]]])
 
 
 class Wrong(Record, frozen=True):
@@ -157,8 +142,10 @@ def _ekf2_did(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What EKF2 did in this flight: by what is wrong with it, and by what the log shows."""
     size_of = {wrong.kind: wrong.size or 0.0 for wrong in mistakes}
-    must = [said for said, kinds in DOES.items() if kinds & size_of.keys()]
-    also = [said for said, kinds in MAY_DO.items() if kinds & size_of.keys()]
+    must, also = (
+        [said for said, kinds in DID[which].items() if kinds & size_of.keys()]
+        for which in ("does", "may_do")
+    )
     if size_of.get("ekf2-noise", 0.0) > sigma_z_m:
         must.append("trusted the positions too little")
     innovations = comparison.main.ekf2_innovations

@@ -40,9 +40,7 @@ def extract(
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output}: is a file. Give a folder with -o.")
     if format == "parquet" and importlib.util.find_spec("pyarrow") is None:
-        raise OutputError(
-            '--format parquet needs pyarrow: pip install "px4fuse[parquet]", or take --format csv.'
-        )
+        raise OutputError.of("no_pyarrow")
     from px4fuse.analysis import read_flight
     from px4fuse.inspect import tables as extraction
     from px4fuse.results.contract import to_json
@@ -73,9 +71,7 @@ def _refuse_mixture(folder: Path, sha256: str) -> None:
     except (OutputError, ValueError, KeyError, TypeError):  # not one of ours
         return
     if other:
-        raise OutputError(
-            f"{folder}: holds the tables of another log, {name}. Give another folder with -o."
-        )
+        raise OutputError.of("tables_of_another", folder=folder, name=name)
 
 
 def _csv(table: pd.DataFrame) -> bytes:

@@ -108,10 +108,7 @@ def _check_place(output: Path, given: tuple[Path, ...]) -> None:
         raise OutputError(f"-o {output}: is not a folder. Give another place.")
     for path in given:
         if path.is_dir() and output.resolve().is_relative_to(path.resolve()):
-            raise OutputError(
-                f"-o {output}: lies inside {path}, which is read; its own output would be graded. "
-                "Choose another folder."
-            )
+            raise OutputError.of("output_within", output=output, path=path)
 
 
 def _page(outcome: GradeOutcome) -> Page:

@@ -13,7 +13,6 @@ from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import click
-import msgspec
 from click.core import ParameterSource
 from msgspec import NODEFAULT, Struct
 from msgspec.structs import fields
@@ -21,6 +20,7 @@ from msgspec.structs import fields
 from px4fuse.cli.outputs import OPENED
 from px4fuse.errors import SettingsError
 from px4fuse.reading import max_log_bytes, read_text
+from px4fuse.record import table
 from px4fuse.request import (
     AUTO,
     CLOCK_OPTION,
@@ -167,17 +167,15 @@ class _Typed(Struct, frozen=True):
     most: int | float | None = None
 
 
-_TABLES = msgspec.toml.decode(
-    Path(__file__).with_name("options.toml").read_bytes(), type=dict[str, dict[str, _Typed]]
-)
+_TABLES = table(__file__, "options.toml", dict[str, dict[str, _Typed]])
 
 
-def options(table: str, **more: Mapping[str, Any]) -> Option:
+def options(title: str, **more: Mapping[str, Any]) -> Option:
     """The options of a table of ``options.toml``; of some more, as click has it."""
     return _together(
         *(
             option(one.typed, one.meaning, one.least, one.most, name=name, **more.get(name, {}))
-            for name, one in _TABLES[table].items()
+            for name, one in _TABLES[title].items()
         )
     )
 

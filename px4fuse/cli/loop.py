@@ -121,9 +121,7 @@ def _files(found: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]
     if tum is not None:
         best = found.best
         if best is found.odometry:
-            raise MissingDataError(
-                f"--tum {shown(tum)}: there is no corrected path: no closure could be used."
-            )
+            raise MissingDataError.of("no_corrected_path", tum=shown(tum))
         contents[tum] = tum_text(in_frame(best.trajectory, found.given_frame)).encode()
     if g2o is not None:
         contents[g2o] = g2o_text(found.solved_graph()).encode()
@@ -143,10 +141,8 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
         raise SettingsError(f"{shown(source)}: a pose graph has no part {part!r}", "Leave it out.")
     for parameter in inputs.typed_parameters():
         if parameter.name not in FOR_GRAPHS:
-            raise SettingsError(
-                f"{shown(source)}: {parameter.opts[-1]} is for flights and trajectories, not for a "
-                "pose graph",
-                "With one, give only --g2o FILE and --json FILE.",
+            raise SettingsError.of(
+                "not_for_graphs", source=shown(source), option=parameter.opts[-1]
             )
     outputs.check_targets([json_path, g2o])
     with outputs.progress(json_path) as step:

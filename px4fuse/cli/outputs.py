@@ -262,15 +262,10 @@ def check_targets(targets: Iterable[Path | None]) -> None:
         except FileNotFoundError:
             pass
         except OSError as error:  # a name that is too long, a file in the place of a folder
-            raise OutputError(
-                f"{target}: cannot be written ({error.strerror}). Choose another place for it."
-            ) from error
+            raise OutputError.of("cannot_be_written", target=target, error=error) from error
         for source in read:
             if there and source.exists() and target.samefile(source):
-                raise OutputError(
-                    f"{target}: is what this command reads; it was not overwritten. Give another "
-                    "name for the output."
-                )
+                raise OutputError.of("output_is_input", target=target)
 
 
 def finish(

@@ -32,10 +32,7 @@ def sample_log() -> Path:
             with as_file(files("px4fuse_samples") / SAMPLE) as installed:
                 found = installed
         except ModuleNotFoundError:
-            raise MissingDataError(
-                "no log was given, and the sample flights are not here either",
-                f"Give a LOG, or run {INSTALL}.",
-            ) from None
+            raise MissingDataError.of("no_sample", install=INSTALL) from None
     click.echo(f"No log was given: this is the sample flight, {SAMPLE}.", err=True)
     return found
 
@@ -57,10 +54,7 @@ def sample(output: Path = FOLDER) -> None:
     contents = {output / one.name: one.read_bytes() for one in sorted(flights, key=str)}
     for path, content in contents.items():
         if path.is_file() and path.read_bytes() != content:
-            raise OutputError(
-                f"{path}: another file of that name is there; nothing was written. Move it away, "
-                "or give another folder with -o."
-            )
+            raise OutputError.of("sample_there", path=path)
     first = next(path for path in contents if path.suffix == ".ulg")
     command = command_line(ComparisonRequest(log=str(first)), "compare", typed=True)
     page = Page()

@@ -128,17 +128,10 @@ def simulate(
 def _check_options(assignment: Path | None) -> None:
     """Refuse options that do not go together."""
     if assignment is not None and click.get_current_context().params["kind"] == OUTDOOR:
-        raise SettingsError(
-            f"--kind {OUTDOOR} is for a single flight",
-            f"With --assignment give --kind aisle, loop or {MIXED}.",
-        )
+        raise SettingsError.of("kind_is_single", outdoor=OUTDOOR, mixed=MIXED)
     for parameter in typed_parameters():
         if assignment is not None and parameter.name not in OF_ASSIGNMENTS:
-            raise SettingsError(
-                f"{parameter.opts[0]} is for a single flight: --assignment draws it for every "
-                "student",
-                "Leave it out.",
-            )
+            raise SettingsError.of("option_is_single", parameter=parameter)
         if assignment is None and parameter.name in ONLY_ASSIGNMENTS:
             raise SettingsError(f"{parameter.opts[0]} requires --assignment ROSTER.csv.")
 

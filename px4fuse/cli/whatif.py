@@ -78,10 +78,7 @@ def _sweep(text: str) -> Sweep:
     name, _, ends = text.partition("=")
     parts = ends.split(":")
     if len(parts) not in (2, 3) or (len(parts) == 3 and not parts[2].isdecimal()):
-        raise SettingsError(
-            f"--sweep {text}: give NAME=LOW:HIGH or NAME=LOW:HIGH:COUNT, for example "
-            "EKF2_EVP_NOISE=0.02:0.5."
-        )
+        raise SettingsError.of("sweep_wrong", text=text)
     low, high = (_number(f"--sweep {text}", name, part) for part in parts[:2])
     return Sweep(name, low, high, *map(int, parts[2:]))
 

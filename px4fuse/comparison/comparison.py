@@ -9,6 +9,7 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.arrays import Array
+from px4fuse.comparison import projection
 from px4fuse.comparison.model import (
     AgainstTruth,
     AxisComparison,
@@ -20,19 +21,11 @@ from px4fuse.comparison.model import (
     Updates,
 )
 from px4fuse.comparison.preparation import Choices, prepare
-from px4fuse.comparison.projection import (
-    MIN_COMMON_SAMPLES,
-    continuous_state,
-    project,
-    project_horizon,
-    project_innovations,
-    project_truth,
-    project_variance,
-)
 from px4fuse.filter.consistency import GATE_SIGMA, HorizontalNis, assess, assess_horizontal
 from px4fuse.filter.kalman import Replay, replay, state_at, variance_at
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import RECORD_NOT_LOGGED, Ekf2, Flight, Unavailable, sample_rate
+from px4fuse.record import lacking
 
 STATE = ("position_m", "velocity_m_s")
 VARIANCES = ("position_variance_m2", "velocity_variance_m2_s2")
@@ -67,7 +60,7 @@ def compare_prepared(
     """:func:`compare`, with what it begins with made."""
     notes, ekf2 = list(prepared.notes), prepared.flight.ekf2
     if isinstance(ekf2, Ekf2):
-        state, statement = continuous_state(ekf2, prepared.source, prepared.segment)
+        state, statement = projection.continuous_state(ekf2, prepared.source, prepared.segment)
         notes += [f"EKF2 {statement}"] if statement else []
         notes += ekf2.notes
         # where resets are undone, positions of the horizon are in other frames
@@ -89,7 +82,7 @@ def compare_prepared(
 def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, run: Replay) -> AxisComparison:
     """Everything about one axis; ``ekf2`` is the flight's, its resets treated."""
     axis, segment, flight = run.axis, prepared.segment, prepared.flight
-    truth = project_truth(flight.truth, axis, segment)
+    truth = projection.project_truth(flight.truth, axis, segment)
     state: Frame
     variance: Frame
     innovations: Frame
@@ -98,10 +91,10 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, run: Replay) -
     if isinstance(ekf2, Unavailable):
         state = variance = innovations = apart = ekf2
     else:
-        state = project(ekf2.state, axis, segment)
-        variance = project_variance(ekf2, axis, segment)
-        horizon = project_horizon(ekf2, axis, segment)
-        innovations = project_innovations(flight, ekf2, prepared.source, axis, segment)
+        state = projection.project(ekf2.state, axis, segment)
+        variance = projection.project_variance(ekf2, axis, segment)
+        horizon = projection.project_horizon(ekf2, axis, segment)
+        innovations = projection.project_innovations(flight, ekf2, prepared.source, axis, segment)
         apart = difference(run, state)
     updates = run.updates.assign(
         prior_variance_m2=run.updates["prior_position_variance_m2"],
@@ -167,12 +160,8 @@ def difference(run: Replay, ekf2_state: pd.DataFrame) -> Difference | Unavailabl
     """Our filter minus EKF2 along one axis, at EKF2's own sample times."""
     apart = np.array(state_at(run, ekf2_state.index.to_numpy())) - ekf2_state[[*STATE]].to_numpy().T
     position, velocity = apart[:, np.isfinite(apart).all(axis=0)]
-    if len(position) < MIN_COMMON_SAMPLES:
-        return Unavailable(
-            "difference to EKF2",
-            f"{len(position)} common samples in the segment",
-            "Choose a segment in which EKF2 runs.",
-        )
+    if len(position) < projection.MIN_COMMON_SAMPLES:
+        return lacking("difference_few", count=len(position))
     return Difference(
         count=len(position),
         position_rmse_m=_rmse(position),
@@ -216,10 +205,8 @@ def against_truth(
         for column in STATE
     ]
     position, velocity = (error[np.isfinite(error)] for error in errors)
-    if len(position) < MIN_COMMON_SAMPLES:
-        return Unavailable(
-            "difference to truth", "no common samples", "Choose a segment that the truth covers."
-        )
+    if len(position) < projection.MIN_COMMON_SAMPLES:
+        return lacking("truth_not_common")
     # EKF2's variances are logged at a tenth of the state's rate: NEES at their own times
     nees = {
         stated: _nees(at_s, error, variance[stated])

@@ -15,6 +15,7 @@ from msgspec import structs
 from scipy.special import stdtr
 
 from px4fuse.arrays import Array
+from px4fuse.comparison import say
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.clock import MAX_HALF_INTERVAL_S, ClockOffset, estimate_clock_offset
 from px4fuse.filter.fitting import Noises
@@ -164,10 +165,7 @@ def with_drift(clock: ClockOffset) -> ClockOffset:
     low, high = (clock.offset_s + scatter * (end - clock.offset_s) for end in clock.interval_s)
     reason = clock.reason
     if not reason and (high - low) / 2.0 > MAX_HALF_INTERVAL_S:
-        reason = (
-            "the parts of the flight differ by more than noise explains, as they do for a source "
-            f"that drifts: offsets from {low:+.2f} s to {high:+.2f} s are possible"
-        )
+        reason = say("parts_differ", low=low, high=high)
     return structs.replace(
         clock,
         interval_s=(float(low), float(high)),

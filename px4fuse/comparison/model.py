@@ -191,9 +191,11 @@ class Comparison(Shown):
             It was not analysed.
         """
         if axis not in self.axes:
-            raise MissingDataError(
-                f"no axis {axis!r} here",
-                f"{did_you_mean(axis, self.axes)}It has: {', '.join(self.axes)}.",
+            raise MissingDataError.of(
+                "no_such_axis",
+                axis=axis,
+                near=did_you_mean(axis, self.axes),
+                known=", ".join(self.axes),
             )
         return self.axes[axis]
 

@@ -6,6 +6,7 @@ from typing import TypedDict, Unpack
 import numpy as np
 from msgspec import structs
 
+from px4fuse.comparison import say
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.projection import observation_variance
 from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
@@ -18,16 +19,13 @@ from px4fuse.plain import capital
 from px4fuse.readers.mavlink_messages import POSITION_INPUTS
 from px4fuse.readers.px4_innovations import GNSS, GNSS_AND_BAROMETER, fuses, with_gnss
 from px4fuse.readers.px4_topics import TOPIC_ORIGINS
+from px4fuse.record import lacking
 from px4fuse.request import HeightName
 from px4fuse.trajectory.rotation import interpolate, matrix
 
 # Of the names under which logs have external positions, PX4's topics and MAVLink's messages
 LOGGED_ORIGINS = TOPIC_ORIGINS | {source.name: source.origin for source in POSITION_INPUTS}
-NOT_ITS_OWN_TRUTH = Unavailable(
-    "ground truth",
-    "the position source is the only reference in the log, and it is what our filter was given",
-    "Choose another --position-source to have it as the truth.",
-)
+NOT_ITS_OWN_TRUTH = lacking("own_truth")
 
 
 # A receiver's height is much noisier than its position, and SIGMA_Z is one number
@@ -188,10 +186,7 @@ def _of_vehicle(track: PositionTrack, flight: Flight) -> PositionTrack:
     samples = track.samples.copy()
     samples[Columns.POSITION] -= turned
     forward, right, down = track.place_m
-    note = (
-        f"positions are those of the vehicle's origin: the sensor is {forward:g} m forward, "
-        f"{right:g} m right and {down:g} m down of it, as EKF2 takes it"
-    )
+    note = say("of_vehicle", forward=forward, right=right, down=down)
     return replace(track, samples=samples, notes=(*track.notes, note))
 
 
@@ -225,19 +220,13 @@ def no_source(flight: Flight) -> Unavailable:
     damaged = "the file is damaged, and " if flight.log.damage else ""
     unused = next((track.name for track in flight.positions if not track.origin.automatic), "")
     looked_for = "no vehicle_visual_odometry, motion capture or EKF2 innovations of external vision"
-    remedy = (
-        "set SDLOG_PROFILE to 129 and send the UWB position to PX4 as VISION_POSITION_ESTIMATE, or "
-        "give the UWB's own file with `position`."
-    )
+    remedy = say("send_positions")
     if flight.log.format.startswith("MAVLink"):
         looked_for = "no VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP"
         ulog = ", or the ULog" if flight.log.has_ulog else ""
         remedy = f"give the positioning system's own file with `position`{ulog}."
     if unused:
-        remedy = (
-            "Only GPS is in it, which EKF2 did not fuse: give `position_source` "
-            f"{unused} to use that, or {remedy}"
-        )
+        remedy = say("gps_alone", unused=unused, remedy=remedy)
     reason = f"{damaged}no external position in this log ({looked_for})"
     return Unavailable("position source", reason, capital(remedy))
 
@@ -288,8 +277,8 @@ def choose_segment(
     SettingsError
         The chosen part is empty or holds fewer than three measurements.
     """
-    source_start, source_end = track.samples.index[[0, -1]].tolist()
-    low, high = max(source_start, 0.0), min(source_end, flight.log.duration_s)
+    runs_s = track.samples.index[[0, -1]].tolist()
+    low, high = max(runs_s[0], 0.0), min(runs_s[1], flight.log.duration_s)
     if isinstance(flight.airborne, Unavailable):
         reason = "the whole span of the source: the log has no land detector"
     elif not flight.airborne:
@@ -309,15 +298,11 @@ def choose_segment(
             low, high = inside
             reason += ", cut at the ends of the data"
     if not low < high:
-        raise SettingsError(
-            f"{flight.log.name}: the segment from {low:.6g} s to {high:.6g} s is empty; the "
-            f"position source runs from {source_start:.2f} s to {source_end:.2f} s."
-        )
+        empty = say("empty_segment", low=low, high=high, runs_s=runs_s)
+        raise SettingsError(f"{flight.log.name}: {empty}")
     segment = Segment(low, high, reason)
     count = len(within(track.samples, segment))
     if count < MIN_MEASUREMENTS:
-        raise SettingsError(
-            f"{flight.log.name}: {count} measurements of {track.name} between {low:.2f} s and "
-            f"{high:.2f} s are too few (at least {MIN_MEASUREMENTS} are needed)."
-        )
+        found = say("too_few", count=count, track=track, segment=segment, least=MIN_MEASUREMENTS)
+        raise SettingsError(f"{flight.log.name}: {found}")
     return segment

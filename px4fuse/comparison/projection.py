@@ -20,6 +20,7 @@ from px4fuse.flight import (
     Truth,
     Unavailable,
 )
+from px4fuse.record import lacking
 
 # EKF2 never trusts external vision better than this (ev_pos_control.cpp, EKF2.cpp)
 EKF2_MIN_NOISE_M = 0.01
@@ -119,7 +120,7 @@ def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame |
         return ekf2.variance
     projected = project(ekf2.variance, axis, segment)
     if projected.empty:
-        return Unavailable("EKF2 variances", "no sample in the segment", "Analyse more of the log.")
+        return lacking("variances_outside_segment")
     return projected
 
 
@@ -158,11 +159,7 @@ def project_innovations(
     ``posterior_variance_m2`` (P⁺ = P⁻R/S, or P⁻ where rejected), NaN where R is unknown.
     """
     if track.aid(axis.name) is None:
-        return Unavailable(
-            "EKF2 innovations",
-            f"EKF2 never fuses {track.name}: those in the log belong to another source",
-            "Choose the source that EKF2 fused (--position-source).",
-        )
+        return lacking("innovations_of_another", name=track.name)
     frames = []
     for name in ("north", "east") if axis.name == AISLE else (axis.name,):
         frame = next(frame for key, frame in ekf2.innovations.items() if key == name)
@@ -173,9 +170,7 @@ def project_innovations(
     if axis.name == AISLE:
         cut = _innovations_along(cut, frames[1], axis.direction)
     if cut.empty:
-        return Unavailable(
-            "EKF2 innovations", "no sample in the segment", "Analyse more of the log."
-        )
+        return lacking("innovations_outside_segment")
     r = cut["observation_variance_m2"].fillna(observation_variance(flight, track, axis, segment))
     s_total = cut["innovation_variance_m2"]
     prior = (s_total - r).where(s_total > r)
@@ -240,9 +235,5 @@ def project_truth(
         return truth
     projected = project(truth.samples, axis, segment)
     if len(projected) < MIN_COMMON_SAMPLES:
-        return Unavailable(
-            "ground truth",
-            f"{truth.name} has no samples in the segment",
-            "Analyse more of the log.",
-        )
+        return lacking("truth_outside_segment", name=truth.name)
     return projected

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from px4fuse.comparison import say
 from px4fuse.comparison.comparison import kf_against_truth
 from px4fuse.comparison.estimates import Tuning, known_noises
 from px4fuse.comparison.model import Comparison
@@ -258,10 +259,7 @@ def filter_words(
     errors = filter_errors_m(comparison, changed)
     if errors is None:
         if unseen_nats is not None and unseen_nats <= 0.0:
-            return (
-                f"Leave it: {typed} is most likely, but settings found on the first half of the "
-                "flight do no better on the second."
-            )
+            return say("unseen", typed=typed)
         return f"{COMMAND} {typed}."
     before, after = errors
     effect = f"position error {before:.3f} → {after:.3f} m (replayed)"

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
+from px4fuse.comparison import say
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.comparison.remedy import noise_used_m
 from px4fuse.ekf2 import walk as ways
@@ -22,6 +23,7 @@ from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import Unavailable
+from px4fuse.record import table
 
 # Filters whose errors differ by less are equally close to the truth
 EQUALLY_CLOSE = 0.05
@@ -29,6 +31,7 @@ EQUALLY_CLOSE = 0.05
 NOTABLE = 0.05
 # How much farther apart than where they were walked both must be elsewhere to be said (m, times)
 FAR_M, FAR_TIMES = 0.5, 3.0
+REASONS = table(__file__, "steps.toml", dict[str, str])
 
 
 def why_ekf2_differs(
@@ -116,10 +119,7 @@ def with_words(why: Why, called: str, because: dict[str, str]) -> Why:
     sentences += [_velocity(why), *_truth(why)]
     far_m = max(FAR_M, FAR_TIMES * float(np.max(np.abs(why.apart_m))))
     if why.outside is not None and why.outside.maximum_m > far_m:
-        sentences.append(
-            f"Elsewhere in the flight, where EKF2 started or did not fuse the source, both are up "
-            f"to {why.outside.maximum_m:.1f} m apart (at {why.outside.at_s:.0f} s)."
-        )
+        sentences.append(say("elsewhere", why=why))
     return structs.replace(why, sentences=tuple(sentences), cause=f"{cause}.")
 
 
@@ -131,10 +131,7 @@ def _share(part: Step, why: Why) -> str:
 
 
 def _moment(part: Step) -> str:
-    return (
-        f"; most at {part.moved_at_s:.1f} s, where it moves the position by "
-        f"{part.position_moved_m:.2f} m"
-    )
+    return say("moment", part=part)
 
 
 def _coasted(why: Why) -> str:
@@ -142,62 +139,34 @@ def _coasted(why: Why) -> str:
     if coast is None:
         return ""
     samples = f"{coast.samples} samples in a row" if coast.samples > 1 else "a sample"
-    return (
-        f": at {coast.start_s:.0f} s it rejected {samples} and coasted {coast.distance_m:.2g} m "
-        f"away in {coast.duration_s:.1f} s"
-    )
+    return say("coasted", coast=coast, samples=samples)
 
 
 def _reasons(
     comparison: Comparison, model: Model, clock: ClockOffset | Unavailable
 ) -> dict[str, str]:
     """What EKF2 does at each step, and what ours does."""
-    settings, inputs = comparison.settings, model.inputs
-    rejected, aid = model.agreement.rejected_share_logged, model.inputs.aid
-    flown, source, fused = inputs.settings, comparison.source.name, inputs.received.source
-    samples = (
-        f"ours predicts every {settings.dt_s:g} s and starts by itself, EKF2 predicts every "
-        f"{inputs.step_s * 1e3:.0f} ms"
-    )
+    settings, inputs, source = comparison.settings, model.inputs, comparison.source
+    flown, delay, data, samples = inputs.settings, inputs.aid.delay, "", ways.SAMPLES
     if settings.input == "zero":
-        samples = "ours knows no acceleration (--input zero), EKF2 follows the IMU"
-    elif source != fused:
-        samples = f"ours was given {source}, EKF2 {fused}"
-    data = ""
+        samples = "no input"
+    elif source.name != inputs.received.source:
+        samples = "another source"
     if isinstance(clock, ClockOffset) and clock.determinable:
         ends_s = (clock.offset_s, *clock.interval_s[::-1])
-        asked, low, high = (1e3 * (comparison.source.age_s - at) for at in ends_s)
+        asked, low, high = (1e3 * (source.age_s - at) for at in ends_s)
         data = f", and the data ask for {asked:.0f} ms (95 % {low:.0f} to {high:.0f})"
     same = flown["EKF2_ACC_NOISE"] * np.sqrt(inputs.step_s / settings.dt_s)
     surer = same < settings.sigma_a_m_s2
-    trusted = "the IMU more, and each position less" if surer else "each position more"
-    return {
-        ways.SAMPLES: samples,
-        ways.STAMPS: (
-            f"EKF2 takes a position to be {flown[aid.delay]:g} ms older than its stamp "
-            f"({aid.delay}), ours {1e3 * (comparison.source.age_s - settings.clock_offset_s):.0f} "
-            f"ms{data}"
-        ),
-        ways.NOISE: (
-            f"EKF2 takes the source's noise to be {noise_used_m(model):.2g} m "
-            f"({aid.noise}), ours {settings.sigma_z_m:.2g} m"
-        ),
-        ways.BIASES: "EKF2 estimates the accelerometer's bias in flight, ours knows none",
-        ways.PROCESS: (
-            f"EKF2_ACC_NOISE {flown['EKF2_ACC_NOISE']:g} is a SIGMA_A of {same:.2g} m/s², ours is "
-            f"{settings.sigma_a_m_s2:.2g}, so EKF2 trusts {trusted}"
-        ),
-        ways.ATTITUDE: "EKF2 lets the positions correct its attitude, ours takes it as it is",
-        ways.FIELD: "EKF2 takes its heading from the magnetometer, ours as EKF2 published it",
-        ways.SPEED: "EKF2 fuses the velocity of GNSS too, ours its position alone",
-        ways.FLOWING: "EKF2 fuses optical flow too, ours positions alone",
-        ways.VISION: "EKF2 fuses external vision besides GNSS, ours one of the two",
-        ways.GATE: f"EKF2's gate rejects {rejected:.1%} of the samples, ours takes all",
-        ways.OUTPUT: (
-            f"EKF2 filters {inputs.horizon_s * 1e3:.0f} ms behind the present, carries that to now "
-            f"by the IMU and smooths it (EKF2_TAU_POS {flown['EKF2_TAU_POS']:g} s)"
-        ),
-    }
+    facts = {
+        "settings": settings, "source": source, "inputs": inputs, "aid": inputs.aid, "data": data,
+        "flown": flown, "delay_ms": flown[delay], "noise_m": noise_used_m(model), "same": same,
+        "age_ms": 1e3 * (source.age_s - settings.clock_offset_s), "step_ms": 1e3 * inputs.step_s,
+        "trusted": "the IMU more, and each position less" if surer else "each position more",
+        "horizon_ms": 1e3 * inputs.horizon_s, "rejected": model.agreement.rejected_share_logged,
+    }  # fmt: skip
+    said = {step: text.format_map(facts) for step, text in REASONS.items()}
+    return {**said, ways.SAMPLES: said[samples]}
 
 
 def _velocity(why: Why) -> str:

@@ -1,6 +1,6 @@
 """The page's plots, empty: the page fills them with what its settings give."""
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from bokeh.document import Document
@@ -19,6 +19,7 @@ from px4fuse.comparison.estimates import Tuning
 from px4fuse.explore.data import RUNNING
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.tuning import AxisTuning
+from px4fuse.record import Record, table
 from px4fuse.report.style import EKF2, MEASUREMENT, OURS, TRUTH
 
 HEIGHT, TALL = 150, 210
@@ -34,64 +35,41 @@ NIS_BAND: dict[str, Any] = {
     "level": "underlay", "fill_alpha": 0.15, "fill_color": "#4a8f5a", "line_color": "#4a8f5a",
 }  # fmt: skip
 LEFT = 96
-# What the page fills, by column; each plot has its own, so that only what is seen is filled
-SOURCES = {
-    "steps": "t p v sp sv",
-    "updates": "t nu plus minus k0 k1 running",
-    "measured": "t z",
-    "state": "t p v",
-    "variance": "t sp sv",
-    "fused": "t nu",
-    "rejected": "t nu",
-    "limits": "t plus minus",
-    "running": "t running",
-    "truth_p": "t p",
-    "truth_v": "t v",
-    "error": "t e",
-    "error_ekf2": "t e",
-    # what lies above or below the axis, at its edge
-    "beyond": "turn t y",
-    "beyond_ekf2": "turn t y",
-}
-# Label, height, scale and unit of each plot, and its lines: source, column, style, name at the
-# pointer. Later ones lie on top
-PLOTS: dict[str, tuple[str, int, Any, str, tuple[tuple[str, str, dict[str, Any], str], ...]]] = {
-    "position": ("position (m)", TALL, "linear", "m", (
-        ("truth_p", "p", TRUTH_LINE, "truth"), ("state", "p", EKF2_LINE, "EKF2"),
-        ("steps", "p", OURS_LINE, "ours"),
-    )),
-    "velocity": ("velocity (m/s)", HEIGHT, "linear", "m/s", (
-        ("truth_v", "v", TRUTH_LINE, "truth"), ("state", "v", EKF2_LINE, "EKF2"),
-        ("steps", "v", OURS_LINE, "ours"),
-    )),
-    "error": ("error (m)", HEIGHT, "linear", "m", (
-        ("error_ekf2", "e", EKF2_LINE, "EKF2"), ("error", "e", OURS_LINE, "ours"),
-    )),
-    "innovation": ("innovation ν (m)", TALL, "linear", "m", (
-        ("limits", "plus", EKF2_LINE, ""), ("limits", "minus", EKF2_LINE, ""),
-    )),
-    "sigma_p": ("σ of position (m)", HEIGHT, "log", "m", (
-        ("steps", "sp", OURS_LINE, "ours"), ("variance", "sp", EKF2_LINE, "EKF2"),
-    )),
-    "sigma_v": ("σ of velocity (m/s)", HEIGHT, "log", "m/s", (
-        ("steps", "sv", OURS_LINE, "ours"), ("variance", "sv", EKF2_LINE, "EKF2"),
-    )),
-    "nis": ("running mean of NIS", HEIGHT, "log", "", (
-        ("running", "running", EKF2_LINE, "EKF2"), ("updates", "running", OURS_LINE, "ours"),
-    )),
-    "gain": ("gain K (1, 1/s)", HEIGHT, "linear", "", (
-        ("updates", "k0", OURS_LINE, "of position"),
-        ("updates", "k1", OURS_LINE | {"line_dash": [2, 2]}, "of velocity, 1/s"),
-    )),
+STYLES = {
+    "ours": OURS_LINE, "dotted": OURS_LINE | {"line_dash": [2, 2]}, "ekf2": EKF2_LINE,
+    "truth": TRUTH_LINE,
 }  # fmt: skip
-# Rows of the strip of events
-STRIP = ["EKF2 reset", "EKF2 rejected", "log dropout", "source silent", "on the ground", "mode"]
 # √(2 · drop of log-likelihood): as far as so many standard deviations
 MAP_SIGMAS = 6.0
-MAP_COLOURS = [
-    "#f7fbff", "#deebf7", "#c6dbef", "#9ecae1", "#6baed6", "#4292c6",
-    "#3182bd", "#2171b5", "#11599d", "#08519c", "#084285", "#08306b",
-][::-1]  # fmt: skip
+
+
+class Plot(Record, frozen=True):
+    """A plot against time.
+
+    Attributes
+    ----------
+    lines : tuple of (source, column, style, name)
+        Of :data:`STYLES`; the name at the pointer, where it has one.
+    """
+
+    label: str
+    lines: tuple[tuple[str, str, str, str], ...]
+    tall: bool = False
+    scale: Literal["linear", "log"] = "linear"
+    unit: str = ""
+
+
+class Figures(Record, frozen=True):
+    """The tables of ``figures.toml``."""
+
+    strip: list[str]
+    map_colours: list[str]
+    panels: dict[str, str]
+    sources: dict[str, str]
+    plots: dict[str, Plot]
+
+
+FIGURES = table(__file__, "figures.toml", Figures)
 
 
 def document_json(
@@ -132,15 +110,16 @@ def _plots(number: int, data: dict[str, Any], time_range: Range1d) -> dict[str, 
         if not any(isinstance(axis[kind], dict) for axis in data["axes"])
     }
     plots: dict[str, Any] = {}
-    for name, (label, height, scale, unit, lines) in PLOTS.items():
+    for name, plot in FIGURES.plots.items():
         if name == "error" and "truth" in lacking:
             continue
         sources = _Sources(name, number)
         made = plots[name] = figure(
-            name=f"{name}-{number}", height=height, sizing_mode="stretch_width",
-            x_range=time_range, y_range=_range(), toolbar_location=None, y_axis_type=scale,
-            tools="xbox_zoom,xpan,tap", active_drag="xbox_zoom", y_axis_label=label,
-            lod_threshold=None, min_border_left=LEFT,
+            name=f"{name}-{number}", height=TALL if plot.tall else HEIGHT,
+            sizing_mode="stretch_width", x_range=time_range, y_range=_range(),
+            toolbar_location=None, y_axis_type=plot.scale, tools="xbox_zoom,xpan,tap",
+            active_drag="xbox_zoom", y_axis_label=plot.label, lod_threshold=None,
+            min_border_left=LEFT,
         )  # fmt: skip
         if name == "position":
             _dots(made, sources["measured"], MEASUREMENT, 3, name="measured")
@@ -150,12 +129,12 @@ def _plots(number: int, data: dict[str, Any], time_range: Range1d) -> dict[str, 
         if name == "nis":
             low, high = nis_band(RUNNING)
             made.add_layout(BoxAnnotation(bottom=low, top=high, **NIS_BAND))
-        for source, column, style, who in lines:
-            if style["name"] in lacking:
+        for source, column, whose, who in plot.lines:
+            if whose in lacking:
                 continue
-            drawn = made.line("t", column, source=sources[source], **style)
+            drawn = made.line("t", column, source=sources[source], **STYLES[whose])
             if who:
-                _hover(made, drawn, (who, f"@{column}{{0.000}} {unit}"))
+                _hover(made, drawn, (who, f"@{column}{{0.000}} {plot.unit}"))
         made.add_layout(Span(dimension="height", location=0.0, visible=False, name="cursor"))
         shift = data["shift"]
         for low, high, style in _bands(data):
@@ -172,7 +151,7 @@ class _Sources(dict[str, ColumnDataSource]):
         self.plot, self.number = plot, number
 
     def __missing__(self, name: str) -> ColumnDataSource:
-        self[name] = _source(f"{self.plot}:{name}", self.number, SOURCES[name])
+        self[name] = _source(f"{self.plot}:{name}", self.number, FIGURES.sources[name])
         return self[name]
 
 
@@ -240,7 +219,8 @@ def _bands(data: dict[str, Any]) -> list[tuple[float, float, dict[str, Any]]]:
 def _strip(number: int, data: dict[str, Any], time_range: Range1d) -> Any:
     """What happened when, a row for each kind, so that no colour is needed to tell them apart."""
     source = _source("strip", number, "row left right text")
-    rows = STRIP if any(isinstance(axis["ekf2"], dict) for axis in data["axes"]) else STRIP[2:]
+    has_ekf2 = any(isinstance(axis["ekf2"], dict) for axis in data["axes"])
+    rows = FIGURES.strip if has_ekf2 else FIGURES.strip[2:]
     made = figure(
         name=f"strip-{number}", height=28 * len(rows) + 24, sizing_mode="stretch_width",
         x_range=time_range, y_range=FactorRange(factors=rows), toolbar_location=None,
@@ -266,7 +246,7 @@ def _map(number: int, tuning: Tuning) -> Any:
         y_axis_type="log", x_range=_range(), y_range=_range(), tools="tap",
         toolbar_location=None, x_axis_label="SIGMA_A (m/s²)", y_axis_label="SIGMA_Z (m)",
     )  # fmt: skip
-    mapper = LinearColorMapper(palette=MAP_COLOURS, low=0.0, high=MAP_SIGMAS)
+    mapper = LinearColorMapper(palette=FIGURES.map_colours, low=0.0, high=MAP_SIGMAS)
     for name, tuned in tuning.items():
         if isinstance(tuned, AxisTuning):
             x, dw = _outer(tuned.map.sigma_a_m_s2)

@@ -8,7 +8,7 @@ from bokeh.resources import Resources
 
 from px4fuse.analysis import Analysis
 from px4fuse.explore.data import flight_data, ranges
-from px4fuse.explore.figures import document_json
+from px4fuse.explore.figures import FIGURES, document_json
 from px4fuse.explore.packing import Packer
 from px4fuse.webpage.safe import cleaned, inert_json, part, policy_hash, template
 
@@ -16,18 +16,6 @@ from px4fuse.webpage.safe import cleaned, inert_json, part, policy_hash, templat
 MAX_CHARACTERS = 2000
 SCRIPTS = ("dom", "story", "grid", "step", "times", "tour")
 HERE = "px4fuse.explore"
-# Plots of a flight, each with what it shows
-PANELS = (
-    ("innovation", "Innovations with ±2√S; arrows mark what lies beyond the axis"),
-    ("sigma_p", "Standard deviation of position: grows on predict, shrinks on update"),
-    ("sigma_v", "Standard deviation of velocity"),
-    ("position", "Position"),
-    ("velocity", "Velocity"),
-    ("error", "Error of position against the truth"),
-    ("nis", "Running mean of NIS: 1 is right, the band holds 95 %"),
-    ("gain", "Gain K: position solid, velocity dotted"),
-    ("strip", "What happened"),
-)
 
 
 def html_text(analyses: Sequence[Analysis]) -> str:
@@ -117,7 +105,7 @@ def page_text(
         data=scripts,
         rounds=rounds,
         choices=choices,
-        panels=PANELS,
+        panels=FIGURES.panels.items(),
         flights=[
             (one["log"], any(isinstance(axis["truth"], dict) for axis in one["axes"]))
             for one in data

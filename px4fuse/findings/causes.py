@@ -5,12 +5,11 @@ per thing to put right.
 """
 
 from collections.abc import Iterable
-from pathlib import Path
 
-import msgspec
 from msgspec.structs import replace
 
 from px4fuse.findings.model import NAMES, SEVERITIES, Finding, by_root
+from px4fuse.record import table
 
 # In the evidence of a finding about a variance: what the detector holds it to be the effect of
 CAUSE = "cause"
@@ -28,9 +27,7 @@ _OURS = frozenset({"kf_variance_overstated", "kf_variance_understated"})
 SETTINGS = frozenset({"sigma_a_large", "sigma_a_small", "sigma_z_large", "sigma_z_small"})
 VARIANCES = _OURS | {"ekf2_variance_overstated", "ekf2_variance_understated"}
 NOISES = SETTINGS | VARIANCES | {"process_noise_forgotten"}
-CONSEQUENCES = msgspec.toml.decode(
-    Path(__file__).with_name("consequences.toml").read_bytes(), type=dict[str, tuple[str, ...]]
-)
+CONSEQUENCES = table(__file__, "consequences.toml", dict[str, tuple[str, ...]])
 # What the recording lacks: put right first, since noises are judged by what was recorded
 RECORDING = frozenset({
     "autopilot_restarted", "imu_gap", "input_unavailable", "log_damaged", "logger_dropouts",

@@ -2,23 +2,19 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import msgspec
 import numpy as np
 import pandas as pd
 from msgspec import Meta
 
 from px4fuse.filter.signals import Segment
-from px4fuse.record import Record, Span
+from px4fuse.record import Record, Span, table
 
 Severity = Literal["error", "warning", "info"]
 SEVERITIES: tuple[Severity, Severity, Severity] = ("error", "warning", "info")
 # Of each finding, in the order in which those of one rank are told
-WORDS: Mapping[str, Mapping[str, Any]] = msgspec.toml.decode(
-    Path(__file__).with_name("words.toml").read_bytes()
-)
+WORDS: Mapping[str, Mapping[str, Any]] = table(__file__, "words.toml", dict[str, Any])
 NAMES: Mapping[str, str] = {name: words["called"] for name, words in WORDS.items()}
 # More times are not listed one by one
 MOST_SPANS = 3

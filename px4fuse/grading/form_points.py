@@ -98,7 +98,7 @@ def _said(matched: list[Match], false: list[Claim], called_clean: bool) -> Itera
     if not matched:
         yield f"your flight has no mistake{', as you say' * called_clean}"
     for wrong, claim, _ in matched:
-        what = f"{wrong.kind} ({MISTAKES[wrong.kind][0]})"
+        what = f"{wrong.kind} ({MISTAKES[wrong.kind].words})"
         if claim is None:
             yield f"you missed {what}"
         elif claim.kind != wrong.kind:
@@ -163,7 +163,7 @@ def size_share(wrong: Wrong, claim: Claim) -> float:
     if wrong.size is None or wrong.low is None or wrong.high is None or size is None:
         return 0.0
     if claim.kind != wrong.kind:
-        same_unit = [*MISTAKES[claim.kind][1]][:1] == [*MISTAKES[wrong.kind][1]][:1]
+        same_unit = [*MISTAKES[claim.kind].units][:1] == [*MISTAKES[wrong.kind].units][:1]
         return 1.0 / 3.0 if wrong.low <= size <= wrong.high and same_unit else 0.0
     close = wrong.kind not in GUESSABLE and abs(size - wrong.size) <= HALF_SIZE * abs(wrong.size)
     return _value_share(size, wrong.low, wrong.high, 0.5 if close else 0.0)

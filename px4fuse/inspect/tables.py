@@ -16,6 +16,7 @@ from px4fuse.errors import MissingDataError
 from px4fuse.filter.signals import ned_acceleration
 from px4fuse.flight import Ekf2, Flight, PositionTrack, Truth, Unavailable
 from px4fuse.plain import plain
+from px4fuse.record import lacking
 
 SCHEMA_NAME = "px4fuse-flight"
 SCHEMA_VERSION = "1.0"
@@ -23,9 +24,7 @@ DICTIONARY_COLUMNS = ["table", "column", "unit", "frame", "meaning", "source_top
 # What a file name may not hold on some system, or what is awkward in a shell
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
 MAX_NAME = 80
-NO_POSITION = Unavailable(
-    "external position", "the log holds no track", "px4fuse info says what would log one."
-)
+NO_POSITION = lacking("no_track")
 
 
 @dataclass(frozen=True)

@@ -90,11 +90,7 @@ def compare(
     if unknown := set(named).difference(known):
         raise SettingsError(f"`axes` {unknown.pop()!r}: choose from {', '.join(known)}.")
     if isinstance(log, Flight) and (position, mavlink, system) != (None, None, None):
-        raise SettingsError(
-            "`position`, `mavlink` and `system` say what is read beside a log, and this flight has "
-            "been read",
-            "Give the path of its log.",
-        )
+        raise SettingsError.of("flight_was_read")
     if isinstance(clock_offset_s, str) and clock_offset_s != request.AUTO:
         raise SettingsError(f"`clock_offset_s` {clock_offset_s!r}: give seconds, or 'auto'.")
     asked = {name: given[name] for name in request.ComparisonRequest.__struct_fields__}
@@ -265,9 +261,7 @@ def _ending(path: Pathlike, ending: str) -> Path:
 
 def _request(analysis: Analysis) -> request.ComparisonRequest:
     if analysis.request is None:
-        raise SettingsError(
-            "this analysis does not say what was asked for", "Make it with px4fuse.compare."
-        )
+        raise SettingsError.of("without_request")
     return analysis.request
 
 

@@ -10,27 +10,14 @@ from px4fuse.ekf2.aids import AidResult, flown
 from px4fuse.findings import Finding
 from px4fuse.flight import AidLog, Flight, Unavailable, at_times
 from px4fuse.plain import factor_words, number_words
+from px4fuse.report import say, style
 from px4fuse.report.cover import about, write_findings
 from px4fuse.report.marks import GROUND
 from px4fuse.report.page import Cell, Page, appendix
-from px4fuse.report.style import (
-    EKF2_DOTS,
-    EKF2_REJECTED,
-    GOOD,
-    MUTED,
-    SEVERITY_COLOURS,
-    thin,
-    time_axis,
-)
 from px4fuse.request import with_options
 from px4fuse.results.contract import AidsResults
 
 TITLE = "What EKF2 fused"
-LEAD = (
-    "Each aid is judged by its own innovations in flight: NIS = ν²/S is 1 in the mean where they "
-    "are as large as EKF2 expects. A small NIS is no proof of accuracy: errors that change slowly "
-    "are followed, and a wrong delay or heading does not show here."
-)
 STRIP = 21.0  # points, height of the innovations of one aid
 WIDEST = 4.0  # in √S; what is beyond stands at the edge
 DOTS = 400  # of each axis, at most
@@ -40,7 +27,7 @@ OUTDOORS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw a page of the appendix where something besides external vision carried the flight."""
-    page = Page(appendix(TITLE), LEAD)
+    page = Page(appendix(TITLE), say("aids"))
     found = write_appendix(page, analysis)
     if found:
         _strips(page, analysis.flight, found)
@@ -60,8 +47,8 @@ def write_appendix(page: Page, analysis: Analysis) -> Mapping[str, AidResult]:
 
 def draw_alone(alone: AidsAlone, results: AidsResults) -> Iterator[Page]:
     """Draw the page of a flight without a position source."""
-    page = Page(TITLE, LEAD)
-    page.write(about(results.student, alone.flight.log), colour=MUTED)
+    page = Page(TITLE, say("aids"))
+    page.write(about(results.student, alone.flight.log), colour=style.MUTED)
     write_alone(page, alone, results.findings)
     _strips(page, alone.flight, alone.aids)
     yield page
@@ -71,7 +58,7 @@ def write_alone(page: Page, alone: AidsAlone, findings: tuple[Finding, ...]) -> 
     """Write why there is no comparison, the table and the findings."""
     lacking = alone.lacking
     page.write(f"Our filter has nothing to compare with EKF2: {lacking.reason}.", above=2.0)
-    page.write(with_options(lacking.remedy), colour=MUTED)
+    page.write(with_options(lacking.remedy), colour=style.MUTED)
     write_aids(page, alone.aids)
     write_findings(page, findings)
 
@@ -84,9 +71,9 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
             continue
         meant = "" if aid.intended_share is None else f"{aid.intended_share:.0%}"
         noise = "" if aid.noise is None else f"{number_words(aid.noise)} {aid.unit}"
-        colour = GOOD if aid.verdict == "consistent" else MUTED
+        colour = style.GOOD if aid.verdict == "consistent" else style.MUTED
         if aid.is_bad:
-            colour = SEVERITY_COLOURS["warning"]
+            colour = style.SEVERITY_COLOURS["warning"]
         begun: list[Cell] = [
             aid.label, (aid_verdict_words(aid), colour), meant, f"{aid.rejected_share:.1%}",
             f"{aid.longest_without:.1f}", noise,
@@ -107,7 +94,9 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
     )  # fmt: skip
     idle = [aid.label for aid in aids.values() if aid.verdict == "idle"]
     if idle:
-        page.write(f"Logged but never fused in flight: {', '.join(idle)}.", colour=MUTED, size=7.0)
+        page.write(
+            f"Logged but never fused in flight: {', '.join(idle)}.", colour=style.MUTED, size=7.0
+        )
 
 
 def aid_verdict_words(aid: AidResult) -> str:
@@ -125,10 +114,7 @@ def _strips(page: Page, flight: Flight, aids: Mapping[str, AidResult]) -> None:
         return
     shown = [name for name, aid in aids.items() if aid.verdict != "idle"]
     page.heading("Innovations over √S, all axes of an aid", above=8.0)
-    page.numbers(
-        "Dots within the lines at ±2 are 95 % of those of a consistent aid; hollow: not fused; "
-        f"grey: not meant to be fused. Beyond ±{WIDEST:g} they stand at the edge."
-    )
+    page.numbers(say("strips", most=WIDEST))
     for name in shown:
         _strip(page, aids[name], flight.ekf2.aids[name], span, last=name == shown[-1])
 
@@ -142,9 +128,9 @@ def _strip(
     for axis in log.axes:
         value = samples[f"innovation_{axis}"] / np.sqrt(samples[f"variance_{axis}"])
         size = value.clip(-WIDEST, WIDEST).to_numpy()
-        for which, look in ((fused, EKF2_DOTS), (~fused, EKF2_REJECTED)):
+        for which, look in ((fused, style.EKF2_DOTS), (~fused, style.EKF2_REJECTED)):
             if which.any():
-                dots = thin(samples.index.to_numpy()[which], size[which], DOTS)
+                dots = style.thin(samples.index.to_numpy()[which], size[which], DOTS)
                 axes.plot(*dots, **look | {"ms": 1.4})
     for level in (-2.0, 2.0):
         axes.axhline(level, color="black", lw=0.4, ls=(0, (1, 1.5)))
@@ -154,4 +140,4 @@ def _strip(
         if off.any():
             axes.fill_between(grid, -WIDEST, WIDEST, where=off.tolist(), zorder=0.1, **GROUND)
     axes.set(xlim=span, ylim=(-1.1 * WIDEST, 1.1 * WIDEST), yticks=(-2.0, 2.0))
-    time_axis(axes, last)
+    style.time_axis(axes, last)

@@ -10,6 +10,7 @@ from px4fuse.findings import Finding
 from px4fuse.findings.source_clock import typed_offset_s
 from px4fuse.flight import Unavailable
 from px4fuse.plain import p_words
+from px4fuse.report import say
 from px4fuse.report.page import Page, legend_above
 from px4fuse.report.style import OURS_BAND, OURS_LINE, Axes
 from px4fuse.results.contract import ComparisonResults
@@ -52,8 +53,7 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
         }
     offset, (low, high) = clock.offset_s, clock.interval_s
     advice = {
-        "Offset": f"{offset:+.3f} s, 95 % {low:+.3f} s to {high:+.3f} s, to be added to the stamps "
-        "of the source",
+        "Offset": say("clock_offset", offset=offset, low=low, high=high),
         "Reading": "the stamps are right as far as this flight can tell",
     }
     if not (low <= 0.0 <= high or abs(offset) < NEGLIGIBLE_S):
@@ -70,9 +70,8 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
         advice["PX4"] = f"{name} is 0 ms and cannot be negative: correct the sender's clock"
     elif delay is not None:
         asked, least, most = (max(1e3 * s, 0.0) for s in (age_s - offset, least, most))
-        advice["PX4"] = (
-            f"{name} is {delay:g} ms, the data ask for {asked:.0f} ms ({least:.0f} to "
-            f"{most:.0f}); set it, or correct the sender's clock"
+        advice["PX4"] = say(
+            "delay_asked", name=name, delay=delay, asked=asked, least=least, most=most
         )
     if clock.change_p is not None and clock.change_p < CHANGE_P:
         parts = ", ".join(f"{p.offset_s:+.2f} s from {p.start_s:.0f} s" for p in clock.parts)
@@ -89,21 +88,12 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
     clock = analysis.clock
     if isinstance(clock, Unavailable) or not has_page(analysis, results.findings):
         return
-    page = Page(
-        "Appendix: the clock of the position source",
-        "Late or early stamps hardly show in the innovations, since the filter follows. They show "
-        "in when the positions answer to what the IMU felt. So the likelihood of the positions is "
-        "maximised over the offset, jointly with sensor biases, attitude errors and noises; the "
-        "attitude is from the gyros alone, because EKF2's was corrected by these very positions.",
-    )
+    page = Page("Appendix: the clock of the position source", say("clock"))
     page.advice(clock_advice(analysis, clock), size=8.5)
     (low, high), best = clock.interval_s, clock.offset_s
-    say = (
-        f"Best at {best:+.3f} s; 95 % from {low:+.3f} to {high:+.3f} s, wider than the curve alone "
-        f"would say because the IMU's noise moves it too. From {clock.count} measurements."
-    )
+    seen = say("clock_best", best=best, low=low, high=high, clock=clock)
     title = "ln of how much less likely each offset is than the best"
-    draw_curve(page.panel(title, say, CURVE, above=14.0), clock)
+    draw_curve(page.panel(title, seen, CURVE, above=14.0), clock)
     yield page
 
 

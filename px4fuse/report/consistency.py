@@ -15,7 +15,7 @@ from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrela
 from px4fuse.findings.since import change_words, share_words
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital, number_words, p_words
-from px4fuse.report import marks
+from px4fuse.report import marks, say
 from px4fuse.report.page import Cell, Page, halves, legend_above
 from px4fuse.report.style import DOTS, LINES, MUTED, OURS_BAND, Axes, curve, plain_ticks
 from px4fuse.report.words import VERDICT_HEAD, filters, verdict_rows, verdict_words
@@ -48,12 +48,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw one page: the axis of the lab in three panels, all axes in a table."""
     result = analysis.main
     along = result.axis.called
-    page = Page(
-        "Appendix: consistency",
-        "Innovations ν of a filter that knows its own variance S are as large as S says (NIS = "
-        "ν²/S is 1 in the mean), normal about zero, and do not predict one another. Both filters "
-        f"are judged by the same rules, along {along}; the table has all axes.",
-    )
+    page = Page("Appendix: consistency", say("consistency", along=along))
     series = _series(result)
     if series:
         axes = marks.panel(page, analysis, "Mean NIS so far, log scale", _nis_words(series),
@@ -94,11 +89,7 @@ def _tried(page: Page, analysis: Analysis) -> None:
     page.heading(f"Causes that were tried along {axis.called}", above=12.0)
     page.table(["filter", "cause", "number", "flown", "put right", "explains"], rows,
                right=(3, 4))  # fmt: skip
-    page.write(
-        "Each row is a replay with that one thing put right. It explains all where it brings the "
-        "number into its band, else the share of its logarithm; what explains half or more is "
-        "called the cause; of a distance the share of its mean square.", size=7.5, colour=MUTED,
-    )  # fmt: skip
+    page.write(say("causes"), size=7.5, colour=MUTED)
 
 
 def _series(result: AxisComparison) -> list[Series]:
@@ -192,8 +183,7 @@ def _nis_words(series: list[Series]) -> str:
 
 def _shape_words(series: list[Series]) -> str:
     said = [
-        f"{capital(one.name)}: {one.statement.outside_two_sigma:.1%} beyond 2√S, mean "
-        f"{one.statement.innovation_mean_m:+z.3f} m ({p_words(one.statement.bias_p)})."
+        say("beyond", who=capital(one.name), one=one, p=p_words(one.statement.bias_p))
         for one in series
     ]
     return "\n".join([*said, "4.5% are expected there."])

@@ -16,6 +16,7 @@ from px4fuse.findings import Finding, by_root
 from px4fuse.flight import Ekf2, Truth, Unavailable
 from px4fuse.plain import length_words
 from px4fuse.recording import LogInfo
+from px4fuse.report import say
 from px4fuse.report.marks import LANDING, TAKE_OFF
 from px4fuse.report.page import WIDTH, Page, halves, legend_above, words
 from px4fuse.report.style import EKF2, LINES, MEASURED, MUTED, OURS, SEVERITY_COLOURS, Axes, as_map
@@ -36,10 +37,6 @@ TALLEST, LOWEST, BESIDE, WIDE = 120.0, 56.0, 150.0, 256.0  # points
 MOST_POINTS = 2000
 Pair = tuple[Array, Array]
 NORTH_EAST = ("north", "east")
-EXPLANATION = (
-    "Mean NIS is 1 where the innovations are as large as a filter's own variance says; below its "
-    "95 % band the variance is overstated, above it understated."
-)
 
 
 def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
@@ -94,7 +91,7 @@ def _verdict(page: Page, analysis: Analysis) -> None:
             column.write(f"{one.reason}.", above=1.0)
         columns.append(column)
     page.beside(*columns, above=14.0)
-    said = [EXPLANATION]
+    said = [say("nis")]
     if isinstance(result.ekf2_state, Unavailable):
         said.append(f"There is no EKF2 to compare with: {result.ekf2_state.reason}.")
     if not isinstance(analysis.flight.truth, Truth):
@@ -106,10 +103,7 @@ def facts(comparison: Comparison) -> dict[str, str]:
     """What was compared, in labels and sentences."""
     flight = comparison.flight
     log, source, segment = flight.log, comparison.source, comparison.segment
-    position = (
-        f"{source.name}: {source.description}, {source.rate_hz:.1f} Hz, {source.frame}; "
-        f"{comparison.source_reason}"
-    )
+    position = say("position", source=source, comparison=comparison)
     placed, clock = "", ""
     if source.alignment is not None:
         alignment, clock = source.alignment, source.clock

@@ -9,7 +9,7 @@ import numpy as np
 from px4fuse.arrays import Array, IntArray
 from px4fuse.flight import Unavailable
 from px4fuse.loop.analysis import SMALLEST_STAMP_S
-from px4fuse.report import style
+from px4fuse.report import say, style
 from px4fuse.report.page import WIDTH, Page, halves
 from px4fuse.report.style import EKF2, MUTED, OURS, TRUTH, Axes, Colormap
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
@@ -85,11 +85,7 @@ def views(score: Evaluation) -> list[View]:
 
 def draw(score: Evaluation, _: object) -> Iterator[Page]:
     """Draw the page, and another where the table of a run over many deltas fills the first."""
-    page = Page(
-        "Trajectory error",
-        "APE: how far a pose is from the reference; over all poses, the ATE. RPE: how wrong a "
-        "motion over a delta is.",
-    )
+    page = Page("Trajectory error", say("errors"))
     page.write(summary(score), size=9.0, bold=True)
     write_evaluation(page, score)
     _maps(page, score)
@@ -315,10 +311,7 @@ def time_words(score: Evaluation) -> str:
     """Whether a few moments decide."""
     squares = np.sort(score.position_error_m**2)
     worst = squares[-max(1, len(squares) // 10) :].sum() / max(squares.sum(), NEGLIGIBLE_M**2)
-    return (
-        f"The worst tenth of the poses makes {worst:.0%} of the squared error: 10% is an error "
-        "that is the same throughout, with much more a few moments decide."
-    )
+    return say("moments", worst=worst)
 
 
 def quarters(score: Evaluation) -> list[float]:
@@ -333,10 +326,7 @@ def quarters(score: Evaluation) -> list[float]:
 def distance_words(score: Evaluation) -> str:
     """Whether the error grows along the path."""
     found = ", ".join(f"{q:.3f}" for q in quarters(score))
-    return (
-        f"RMSE by quarters of the path {found} m. Drift grows along the path; after an alignment "
-        "it is high at both ends."
-    )
+    return say("quarters", found=found)
 
 
 def growth_words(rpe: tuple[PairwiseError, ...]) -> str:
@@ -368,10 +358,7 @@ def interval_words(interval: Interval | Unavailable) -> str:
 
 def track_words(path: Trajectory) -> str:
     """A trajectory by its name, what it is, its length in time and its frame."""
-    return (
-        f"{path.name}: {path.kind}, {len(path)} poses over "
-        f"{path.time_s[-1] - path.time_s[0]:.1f} s, frame {path.frame}"
-    )
+    return say("track", path=path, poses=len(path), span_s=path.time_s[-1] - path.time_s[0])
 
 
 def score_words(score: Evaluation) -> str:
@@ -379,9 +366,6 @@ def score_words(score: Evaluation) -> str:
     matched = score.association
     offset = score.time_offset.offset_s
     clock = "" if not offset else f"; clocks matched by {offset:+.3f} s"
-    return (
-        f"alignment {score.alignment} ({score.alignment_reason.rstrip('.')}); "
-        f"{matched.poses} poses, "
-        f"{matched.coverage_estimate:.0%} of the estimate, {matched.coverage_reference:.0%} of the "
-        f"reference's time{clock}"
+    return say(
+        "how", score=score, reason=score.alignment_reason.rstrip("."), matched=matched, clock=clock
     )

@@ -13,7 +13,7 @@ from px4fuse.comparison.model import AxisComparison, Difference
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Unavailable
 from px4fuse.record import Span
-from px4fuse.report import marks, panels, style
+from px4fuse.report import marks, panels, say, style
 from px4fuse.report.page import WIDTH, Page
 from px4fuse.report.style import EKF2, LINES, OURS, Artist, Axes
 from px4fuse.report.why import nothing_concluded
@@ -141,11 +141,7 @@ def zoom_words(result: AxisComparison) -> str:
         shrink = 1.0 - after**2 / before**2
         shrinks = f"{name} {before:.3f} to {after:.3f} m, {shrink:.0%} of the variance"
         if name == "ours":
-            shrinks = (
-                f"Without measurement σ grows, by SIGMA_A "
-                f"{result.replay.settings.sigma_a_m_s2:g} m/s² (predict); each measurement shrinks "
-                f"it ({shrinks})"
-            )
+            shrinks = say("predict_and_update", settings=result.replay.settings, shrinks=shrinks)
         said.append(shrinks)
     return f"{'; '.join(said)}." if said else ""
 
@@ -155,11 +151,7 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
     others = analysis.others
     if not others:
         return
-    page = Page(
-        "Appendix: other axes",
-        "The panels of the pages before for the axes that they leave out; lines, bands and marks "
-        "are the same.",
-    )
+    page = Page("Appendix: other axes", say("other_axes"))
     width = (WIDTH - GAP * (len(others) - 1)) / max(len(others), 3)
     columns = [Page(width=width) for _ in others]
     for column, result in zip(columns, others, strict=True):

@@ -10,6 +10,8 @@ from pathlib import Path
 from matplotlib import font_manager
 from matplotlib.font_manager import FontEntry, FontPath
 
+from px4fuse.report import say
+
 # Matplotlib's own, always there: Latin, Greek, Cyrillic, Arabic, Hebrew and symbols
 FONT = "DejaVu Sans"
 # These have a box for every character
@@ -47,10 +49,7 @@ def missing(text: str) -> str:
 def advice(characters: str) -> str:
     """What to install for :func:`missing` characters, as one sentence or two."""
     shown = characters[:MOST_SHOWN] + ("…" if len(characters) > MOST_SHOWN else "")
-    return (
-        f"No font of this machine has the characters {shown}: the report shows {NO_GLYPH} for "
-        "each. Install a font that has them: Noto Sans of their script, from fonts.google.com/noto."
-    )
+    return say("install_font", shown=shown, sign=NO_GLYPH)
 
 
 def _foreign(text: str) -> list[str]:

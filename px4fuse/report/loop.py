@@ -13,7 +13,7 @@ from px4fuse.loop.analysis import SMALLEST_STAMP_S
 from px4fuse.loop.corrections import SINGLE_LOOP
 from px4fuse.loop.model import LANDING, Closure, CorrectedPath, Loop
 from px4fuse.plain import capital, p_words
-from px4fuse.report import style
+from px4fuse.report import say, style
 from px4fuse.report.cover import who, write_finding
 from px4fuse.report.evaluation import interval_words, score_words, way
 from px4fuse.report.page import AXIS_LABEL, TICKS, Cell, Page, appendix
@@ -41,13 +41,7 @@ KINDS = {
 CLOSURE_HEAD = (
     "same place at", "missed\nby (m)", "d²", "dof", "p", "gate", "DCS\nweight", "GNC\nweight",
 )  # fmt: skip
-TITLE, LEAD = (
-    "Loop closure",
-    "A path that truly returns must close; the gap is what the odometry drifted. Each correction "
-    "spreads it over the path: by distance (positions only as in the lesson's Example 2, or "
-    "headings too), or as a pose graph weighs it. A closure that is not true would warp the whole "
-    "path, so that each one is tested before its use.",
-)
+TITLE = "Loop closure"
 MAP_POINTS = 2000
 MAP, LEGEND = 290.0, 38.0  # of the axes, and of the legend below them, in points
 
@@ -55,14 +49,14 @@ MAP, LEGEND = 290.0, 38.0  # of the axes, and of the legend below them, in point
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the loop's page; none where the flight holds no loop."""
     if isinstance(analysis.loop, Loop):
-        page = Page(appendix(TITLE), LEAD)
+        page = Page(appendix(TITLE), say("loop"))
         _write(page, analysis.loop)
         yield page
 
 
 def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
     """Draw the page of a report on a loop alone, with its findings."""
-    page = Page(TITLE, LEAD)
+    page = Page(TITLE, say("loop"))
     if student := who(results.student, ", "):
         page.labelled("Student", student)
     page.labelled("SHA-256", loop.odometry.trajectory.sha256)
@@ -75,13 +69,7 @@ def _write(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
     write_loop(page, loop, findings)
     _map(page, loop)
     page.heading("Closures and scores", 10.5, above=14.0)
-    page.write(
-        "d² is the squared misclosure against what drift and closure explain together; p is the "
-        "chance of a larger one if the closure is true. Robust solving (dynamic covariance "
-        "scaling, DCS; graduated non-convexity, GNC) weighs each closure by how well the others "
-        "agree with it: 1 keeps it, 0 drops it.",
-        colour=MUTED,
-    )
+    page.write(say("closures"), colour=MUTED)
     write_scores(page, loop)
 
 
@@ -142,11 +130,8 @@ def summary(loop: Loop, findings: tuple[Finding, ...]) -> Page:
 def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
     """Write what was found, with every path, how far it moved, and its ATE to each reference."""
     path = loop.odometry.trajectory
-    page.labelled(
-        "Track",
-        f"{path.name}: {KINDS[path.kind]}, {len(path)} poses, {loop.key_frames} key frames "
-        f"{loop.key_frame_spacing_m:.2g} m apart",
-    )
+    told = say("loop_track", path=path, kind=KINDS[path.kind], poses=len(path), loop=loop)
+    page.labelled("Track", told)
     page.labelled("Part", f"{_span(loop)}, {loop.part_reason}")
     page.labelled("Closure", closure_words(loop))
     end = loop.known_end
@@ -166,13 +151,7 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
             for part in loop.reported
         ],
     )
-    page.numbers(
-        "ATE is the RMSE of position after alignment, in brackets its 95 % interval by block "
-        "bootstrap where the flight is long enough for one."
-        if names
-        else "Neither ground truth nor a SLAM trajectory is given, so that no error of the path "
-        "can be stated; --reference FILE scores it."
-    )
+    page.numbers(say("ate") if names else say("no_reference"))
 
 
 def write_scores(page: Page, loop: Loop) -> None:
@@ -236,10 +215,7 @@ def gate_words(closure: Closure) -> str:
     verdict = "as the stated drift allows"
     if not closure.accepted:
         verdict = "REJECTED: the drift cannot explain it"
-    return (
-        f"d² {closure.d2:.1f} with {closure.degrees_of_freedom} degrees of freedom, p "
-        f"{closure.p:.2g} (rejected below {GATE_ALPHA:g}): {verdict}"
-    )
+    return say("gate", closure=closure, least=GATE_ALPHA, verdict=verdict)
 
 
 def closure_name(closure: Closure, loop: Loop) -> str:
@@ -258,10 +234,7 @@ def by_distance_words(loop: Loop) -> str:
     headings = "Headings too: each step is first turned back by its share of the heading error."
     if isinstance(turned, Unavailable):
         headings = f"Headings are not turned: {turned.reason}."
-    return (
-        "By distance, positions only, is the lesson's Example 2: each position moves by its share "
-        f"of the gap, and the path keeps the bend of its headings. {headings}"
-    )
+    return say("by_distance", headings=headings)
 
 
 def refusals(loop: Loop) -> list[str]:
@@ -297,11 +270,7 @@ def moved_words(correction: CorrectedPath) -> str:
 def graph_summary(solved: SolvedGraph) -> Page:
     """How a pose graph was solved, and the closures that the gate rejects."""
     page = Page()
-    page.labelled(
-        "Graph",
-        f"{solved.name}: {solved.dimension}-D, {solved.poses} poses, {solved.edges} edges; poses "
-        f"from {solved.initialised}",
-    )
+    page.labelled("Graph", say("graph", solved=solved))
     gates = solved.gates
     if isinstance(gates, Unavailable):
         page.labelled("Gate", f"none: {gates.reason}")

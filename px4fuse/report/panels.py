@@ -14,7 +14,7 @@ from px4fuse.comparison.model import AxisComparison, Difference
 from px4fuse.filter.consistency import Consistency
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital
-from px4fuse.report import marks, style
+from px4fuse.report import marks, say, style
 from px4fuse.report.page import Page
 from px4fuse.report.style import DOTS, LINES, Axes, band, curve, log_ticks
 from px4fuse.report.words import filters, verdict_words
@@ -138,10 +138,7 @@ def _position_words(_: Analysis, result: AxisComparison) -> str:
     if isinstance(result.ekf2_state, Unavailable) or isinstance(result.difference, Unavailable):
         return f"{words}; our filter follows them."
     distance = apart(result.ekf2_state, result.replay.steps).abs()
-    return (
-        f"{words}; ours and EKF2 are farthest apart, {distance.max():.2g} m, at "
-        f"{distance.idxmax():.1f} s."
-    )
+    return say("farthest", words=words, most_m=distance.max(), at_s=distance.idxmax())
 
 
 def _velocity_words(_: Analysis, result: AxisComparison) -> str:
@@ -154,10 +151,7 @@ def _error_words(_: Analysis, result: AxisComparison) -> str:
     if isinstance(result.truth, pd.DataFrame):
         said = f"{share:.0%} of our error lies in our own ±2σ (blue), where 95% should."
         return f"{nearer(result, POSITIONS)} {said}".lstrip()
-    return (
-        f"The log has no truth: this says how far both are apart, not who is right. {share:.0%} "
-        "of it lies in our ±2σ (blue)."
-    )
+    return say("no_truth", share=share)
 
 
 def nearer(result: AxisComparison, of: Quantity) -> str:
@@ -194,10 +188,7 @@ def _position_numbers(result: AxisComparison) -> str:
     part = result.difference
     if isinstance(part, Unavailable):
         return f"{part.what}: {part.reason}"
-    return (
-        f"ours - EKF2: RMS {part.position_rmse_m:.3f} m, mean {part.position_mean_m:+.3f} m, "
-        f"largest {part.position_maximum_m:.2f} m"
-    )
+    return say("apart", part=part)
 
 
 def _velocity_numbers(result: AxisComparison) -> str:
@@ -252,10 +243,7 @@ def innovation_words(_: Analysis, result: AxisComparison) -> str:
         if isinstance(one, Unavailable):
             said.append(f"{capital(name)}: {one.reason}.")
         else:
-            said.append(
-                f"{capital(name)}: {one.outside_two_sigma:.1%} of {one.count} outside its own "
-                f"±2√S, where 5% should be: {verdict_words(one)}."
-            )
+            said.append(say("outside", who=capital(name), one=one, verdict=verdict_words(one)))
     if isinstance(result.ekf2_state, Unavailable):
         said.append(f"EKF2: {result.ekf2_state.reason}.")
     elif isinstance(result.ekf2_innovations, pd.DataFrame):
@@ -272,8 +260,7 @@ def _innovation_numbers(result: AxisComparison) -> str:
         if isinstance(one, Consistency) and isinstance(frame, pd.DataFrame):
             beyond = int((frame["innovation_m"].abs() > edge).sum())
             said.append(
-                f"{name}: mean {one.innovation_mean_m:+.3f} m, std {one.innovation_std_m:.3f} m, "
-                f"median √S {one.sqrt_s_median_m:.3f} m"
+                say("innovations", name=name, one=one)
                 + (f", {beyond} beyond the axis (triangles)" if beyond else "")
             )
     return "; ".join(said)

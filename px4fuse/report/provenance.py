@@ -7,7 +7,7 @@ from px4fuse.analysis import AidsAlone, Analysis
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
 from px4fuse.flight import Flight, PositionTrack, Unavailable
 from px4fuse.loop.model import Loop
-from px4fuse.report import clock, fonts
+from px4fuse.report import clock, fonts, say
 from px4fuse.report.page import Page
 from px4fuse.report.style import MUTED
 from px4fuse.report.words import alignment_words, clock_words
@@ -53,10 +53,7 @@ def _log(page: Page, flight: Flight, source: PositionTrack | None = None) -> Non
     if source is not None:
         aid = source.origin.aid or EV_POS
         unlike = unlike.union(*(one.own for one in (EV_POS, GNSS_POS) if one != aid))
-        facts["position source"] = (
-            f"{source.name} ({source.origin.kind}, {source.origin.passage}) from "
-            f"{', '.join(source.topics)}; clock: {source.clock}"
-        )
+        facts["position source"] = say("source", source=source, topics=", ".join(source.topics))
     parameters = (f"{n} {value:g}" for n, value in log.parameters.items() if n not in unlike)
     facts = {
         "file": f"{log.name}, {log.bytes} bytes, {log.format}",
@@ -104,10 +101,7 @@ def _begin(title: str, results: ComparisonResults | AidsResults | LoopResults) -
         "results": "attached inside this PDF as results.json",
     }
     if fonts.missing(student.name + student.id + student.notes):
-        facts["fonts"] = (
-            f"{fonts.NO_GLYPH} stands for characters that no font on this machine has; "
-            "results.json holds the text as given"
-        )
+        facts["fonts"] = say("no_font", sign=fonts.NO_GLYPH)
     _section(page, "Made with", facts.items())
     return page
 

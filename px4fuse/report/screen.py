@@ -52,7 +52,7 @@ def show(console: Console, blocks: Iterable[Block], request: Request | None = No
     for block in blocks:
         match block["kind"]:
             case "text" | "heading":
-                say(console, _styled(block), indent=round(block.get("indent", 0.0) / COLUMN))
+                paragraph(console, _styled(block), indent=round(block.get("indent", 0.0) / COLUMN))
             case "labelled":
                 _show_labelled(console, block, request)
             case "table":
@@ -75,7 +75,7 @@ def _show_labelled(console: Console, block: Block, request: Request | None) -> N
         if request is not None:
             words.plain, commands = runnable(words.plain, request)
         words.append("" if place else aside)
-        say(console, words, _styled({**block["label"], "text": label or ""}), INDENT)
+        paragraph(console, words, _styled({**block["label"], "text": label or ""}), INDENT)
         for command in commands:
             print_line(console, "", command)
 
@@ -125,7 +125,7 @@ def _styled(block: Block) -> Text:
     return Text(block["text"], f"{style} bold" if block["weight"] == "bold" else style)
 
 
-def say(console: Console, text: str | Text, head: str | Text = "", indent: int = 0) -> None:
+def paragraph(console: Console, text: str | Text, head: str | Text = "", indent: int = 0) -> None:
     """Print a paragraph.
 
     Parameters

@@ -13,6 +13,7 @@ from px4fuse.filter.likelihood import States, preintegrate, states, total_over_g
 from px4fuse.filter.tuning import HORIZONTAL, MIN_MEASUREMENTS, AxisTuning, Noise
 from px4fuse.flight import Unavailable
 from px4fuse.plain import factor_words, number_words
+from px4fuse.report import say
 from px4fuse.report.page import Page, legend_above
 from px4fuse.report.style import OURS, plain_ticks
 
@@ -43,12 +44,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     result, settings = analysis.main, analysis.settings
     if not analysis.tuning or len(result.replay.updates) < MIN_MEASUREMENTS:
         return
-    page = Page(
-        "Appendix: what the knobs do",
-        "The filter's gain depends on SIGMA_A / SIGMA_Z alone. Their size does not move the track: "
-        "it scales what the filter claims about it, σ and S, and so the NIS. NIS tells the size, "
-        "the track the ratio; maximum likelihood weighs both.",
-    )
+    page = Page("Appendix: what the knobs do", say("knobs"))
     chosen = np.array([settings.sigma_a_m_s2, settings.sigma_z_m])
     factors = np.array([(a, z) for _, a, z in SETTINGS]).T
     run = states(preintegrate(result.axis, settings), *(chosen[:, None] * factors))
@@ -176,8 +172,5 @@ def _table(page: Page, result: AxisComparison, run: States, chosen: Array) -> No
             f", and the NIS {factor_words(nis[2] / nis[1])} times smaller, about the same track"
         )
     page.heading("One track, two claims", above=10.0)
-    page.write(
-        f"With four times SIGMA_A σ_p is {factor_words(sigmas[1] / sigmas[2])} times what it is "
-        f"with a quarter of SIGMA_Z{smaller}. Numbers over the second half of the flight."
-    )
+    page.write(say("two_claims", times=factor_words(sigmas[1] / sigmas[2]), smaller=smaller))
     page.table(head, rows, right=range(1, len(head)))

@@ -11,6 +11,7 @@ from px4fuse.ekf2_parameters import AIDS, PARAMETERS
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
 from px4fuse.plain import number_words
+from px4fuse.report import say
 from px4fuse.report.page import Page
 from px4fuse.report.why import agreement_words, write_why
 from px4fuse.results.contract import WhatIfResults
@@ -128,15 +129,11 @@ def reading(made_of: Counterfactual) -> list[str]:
         if errors:
             least = min(errors)
             lines.append(
-                f"The position error to the truth is least at {name} {number_words(errors[least])} "
-                f"({least:.3f} m, horizontally)."
+                say("sweep_error", name=name, value=number_words(errors[least]), least=least)
             )
     if not all(one.steady for one in made_of.whatif.whatif):
         lines.append(
-            f"Chaotic: more than {MOST_REJECTED:.0%} would be rejected, or "
-            f"{1e3 * DISTURBED_M:.0f} mm of noise on the positions changes the answer, or heights "
-            f"would be rejected for {HEIGHT_TIMEOUT_S:g} s on end. Each rejection decides the next "
-            "there, and nothing can be predicted."
+            say("chaotic", most=MOST_REJECTED, noise_mm=1e3 * DISTURBED_M, for_s=HEIGHT_TIMEOUT_S)
         )
     return [*lines, *(f"{note}." for note in made_of.whatif.notes)]
 
@@ -147,11 +144,7 @@ def _number(value: float | Unavailable, digits: int = 3) -> str:
 
 def draw(made_of: Counterfactual, results: WhatIfResults) -> Iterator[Page]:
     """One page of tables."""
-    page = Page(
-        "EKF2 with other parameters",
-        "EKF2 replayed from the log by px4fuse's model of it, which is not PX4's own code: as "
-        "flown, and with other parameters. All columns are judged over the same times.",
-    )
+    page = Page("EKF2 with other parameters", say("whatif"))
     page.labelled("Command", results.provenance.command)
     _tables(page, made_of)
     yield page

@@ -14,16 +14,11 @@ from px4fuse.ekf2_parameters import AIDS
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital
-from px4fuse.report import marks
+from px4fuse.report import marks, say
 from px4fuse.report.page import Page, halves
 from px4fuse.report.style import EKF2, EKF2_BAND, LINES, MUTED, OURS, OURS_BAND, Axes, curve
 
 TITLE = "Why EKF2 differs"
-LEAD = (
-    "From our filter to the logged EKF2, one thing after the other is changed to be as in EKF2, in "
-    "px4fuse's own model of it. A bar is by how much that brings our track nearer to EKF2's (mean "
-    "square; hatched: farther away, which later steps make good). They add up to the whole."
-)
 ROW_POINTS, LABELS, GAP = 12.0, 128.0, 14.0  # height of a bar, width of the names of steps
 WITH_NAMES = 0.62  # of the width: the bars that have the names of steps beside them
 TIME_POINTS = 105.0
@@ -35,7 +30,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     found = _walks(analysis)
     if not any(isinstance(why, Why) for why in found.values()):
         return
-    page = Page(TITLE, LEAD)
+    page = Page(TITLE, say("why"))
     for name, why in found.items():
         if isinstance(why, Unavailable):
             page.heading(f"{name}: nothing is concluded", 9.5, above=10.0)

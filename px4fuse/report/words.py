@@ -14,6 +14,7 @@ from px4fuse.findings import Finding
 from px4fuse.flight import Alignment, Truth, Unavailable
 from px4fuse.plain import factor_words, number_words, p_words
 from px4fuse.recording import ClockMap
+from px4fuse.report import say
 from px4fuse.report.style import GOOD, MUTED, SEVERITY_COLOURS
 
 if TYPE_CHECKING:
@@ -28,10 +29,7 @@ RMSE = ("position_rmse_m", "velocity_rmse_m_s")
 def settings_words(settings: Settings) -> str:
     """The filter's settings in one phrase."""
     offset = f", clock offset {settings.clock_offset_s:+g} s" if settings.clock_offset_s else ""
-    return (
-        f"SIGMA_A {settings.sigma_a_m_s2:g} m/s², SIGMA_Z {settings.sigma_z_m:g} m, "
-        f"DT {settings.dt_s:g} s, input {settings.input}{offset}"
-    )
+    return say("settings", settings=settings, offset=offset)
 
 
 def verdict_words(statement: Consistency | Unavailable) -> str:
@@ -111,20 +109,14 @@ def verdict_notes(comparison: Comparison) -> list[str]:
     ]
     notes = []
     if comparison.source.origin.may_drift:
-        notes.append(
-            "Consistent with a source that may drift is not correct: these verdicts say how well "
-            "each filter follows it. Truth or a loop judges the error."
-        )
+        notes.append(say("follows_source"))
     small = [
         f"{owner} {axis} {verdict_words(statement)}"
         for axis, owner, statement in stated
         if statement.verdict != "consistent" and statement.times_off < SIGMA_OFF
     ]
     if small:
-        notes.append(
-            f"{', '.join(small)}: more than chance, but less than {SIGMA_OFF:g}×, from "
-            "where it is a finding."
-        )
+        notes.append(say("small_factors", which=", ".join(small), least=SIGMA_OFF))
     coloured = [
         f"{owner} {axis} {p_words(statement.ljung_box_p)}, lag-1 "
         f"{statement.lag1_autocorrelation:+.2f}"
@@ -132,11 +124,7 @@ def verdict_notes(comparison: Comparison) -> list[str]:
         if statement.verdict == "consistent" and statement.ljung_box_p < WHITE_P
     ]
     if coloured:
-        notes.append(
-            f"Of the right size but not white (Ljung-Box): {'; '.join(coloured)}. Each "
-            "innovation then tells of the next: with a positive lag-1 the filter lags (SIGMA_A is "
-            "small), with a negative one it overshoots (SIGMA_A is large)."
-        )
+        notes.append(say("not_white", which="; ".join(coloured)))
     return notes
 
 
@@ -150,10 +138,8 @@ def clock_words(clock: ClockMap) -> str:
     told = clock.method in ("boot clock", "arrival time") or "own speed" in clock.note
     if told or clock.distinct_stamps is not None:
         return f"{clock.clock}: {clock.note}"
-    return (
-        f"{clock.clock} by {clock.method}: offset {clock.offset_s:+.4f} s, drift "
-        f"{clock.drift_ppm:+.3g} ppm, jitter {clock.jitter_s * 1e3:.2g} ms, {clock.pairs} pairs"
-        + (f"; {clock.note}" if clock.note else "")
+    return say("clock_map", clock=clock, jitter_ms=clock.jitter_s * 1e3) + (
+        f"; {clock.note}" if clock.note else ""
     )
 
 
@@ -192,10 +178,7 @@ def tuning_advice(
     advice, sigma_a, sigma_z = {}, found.filter_sigma_a, found.sigma_z
     drifts, log = comparison.source.origin.may_drift, comparison.flight.log
     if drifts:
-        advice["Drift"] = (
-            "the source may drift: these noises make a filter follow it and are not how wrong it "
-            "is. Take no SIGMA_Z and no EKF2_EVP_NOISE below what truth or a loop shows."
-        )
+        advice["Drift"] = say("tuned_drifts")
     options = [
         f" {option} {noise.value:.3g}"
         for option, noise in (("--sigma-a", sigma_a), ("--sigma-z", sigma_z))
@@ -208,10 +191,7 @@ def tuning_advice(
         advice["SIGMA_Z"] = f"is at least {sigma_z.low:.2g} m: is this a position source at all?"
     elif sigma_z.value is None:
         bound = "" if sigma_z.high is None else f" (at most {sigma_z.high:.2g} m)"
-        advice["SIGMA_Z"] = (
-            f"is below what this logging rate can show{bound}: between samples the process noise "
-            "hides it. Log the source at a higher rate."
-        )
+        advice["SIGMA_Z"] = say("sigma_z_hidden", bound=bound)
     elif log.autopilot == "PX4" and not drifts and comparison.source.origin.is_vision:
         now = log.parameters.get("EKF2_EVP_NOISE")
         said = "" if now is None else f" (now {now:g})"
@@ -224,13 +204,9 @@ def tuning_advice(
         )
     elif found.biases_fitted and (alone := found.sigma_a.value or found.sigma_a.high) is not None:
         bound = "" if found.sigma_a.value is not None else "at most "
-        advice["SIGMA_A"] = (
-            f"of the acceleration alone is {bound}{alone:.2g} m/s²; the filter has no state for "
-            f"the accelerometer's bias and tilt, and needs {sigma_a.value:.2g} m/s² to cover them"
-        )
+        advice["SIGMA_A"] = say("sigma_a_alone", bound=bound, alone=alone, sigma_a=sigma_a)
     if len(found.outlier_time_s):
-        advice["Outliers"] = (
-            f"{len(found.outlier_time_s)} of {found.count} measurements ({name}), the first at "
-            f"{found.outlier_time_s[0]:.1f} s; they do not enter the noises"
+        advice["Outliers"] = say(
+            "tuned_outliers", count=len(found.outlier_time_s), found=found, name=name
         )
     return advice

@@ -50,17 +50,13 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
     if schema is None or kind is None:
         raise ResultsError(f"{name} holds no results of px4fuse.")
     if (version := str(schema.get("version"))) != VERSION:
-        raise ResultsError(
-            f"{name} follows version {one_line(version, 20)} of the results' schema, this px4fuse "
-            f"reads version {VERSION}: make the report again with it.",
-            "Run it with the px4fuse that the report was made with.",
+        raise ResultsError.of(
+            "other_version", name=name, version=one_line(version, 20), reads=VERSION
         )
     try:
         found: Results = msgspec.convert(value, kind, dec_hook=choose)
     except msgspec.ValidationError as error:
-        raise ResultsError(
-            f"{name} does not follow the schema: {one_line(str(error), 300)}."
-        ) from error
+        raise ResultsError.of("not_of_schema", name=name, why=one_line(str(error), 300)) from error
     return found
 
 

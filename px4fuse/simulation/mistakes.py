@@ -6,11 +6,9 @@ clear case.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-
-import msgspec
 
 from px4fuse.errors import SettingsError, did_you_mean
+from px4fuse.record import table
 from px4fuse.simulation.scenario import KINDS, Kind, quantities
 from px4fuse.units import NAMES, in_unit
 
@@ -105,9 +103,7 @@ class Mistake:
         return first + "".join(f"[,{name[1:]}]" for name in rest)
 
 
-MISTAKES: Mapping[str, Mistake] = msgspec.toml.decode(
-    Path(__file__).with_name("mistakes.toml").read_bytes(), type=dict[str, Mistake]
-)
+MISTAKES: Mapping[str, Mistake] = table(__file__, "mistakes.toml", dict[str, Mistake])
 
 
 def parse(texts: Iterable[str]) -> Mistakes:
