@@ -14,7 +14,16 @@ from findings_tools import NONE, log, made
 from scipy.spatial.transform import Rotation
 
 from px4fuse.ekf2 import inputs as inputs_module
-from px4fuse.ekf2.inputs import Inputs, Received, Rules, _decisions, _source, prepare, read_vision
+from px4fuse.ekf2.inputs import (
+    Inputs,
+    Received,
+    Rules,
+    _decisions,
+    _moved,
+    _source,
+    prepare,
+    read_vision,
+)
 from px4fuse.ekf2.stretches import (
     Stretch,
     _stretch,
@@ -225,6 +234,28 @@ def test_what_ekf2_did_with_a_sample_is_found_by_its_time() -> None:
 
 
 # ---------------------------------------------------------------- stretches
+
+
+def test_a_reset_of_the_position_is_no_fusion() -> None:
+    """EKF2 flies north at 2 m/s and is set 3 m east at 5 s; every third sample's fate is logged."""
+    times = np.arange(0.0, 10.0, 0.1)
+    state = pd.DataFrame(0.0, pd.Index(times, name="time_s"), Columns.STATE)
+    state["north_m"], state["north_m_s"], state["east_m"] = 2.0 * times, 2.0, 3.0 * (times >= 5.0)
+    reset = Reset(5.0, "position", (0.0, 3.0, 0.0))
+    record = made(FusionRecord, parameters={})
+    taken, fates = np.arange(1.02, 8.0, 0.1), np.tile([0.0, np.nan, np.nan], 24)[:70]
+
+    some = np.where(fates == 0.0, 1.0, fates)
+
+    def moved(*resets: Reset, rejected: Any = some) -> Any:
+        ekf2 = made(Ekf2, state=state, resets=resets, horizon_s=0.2, step_s=0.01)
+        return _moved(ekf2, record, taken, rejected)
+
+    np.testing.assert_allclose(moved(reset), 0.0, atol=1e-9)
+    assert np.nanmax(moved()) > 1.0
+    # nothing is rejected, or all is known
+    assert moved(reset, rejected=fates) is None
+    assert moved(reset, rejected=np.ones(70)) is None
 
 
 @pytest.mark.parametrize(

@@ -77,11 +77,20 @@ def test_what_the_filter_was_moved_by_is_told_by_what_is_published() -> None:
     flat = np.zeros((n, 2))
     still = np.zeros((n + 1, 2))
     v, p = buffered(flat, velocity, position, still, lag, tau_s, tau_s)
-    rows = np.arange(0, n + 1, 10)
-    found = corrections(rows * STEP_S, v[rows], p[rows], (at + lag - 1) * STEP_S, tau_s)
+    rows, known_s = np.arange(0, n + 1, 10), (at + lag - 1) * STEP_S
+    found = corrections(rows * STEP_S, v[rows], p[rows], known_s, tau_s)
     assert np.abs(moved).max() > 0.2
     np.testing.assert_allclose(found, moved, atol=0.05)
     assert np.corrcoef(found.ravel(), moved.ravel())[0, 1] > 0.97
+    # with half a second of rows missing, and as much without a position
+    rows = np.delete(rows, np.arange(20, 25))
+    p[400:450] = np.nan
+    partly = corrections(rows * STEP_S, v[rows], p[rows], known_s, tau_s)
+    lost = ~np.isfinite(partly[:, 0])
+    assert 5 <= lost[15:25].sum() <= 8
+    assert 3 <= lost[33:45].sum() <= 6
+    assert lost.sum() == lost[15:25].sum() + lost[33:45].sum()
+    np.testing.assert_allclose(partly[~lost], moved[~lost], atol=0.08)
 
 
 def test_the_published_attitude_follows_by_half_a_step_per_horizon() -> None:

@@ -375,6 +375,9 @@ def _moved(ekf2: Ekf2, record: FusionRecord, taken_s: Array, rejected: Array) ->
     velocity, position = (
         ekf2.state[names[:2]].to_numpy() for names in (Columns.VELOCITY, Columns.POSITION)
     )
+    for reset in ekf2.resets:
+        if reset.quantity == "position":
+            position = position - (times >= reset.time_s)[:, None] * np.array(reset.delta[:2])
     known_s = taken_s + ekf2.horizon_s - ekf2.step_s  # the first part of it is there at once
     return corrections(times, velocity, position, known_s, tau_s)
 

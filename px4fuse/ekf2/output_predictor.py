@@ -31,6 +31,9 @@ INTEGRAL_SHARE = 0.1
 FOLLOWED = 5.0
 # Against what nothing tells apart: two corrections between the same rows
 NO_CORRECTION = 1e-3
+# A row after so many usual intervals has others missing before it; so much of a correction must
+# show in rows that are there
+MISSING_ROWS, SEEN_SHARE = 3.0, 0.5
 ATTITUDE_SHARE = 0.5
 
 
@@ -108,19 +111,25 @@ def corrections(
     Returns
     -------
     ndarray, shape (m, a)
+        NaN where rows of the log are missing after it.
     """
-    carried = 0.5 * (velocity_m_s[1:] + velocity_m_s[:-1]) * np.diff(time_s)[:, None]
+    interval_s = np.diff(time_s)
+    carried = 0.5 * (velocity_m_s[1:] + velocity_m_s[:-1]) * interval_s[:, None]
     beyond = np.diff(position_m, axis=0) - carried
-    span = math.ceil(FOLLOWED * tau_s / float(np.median(np.diff(time_s)))) + 1
+    usual_s = float(np.median(interval_s))
+    usable = np.isfinite(beyond).all(axis=1) & (interval_s < MISSING_ROWS * usual_s)
+    beyond[~usable] = 0.0
+    span = math.ceil(FOLLOWED * tau_s / usual_s) + 1
     row = np.searchsorted(time_s, known_s, side="right") - 1 + np.arange(span)[:, None]
-    inside = (row >= 0) & (row < len(beyond))
+    inside = (row >= 0) & (row < len(beyond)) & usable[np.clip(row, 0, len(beyond) - 1)]
     row, sample = row[inside], np.nonzero(inside)[1]
     begun, ended = (
         np.exp(-np.maximum(time_s[each] - known_s[sample], 0.0) / tau_s) for each in (row, row + 1)
     )
     shares = csr_array((begun - ended, (row, sample)), shape=(len(beyond), len(known_s)))
     normal = shares.T @ shares + NO_CORRECTION * eye_array(len(known_s))
-    return np.reshape(spsolve(normal.tocsc(), shares.T @ beyond), (len(known_s), -1))
+    found = np.reshape(spsolve(normal.tocsc(), shares.T @ beyond), (len(known_s), -1))
+    return np.where(shares.sum(axis=0)[:, None] > SEEN_SHARE, found, np.nan)
 
 
 def later(values: Array, lag: int) -> Array:

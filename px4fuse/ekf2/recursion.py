@@ -292,6 +292,7 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
             if moved is not None:
                 ratio = (nu * nu / (gate2 * S))[:, LEVEL].max(axis=1)
                 edge = (ratio > 1.0 / ON_EDGE) & (ratio < ON_EDGE)
+                edge &= np.isfinite(moved[sample[e]]).all()
                 full = (1.0 - noise[e] / S)[:, LEVEL] * nu[:, LEVEL]
                 kept = full @ moved[sample[e]] < 0.5 * (full * full).sum(axis=1)
                 outside = np.where(as_logged & edge, kept, outside)
