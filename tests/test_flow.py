@@ -196,6 +196,17 @@ def test_fixes_that_come_while_ekf2_does_without_gnss_are_not_fused() -> None:
     np.testing.assert_array_equal(found.stamp_s, every.stamp_s[kept])  # type: ignore[union-attr]
 
 
+def test_a_replay_begins_with_the_correlations_of_what_was_before() -> None:
+    """It stood for six seconds and rose: tilt and bias of the accelerometer are known together."""
+    (stretch,) = model().inputs.stretches
+    assert stretch.history is not None
+    assert stretch.history.time_s[-1] == pytest.approx(stretch.time_s[0], abs=1e-6)
+    assert stretch.history.time_s[0] < 1.0
+    of_tilt = stretch.correlation[:2, 12:15] @ stretch.rotation[0].T
+    # θ x f = Rb, with f = -g: north by the tilt to the east, east by that to the north
+    np.testing.assert_allclose(of_tilt[:, :2], [[0.0, 0.98], [-0.98, 0.0]], atol=0.02)
+
+
 # ---------------------------------------------------------------- flights of PX4's EKF2
 
 
