@@ -279,10 +279,8 @@ def _find_table(
     line, separator, names = next(headers, (0, "", []))
     if not names:
         told = ", ".join(map(quote, sorted(wanted))) or "time, x, y, z"
-        raise LogError(
-            f"{file}: no header with the columns {told} in its first {len(lines)} lines, of which "
-            f"the first is {quote(lines[0])}",
-            f"Give a CSV file with a header, or name its columns with {_COLUMNS}.",
+        raise LogError.of(
+            "no_header", file=file, told=told, n=len(lines), first=quote(lines[0]), option=_COLUMNS
         )
     body = re.sub(r"(?m)^[ \t]*[#%].*", "", text.split("\n", line)[line])
     head = body[:HEAD_CHARS].lstrip("\n").partition("\n")[0].rstrip(f"{separator} ")

@@ -114,11 +114,8 @@ def _covariances(graph: model.PoseGraph, used: IntArray) -> Array:
     whole = np.linalg.eigvalsh(scaled)[:, 0] > 1e-12
     if not np.all(whole):
         edge = used[int(np.argmin(whole))]
-        raise TrajectoryError(
-            f"The odometry edge from vertex {graph.ids[graph.first[edge]]} to "
-            f"{graph.ids[graph.second[edge]]} has a direction without information, so its error "
-            "has no bound",
-            "Give the information of all directions.",
+        raise TrajectoryError.of(
+            "edge_unbound", one=graph.ids[graph.first[edge]], two=graph.ids[graph.second[edge]]
         )
     covariance = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
     back = graph.first[used] > graph.second[used]
