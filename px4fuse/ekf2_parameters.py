@@ -8,11 +8,11 @@ spells the name of a parameter of external vision or GNSS: who needs one asks th
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import msgspec
 
 from px4fuse.errors import SettingsError, did_you_mean
+from px4fuse.record import table
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class Parameter:
     maximum: float
 
 
-TABLE = msgspec.toml.decode(Path(__file__).with_name("ekf2_parameters.toml").read_bytes())
+TABLE = table(__file__, "ekf2_parameters.toml", dict)
 AIDS, DISTURBANCES = (
     msgspec.convert({name: {"name": name, **row} for name, row in rows.items()}, dict[str, Aid])
     for rows in (TABLE["aids"], TABLE["disturbances"])
@@ -175,9 +175,8 @@ def check(chosen: Mapping[str, float]) -> dict[str, float]:
             )
         if not known.minimum <= value <= known.maximum or not math.isfinite(value):
             unit = f" {known.unit}" if known.unit else ""
-            raise SettingsError(
-                f"{name}={value:g} is outside PX4's range, {known.minimum:g} to "
-                f"{known.maximum:g}{unit} (default {known.default:g})."
+            raise SettingsError.of(
+                "parameter_outside", name=name, value=value, known=known, unit=unit
             )
         if name == EV_POS.noise_mode and value not in (0.0, 1.0):
             raise SettingsError(f"{name}={value:g}: only 0 and 1 have a meaning.")

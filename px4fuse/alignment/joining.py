@@ -38,16 +38,12 @@ def join(flight: Flight, other: Flight) -> Flight:
         The two do not overlap in time, or are not of the same flight.
     """
     if other.log.sha256 == flight.log.sha256:
-        raise MissingDataError(
-            f"{other.log.name}: the same recording twice", "Give the other recording of the flight."
-        )
+        raise MissingDataError.of("recording_twice", other=other)
     shift_s = other.log.boot_time_s - flight.log.boot_time_s
     low, high = max(0.0, shift_s), min(flight.log.duration_s, shift_s + other.log.duration_s)
     if high - low < MIN_OVERLAP_S:
-        raise MissingDataError(
-            f"{flight.log.name} and {other.log.name} do not overlap in time: {_span(flight)} and "
-            f"{_span(other)} on the autopilot's boot clock",
-            "Give the recordings of one flight.",
+        raise MissingDataError.of(
+            "no_common_time", flight=flight, other=other, one=_span(flight), two=_span(other)
         )
     moved = later(other, shift_s)
     agreement = _agreement(flight, moved)
@@ -132,10 +128,6 @@ def _agreement(flight: Flight, other: Flight) -> str:
             apart = np.linalg.norm(ours - theirs.loc[at, Columns.POSITION].to_numpy(), axis=1)
             median = float(np.median(apart))
             if median > MAX_POSITION_DIFFERENCE_M:
-                raise MissingDataError(
-                    f"{flight.log.name} and {other.log.name} are not of the same flight: EKF2's "
-                    f"positions differ by {median:.2f} m (median).",
-                    "Give the recordings of one flight.",
-                )
+                raise MissingDataError.of("other_flight", flight=flight, other=other, median=median)
             return f"their EKF2 positions differ by {median:.3f} m (median)"
     return "that they are of the same flight could not be checked: no EKF2 in both"

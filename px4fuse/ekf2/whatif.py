@@ -238,9 +238,8 @@ def what_if(
         left = [(max(start, since), end) for start, end in judged if end - since > JUDGED_S]
         judged = tuple(left[:1])
         if not judged:
-            raise SettingsError(
-                f"{since:g} s: less than {JUDGED_S:g} s of the flight that is replayed are left "
-                f"then; it ends at {model.flown.judged_s[-1][1]:.0f} s."
+            raise SettingsError.of(
+                "since_late", since=since, least_s=JUDGED_S, end_s=model.flown.judged_s[-1][1]
             )
     gnss = model.inputs.aid == GNSS_POS
     return WhatIf(

@@ -205,9 +205,7 @@ def make_axes(
     if heading_deg is not None and not 0.0 <= heading_deg <= 360.0:
         raise SettingsError(f"`heading_deg` {heading_deg:g} is not between 0 and 360 degrees.")
     if unknown := [name for name in asked if name not in known]:
-        raise SettingsError(
-            f"axis {unknown[0]}: not a known axis", f"Choose from {', '.join(known)}."
-        )
+        raise SettingsError.of("axis_unknown", axis=unknown[0], known=", ".join(known))
     where = f"{flight.log.name}: {track.name}"
     axes = []
     for name in asked:

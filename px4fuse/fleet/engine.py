@@ -53,17 +53,13 @@ def connected(scheduler: str | None = None) -> Iterator[Client | None]:
         from distributed import Client  # noqa: PLC0415 - of the extra `batch`
         from distributed.utils import silence_logging_cmgr  # noqa: PLC0415
     except ImportError as error:
-        raise SettingsError(
-            "a scheduler requires Dask", 'Run pip install "px4fuse[batch]".'
-        ) from error
+        raise SettingsError.of("no_dask") from error
     try:
         # one that fails must not become the session's own
         client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise SettingsError(
-            f"`scheduler` {scheduler}: no Dask scheduler answers there "
-            f"({one_line(str(error), 120)})",
-            "Start one with: dask scheduler",
+        raise SettingsError.of(
+            "no_scheduler", scheduler=scheduler, why=one_line(str(error), 120)
         ) from error
     # a scheduler that goes is said here, in one line: Dask would print its tracebacks
     with silence_logging_cmgr(logging.CRITICAL), client, client.as_current():
@@ -89,16 +85,12 @@ def _check(client: Client) -> None:
     try:
         client.wait_for_workers(1, timeout=CONNECT_S)
     except TimeoutError as error:
-        raise SettingsError(
-            f"{address}: has no workers", f"Start workers with: dask worker {address} --nthreads 1"
-        ) from error
+        raise SettingsError.of("no_workers", address=address) from error
     here = metadata.version("px4fuse")
     for name, there in client.run(metadata.version, "px4fuse", on_error="return").items():
         if there != here:
             other = f"px4fuse {there}" if isinstance(there, str) else "no px4fuse"
-            raise SettingsError(
-                f"worker {name} has {other}, and this is {here}", "Install the same on both."
-            )
+            raise SettingsError.of("worker_of_another", name=name, other=other, here=here)
 
 
 def outcomes(

@@ -79,10 +79,7 @@ def _read(path: Path) -> DiffInput | None:
     content = read_whole(path, ResultsError, limit, smaller=advice)
     found = (attached_results if is_report else read_results)(content, name)
     if not isinstance(found, ComparisonResults | AidsResults):
-        raise ResultsError(
-            f"{name}: holds {found.schema.name}; px4fuse diff takes what px4fuse compare writes, "
-            "or a log."
-        )
+        raise ResultsError.of("not_to_compare", name=name, found=found)
     return DiffInput(name, "report" if is_report else "results", found)
 
 

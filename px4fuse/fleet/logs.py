@@ -84,10 +84,7 @@ def _logs_in(given: str) -> list[FoundLog]:
             f"{given}: cannot be read ({one_line(str(error), 200) or type(error).__name__})."
         ) from error
     if not infos:
-        raise SettingsError(
-            f"{given}: no logs there ({', '.join(SUFFIXES)})",
-            "Give a file, or a folder that holds some.",
-        )
+        raise SettingsError.of("no_logs", given=given, suffixes=", ".join(SUFFIXES))
     found = []
     for path, info in infos.items():
         address = path if _is_local(files) else files.unstrip_protocol(path)
@@ -119,10 +116,7 @@ def local_file(address: str) -> Iterator[Path]:
         return
     size, limit = files.info(path).get("size"), max_log_bytes.get()
     if size is not None and size > limit:
-        raise LogError(
-            f"{size / 1e6:,.0f} MB, more than the limit of {limit / 1e6:,.0f} MB",
-            "Allow more with --max-size MB.",
-        )
+        raise LogError.of("log_large", size_mb=size / 1000000.0, limit_mb=limit / 1000000.0)
     with TemporaryDirectory(prefix="px4fuse-") as folder:
         local = Path(folder, _name(path))
         files.get_file(path, str(local))
@@ -136,9 +130,7 @@ def _file_system(address: str) -> tuple[AbstractFileSystem, str]:
         files, path = url_to_fs(address)
     except ImportError as error:  # its cause names the module, which is the package's name
         package = getattr(error.__cause__, "name", None) or "the package that it names"
-        raise SettingsError(
-            f"{address}: this kind of URL requires a package", f'Run pip install "{package}".'
-        ) from error
+        raise SettingsError.of("no_package_of_url", address=address, package=package) from error
     except ValueError as error:  # of a protocol that nobody knows
         raise SettingsError(f"{address}: {error}", "Give a path or another URL.") from error
     return files, path

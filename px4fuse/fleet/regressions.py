@@ -54,9 +54,7 @@ def read_baseline(path: Path) -> pd.DataFrame:
         raise SettingsError(f"{path.name}: cannot be read as a table ({error}).") from error
     needed = {"log", "log_sha256", "settings", "status", "vehicle", "axis", *_MEASURES}
     if lacking := sorted(needed - set(found.columns)):
-        raise SettingsError(
-            f"{path.name}: has no column {lacking[0]}", "Give the fleet.parquet of px4fuse batch."
-        )
+        raise SettingsError.of("no_column_of_fleet", path=path, column=lacking[0])
     return found.fillna(dict.fromkeys(texts.keys() & set(found.columns), ""))
 
 

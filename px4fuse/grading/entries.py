@@ -427,10 +427,7 @@ def due_time(text: str) -> datetime:
         zone = ZoneInfo(words.pop()) if words and words[-1][0].isalpha() else None
         found = datetime.fromisoformat("T".join(words[:2]) + "".join(words[2:]))
     except (ZoneInfoNotFoundError, ValueError, OSError) as error:
-        raise SettingsError(
-            f"--due {text!r}: give a time such as '2026-11-20 23:59', with or without a time zone "
-            "('+01:00' or 'Europe/Berlin') behind it."
-        ) from error
+        raise SettingsError.of("due_wrong", text=text) from error
     clock = re.search(r"\d\d:\d\d(:\d\d)?", text)
     if clock is None:
         found = found.replace(hour=23, minute=59)

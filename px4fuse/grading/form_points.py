@@ -8,13 +8,13 @@ claim that is not true costs, and what needs no measurement counts only with the
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import msgspec
 
 from px4fuse.answers import MISTAKES, Answers, Claim, Quantified
 from px4fuse.assignment.truth import FormTruth, Wrong
 from px4fuse.filter.consistency import SIGMA_OFF
+from px4fuse.record import table
 
 FALSE_CLAIM, MOST_FALSE = 10.0, 3
 NEIGHBOUR, SAME_NUMBER, EFFECT = 0.4, 2.0 / 3.0, 0.15
@@ -37,7 +37,7 @@ class _Cure:
     late: bool = False
 
 
-TABLE = msgspec.toml.decode(Path(__file__).with_name("form_points.toml").read_bytes())
+TABLE = table(__file__, "form_points.toml", dict)
 CURES = msgspec.convert(TABLE["cures"], tuple[_Cure, ...])
 NEIGHBOURS = msgspec.convert([*TABLE["neighbours"].values()], tuple[frozenset[str], ...])
 PARTS = tuple(TABLE["weights"])

@@ -33,12 +33,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO
 
-import msgspec
-
 from px4fuse.assignment.roster import Person, distinct
 from px4fuse.errors import SettingsError
 from px4fuse.grading.model import NOBODY, ExportOrigin, Submission
 from px4fuse.reading import files_below
+from px4fuse.record import table
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification.intake import MAX_BYTES
 from px4fuse.verification.model import BAD_VALUES, Refused
@@ -61,9 +60,7 @@ METADATA = "submission_metadata.yml"
 # By platform: how its exports name files
 PLATFORMS = {
     name: re.compile(pattern)
-    for name, pattern in msgspec.toml.decode(
-        Path(__file__).with_name("platforms.toml").read_bytes(), type=dict[str, str]
-    ).items()
+    for name, pattern in table(__file__, "platforms.toml", dict[str, str]).items()
 }
 # What a platform writes into a name once, and nobody else by chance
 _PARTS = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")

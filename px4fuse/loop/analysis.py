@@ -153,11 +153,7 @@ def _key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
     frames = key_frames(path.position_m, spacing_m)
     along = cumulative_distance(path.position_m[frames])
     if not along[-1] >= max(MIN_PATH_M * min(1.0, spacing_m / 0.5), 1e-6):
-        raise TrajectoryError(
-            f"{path.name}: the path is {along[-1]:.2f} m long on key frames {spacing_m:g} m apart, "
-            "too short for a loop",
-            "Give the part with `start_s` and `end_s`, or `key_frames_m`.",
-        )
+        raise TrajectoryError.of("path_short", path=path, length_m=along[-1], spacing_m=spacing_m)
     return frames, np.interp(path.time_s, path.time_s[frames], along)
 
 
@@ -171,10 +167,7 @@ def _check(closure: GivenClosure, path: Trajectory) -> None:
     (low, high), times = path.time_s[[0, -1]], (closure.time_1_s, closure.time_2_s)
     label = f"{path.name}: closure {times[0]:.12g},{times[1]:.12g}"
     if not low <= times[0] < times[1] <= high:
-        raise TrajectoryError(
-            f"{label}: its times do not follow each other within the path, which runs from "
-            f"{low:.2f} s to {high:.2f} s."
-        )
+        raise TrajectoryError.of("closure_outside", label=label, low=low, high=high)
     if not 1e-4 <= closure.sigma_m <= MOST:
         raise TrajectoryError(f"{label}: SIGMA {closure.sigma_m:g} is outside 0.0001 to 100 m.")
 

@@ -164,9 +164,8 @@ def split_part(argument: str) -> tuple[Path, Part | None]:
     if part in PARTS:
         return Path(path), part
     if Path(path).is_file():
-        raise TrajectoryError(
-            f"{shown(Path(path))}:{part}: {part!r} is not a part of a flight",
-            f"Choose from {', '.join(PARTS)}.",
+        raise TrajectoryError.of(
+            "no_such_part", path=shown(Path(path)), part=part, known=", ".join(PARTS)
         )
     return whole, None
 
@@ -218,23 +217,14 @@ def read_source(
     if not head:
         raise TrajectoryError(f"{shown(path)}: the file is empty", "Copy or export it again.")
     if is_g2o(path):
-        raise TrajectoryError(
-            f"{shown(path)}: a pose graph, not a trajectory",
-            f"Solve it with px4fuse loop {shown(path)}.",
-        )
+        raise TrajectoryError.of("graph_not_trajectory", path=shown(path))
     if text_of(head) is not None:  # and so no flight log
         if part is not None:
-            raise TrajectoryError(
-                f"{shown(path)}: a trajectory file has no part {part!r}", "Leave it out."
-            )
+            raise TrajectoryError.of("part_of_trajectory", path=shown(path), part=part)
         trajectory = read_trajectory(path)
         return LoopSource(trajectory if frame is None else replace(trajectory, frame=frame), None)
     if frame is not None:
-        raise SettingsError(
-            f"`frame` {frame.lower()} is for trajectory files; {shown(path)} is a flight log, "
-            "which states its frame",
-            "Leave `frame` out.",
-        )
+        raise SettingsError.of("frame_of_log", frame=frame.lower(), path=shown(path))
     flight = read_log(path, system=system)
     chosen = part or default
     if chosen is None:

@@ -5,15 +5,13 @@ The tables are ``px4_topics.toml`` and ``mavlink_messages.toml``.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
 
 from px4fuse.flight import Columns
 
 GLOBAL_COLUMNS = ["latitude_deg", "longitude_deg", "altitude_m"]
-Table = TypeVar("Table")
 
 
 @dataclass(frozen=True)
@@ -36,11 +34,6 @@ class Layout:
     columns: Mapping[str, str] = field(default_factory=dict)
     optional: Mapping[str, str] = field(default_factory=dict)
     scale: Mapping[str, float] = field(default_factory=dict)
-
-
-def read_table(file: str, kind: type[Table]) -> Table:
-    """A table of this folder, as a record of this kind."""
-    return msgspec.toml.decode(Path(__file__).with_name(file).read_bytes(), type=kind)
 
 
 def one_by_one(rows: Mapping[str, Any]) -> dict[str, Layout]:

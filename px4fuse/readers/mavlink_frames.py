@@ -178,11 +178,7 @@ def read_frames(name: str, content: bytes) -> Frames:
     stamp = STAMP if len(start) and _is_stamped(start, end) else 0
     good = int(np.sum(end - start))
     if good < MIN_GOOD_SHARE * len(content) or not len(start):
-        raise LogError(
-            f"{name}: not a PX4 ULog, and not a MAVLink recording ({len(start)} frames with a "
-            f"good checksum in {len(content)} bytes)",
-            "Give the .ulg from the vehicle, or a .tlog or raw MAVLink stream.",
-        )
+        raise LogError.of("not_a_log", name=name, frames=len(start), length=len(content))
     source = np.frombuffer(content, dtype=np.uint8)
     second = source[start] == MAGIC_2
     # sequence, system and component follow one another

@@ -11,8 +11,8 @@ import msgspec
 
 from px4fuse.flight import RECORD_NOT_LOGGED, Unavailable
 from px4fuse.origin import Origin, find_origin
-from px4fuse.readers.layouts import Layout, one_by_one, read_table
-from px4fuse.record import lacking
+from px4fuse.readers.layouts import Layout, one_by_one
+from px4fuse.record import lacking, table
 
 AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: a ground station, a camera, a companion computer
@@ -74,7 +74,7 @@ class FrameOfReference:
     body: bool = False
 
 
-_ROWS = read_table("mavlink_messages.toml", dict[str, dict[str, Any]])
+_ROWS = table(__file__, "mavlink_messages.toml", dict[str, dict[str, Any]])
 LAYOUTS = one_by_one(_ROWS["layouts"])
 _INPUTS = msgspec.convert(_ROWS["positions"], dict[str, PositionInput])
 FRAMES_OF_REFERENCE = msgspec.convert(_ROWS["frames"], dict[int, FrameOfReference], strict=False)

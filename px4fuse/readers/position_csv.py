@@ -119,9 +119,7 @@ class _Table:
                 quoting=csv.QUOTE_NONE,
             )
         except ValueError as error:
-            raise LogError(
-                f"{self.file}: no table of numbers", "Export it as CSV again."
-            ) from error
+            raise LogError.of("no_numbers", file=self.file) from error
         return texts.dropna(how="all")
 
 
@@ -243,10 +241,7 @@ def _check_options(
             raise SettingsError(f"`{name}`: {value!r} is not one of {', '.join(units)}.")
     given = columns or ("1", "2", "3")
     if "" in given or not 3 <= len({*given}) == len(given) <= 5:
-        raise SettingsError(
-            f"{_COLUMNS}[,SIGMA]: {','.join(given)!r} does not name four or five different "
-            "columns (three where there is no height)."
-        )
+        raise SettingsError.of("columns_wrong", option=_COLUMNS, given=",".join(given))
 
 
 def _count(rows: int) -> str:
@@ -266,10 +261,7 @@ def _find_table(
     """Find separator, header and first row, and say whether a last line was left out."""
     text = text_of(content)
     if text is None:
-        raise LogError(
-            f"{file}: a binary file, not a text table",
-            "Give the CSV file of the UWB system; a flight log is read without `position`.",
-        )
+        raise LogError.of("binary_table", file=file)
     notes = []
     whole, _, last = text.replace('"', "").rpartition("\n")
     text = f"{whole}\n"
@@ -287,19 +279,14 @@ def _find_table(
     line, separator, names = next(headers, (0, "", []))
     if not names:
         told = ", ".join(map(quote, sorted(wanted))) or "time, x, y, z"
-        raise LogError(
-            f"{file}: no header with the columns {told} in its first {len(lines)} lines, of which "
-            f"the first is {quote(lines[0])}",
-            f"Give a CSV file with a header, or name its columns with {_COLUMNS}.",
+        raise LogError.of(
+            "no_header", file=file, told=told, n=len(lines), first=quote(lines[0]), option=_COLUMNS
         )
     body = re.sub(r"(?m)^[ \t]*[#%].*", "", text.split("\n", line)[line])
     head = body[:HEAD_CHARS].lstrip("\n").partition("\n")[0].rstrip(f"{separator} ")
     width = len(_split(head, separator))
     if width > len(names):
-        raise LogError(
-            f"{file}: the header names {len(names)} columns, but rows have {width}",
-            "Export it with decimal points, and with a name for every column.",
-        )
+        raise LogError.of("header_short", file=file, count=len(names), width=width)
     return _Table(file, separator, names, body, line), notes
 
 

@@ -5,7 +5,7 @@ import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from px4fuse.readers.layouts import read_table
+from px4fuse.record import table
 
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
@@ -13,7 +13,7 @@ LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 Position = tuple[int, int, int | None]
 
 
-_WORDS = read_table("position_names.toml", dict[str, dict[str, str]])
+_WORDS = table(__file__, "position_names.toml", dict[str, dict[str, str]])
 _UNITS, _AXES = (
     {word: meaning for meaning, words in _WORDS[table].items() for word in words.split()}
     for table in ("units", "axes")

@@ -14,7 +14,8 @@ import msgspec
 
 from px4fuse.ekf2_parameters import AIDS
 from px4fuse.origin import Origin, find_origin
-from px4fuse.readers.layouts import Layout, one_by_one, read_table
+from px4fuse.readers.layouts import Layout, one_by_one
+from px4fuse.record import table
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class TrackSource:
         return find_origin(self.kind, self.passage)
 
 
-_ROWS = read_table("px4_topics.toml", dict[str, dict[str, Any]])
+_ROWS = table(__file__, "px4_topics.toml", dict[str, dict[str, Any]])
 LAYOUTS = one_by_one(_ROWS["layouts"])
 TRACKS = msgspec.convert(_ROWS["tracks"], dict[str, TrackSource])
 FRAMES = msgspec.convert(_ROWS["frames"], dict[str, dict[int, str]], strict=False)

@@ -126,10 +126,7 @@ def tum_text(trajectory: Trajectory) -> str:
         It has no orientation, which the format demands.
     """
     if trajectory.rotation is None:
-        raise TrajectoryError(
-            f"{trajectory.name}: a TUM file needs orientations, and here are only positions",
-            "Choose a part with orientation.",
-        )
+        raise TrajectoryError.of("tum_without_orientation", trajectory=trajectory)
     time = trajectory.time_s + (trajectory.unix_offset_s or 0.0)
     table = np.column_stack((time, trajectory.position_m, trajectory.rotation.as_quat()))
     rows = (" ".join(map(repr, row)) for row in table.tolist())
@@ -158,10 +155,7 @@ def _rows(name: str, content: bytes) -> tuple[Rows, str, str]:
         cut = f"Line {data[-1][0]}, the last one, was dropped: it is cut."
         data.pop()
     if len(data) < MIN_POSES:
-        raise TrajectoryError(
-            f"{name}: poses: {len(data)}, at least {MIN_POSES} are needed",
-            "Export the trajectory again; where SLAM lost track at once, its file is almost empty.",
-        )
+        raise TrajectoryError.of("poses_few", name=name, count=len(data), least=MIN_POSES)
     return Rows(name, data), "\n".join(comments), cut
 
 
@@ -217,11 +211,7 @@ def _seconds(rows: Rows, stamps: list[str]) -> tuple[Array, str]:
             words = f"Its stamps are {unit} and were divided by {per_second:.0e}."
             # in two parts, as float64 does not hold the digits of UNIX time in ns
             return ticks // per_second + ticks % per_second / per_second, words
-    raise TrajectoryError(
-        f"{rows.file}: its stamps are {step:.3g} apart (median), which is not an interval of "
-        "frames in seconds or nanoseconds",
-        "Give stamps in seconds.",
-    )
+    raise TrajectoryError.of("stamps_apart", rows=rows, step=step)
 
 
 def _increasing(rows: Rows, time: Array) -> tuple[BoolArray, str]:

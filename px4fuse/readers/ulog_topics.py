@@ -275,16 +275,12 @@ def read_topics(name: str, content: bytes) -> Topics:
             # a log of other topics can still be placed in time, by all that it holds
             placed = tables or _tables(ULog(io.BytesIO(framing.content)))
     except _PARSE_ERRORS as error:
-        raise LogError(
-            f"{name}: not a readable ULog ({str(error) or type(error).__name__})",
-            "Copy the .ulg from the vehicle again.",
+        raise LogError.of(
+            "ulog_unreadable", name=name, why=str(error) or type(error).__name__
         ) from error
     notes: tuple[str, ...] = ()
     if not placed:
-        raise LogError(
-            f"{name}: a ULog without any data (no IMU, no position, no EKF2)",
-            "If it is cut short, copy it again; else record with SDLOG_PROFILE 129.",
-        )
+        raise LogError.of("ulog_empty", name=name)
     if not tables:
         names = sorted({topic for topic, _ in placed})
         notes += (f"none of its topics is one that px4fuse uses (it holds {few_words(names, 5)})",)
@@ -347,10 +343,7 @@ def _data_span(
             breaks = np.flatnonzero(np.diff(kept) > MAX_DATA_GAP_S / _MICROSECOND) + 1
             stretch = max(np.split(kept, breaks), key=len)
             return int(stretch[0]), int(stretch[-1])
-    raise LogError(
-        f"{name}: every time stamp in it is zero, so nothing can be placed in time",
-        "The logger ran before the clock did; record again.",
-    )
+    raise LogError.of("stamps_zero", name=name)
 
 
 def _text(info: dict[str, Any], key: str, otherwise: str) -> str:

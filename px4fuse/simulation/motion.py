@@ -270,10 +270,7 @@ def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Mo
     ramps.change(-up, CLIMB_RAMP_S, rise_s)
     touch_down_s = ramps.centre_s + CLIMB_RAMP_S / 2.0
     if touch_down_s > LONGEST_S:
-        raise SettingsError(
-            f"this flight would take {touch_down_s:.0f} s, at most {LONGEST_S:g} s can be "
-            "simulated: lower --passes or --length."
-        )
+        raise SettingsError.of("flight_long", touch_down_s=touch_down_s, longest_s=LONGEST_S)
     ramps.change(up, CLIMB_RAMP_S, 0.0)
     return Motion(
         path=Ramps.of(ramps.path),

@@ -3,13 +3,11 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
-
-import msgspec
 
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, Aid
 from px4fuse.errors import SettingsError
+from px4fuse.record import table
 
 Kind = Literal["aisle", "loop", "outdoor"]
 Yaw = Literal["fixed", "follow"]
@@ -62,9 +60,7 @@ class Bounds:
             raise SettingsError(f"{name} {value:g} is out of range: {allowed}.")
 
 
-_BOUNDS = msgspec.toml.decode(
-    Path(__file__).with_name("quantities.toml").read_bytes(), type=dict[str, dict[str, Bounds]]
-)
+_BOUNDS = table(__file__, "quantities.toml", dict[str, dict[str, Bounds]])
 
 
 def quantities(record: type) -> dict[str, Bounds]:
@@ -172,9 +168,8 @@ class Scenario:
             taken.check(getattr(self, name), taken.typed or name)
         needed = self.speed_m_s * (START_STOP_S if self.kind == "aisle" else CORNER_S)
         if self.length_m < needed:
-            raise SettingsError(
-                f"--length {self.length_m:g} is too short for --speed {self.speed_m_s:g}: starts, "
-                f"stops and corners need {needed:g} m."
+            raise SettingsError.of(
+                "side_short", length_m=self.length_m, speed_m_s=self.speed_m_s, needed=needed
             )
 
     @property

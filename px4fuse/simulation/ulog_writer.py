@@ -6,23 +6,20 @@ Source: ULog file format, version 1, https://docs.px4.io/main/en/dev_log/ulog_fi
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from px4fuse.readers import ULOG_MAGIC
+from px4fuse.record import table
 
 _VERSION = b"\x01"
 # By numpy's names, where they are not the same but for the "_t" of integers
 _TYPES = {"float64": "double", "float32": "float", "bool": "bool"}
 _FLAG_BITS = bytes(40)
 # By topic and field: its type, and what it holds where that is not given
-FIELDS = msgspec.toml.decode(
-    Path(__file__).with_name("topics.toml").read_bytes(), type=dict[str, dict[str, list[Any]]]
-)
+FIELDS = table(__file__, "topics.toml", dict[str, dict[str, list[Any]]])
 
 
 @dataclass(frozen=True)

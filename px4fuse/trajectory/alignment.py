@@ -81,10 +81,7 @@ def fit(estimate_m: Array, reference_m: Array, kind: AlignmentKind) -> Transform
         along a line, about which any turn fits as well.
     """
     if len(estimate_m) < MIN_POSES:
-        raise TrajectoryError(
-            f"Only {len(estimate_m)} poses match in time: an alignment needs {MIN_POSES}",
-            "Check that both are of the same flight, and their clocks (`time_offset_s` auto).",
-        )
+        raise TrajectoryError.of("matches_few", count=len(estimate_m), least=MIN_POSES)
     if kind == "none":
         return Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 0)
     if kind == "yaw":
@@ -159,8 +156,6 @@ def _check(transform: Transform, estimate_m: Array, reference_m: Array, kind: st
         motion = f"motion is along a line: {length:.2g} m (RMS) by"
         instead = "`alignment` yaw if z is vertical in both, or `alignment` none"
     if told < max(MIN_SPREAD_M, MIN_SHARE * length) or left > limit * told:
-        raise TrajectoryError(
-            f"The {motion} {told:.2g} m, where an alignment leaves {left:.2g} m, so {kind} cannot "
-            "be found",
-            f"The vehicle did not move enough, or the estimate does not follow; use {instead}.",
+        raise TrajectoryError.of(
+            "alignment_open", motion=motion, told=told, left=left, kind=kind, instead=instead
         )

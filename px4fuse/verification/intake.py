@@ -258,14 +258,9 @@ def _attachment(reader: pypdf.PdfReader) -> bytes:
     if found:
         raise ResultsError(f"it contains {', '.join(sorted(found))}; no report does.")
     if not files and not streams:
-        raise ResultsError(
-            f"no {RESULTS_NAME} is attached: not a report of px4fuse, or one that was printed to "
-            "PDF, which leaves the results out. Hand in the original file that px4fuse wrote."
-        )
+        raise ResultsError.of("no_results_attached", name=RESULTS_NAME)
     if len(files) != 1 or len(streams) != 1:
-        raise ResultsError(
-            "more than one file is attached, or none that can be read: hand in one report per PDF."
-        )
+        raise ResultsError.of("attachments_many")
     (file,), (stream,) = files, streams.values()
     names = {str(_resolved(file.get(key))) for key in ("/UF", "/F", "/DOS", "/Mac", "/Unix")
              if key in file}  # fmt: skip

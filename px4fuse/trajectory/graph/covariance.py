@@ -78,11 +78,7 @@ def gate(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -> list
     gap = np.flatnonzero(used < 0)
     if len(gap):
         at = low + int(gap[0])
-        raise TrajectoryError(
-            f"No odometry edge joins vertices {graph.ids[at]} and {graph.ids[at + 1]}, so odometry "
-            "alone does not tell how well the closure fits",
-            "Add the edge, or test shorter closures.",
-        )
+        raise TrajectoryError.of("odometry_gap", one=graph.ids[at], two=graph.ids[at + 1])
     poses = lie.chain(model.odometry_steps(graph, used))
     carry = lie.adjoint(poses[1:])
     worlds = carry @ _covariances(graph, used) @ carry.transpose(0, 2, 1)  # in the axes of low
@@ -106,11 +102,7 @@ def _tested(graph: model.PoseGraph, edge: int, residual: Array, covariance: Arra
     spread = directions.T @ covariance @ directions + np.diag(variance)
     known = freedom and np.isfinite(spread).all()
     if not known or np.linalg.eigvalsh(model.unit_diagonal(spread)[1])[0] <= _SINGULAR:
-        raise TrajectoryError(
-            f"The closure from vertex {ends[0]} to {ends[1]} cannot be tested: it has no "
-            "information, or odometry is too uncertain for the digits that numbers have",
-            "Give the closure's inverse covariance, and odometry information closer to it.",
-        )
+        raise TrajectoryError.of("closure_untestable", one=ends[0], two=ends[1])
     d2 = float(seen @ np.linalg.solve(spread, seen))
     p = float(chdtrc(freedom, d2))
     return GateResult(*ends, d2, freedom, p, p >= GATE_ALPHA)
@@ -122,11 +114,8 @@ def _covariances(graph: model.PoseGraph, used: IntArray) -> Array:
     whole = np.linalg.eigvalsh(scaled)[:, 0] > 1e-12
     if not np.all(whole):
         edge = used[int(np.argmin(whole))]
-        raise TrajectoryError(
-            f"The odometry edge from vertex {graph.ids[graph.first[edge]]} to "
-            f"{graph.ids[graph.second[edge]]} has a direction without information, so its error "
-            "has no bound",
-            "Give the information of all directions.",
+        raise TrajectoryError.of(
+            "edge_unbound", one=graph.ids[graph.first[edge]], two=graph.ids[graph.second[edge]]
         )
     covariance = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
     back = graph.first[used] > graph.second[used]

@@ -166,10 +166,8 @@ def require_connected(graph: PoseGraph, used: BoolArray, what: str) -> None:
     parts, part = connected_components(links, directed=False)
     if parts > 1:
         apart = graph.ids[np.flatnonzero(part != part[0])[0]]
-        raise TrajectoryError(
-            f"The pose graph falls into {parts} parts: vertex {apart} is not joined to vertex "
-            f"{graph.ids[0]} by {what}",
-            "Add an edge between the parts, or solve them one by one.",
+        raise TrajectoryError.of(
+            "graph_in_parts", parts=parts, apart=apart, first=graph.ids[0], what=what
         )
 
 

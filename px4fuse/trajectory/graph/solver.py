@@ -139,11 +139,7 @@ def solve(
     start = model.residuals(graph, graph.poses)
     cost_initial = 0.5 * float(np.sum(start.chi2))
     if not np.isfinite(cost_initial):
-        raise TrajectoryError(
-            "The pose graph has a pose or measurement that is not a finite number, or one too "
-            "large to square",
-            "Correct it, or take the edge out.",
-        )
+        raise TrajectoryError.of("graph_not_finite")
     plain = problem.minimise(start, _least_squares(np.ones(len(doubtful))))
     weights = np.ones(len(doubtful))
     run = plain
