@@ -517,6 +517,15 @@ def test_the_height_of_a_recording_may_be_the_barometers(read):
     assert down.measurement_m - true == pytest.approx(0.0, abs=0.05)
 
 
+def test_pressures_without_a_time_are_dropped_and_it_is_said(read):
+    def pressure(boot_s):
+        return message("SCALED_PRESSURE", time_boot_ms=0, press_abs=950.0)
+
+    flight = read(add(outdoors(), 5.0, pressure))
+    assert flight.barometer is None
+    assert [note for note in flight.log.notes if "SCALED_PRESSURE" in note]
+
+
 def test_gnss_is_not_taken_by_itself_where_the_autopilot_does_not_know_where_it_is(read):
     flight = read(outdoors(knows=False))
     assert not flight.positions[0].origin.automatic

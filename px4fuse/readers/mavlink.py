@@ -71,8 +71,10 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     truth = read_truth(recording, positions, remedies)
     airborne = _read_airborne(recording, remedies["landed"])
     in_flight = parts.ends_in_flight(airborne, recording.duration_s)
-    pressure = messages.LAYOUTS["pressure"]
+    pressure = recording.read(messages.LAYOUTS["pressure"])["pressure_hpa"]
+    modes = _read_modes(recording) if autopilot == "PX4" else messages.NO_MODES
     return Flight(
+        # after all that is read, since it tells what was dropped
         log=_describe(recording, parameters, autopilot, in_flight),
         imu=imu,
         attitude=attitude,
@@ -80,8 +82,8 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
         ekf2=ekf2,
         truth=truth,
         airborne=airborne,
-        barometer=barometer(pressure_altitude(recording.read(pressure)["pressure_hpa"])),
-        modes=_read_modes(recording) if autopilot == "PX4" else messages.NO_MODES,
+        barometer=barometer(pressure_altitude(pressure)),
+        modes=modes,
         missing=(*parts.missing_parts(imu, attitude, ekf2, truth), *missing_positions),
         streams=MappingProxyType(recording.streams),
         clocks=senders.clock_maps(recording, mapped),
