@@ -161,22 +161,29 @@ def boxes(
 
 
 def page(
-    *, columns: Sequence[Column], rows: Sequence[Row], noun: tuple[str, str], **texts: Any
+    *,
+    title: str,
+    subtitle: str,
+    above: str,
+    noun: tuple[str, str],
+    columns: Sequence[Column],
+    rows: Sequence[Row],
+    filters: Sequence[tuple[str, Sequence[tuple[str, str]]]],
+    groups: Sequence[tuple[str, str]] = (),
+    placeholder: str,
+    otherwise: str,
 ) -> str:
     """Lay out a page.
 
     Parameters
     ----------
-    columns : sequence of Column
-    rows : sequence of Row
-    noun : (str, str)
-        What a row is, one and many.
-    title, subtitle : str
     above : str
         HTML for above the table, of a :func:`~px4fuse.webpage.safe.template`.
+    noun : (str, str)
+        What a row is, one and many.
     filters : sequence of (label, ((tag, words), ...))
         Rows that have the chosen tag are shown.
-    groups : sequence of (group, label), optional
+    groups : sequence of (group, label)
         Boxes that show more columns.
     placeholder : str
         What one may search for.
@@ -204,15 +211,21 @@ def page(
         "nouns": noun,
     }
     return template("webpage/frame.html").render(
-        {"groups": (), **texts},
         style_hash=policy_hash(style),
         script_hash=policy_hash(script),
         style=style,
         script=script,
+        title=title,
+        subtitle=subtitle,
+        above=above,
+        placeholder=placeholder,
+        filters=filters,
+        groups=groups,
         noun=noun,
         columns=columns,
         rows=rows,
         plain_rows=PLAIN_ROWS,
+        otherwise=otherwise,
         content=inert_json(cleaned(content)),
     )
 
