@@ -6,7 +6,6 @@ import importlib
 import os
 import signal
 import sys
-from pathlib import Path
 
 import click
 
@@ -16,8 +15,28 @@ from px4fuse.threads import ONE_THREAD
 from px4fuse.writing import STOPPING
 
 # Commands, each in a module of its name, and their help: --help must not import what they need
-_LINES = Path(__file__).with_name("commands.txt").read_text("utf-8").splitlines()
-COMMANDS = {name: said.strip() for name, _, said in (line.partition(" ") for line in _LINES)}
+COMMANDS = {
+    "compare": "Compare a flight's EKF2 with a two-state Kalman filter.",
+    "batch": "Compare many logs, on this computer or a cluster.",
+    "diff": "Say what changed between two flights or two settings.",
+    "answers": "Write the form about a flight, to be filled in.",
+    "explore": "Turn the filter's knobs on a flight, in a web page.",
+    "practice": "Find what is wrong with simulated flights, in a web page.",
+    "info": "Say what is in a log and what can be done with it.",
+    "extract": "Write a log's data as tidy tables, CSV or Parquet.",
+    "tune": "Find the noises that the data ask for, with intervals.",
+    "sync": "Estimate the position source's clock offset.",
+    "whatif": "Say what EKF2 would have done with other parameters.",
+    "loop": "Measure and correct the closure error of a loop.",
+    "evaluate": "Score a trajectory: ATE and RPE against a reference.",
+    "simulate": "Simulate a flight with chosen mistakes, as ULog.",
+    "verify": "Check a report against its log, number by number.",
+    "grade": "Verify and score a class's reports.",
+    "sample": "Write the sample flights, to try things on.",
+    "lesson": "Run the lesson's worked examples through this engine.",
+}
+
+
 # pandas loads pyarrow wherever it is installed: 70 MB that only these need
 PARQUET = ("batch", "extract")
 
@@ -45,6 +64,7 @@ class LazyGroup(click.Group):
         if name not in COMMANDS and not name.startswith("-"):
             import difflib
             import shlex
+            from pathlib import Path
 
             said = f"No such command {name!r}."
             if near := difflib.get_close_matches(name.lower(), COMMANDS):
