@@ -2,12 +2,11 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, Aid
 from px4fuse.errors import SettingsError
-from px4fuse.record import table
 
 Kind = Literal["aisle", "loop", "outdoor"]
 Yaw = Literal["fixed", "follow"]
@@ -60,12 +59,14 @@ class Bounds:
             raise SettingsError(f"{name} {value:g} is out of range: {allowed}.")
 
 
-_BOUNDS = table(__file__, "quantities.toml", dict[str, dict[str, Bounds]])
+def number(usual: Any, *about: Any) -> Any:
+    """A field of a record that is a number, its default, and what it may be."""
+    return field(default=usual, metadata={"quantity": Bounds(*about)})
 
 
 def quantities(record: type) -> dict[str, Bounds]:
-    """What the numbers of a record may be, by field: a row of ``quantities.toml`` each."""
-    return _BOUNDS[record.__name__]
+    """The fields of a record that :func:`number` made."""
+    return {one.name: one.metadata["quantity"] for one in fields(record) if one.metadata}
 
 
 @dataclass(frozen=True)
@@ -129,35 +130,49 @@ class Scenario:
     """
 
     kind: Kind = "aisle"
-    passes: int = 6
-    length_m: float = 12.0
-    speed_m_s: float = 1.0
-    heading_deg: float = 30.0
-    altitude_m: float = 1.5
+    passes: int = number(6, 1, 100, "", "--passes")
+    length_m: float = number(
+        12.0, 2.0, 1000.0, "m", "--length", "Of the aisle, or of a side of the square."
+    )
+    speed_m_s: float = number(1.0, 0.1, 10.0, "m/s", "--speed", "On the straight.")
+    heading_deg: float = number(
+        30.0, -360.0, 360.0, "°", "--heading", "Of the aisle or of the first side, from north."
+    )
+    altitude_m: float = number(1.5, 0.5, 50.0, "m")
     yaw: Yaw | None = None
-    pause_s: float = 3.0
-    wander_m: float = 0.03
-    uwb_rate_hz: float = 5.0
-    sigma_uwb_m: float = 0.10
-    vio_rate_hz: float = 30.0
-    sigma_vio_m: float = 0.01
-    vio_drift: float = 0.015
-    vio_walk_m: float = 0.01
-    gnss_rate_hz: float = 5.0
-    sigma_gnss_m: float = 0.4
-    sigma_gnss_m_s: float = 0.3
-    sigma_a_m_s2: float = 0.2
-    accel_bias_sigma_m_s2: float = 0.03
-    gyro_bias_sigma_rad_s: float = 0.002
-    gyro_noise_rad_s: float = 0.01
-    tilt_error_deg: float = 0.1
-    yaw_error_deg: float = 1.0
-    imu_rate_hz: float = 250.0
-    attitude_rate_hz: float = 50.0
-    truth_rate_hz: float = 50.0
+    pause_s: float = number(3.0, 0.0, 600.0, "s")
+    wander_m: float = number(0.03, 0.0, 1.0, "m")
+    uwb_rate_hz: float = number(5.0, 0.5, 100.0, "Hz", "--uwb-rate", "Rate of the UWB.")
+    sigma_uwb_m: float = number(
+        0.10, 0.0, 10.0, "m", "--sigma-uwb", "White noise of the UWB: the true SIGMA_Z."
+    )
+    vio_rate_hz: float = number(30.0, 1.0, 200.0, "Hz")
+    sigma_vio_m: float = number(0.01, 0.0, 10.0, "m")
+    vio_drift: float = number(
+        0.015, 0.0, 0.5, "", "--vio-drift", "Drift of the VIO, as a share of the distance."
+    )
+    vio_walk_m: float = number(0.01, 0.0, 1.0)
+    gnss_rate_hz: float = number(5.0, 1.0, 10.0, "Hz")
+    sigma_gnss_m: float = number(
+        0.4, 0.0, 10.0, "m", "--sigma-gnss", "White noise of GNSS, north and east."
+    )
+    sigma_gnss_m_s: float = number(0.3, 0.0, 5.0, "m/s")
+    sigma_a_m_s2: float = number(
+        0.2, 0.0, 20.0, "m/s²", "--sigma-a", "White noise of the IMU over 0.1 s: the true SIGMA_A."
+    )
+    accel_bias_sigma_m_s2: float = number(
+        0.03, 0.0, 2.0, "m/s²", "--accel-bias-sigma", "Spread of the accelerometer's constant bias."
+    )
+    gyro_bias_sigma_rad_s: float = number(0.002, 0.0, 0.5)
+    gyro_noise_rad_s: float = number(0.01, 0.0, 1.0)
+    tilt_error_deg: float = number(0.1, 0.0, 10.0, "°")
+    yaw_error_deg: float = number(1.0, 0.0, 45.0, "°")
+    imu_rate_hz: float = number(250.0, 50.0, 1000.0, "Hz")
+    attitude_rate_hz: float = number(50.0, 5.0, 250.0, "Hz")
+    truth_rate_hz: float = number(50.0, 1.0, 250.0, "Hz")
     truth: bool = True
     ekf2: bool = True
-    seed: int = 1
+    seed: int = number(1, 0, 2**32 - 1, "", "--seed")
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
