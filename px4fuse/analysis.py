@@ -234,13 +234,13 @@ def run_or_judge_aids(
     given = request.position_source is not None
     if given or any(track.origin.automatic for track in flight.positions):
         return run(request, progress, flight)
-    lacking, aids = no_source(flight), judge_aids(flight)
+    no_position, aids = no_source(flight), judge_aids(flight)
     if isinstance(aids, Unavailable):
         if flight.airborne == ():
             raise MissingDataError.of("not_flown", log=flight.log.name, reason=aids.reason)
-        neither = f"{lacking.reason}, and the aids of EKF2 cannot be judged: {aids.reason}"
-        raise MissingDataError(f"{flight.log.name}: {neither}", lacking.remedy)
-    return AidsAlone(flight, aids, lacking)
+        neither = f"{no_position.reason}, and the aids of EKF2 cannot be judged: {aids.reason}"
+        raise MissingDataError(f"{flight.log.name}: {neither}", no_position.remedy)
+    return AidsAlone(flight, aids, no_position)
 
 
 def run(

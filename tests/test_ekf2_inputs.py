@@ -242,14 +242,13 @@ def test_a_reset_of_the_position_is_no_fusion() -> None:
     state = pd.DataFrame(0.0, pd.Index(times, name="time_s"), Columns.STATE)
     state["north_m"], state["north_m_s"], state["east_m"] = 2.0 * times, 2.0, 3.0 * (times >= 5.0)
     reset = Reset(5.0, "position", (0.0, 3.0, 0.0))
-    record = made(FusionRecord, parameters={})
-    taken, fates = np.arange(1.02, 8.0, 0.1), np.tile([0.0, np.nan, np.nan], 24)[:70]
+    measured_s, fates = np.arange(1.025, 8.0, 0.1), np.tile([0.0, np.nan, np.nan], 24)[:70]
 
     some = np.where(fates == 0.0, 1.0, fates)
 
     def moved(*resets: Reset, rejected: Any = some) -> Any:
         ekf2 = made(Ekf2, state=state, resets=resets, horizon_s=0.2, step_s=0.01)
-        return _moved(ekf2, record, taken, rejected)
+        return _moved(ekf2, measured_s, rejected, 0.25)
 
     np.testing.assert_allclose(moved(reset), 0.0, atol=1e-9)
     assert np.nanmax(moved()) > 1.0

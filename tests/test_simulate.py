@@ -1,6 +1,7 @@
 """Simulated flights against their own truth: motion, sensors, mistakes, ULog and command."""
 
 import json
+from dataclasses import fields
 
 import numpy as np
 import pandas as pd
@@ -24,7 +25,7 @@ from px4fuse.simulation import sensors
 from px4fuse.simulation.flights import answer, simulate, simulate_flight, to_flight, to_ulog
 from px4fuse.simulation.mistakes import MISTAKES, Mistakes, as_typed, made, parse
 from px4fuse.simulation.motion import attitude, direction, plan
-from px4fuse.simulation.scenario import DT_S, Scenario
+from px4fuse.simulation.scenario import DT_S, Scenario, quantities
 
 NO_MISTAKES = Mistakes()
 AISLE = Scenario(passes=2, seed=4)
@@ -38,6 +39,13 @@ IDEAL = {
     "tilt_error_deg": 0.0,
     "yaw_error_deg": 0.0,
 }
+
+
+@pytest.mark.parametrize("record", [Scenario, Mistakes])
+def test_every_number_has_bounds(record) -> None:
+    numbers = {one.name for one in fields(record) if {"int", "float"} & {*str(one.type).split()}}
+    numbers |= {one.name for one in fields(record) if one.type in (int, float)}
+    assert set(quantities(record)) == numbers
 
 
 def motion_of(scenario, mistakes=NO_MISTAKES):

@@ -298,11 +298,14 @@ def choose_segment(
             low, high = inside
             reason += ", cut at the ends of the data"
     if not low < high:
-        empty = say("empty_segment", low=low, high=high, runs_s=runs_s)
-        raise SettingsError(f"{flight.log.name}: {empty}")
+        raise SettingsError.of(
+            "segment_empty", log=flight.log.name, low=low, high=high, runs_s=runs_s
+        )
     segment = Segment(low, high, reason)
     count = len(within(track.samples, segment))
     if count < MIN_MEASUREMENTS:
-        found = say("too_few", count=count, track=track, segment=segment, least=MIN_MEASUREMENTS)
-        raise SettingsError(f"{flight.log.name}: {found}")
+        raise SettingsError.of(
+            "segment_short", log=flight.log.name, count=count, track=track, segment=segment,
+            least=MIN_MEASUREMENTS,
+        )  # fmt: skip
     return segment

@@ -340,7 +340,8 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> Received | Un
         kept = at_times(meant, samples.index) > 0.0
         samples, velocities = samples[kept], velocities[kept]
     # the stamp of a fix that has a time of its own is made up, so that its age is the delay
-    flown_s = settings_in_force(parameters, GNSS_POS)[GNSS_POS.delay] * 1e-3
+    flown = settings_in_force(parameters, GNSS_POS)
+    flown_s = flown[GNSS_POS.delay] * 1e-3
     stamp = samples.index.to_numpy() + flown_s
     # EKF2 believes no fix to be worse than without aiding (gps_control.cpp)
     worst_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
@@ -360,17 +361,16 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> Received | Un
         velocity if known else None,
         spread if known else None,
         own_times=track.age_s == 0.0 != flown_s,
-        moved_m=_moved(ekf2, record, stamp - flown_s - 0.5 * ekf2.step_s, decisions[0]),
+        moved_m=_moved(ekf2, samples.index.to_numpy(), decisions[0], flown["EKF2_TAU_POS"]),
     )
 
 
-def _moved(ekf2: Ekf2, record: FusionRecord, taken_s: Array, rejected: Array) -> Array | None:
+def _moved(ekf2: Ekf2, measured_s: Array, rejected: Array, tau_s: float) -> Array | None:
     """By how much EKF2 moved its position to each sample; None where that tells nothing more."""
     if not (rejected > 0.0).any() or np.isfinite(rejected).all():
         return None
     if isinstance(ekf2.horizon_s, Unavailable):
         return None
-    tau_s = record.parameters.get("EKF2_TAU_POS", 0.25)
     times = ekf2.state.index.to_numpy()
     velocity, position = (
         ekf2.state[names[:2]].to_numpy() for names in (Columns.VELOCITY, Columns.POSITION)
@@ -378,7 +378,8 @@ def _moved(ekf2: Ekf2, record: FusionRecord, taken_s: Array, rejected: Array) ->
     for reset in ekf2.resets:
         if reset.quantity == "position":
             position = position - (times >= reset.time_s)[:, None] * np.array(reset.delta[:2])
-    known_s = taken_s + ekf2.horizon_s - ekf2.step_s  # the first part of it is there at once
+    # EKF2 takes it half a step before, and the first part of what it does shows at once
+    known_s = measured_s + ekf2.horizon_s - 1.5 * ekf2.step_s
     return corrections(times, velocity, position, known_s, tau_s)
 
 

@@ -243,7 +243,8 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     floor = inputs.rules.bias_floor
     x, P = _start(stretch, biases, attitude)
     logged = inputs.received.rejected[sample], inputs.received.reset[sample]
-    used, moved = on[inputs.aid.name], inputs.received.moved_m
+    used = on[inputs.aid.name]
+    moved = inputs.received.moved_m if as_logged.any() else None
     usable = np.where(used, action, IDLE), event["startable"] & used, now_s, gated, as_logged
     fusion = _Fusion(inputs.rules, stretch.time_s[0], *usable, *logged)
     innovations, variances = np.full((2, events, size, 6), np.nan)
@@ -290,11 +291,9 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
             moving = with_velocity[e] & ~(outside[:, SPEED].any(axis=1) & gated)
             outside = outside[:, LEVEL].any(axis=1)
             if moved is not None:
-                ratio = (nu * nu / (gate2 * S))[:, LEVEL].max(axis=1)
-                edge = (ratio > 1.0 / ON_EDGE) & (ratio < ON_EDGE)
-                edge &= np.isfinite(moved[sample[e]]).all()
-                full = (1.0 - noise[e] / S)[:, LEVEL] * nu[:, LEVEL]
-                kept = full @ moved[sample[e]] < 0.5 * (full * full).sum(axis=1)
+                edge, kept = _by_output(moved[sample[e]], *(
+                    each[:, LEVEL] for each in (nu, S, noise[e], gate2)
+                ))  # fmt: skip
                 outside = np.where(as_logged & edge, kept, outside)
             rejected[e], fused[e], reset[e], moving = fusion.decide(e, outside, moving)
             if in_turn:
@@ -390,6 +389,20 @@ def _in_turn(
     x = x + ((weight * nu)[:, None] @ columns)[:, 0]
     root = np.sqrt(b)[:, :, None] * columns
     return x, P - np.swapaxes(root, 1, 2) @ root
+
+
+def _by_output(
+    moved_m: Array, nu: Array, S: Array, R: Array, gate2: Array
+) -> tuple[BoolArray, BoolArray]:
+    """Whether a sample lies on the edge of the gate, and then whether it was rejected.
+
+    As what was published after it moved, of shape (k,), to less than half of what its fusion does,
+    (1 - R/S)ν; the others are of shape (S, k).
+    """
+    ratio = (nu * nu / (gate2 * S)).max(axis=1)
+    edge = (ratio > 1.0 / ON_EDGE) & (ratio < ON_EDGE) & np.isfinite(moved_m).all()
+    fusion = (1.0 - R / S) * nu
+    return edge, fusion @ moved_m < 0.5 * (fusion * fusion).sum(axis=1)
 
 
 @dataclass

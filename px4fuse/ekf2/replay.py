@@ -311,10 +311,8 @@ def _velocity(ekf2: Ekf2, replay: Ekf2Replay, *, own: bool) -> dict[str, AxisAgr
     for axis in AXIS_NAMES:
         nu, S = f"innovation_{axis}_m", f"innovation_variance_{axis}_m2"
         names |= {f"{nu}_s": nu, f"{S}_s2": S, f"innovation_{axis}": nu, f"variance_{axis}": S}
-    logged, model = (
-        logged.rename(columns=names),
-        model[VELOCITY_UPDATE_COLUMNS].rename(columns=names),
-    )
+    logged = logged.rename(columns=names)
+    model = model[VELOCITY_UPDATE_COLUMNS].rename(columns=names)
     # down where the height is no longer EKF2's own
     axes = AXIS_NAMES if GNSS_HGT.name in replay.besides else HORIZONTAL
     return {axis: _axis(axis, logged, model, ekf2, replay) for axis in axes}

@@ -159,9 +159,9 @@ def heading_error(
     low, high = acceleration.index[[0, -1]]
     samples = samples[(samples.index >= low) & (samples.index <= high)]
     slow = np.median(np.diff(acceleration.index.to_numpy())) > MAX_IMU_INTERVAL_S
-    if slow or len(samples) < MIN_MEASUREMENTS:
-        few = lacking("heading_few", count=len(samples))
-        return lacking("heading_slow_imu") if slow else few
+    count = len(samples)
+    if slow or count < MIN_MEASUREMENTS:
+        return lacking("heading_slow_imu") if slow else lacking("heading_few", count=count)
     samples = samples.iloc[:: int(np.ceil(len(samples) / MAX_MEASUREMENTS))]
     found = _by_positions(acceleration, samples, settings.dt_s, sigma_z_m)
     # how the source's own axes lie in the vehicle is not known, but that they do not turn is

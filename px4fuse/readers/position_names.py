@@ -15,8 +15,8 @@ Position = tuple[int, int, int | None]
 
 _WORDS = table(__file__, "position_names.toml", dict[str, dict[str, str]])
 _UNITS, _AXES = (
-    {word: meaning for meaning, words in _WORDS[table].items() for word in words.split()}
-    for table in ("units", "axes")
+    {word: meaning for meaning, words in _WORDS[group].items() for word in words.split()}
+    for group in ("units", "axes")
 )
 _ROLES = {role: {*words.split()} for role, words in _WORDS["roles"].items()}
 _TIME_ROLES = _ROLES["time"] | _ROLES["measured"] | _ROLES["recorded"] | _ROLES["context"]
