@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
+from datetime import UTC, datetime
 from decimal import Decimal
 from typing import Any
 
@@ -31,6 +32,20 @@ def plain(value: object) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def utc_time(unix_s: float | None) -> str | None:
+    """ISO 8601 with milliseconds; None where it is not known, or a clock is beyond the calendar.
+
+    >>> utc_time(1.5), utc_time(1e18)
+    ('1970-01-01T00:00:01.500+00:00', None)
+    """
+    if unix_s is None:
+        return None
+    try:
+        return datetime.fromtimestamp(unix_s, UTC).isoformat(timespec="milliseconds")
+    except (OverflowError, ValueError, OSError):
+        return None
 
 
 def number_words(value: float, digits: int = 3) -> str:

@@ -38,7 +38,7 @@ from px4fuse.fleet import engine, job, run
 from px4fuse.fleet.engine import connected, outcomes
 from px4fuse.fleet.job import Job
 from px4fuse.fleet.logs import find_logs
-from px4fuse.fleet.rows import COLUMNS, csv_bytes, rows_of, table_of
+from px4fuse.fleet.rows import COLUMNS, csv_bytes, log_columns, rows_of, table_of
 from px4fuse.fleet.run import Fleet, kept_in
 from px4fuse.fleet.terminal import summary
 from px4fuse.report.screen import show
@@ -138,6 +138,10 @@ def test_every_log_is_in_the_table_with_its_numbers_or_its_line(tmp_path):
     assert results.request.log == "f1.ulg"
     assert results.story == tuple(first.loc[0, "story"].split("\n"))
     assert (output / first.loc[0, "report"]).read_bytes().startswith(b"%PDF")
+    # a recording whose clock is beyond the calendar has no date
+    beyond = structs.replace(results.log, start_unix_s=1e18)
+    assert log_columns(results.log)["date"] == first.loc[0, "date"]
+    assert log_columns(beyond)["date"] == ""
     # a clock offset is there where it is determinable
     rows = rows_of(
         structs.replace(results, clock=structs.replace(results.clock, determinable=False))

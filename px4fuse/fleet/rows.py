@@ -1,7 +1,6 @@
 """Results of a comparison → rows of the fleet's table, and how that table is written."""
 
 from collections.abc import Iterable, Mapping
-from datetime import UTC, datetime
 from typing import Any
 
 import pandas as pd
@@ -9,6 +8,7 @@ import pandas as pd
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.findings import Finding
 from px4fuse.fleet.measures import at, read_rows
+from px4fuse.plain import utc_time
 from px4fuse.record import Unavailable
 from px4fuse.results.contract import ComparisonResults, Log
 from px4fuse.spreadsheet import neutral
@@ -66,12 +66,11 @@ def what_was_found(findings: Iterable[Finding], aids: Mapping[str, AidResult]) -
 
 def log_columns(log: Log) -> Row:
     """What is known of a log once it is read."""
-    start = log.start_unix_s
-    found = {"log": log}
+    start, found = utc_time(log.start_unix_s), {"log": log}
     places = {name: place for name, place in PLACES.items() if place.startswith("log.")}
     return {name: at(found, place) for name, place in places.items()} | {
         "airframe": f"{airframe:g}" if (airframe := log.parameters.get("SYS_AUTOSTART")) else "",
-        "date": "" if start is None else f"{datetime.fromtimestamp(start, UTC):%Y-%m-%dT%H:%M:%SZ}",
+        "date": f"{start[:19]}Z" if start else "",
     }
 
 

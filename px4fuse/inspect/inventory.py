@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from px4fuse.filter.signals import IMU_GAP_INTERVALS, IMU_GAP_S, Segment, ned_ac
 from px4fuse.findings import ekf2_not_fusing, imu, missing, named, recording
 from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable, sample_rate
 from px4fuse.inspect.tables import NO_POSITION, absent
-from px4fuse.plain import capital, plain
+from px4fuse.plain import capital, plain, utc_time
 from px4fuse.recording import Stream
 from px4fuse.request import with_options
 
@@ -186,7 +185,7 @@ def take_inventory(flight: Flight) -> Inventory:
     cut = log.ends_in_flight and not log.damage
     return Inventory(
         flight=flight,
-        start_utc=_utc(log.start_unix_s),
+        start_utc=utc_time(log.start_unix_s),
         sources=tuple(_sources(flight, compared, reason)),
         source_reason=reason,
         segment=None if compared is None else compared.segment,
@@ -211,15 +210,6 @@ def to_plain(inventory: Inventory) -> dict[str, Any]:
         del logged["airborne"]
     data: dict[str, Any] = plain(logged | found)
     return {"schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION}, **data}
-
-
-def _utc(unix_s: float | None) -> str | None:
-    if unix_s is None:
-        return None
-    try:
-        return datetime.fromtimestamp(unix_s, UTC).isoformat(timespec="milliseconds")
-    except (OverflowError, ValueError, OSError):  # a clock beyond the calendar
-        return None
 
 
 def _parts(flight: Flight) -> dict[str, pd.DataFrame | Spans | Unavailable]:
