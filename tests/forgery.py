@@ -19,7 +19,7 @@ from px4fuse.reading import files_by_sha256
 from px4fuse.results.contract import Reported, to_json
 from px4fuse.results.reading import read_results
 from px4fuse.verification import verification
-from px4fuse.verification.model import Refused, Verdict
+from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import Recomputed, verify
 
 Forge = Callable[[PdfWriter], Any]
@@ -161,7 +161,7 @@ class Base:
     again: Recomputed
     files: Mapping[str, Path]
 
-    def recompute(self, results: Reported, logs: Mapping[str, Path]) -> Recomputed | Refused:
+    def recompute(self, results: Reported, logs: Mapping[str, Path]) -> Recomputed | Verdict:
         """What a new run gives; from memory where everything that it rests on is recorded so."""
         ours, theirs = (
             # the recorded command is made anew from the request

@@ -23,6 +23,7 @@ from results_tools import LOOP, SHA256, changed, decoded
 from px4fuse.answers import form_text
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.truth import truth_of
+from px4fuse.errors import ResultsError
 from px4fuse.grading.model import Graded
 from px4fuse.grading.rubric import Rubric, assess, read_rubric, refused
 from px4fuse.report import pdf as pdf_module
@@ -32,7 +33,8 @@ from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.verification import pages
 from px4fuse.verification.intake import read_report
-from px4fuse.verification.model import Refused, Verdict
+from px4fuse.verification.model import Verdict
+from px4fuse.verification.verification import unknown
 
 pytestmark = pytest.mark.usefixtures("analysed_once", "_pages_here")
 
@@ -63,9 +65,9 @@ class Flight:
     honest: Base
     key: AnswerKey
 
-    def graded(self, report: Reported | Refused, verdict: Verdict, rubric: Rubric) -> Graded:
-        if isinstance(report, Refused):
-            made = refused(rubric, self.key, report)
+    def graded(self, report: Reported | ResultsError, verdict: Verdict, rubric: Rubric) -> Graded:
+        if isinstance(report, ResultsError):
+            made = refused(rubric, self.key, f"{report.reason}.", report.remedy)
             return Graded("a.pdf", "", "", verdict, made.items, pending=made.pending)
         made = assess(report, verdict, rubric, self.key)
         return Graded("a.pdf", "", "", verdict, made.items, made.flags, made.pending)
@@ -220,11 +222,11 @@ def test_files(
     # only where numbers agree are pages compared
     text = json.dumps(results)
     pdf = flight.honest.with_results(results) if status == "page differs" else page_of(None, text)
-    report = read_report(pdf, "a.pdf")
-    if isinstance(report, Refused):
-        verdict = Verdict("cannot verify", (report.reason,), with_log=False)
-    else:
+    try:
+        report: Reported | ResultsError = read_report(pdf, "a.pdf")
         verdict = flight.honest.verified(pdf)
+    except ResultsError as error:
+        report, verdict = error, unknown(str(error))
     graded = flight.graded(report, verdict, rubric)
     assert graded.status != "verified"
     assert not graded.counted

@@ -47,14 +47,11 @@ def verify(
     input.
     """
     from px4fuse.verification.intake import MAX_BYTES, read_report
-    from px4fuse.verification.model import Refused
     from px4fuse.verification.verification import verify as verify_report
     from px4fuse.workers import Failed, bounded
 
     content = read_whole(report, LogError, MAX_BYTES, smaller="Reports are below 2 MB")
     read = read_report(content, shown(report))
-    if isinstance(read, Refused):
-        raise LogError(read.reason)
     check_targets([json_path, output])
     with progress(json_path) as step:
         step("hashing the logs")

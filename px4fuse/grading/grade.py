@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from px4fuse.assignment.key import AnswerKey
+from px4fuse.errors import ResultsError
 from px4fuse.grading import submissions
 from px4fuse.grading.entries import NAME, Course, Overrides, class_entries, read_overrides
 from px4fuse.grading.model import Entry, Graded, Submission
@@ -16,7 +17,6 @@ from px4fuse.grading.records import RECORDS, verified
 from px4fuse.grading.rubric import Rubric, assess, refused
 from px4fuse.reading import files_by_sha256, max_log_bytes
 from px4fuse.results.reading import one_line
-from px4fuse.verification.model import Refused
 from px4fuse.workers import Failed, run_bounded
 
 FAILED = "Do not open it: ask for the report as px4fuse wrote it."
@@ -120,8 +120,8 @@ def grade_all(
     with closing(run_bounded(scored, jobs, processes=processes)) as work:
         for index, result in work:
             if isinstance(result, Failed):
-                why = Refused(f"Grading it failed: {result.reason}", FAILED)
-                one, recalled = refused(*rules, why), False
+                one = refused(*rules, f"Grading it failed: {result.reason}", FAILED)
+                recalled = False
             else:
                 one, recalled = result
             submission = found[index]
@@ -145,12 +145,13 @@ def grade_one(
     """Read, verify or recall, and score a file, whoever it is from; in a process of its own."""
     max_log_bytes.set(largest_log_bytes)
     submission, owner_id = job
-    content = submissions.read(submission)
-    if isinstance(content, Refused):
-        return refused(rubric, key, content), False
-    sha256 = hashlib.sha256(content).hexdigest()
     handed_out = frozenset(answer.sha256 for answer in key.answers) if key else frozenset()
-    found, recalled = verified(records, content, logs, handed_out)
-    if isinstance(found, Refused):
-        return replace(refused(rubric, key, found), sha256=sha256), recalled
-    return replace(assess(*found, rubric, key, owner_id), sha256=sha256), recalled
+    sha256, recalled = "", False
+    try:
+        content = submissions.read(submission)
+        sha256 = hashlib.sha256(content).hexdigest()
+        results, verdict, recalled = verified(records, content, logs, handed_out)
+        one = assess(results, verdict, rubric, key, owner_id)
+    except ResultsError as error:
+        one = refused(rubric, key, f"{error.reason}.", error.remedy)
+    return replace(one, sha256=sha256), recalled

@@ -19,7 +19,7 @@ from px4fuse.results.contract import Reported, files_named, to_json
 from px4fuse.results.model import provenance
 from px4fuse.results.reading import read_results
 from px4fuse.verification.intake import read_report
-from px4fuse.verification.model import Refused, Verdict
+from px4fuse.verification.model import Verdict
 from px4fuse.verification.pages import MEMORY_BYTES, TIMEOUT_S, pictures
 from px4fuse.verification.verification import log_sha256, verify
 from px4fuse.workers import bounded
@@ -34,7 +34,7 @@ HANDED_IN, REDRAWN, PAGE = ".handed-in.png", ".pdf", ".page-{:03}.png"
 
 @dataclass(frozen=True)
 class VerificationRecord:
-    """What was found of one PDF; of what is no report only why.
+    """What was found of one report.
 
     Attributes
     ----------
@@ -45,14 +45,13 @@ class VerificationRecord:
     """
 
     rests_on: dict[str, str]
-    refused: Refused | None = None
-    results: str = ""
-    verdict: Verdict | None = None
+    results: str
+    verdict: Verdict
 
 
 def verified(
     records: Path, pdf: bytes, logs: Mapping[str, Path], handed_out: frozenset[str]
-) -> tuple[tuple[Reported, Verdict] | Refused, bool]:
+) -> tuple[Reported, Verdict, bool]:
     """Read and verify a report, or recall what an earlier run found.
 
     Parameters
@@ -67,17 +66,18 @@ def verified(
 
     Returns
     -------
-    (results, verdict), or Refused
+    results, verdict
     recalled : bool
+
+    Raises
+    ------
+    ResultsError
+        It is no report.
     """
     sha256 = hashlib.sha256(pdf).hexdigest()
-    found = _recalled(records, sha256, logs, handed_out)
-    if found is not None:
-        return found, True
+    if found := _recalled(records, sha256, logs, handed_out):
+        return *found, True
     results = read_report(pdf, "The file")
-    if isinstance(results, Refused):
-        _keep(records, sha256, VerificationRecord(_versions(), results), {})
-        return results, False
     attached = to_json(results)
     rests_on = _rests_on(attached, logs, handed_out)
     gap = rests_on.get(log_sha256(results)) == "handed out"
@@ -93,8 +93,8 @@ def verified(
         parts |= {PAGE.format(at): made for at, made in enumerate(shown, start=1)}
         parts[REDRAWN] = verdict.redrawn
     unread = replace(verdict, redrawn=b"")
-    _keep(records, sha256, VerificationRecord(rests_on, None, attached, unread), parts)
-    return (results, unread), False
+    _keep(records, sha256, VerificationRecord(rests_on, attached, unread), parts)
+    return results, unread, False
 
 
 def _rests_on(results: str, logs: Mapping[str, Path], handed_out: frozenset[str]) -> dict[str, str]:
@@ -127,15 +127,13 @@ def _keep(records: Path, sha256: str, kept: VerificationRecord, parts: Mapping[s
 
 def _recalled(
     records: Path, sha256: str, logs: Mapping[str, Path], handed_out: frozenset[str]
-) -> tuple[Reported, Verdict] | Refused | None:
+) -> tuple[Reported, Verdict] | None:
     """What an earlier run found, if nothing that it rests on has changed."""
     try:
         content = (records / f"{sha256}.json").read_bytes()
         kept = msgspec.json.decode(content, type=VerificationRecord)
         if kept.rests_on != _rests_on(kept.results, logs, handed_out):
             return None
-        if kept.verdict is None:
-            return kept.refused
         results = read_results(kept.results.encode())
     # none, or not one of ours: done again
     except (OSError, msgspec.MsgspecError, ResultsError):

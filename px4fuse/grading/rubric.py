@@ -26,8 +26,8 @@ from px4fuse.grading.model import TOTAL, Graded, Item
 from px4fuse.reading import read_text
 from px4fuse.results.contract import Reported
 from px4fuse.results.reading import one_line
-from px4fuse.verification.model import Refused, Verdict
-from px4fuse.verification.verification import log_sha256
+from px4fuse.verification.model import Verdict
+from px4fuse.verification.verification import log_sha256, unknown
 
 DEFAULT = "rubric.toml"
 MAX_RUBRIC_BYTES = 1_000_000
@@ -213,13 +213,12 @@ def _whose(evidence: Evidence) -> str:
     return f"Find out whose report it is: the log was given to {whose}, {said}."
 
 
-def refused(rubric: Rubric, key: AnswerKey | None, why: Refused) -> Graded:
+def refused(rubric: Rubric, key: AnswerKey | None, why: str, remedy: str = "") -> Graded:
     """No points for what is not a report, so that it stands in the table with the others."""
-    comment = f"No points, since the file could not be read as a report: {text_of(why.reason)}"
+    comment = f"No points, since the file could not be read as a report: {text_of(why)}"
     items = (
         Item(item.title, 0.0, item.points, comment)
         for item in rubric.items
         if item.applies("compare", key)
     )
-    verdict = Verdict("cannot verify", (why.reason,), with_log=False)
-    return Graded("", "", "", verdict, tuple(items), pending=why.remedy)
+    return Graded("", "", "", unknown(why, remedy), tuple(items), pending=remedy)

@@ -34,13 +34,13 @@ from pathlib import Path
 from typing import IO
 
 from px4fuse.assignment.roster import Person, distinct
-from px4fuse.errors import SettingsError
+from px4fuse.errors import ResultsError, SettingsError
 from px4fuse.grading.model import NOBODY, ExportOrigin, Submission
 from px4fuse.reading import files_below
 from px4fuse.record import table
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification.intake import MAX_BYTES
-from px4fuse.verification.model import BAD_VALUES, Refused
+from px4fuse.verification.model import BAD_VALUES
 
 MAX_ENTRIES = 10_000
 # Of the table of contents, which zipfile reads in one piece before it can be counted
@@ -122,10 +122,12 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
                 zips += end == ".zip"
             elif not _is_metadata(place.name):
                 others += 1
-            elif isinstance(content := read(place), Refused):
-                notes.append(content.reason)
             else:
-                people |= gradescope_metadata(content.decode("utf-8", errors="replace"))
+                try:
+                    text = read(place).decode("utf-8", errors="replace")
+                    people |= gradescope_metadata(text)
+                except ResultsError as error:
+                    notes.append(str(error))
     if others:
         notes.append(f"Files passed over that are not PDFs: {others}.")
     if zips:
@@ -168,8 +170,14 @@ def with_origins(
         yield replace(one, origin=origin)
 
 
-def read(submission: Submission) -> bytes | Refused:
-    """Bytes of a submission, at most :data:`~px4fuse.verification.intake.MAX_BYTES` of them."""
+def read(submission: Submission) -> bytes:
+    """Bytes of a submission, at most :data:`~px4fuse.verification.intake.MAX_BYTES` of them.
+
+    Raises
+    ------
+    ResultsError
+        It cannot be read.
+    """
     try:
         with submission.file.open("rb") as file:
             if submission.entry:
@@ -180,7 +188,7 @@ def read(submission: Submission) -> bytes | Refused:
         if len(content) > MAX_BYTES:
             raise _EntryError(_TOO_LARGE)
     except _UNREADABLE as error:
-        return Refused(f"{one_line(submission.name, MAX_NAME)}: {_why(error)}")
+        raise ResultsError(f"{one_line(submission.name, MAX_NAME)}: {_why(error)}") from error
     return content
 
 

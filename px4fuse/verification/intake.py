@@ -1,4 +1,4 @@
-"""A handed-in PDF, read without trusting it: a report, or one sentence that says why not.
+"""A handed-in PDF, read without trusting it: a report, or an error that says why not.
 
 Nothing in the file is executed, followed or written anywhere. Sizes are bounded here before pypdf
 sees the file, and by pypdf's own limits while it reads; what is left (a file made to be slow
@@ -25,7 +25,7 @@ from px4fuse.report.pdf import RESULTS_NAME
 from px4fuse.results.contract import AidsResults, Reported, Results
 from px4fuse.results.reading import MAX_BYTES as MAX_ATTACHMENT_BYTES
 from px4fuse.results.reading import one_line, read_results
-from px4fuse.verification.model import BAD_VALUES, Refused
+from px4fuse.verification.model import BAD_VALUES
 
 MAX_BYTES = 25_000_000
 MAX_PAGES = 100
@@ -82,7 +82,7 @@ _STREAM = re.compile(rb"(?<!end)stream *\r?\n?")
 logging.getLogger("pypdf").setLevel(logging.CRITICAL + 1)
 
 
-def read_report(pdf: bytes, name: str) -> Reported | Refused:
+def read_report(pdf: bytes, name: str) -> Reported:
     """Read a report that was handed in.
 
     Parameters
@@ -90,22 +90,25 @@ def read_report(pdf: bytes, name: str) -> Reported | Refused:
     pdf : bytes
         Anything.
     name : str
-        What to call the file in a refusal.
+        What to call the file in errors.
 
     Returns
     -------
-    ComparisonResults, LoopResults or Refused
-        What is attached; Refused too where that cannot be verified: the aids of EKF2 alone.
+    ComparisonResults or LoopResults
+        What is attached.
+
+    Raises
+    ------
+    ResultsError
+        From :func:`attached_results`, or what is attached cannot be verified: the aids of EKF2
+        alone.
     """
-    try:
-        results = attached_results(pdf, name)
-    except ResultsError as refusal:
-        return Refused(f"{refusal.reason}.", refusal.remedy)
+    results = attached_results(pdf, name)
     if not isinstance(results, Reported):
         held = "no results of a report"
         if isinstance(results, AidsResults):
             held = "the aids of EKF2 alone, nothing of our filter"
-        return Refused(f"{one_line(name, 200)}: {RESULTS_NAME} in it holds {held}.")
+        raise ResultsError(f"{one_line(name, 200)}: {RESULTS_NAME} in it holds {held}.")
     return results
 
 
@@ -131,7 +134,7 @@ def attached_results(pdf: bytes, name: str) -> Results:
                 raise ResultsError(f"a PDF without pages, or with more than {MAX_PAGES}.")
             return read_results(_attachment(reader), f"{RESULTS_NAME} in it")
     except ResultsError as refusal:
-        reason, remedy = refusal.reason, refusal.remedy
+        reason, remedy = f"{refusal.reason}.", refusal.remedy
     except (LimitReachedError, RecursionError, MemoryError):
         reason = _COSTLY
     except BROKEN:

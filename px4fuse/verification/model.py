@@ -13,19 +13,6 @@ PageStatus = Literal["same", "differ", "not compared"]
 
 
 @dataclass(frozen=True)
-class Refused:
-    """A submission that cannot be read as a report, and why: one sentence for a person.
-
-    ``remedy`` is what whoever verifies it can do, "" where nothing helps; ``missing`` the name of a
-    file that would help.
-    """
-
-    reason: str
-    remedy: str = ""
-    missing: str = ""
-
-
-@dataclass(frozen=True)
 class Mismatch:
     """One number or text that a new run of the analysis does not confirm.
 

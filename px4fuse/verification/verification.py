@@ -29,7 +29,7 @@ from px4fuse.flight import Unavailable
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json, to_plain
 from px4fuse.results.model import LIBRARIES, Provenance
 from px4fuse.results.reading import cleaned, one_line
-from px4fuse.verification.model import Mismatch, PageStatus, Refused, Status, Verdict
+from px4fuse.verification.model import Mismatch, PageStatus, Status, Verdict
 from px4fuse.verification.pages import NumbersAlike, compare_pages
 
 ADD = "Add {} to --logs."
@@ -69,7 +69,7 @@ _Place = Callable[[str, str | None, str], str]
 
 
 class _RefusedError(Exception):
-    """Why an analysis is not run again, with the arguments of :class:`Refused`."""
+    """Why an analysis is not run again, with the arguments of :func:`unknown`."""
 
 
 def log_sha256(results: Reported) -> str:
@@ -83,7 +83,7 @@ def log_name(results: Reported) -> str:
     return split_part(results.track.name)[0] if loop else results.log.name  # type: ignore[union-attr]
 
 
-def recompute(results: Reported, logs: Mapping[str, Path]) -> Recomputed | Refused:
+def recompute(results: Reported, logs: Mapping[str, Path]) -> Recomputed | Verdict:
     """Repeat the analysis from what a report recorded.
 
     Parameters
@@ -95,8 +95,9 @@ def recompute(results: Reported, logs: Mapping[str, Path]) -> Recomputed | Refus
 
     Returns
     -------
-    Recomputed or Refused
-        Refused where the command is not px4fuse's, a file is missing, or the analysis fails.
+    Recomputed or Verdict
+        "cannot verify" where the command is not px4fuse's, a file is missing, or the analysis
+        fails.
     """
     try:
         if tuple(results.provenance.libraries) != LIBRARIES:
@@ -109,13 +110,13 @@ def recompute(results: Reported, logs: Mapping[str, Path]) -> Recomputed | Refus
                 found, made = _compared(results, place)
         return made, partial(_drawn, found, made, results.provenance)
     except SettingsError as error:  # no run with these settings can have made a report
-        return Refused(f"{NOT_OURS}: {error}", ASK)
+        return unknown(f"{NOT_OURS}: {error}", ASK)
     except _RefusedError as error:
-        return Refused(*error.args)
+        return unknown(*error.args)
     except Px4FuseError as error:
-        return Refused(str(error), ASK)
+        return unknown(str(error), ASK)
     except Exception as error:  # noqa: BLE001 - settings made to fail may fail anywhere
-        return Refused(f"the analysis cannot be repeated ({type(error).__name__})", ASK)
+        return unknown(f"the analysis cannot be repeated ({type(error).__name__})", ASK)
 
 
 def _place(logs: Mapping[str, Path], within: Path, name: str, sha256: str | None, what: str) -> str:
@@ -197,7 +198,7 @@ def verify(
     pdf: bytes,
     logs: Mapping[str, Path],
     *,
-    recompute: Callable[[Reported, Mapping[str, Path]], Recomputed | Refused] = recompute,
+    recompute: Callable[[Reported, Mapping[str, Path]], Recomputed | Verdict] = recompute,
 ) -> Verdict:
     """Say whether a report's numbers are what its log gives, and draw it again.
 
@@ -219,10 +220,10 @@ def verify(
     if theirs != ours:
         named = one_line(theirs, 40)
         why = f"made with px4fuse {named}, this is {ours}"
-        return _unknown(Refused(why, f"Run it with px4fuse {named}."))
+        return unknown(why, f"Run it with px4fuse {named}.")
     name = one_line(log_name(results), 80) or "its log"
     if not logs:
-        return _unknown(Refused(NO_LOG, ADD.format(name), name))
+        return unknown(NO_LOG, ADD.format(name), name)
     sha256 = log_sha256(results)
     if sha256 not in logs:
         asked = one_line(sha256, 64) or "none"
@@ -231,14 +232,15 @@ def verify(
         return Verdict("other log", (reason,), False, remedy=remedy, missing=name)
     if results.student.notes.count("\n") > MAX_NOTES_LINES:
         reason = f"its notes have more than {MAX_NOTES_LINES} lines, which is no report"
-        return _unknown(Refused(reason, ASK))
+        return unknown(reason, ASK)
     again = recompute(results, logs)
-    return _unknown(again) if isinstance(again, Refused) else _with_log(results, pdf, *again)
+    return again if isinstance(again, Verdict) else _with_log(results, pdf, *again)
 
 
-def _unknown(why: Refused) -> Verdict:
-    reasons = (one_line(why.reason, 400),)
-    return Verdict("cannot verify", reasons, False, remedy=why.remedy, missing=why.missing)
+def unknown(reason: str, remedy: str = "", missing: str = "") -> Verdict:
+    """Nothing can be said, for this reason; with what helps, and the name of a file that would."""
+    reasons = (one_line(reason, 400),)
+    return Verdict("cannot verify", reasons, False, remedy=remedy, missing=missing)
 
 
 def _with_log(theirs: Reported, pdf: bytes, ours: Reported, draw: Callable[[], bytes]) -> Verdict:
