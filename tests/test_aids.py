@@ -21,7 +21,6 @@ from px4fuse.findings.aids import find_in
 from px4fuse.findings.causes import CAUSE, CHANGE, SENSOR
 from px4fuse.flight import AidLog, Flight, Unavailable
 from px4fuse.readers import read_log
-from px4fuse.readers.px4_innovations import innovations_of
 from px4fuse.results.reading import read_results
 
 # ------------------------------------------------------------------------------- judged
@@ -35,11 +34,11 @@ def steps(*changes: tuple[float, float]) -> pd.Series:
 
 
 def aid_log(
-    *, sigma: float = 0.5, claimed: float = 0.5, mean: float = 0.0, gate: float = 5.0,
-    own: bool = True, meant: pd.Series | None = None, axes: tuple[str, ...] = ("north", "east"),
-    **parameters: float,
+    *, sigma: float = 0.5, mean: float = 0.0, gate: float = 5.0, own: bool = True,
+    meant: pd.Series | None = None, **parameters: float,
 ) -> AidLog:  # fmt: skip
-    """White innovations of a standard deviation, of which EKF2 claims another, R half of S."""
+    """White innovations of a standard deviation, of which EKF2 claims 0.5, R half of S."""
+    claimed, axes = 0.5, ("north", "east")
     rng = np.random.default_rng(7)
     white = rng.normal(size=(len(TIMES), len(axes)))
     white = (white - white.mean(axis=0)) / white.std(axis=0)
@@ -67,11 +66,10 @@ def judged(log: AidLog, name: str = "gnss_pos") -> AidResult:
     return judge_aids(with_aids(**{name: log}))[name]
 
 
-@pytest.mark.parametrize(
-    ("sigma", "verdict"),
-    [(0.5, "consistent"), (0.58, "consistent"), (0.68, "variance understated"),
-     (0.43, "consistent"), (0.37, "variance overstated")],
-)  # fmt: skip
+@pytest.mark.parametrize(("sigma", "verdict"), [
+    (0.5, "consistent"), (0.58, "consistent"), (0.68, "variance understated"),
+    (0.43, "consistent"), (0.37, "variance overstated"),
+])  # fmt: skip
 def test_a_verdict_needs_more_than_chance_and_a_quarter_in_sigma(sigma, verdict) -> None:
     aid = judged(aid_log(sigma=sigma))
     assert aid.verdict == verdict
@@ -140,16 +138,15 @@ def test_the_gate_is_the_log_s_own_and_else_the_parameter() -> None:
     assert not aid.fused_logged
 
 
-@pytest.mark.parametrize(
-    ("name", "parameters", "set_by"),
-    [("gnss_hgt", {"EKF2_GPS_P_NOISE": 0.5**0.5 / 3.0}, "EKF2_GPS_P_NOISE"),
-     ("ev_yaw", {"EKF2_EVA_NOISE": 0.125}, "EKF2_EVA_NOISE"),
-     ("gnss_pos", {"EKF2_GPS_P_NOISE": 0.5**1.5 / 1.019}, "EKF2_GPS_P_NOISE"),
-     ("gnss_pos", {"EKF2_GPS_P_NOISE": 0.5**1.5 / 1.025},
-      "the accuracy that the receiver states"),
-     ("mag", {"EKF2_MAG_NOISE": 0.05}, "EKF2_MAG_NOISE"),
-     ("gnss_pos", {}, "the accuracy that the receiver states")],
-)  # fmt: skip
+@pytest.mark.parametrize(("name", "parameters", "set_by"), [
+    ("gnss_hgt", {"EKF2_GPS_P_NOISE": 0.5**0.5 / 3.0}, "EKF2_GPS_P_NOISE"),
+    ("ev_yaw", {"EKF2_EVA_NOISE": 0.125}, "EKF2_EVA_NOISE"),
+    ("gnss_pos", {"EKF2_GPS_P_NOISE": 0.5**1.5 / 1.019}, "EKF2_GPS_P_NOISE"),
+    ("gnss_pos", {"EKF2_GPS_P_NOISE": 0.5**1.5 / 1.025},
+     "the accuracy that the receiver states"),
+    ("mag", {"EKF2_MAG_NOISE": 0.05}, "EKF2_MAG_NOISE"),
+    ("gnss_pos", {}, "the accuracy that the receiver states"),
+])  # fmt: skip
 def test_who_set_the_noise(name: str, parameters: dict[str, float], set_by: str) -> None:
     aid = judged(aid_log(**parameters), name)
     assert aid.noise == pytest.approx(0.5 * 0.5**0.5)
@@ -264,17 +261,3 @@ def test_on_the_ground_there_is_nothing_to_judge(tmp_path: Path) -> None:
     assert "not flown, nothing to judge: the vehicle never took off" in str(done.exception)
     assert "px4fuse info a.ulg says what is logged" in str(done.exception)
     assert not (tmp_path / "a.pdf").exists()
-
-
-def test_a_rejection_that_is_not_logged_is_beyond_the_gate_and_of_both_axes() -> None:
-    log = aid_log(own=False)
-    samples = log.samples.copy()
-    samples["innovation_north"], samples["innovation_east"] = 0.1, 0.1
-    samples.iloc[10, 0], samples.iloc[20, 0] = 4.9 * 0.5, -5.1 * 0.5
-    fusing = pd.DataFrame({"horizontal": [1.0], "vertical": [0.0], "yaw": [0.0]}, index=[0.0])
-    found, topics = innovations_of({"ev_pos": replace(log, samples=samples)}, fusing, 5.0)
-    for axis in ("north", "east"):
-        frame = found[axis]
-        assert np.flatnonzero(frame["rejected"]).tolist() == [20]
-    assert isinstance(found["down"], Unavailable)
-    assert topics == ("a_topic",)

@@ -1,7 +1,5 @@
 """Moments over all lags, against sums written out."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import f

@@ -1,7 +1,5 @@
 """The earth in the model of EKF2: metres where EKF2 keeps latitude, and how the earth turns."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -23,10 +21,8 @@ ECCENTRICITY2 = 0.00669438
 
 
 def record(latitude_deg: float, altitude_m: float = 0.0, north_m: float = np.nan) -> FusionRecord:
-    delayed = pd.DataFrame({"north_m": [north_m]})
-    return made(
-        FusionRecord, latitude_deg=latitude_deg, altitude_m=altitude_m, delayed=delayed
-    )  # fmt: skip
+    known = {"latitude_deg": latitude_deg, "altitude_m": altitude_m}
+    return made(FusionRecord, **known, delayed=pd.DataFrame({"north_m": [north_m]}))
 
 
 @pytest.mark.parametrize("latitude_deg", DEGREE_M)
@@ -62,20 +58,16 @@ def test_a_flight_on_gnss_is_replayed_on_the_earth() -> None:
     """In EKF2's metres inside, in those of the tracks outside; simulated ones are on a sphere."""
     flight = simulate_flight(scenario_of("outdoor", seed=3), parse(()))
     assert MODEL_NOTE in flight.log.notes
-    known = flight.ekf2
-    flat, round_ = (
-        opened(replace(flight, log=replace(flight.log, notes=notes)))
-        for notes in (flight.log.notes, ())
-    )
-    metres = metres_of(known.record)
+    flat, round_ = opened(flight), opened(replace(flight, log=replace(flight.log, notes=())))
+    known = flight.ekf2.record
+    metres = metres_of(known)
     assert metres == pytest.approx((1.00357, 1.00302, 1.0), abs=1e-5)
-    np.testing.assert_allclose(
-        round_.inputs.received.position_m, flat.inputs.received.position_m * metres
-    )
+    theirs, ours = (one.inputs.received.position_m for one in (flat, round_))
+    np.testing.assert_allclose(ours, theirs * metres)
     (flat_stretch,), (stretch,) = flat.inputs.stretches, round_.inputs.stretches
     np.testing.assert_allclose(stretch.state[6:9], flat_stretch.state[6:9] * metres)
     turned = stretch.correction_rad - flat_stretch.correction_rad
-    expected = earth_rate_rad_s(known.record) * stretch.step_s[:, None]
+    expected = earth_rate_rad_s(known) * stretch.step_s[:, None]
     np.testing.assert_allclose(turned, expected, atol=1e-12)
     for name in ("delayed", "published"):
         apart = getattr(round_.flown, name) - getattr(flat.flown, name)

@@ -34,7 +34,7 @@ def replayed(fused_at: list[float], taken: list[float] | None = None) -> pd.Data
     return pd.DataFrame({"fused_at_s": fused_at}, index=index)
 
 
-def test_a_logged_innovation_belongs_to_the_sample_of_its_time() -> None:
+def test_a_logged_innovation_belongs_to_the_sample_of_its_time():
     """An older topic has none, and repeats the last fusion for half a second."""
     times = np.array([0.9, 0.9941, 1.0, 1.1059, 1.1061, 1.2, 1.3])
     found = match(replayed([9.0, 9.0, 9.0], [1.0, 1.1, 1.2]), times, own=True)
@@ -44,7 +44,7 @@ def test_a_logged_innovation_belongs_to_the_sample_of_its_time() -> None:
     assert found.tolist() == [-1, 0, 0, 0, -1, 1, 1]
 
 
-def test_the_first_five_seconds_of_each_stretch_are_not_judged() -> None:
+def test_the_first_five_seconds_of_each_stretch_are_not_judged():
     replay = made(Ekf2Replay, stretches_s=((10.0, 30.0), (40.0, 60.0)), carried_s=())
     judged = replay.judged_s
     assert judged == ((15.0, 30.0), (45.0, 60.0))
@@ -66,46 +66,38 @@ def agreeing(
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("axis", "logged", "replayed_share", "good", "says"),
-    [
-        (agreeing(s=1.049), 0.0, 0.0, True, "correlate by 1.0000 or better"),
-        (agreeing(s=1.051), 0.0, 0.0, False, "is 1.05 of the logged one"),
-        (agreeing(s=0.949), 0.0, 0.0, False, "is 0.95 of the logged one"),
-        (agreeing(0.95), 0.0, 0.0, True, "correlate by 0.9500"),
-        (agreeing(published_m=0.09), 0.0, 0.0, True, "correlate by 1.0000 or better"),
-        (agreeing(published_m=0.11), 0.0, 0.0, False, "what is published is 0.11 m off the log"),
-        # with digits enough to be beyond what is allowed
-        (agreeing(published_m=0.1028), 0.0, 0.0, False, "is 0.103 m off the log (RMS; at most 0.1"),
-        (agreeing(published_m=0.10004), 0.0, 0.0, False, "published is 0.10004 m off the log"),
-        (agreeing(0.949), 0.0, 0.09, False, "correlate by 0.9490 only"),
-        # where much is rejected, shares and NIS decide
-        (agreeing(0.5), 0.1, 0.06, True, "6.0% of the samples are rejected, 10.0% in the log"),
-        (agreeing(0.5), 0.06, 0.1, True, "single samples part"),
-        (agreeing(0.5), 0.25, 0.19, False, "are allowed"),
-        (agreeing(0.5), 0.125, 0.1875, False, "are allowed"),
-        (agreeing(0.5, nis=1.25), 0.1, 0.1, True, "mean NIS differs by 25%"),
-        (agreeing(0.5, nis=1.26), 0.1, 0.1, False, "mean NIS differs by 26%"),
-        (agreeing(0.5, nis=0.74), 0.1, 0.1, False, "mean NIS differs by 26%"),
-    ],
-)  # fmt: skip
-def test_when_a_replay_is_believed(
-    axis: AxisAgreement, logged: float, replayed_share: float, good: bool, says: str
-) -> None:
+@pytest.mark.parametrize(("axis", "logged", "replayed_share", "good", "says"), [
+    (agreeing(s=1.049), 0.0, 0.0, True, "correlate by 1.0000 or better"),
+    (agreeing(s=1.051), 0.0, 0.0, False, "is 1.05 of the logged one"),
+    (agreeing(s=0.949), 0.0, 0.0, False, "is 0.95 of the logged one"),
+    (agreeing(0.95), 0.0, 0.0, True, "correlate by 0.9500"),
+    (agreeing(published_m=0.09), 0.0, 0.0, True, "correlate by 1.0000 or better"),
+    (agreeing(published_m=0.11), 0.0, 0.0, False, "what is published is 0.11 m off the log"),
+    # with digits enough to be beyond what is allowed
+    (agreeing(published_m=0.1028), 0.0, 0.0, False, "is 0.103 m off the log (RMS; at most 0.1"),
+    (agreeing(published_m=0.10004), 0.0, 0.0, False, "published is 0.10004 m off the log"),
+    (agreeing(0.949), 0.0, 0.09, False, "correlate by 0.9490 only"),
+    # where much is rejected, shares and NIS decide
+    (agreeing(0.5), 0.1, 0.06, True, "6.0% of the samples are rejected, 10.0% in the log"),
+    (agreeing(0.5), 0.06, 0.1, True, "single samples part"),
+    (agreeing(0.5), 0.25, 0.19, False, "are allowed"),
+    (agreeing(0.5), 0.125, 0.1875, False, "are allowed"),
+    (agreeing(0.5, nis=1.25), 0.1, 0.1, True, "mean NIS differs by 25%"),
+    (agreeing(0.5, nis=1.26), 0.1, 0.1, False, "mean NIS differs by 26%"),
+    (agreeing(0.5, nis=0.74), 0.1, 0.1, False, "mean NIS differs by 26%"),
+])  # fmt: skip
+def test_when_a_replay_is_believed(axis, logged, replayed_share, good, says):
     for axes in ({"north": axis, "east": agreeing()}, {"north": agreeing(), "east": axis}):
         found, reason = _verdict(axes, logged, replayed_share)
         assert found is good
         assert says in reason
 
 
-@pytest.mark.parametrize(
-    ("axis", "good"),
-    [(agreeing(0.949), False), (agreeing(s=1.051), False), (agreeing(published_m=0.29), True),
-     (agreeing(published_m=0.31), False)],
-)  # fmt: skip
-def test_where_much_is_rejected_the_replay_that_obeys_the_log_decides(
-    axis: AxisAgreement, good: bool
-) -> None:
+@pytest.mark.parametrize(("axis", "good"), [
+    (agreeing(0.949), False), (agreeing(s=1.051), False), (agreeing(published_m=0.29), True),
+    (agreeing(published_m=0.31), False),
+])  # fmt: skip
+def test_where_much_is_rejected_the_replay_that_obeys_the_log_decides(axis, good):
     """It refuses what by its own gate agreed by chance, and rescues what parted by chance."""
     one = Agreement(
         north=agreeing(0.5), east=agreeing(0.5), ev_pos={}, samples=50, rejected_share_logged=0.2,
@@ -122,7 +114,7 @@ def test_where_much_is_rejected_the_replay_that_obeys_the_log_decides(
         assert found.axes == (obedient if all_told else one).axes
 
 
-def test_what_an_axis_is_compared_by() -> None:
+def test_what_an_axis_is_compared_by():
     s_log = np.full(101, 4.0)
     s = np.linspace(4.0, 8.0, 101)
     nu_log = np.tile([2.0, -2.0], 51)[:101]
@@ -135,9 +127,8 @@ def test_what_an_axis_is_compared_by() -> None:
     found = _axis("east", pd.DataFrame(frame), model, made(Ekf2, state=still), replay)  # type: ignore[arg-type]
     assert found.innovation_correlation == pytest.approx(1.0)
     assert found.innovation_rms_difference == pytest.approx(0.5)
-    assert (found.s_ratio_p5, found.s_ratio_median, found.s_ratio_p95) == pytest.approx(
-        (1.05, 1.5, 1.95)
-    )
+    ratios = found.s_ratio_p5, found.s_ratio_median, found.s_ratio_p95
+    assert ratios == pytest.approx((1.05, 1.5, 1.95))
     assert found.nis_mean_logged == pytest.approx(1.0)
     assert found.nis_mean_replayed == pytest.approx(np.mean((nu_log + 0.5) ** 2 / s))
     assert found.position_rms_difference_m == pytest.approx(math.sqrt(12.5))
@@ -168,7 +159,7 @@ def compared(count: int, *, varying: bool = True) -> Agreement | Unavailable:
     return agreement_with_log(SimpleNamespace(ekf2=ekf2), replay)  # type: ignore[arg-type]
 
 
-def test_twenty_innovations_are_enough_to_compare() -> None:
+def test_twenty_innovations_are_enough_to_compare():
     found = compared(20)
     assert found.samples == 20
     assert found.good
@@ -180,7 +171,7 @@ def test_twenty_innovations_are_enough_to_compare() -> None:
     assert "do not vary" in same.reason
 
 
-def test_without_innovations_there_is_nothing_to_compare() -> None:
+def test_without_innovations_there_is_nothing_to_compare():
     frame = pd.DataFrame({"innovation_m": [0.1], "innovation_variance_m2": 0.1, "rejected": 0.0})
     for other in (NONE, frame.assign(rejected=np.nan)):
         ekf2 = made(Ekf2, innovations={"north": frame, "east": other}, innovation_topics=AID)

@@ -5,12 +5,14 @@ The limits are written out here, so that one that is changed must be changed her
 
 import math
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 from findings_tools import NONE, log, made
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from px4fuse.ekf2 import inputs as inputs_module
@@ -46,15 +48,11 @@ AID = ("estimator_aid_src_ev_pos",)
 # ---------------------------------------------------------------- parameters
 
 
-def test_parameters_are_px4s() -> None:
+def test_parameters_are_px4s():
     """Defaults of PX4's module.yaml and params_*.yaml, by what is fused."""
     vision, gnss = settings_in_force({}), settings_in_force({}, GNSS_POS)
-    assert {name for name in vision if name not in gnss} == {
-        name for name in PARAMETERS if name.startswith("EKF2_EV")
-    }
-    assert {name for name in gnss if name not in vision} == {
-        name for name in PARAMETERS if name.startswith("EKF2_GPS")
-    }
+    for one, other, begin in ((vision, gnss, "EKF2_EV"), (gnss, vision, "EKF2_GPS")):
+        assert {*one} - {*other} == {name for name in PARAMETERS if name.startswith(begin)}
     assert settings_in_force({"EKF2_AID_MASK": 1.0}, GNSS_POS)["EKF2_GPS_DELAY"] == 110.0
     assert settings_in_force({})["EKF2_EV_DELAY"] == 0.0
     assert settings_in_force({"EKF2_AID_MASK": 8.0})["EKF2_EV_DELAY"] == 175.0
@@ -62,14 +60,11 @@ def test_parameters_are_px4s() -> None:
     assert not fuses_by_mask({"EKF2_AID_MASK": 8.0, "EKF2_EV_CTRL": 15.0})
 
 
-@pytest.mark.parametrize(
-    ("name", "fits", "not_fits"),
-    [("EKF2_EVP_GATE", (1.0, 1e3), (0.99, 1001.0)), ("EKF2_EV_NOISE_MD", (0.0, 1.0), (0.5, 2.0)),
-     ("EKF2_EV_POS_X", (-5.0, 5.0), (math.inf, math.nan))],
-)  # fmt: skip
-def test_both_ends_of_a_range_are_in_it(
-    name: str, fits: tuple[float, ...], not_fits: tuple[float, ...]
-) -> None:
+@pytest.mark.parametrize(("name", "fits", "not_fits"), [
+    ("EKF2_EVP_GATE", (1.0, 1e3), (0.99, 1001.0)), ("EKF2_EV_NOISE_MD", (0.0, 1.0), (0.5, 2.0)),
+    ("EKF2_EV_POS_X", (-5.0, 5.0), (math.inf, math.nan)),
+])  # fmt: skip
+def test_both_ends_of_a_range_are_in_it(name, fits, not_fits):
     for value in fits:
         assert check({name: value}) == {name: value}
     for value in not_fits:
@@ -78,7 +73,7 @@ def test_both_ends_of_a_range_are_in_it(
             check({name: value})
 
 
-def test_a_sweep_has_2_to_200_values() -> None:
+def test_a_sweep_has_2_to_200_values():
     assert sweep_values("EKF2_EV_DELAY", 0.0, 100.0, 2) == [0.0, 100.0]
     assert len(sweep_values("EKF2_EV_DELAY", 0.0, 100.0, 200)) == 200
     assert len(sweep_values("EKF2_EV_DELAY", 0.0, 100.0)) == 9
@@ -95,9 +90,8 @@ def test_a_sweep_has_2_to_200_values() -> None:
 def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     """What is prepared of a flight of which only the parameters matter."""
     monkeypatch.setattr(inputs_module, "read_vision", lambda *_: made(Received, stamp_s=None))
-    monkeypatch.setattr(
-        inputs_module, "find_stretches", lambda *_, **_more: (made(Stretch, field=None),)
-    )
+    stretch = made(Stretch, field=None)
+    monkeypatch.setattr(inputs_module, "find_stretches", lambda *_, **_more: (stretch,))
 
     def prepared(
         interval_s: float = 0.008, horizon_s: Any = 0.1, firmware: str = "PX4 v1.16.1",
@@ -117,7 +111,7 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     return prepared
 
 
-def test_rules_of_the_releases(flown: Callable[..., Any]) -> None:
+def test_rules_of_the_releases(flown):
     """EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h."""
     new = flown(EKF2_DELAY_MAX=200.0, EKF2_IMU_POS_Y=0.25)
     assert new.rules == Rules(0.2, 0.4, 1.0, 5, None, False)
@@ -129,7 +123,7 @@ def test_rules_of_the_releases(flown: Callable[..., Any]) -> None:
     assert flown(EKF2_PREDICT_US=8000.0).predict_s == pytest.approx(0.008)
 
 
-def test_what_a_log_must_hold(flown: Callable[..., Any]) -> None:
+def test_what_a_log_must_hold(flown):
     assert isinstance(flown(0.0119), Inputs)
     assert "logged at 80 Hz" in flown(0.0125).reason
     assert isinstance(flown(horizon_s=NONE), Unavailable)
@@ -151,28 +145,23 @@ def track(name: str, origin: Origin, interval_s: float = 0.1, **parts: Any) -> P
     return made(PositionTrack, name=name, origin=origin, samples=samples, **{**usual, **parts})
 
 
-@pytest.mark.parametrize(
-    ("tracks", "expected"),
-    [
-        ([track("file", GIVEN_FILE), track("vehicle_visual_odometry", RECEIVED)],
-         "vehicle_visual_odometry"),
-        ([track("file", GIVEN_FILE), track("gps", GNSS)], "file"),
-        ([track("mocap", MOTION_CAPTURE)], None),
-        # copies that the logger did not thin: below 0.9 of its interval, and 4 Hz at least
-        ([track(ALIGNED_TOPIC, ALIGNED, 0.179)], ALIGNED_TOPIC),
-        ([track(ALIGNED_TOPIC, ALIGNED, 0.181)], None),
-        ([track("estimator_aid_src_ev_pos", KEPT, 0.25)], "estimator_aid_src_ev_pos"),
-        ([track("estimator_aid_src_ev_pos", KEPT, 0.26)], None),
-    ],
-)  # fmt: skip
-def test_the_track_that_ekf2_received_whole(
-    tracks: list[PositionTrack], expected: str | None
-) -> None:
+@pytest.mark.parametrize(("tracks", "expected"), [
+    ([track("file", GIVEN_FILE), track("vehicle_visual_odometry", RECEIVED)],
+     "vehicle_visual_odometry"),
+    ([track("file", GIVEN_FILE), track("gps", GNSS)], "file"),
+    ([track("mocap", MOTION_CAPTURE)], None),
+    # copies that the logger did not thin: below 0.9 of its interval, and 4 Hz at least
+    ([track(ALIGNED_TOPIC, ALIGNED, 0.179)], ALIGNED_TOPIC),
+    ([track(ALIGNED_TOPIC, ALIGNED, 0.181)], None),
+    ([track("estimator_aid_src_ev_pos", KEPT, 0.25)], "estimator_aid_src_ev_pos"),
+    ([track("estimator_aid_src_ev_pos", KEPT, 0.26)], None),
+])  # fmt: skip
+def test_the_track_that_ekf2_received_whole(tracks, expected):
     found = _source(made(Flight, positions=tuple(tracks)))
     assert getattr(found, "name", None) == expected
 
 
-def test_a_frame_of_its_own_is_turned_with_its_variance() -> None:
+def test_a_frame_of_its_own_is_turned_with_its_variance():
     """Published heading 90°, sent 0°: what was sent as north lies east."""
     time = 10.0 + 0.1 * np.arange(30)
 
@@ -195,16 +184,16 @@ def test_a_frame_of_its_own_is_turned_with_its_variance() -> None:
         )  # fmt: skip
         found = read_vision(made(Flight, positions=(own,)), ekf2, record, facing(90.0))
         where = [-0.5, 2.0, -1.0] if turned else [2.0, 0.5, -1.0]
-        np.testing.assert_allclose(found.position_m, [where] * 30, atol=1e-12)
+        assert_allclose(found.position_m, [where] * 30, atol=1e-12)
         spread = [0.0, 0.04, 0.09] if turned else [0.04, 0.0, 0.09]
-        np.testing.assert_allclose(found.variance_m2, [spread] * 30, atol=1e-12)
-        np.testing.assert_allclose(found.arrival_s - time, np.linspace(0.05, 0.15, 30))
+        assert_allclose(found.variance_m2, [spread] * 30, atol=1e-12)
+        assert_allclose(found.arrival_s - time, np.linspace(0.05, 0.15, 30))
     copy = track("estimator_aid_src_ev_pos", KEPT)
     found = read_vision(made(Flight, positions=(copy,)), ekf2, record, facing(90.0))
     assert np.all(found.arrival_s == -np.inf)
 
 
-def test_what_ekf2_did_with_a_sample_is_found_by_its_time() -> None:
+def test_what_ekf2_did_with_a_sample_is_found_by_its_time():
     """Measured half a step and the delay before its stamp, to 6 ms; resets show within 0.2 s."""
     stamp = 10.0 + 0.5 * np.arange(6)
     taken = stamp - 0.05 - 0.005
@@ -225,7 +214,7 @@ def test_what_ekf2_did_with_a_sample_is_found_by_its_time() -> None:
         "innovation_topics": AID,
     }  # fmt: skip
     rejected, reset = _decisions(made(Ekf2, **parts), record, stamp)
-    np.testing.assert_array_equal(rejected, [1.0, 1.0, 0.0, np.nan, np.nan, 0.0])
+    assert_array_equal(rejected, [1.0, 1.0, 0.0, np.nan, np.nan, 0.0])
     assert reset.tolist() == [True, False, False, False, True, False]
     for other in ({"innovation_topics": ()}, {"horizon_s": NONE}, {"innovations": {"north": NONE}}):
         rejected, reset = _decisions(made(Ekf2, **{**parts, **other}), record, stamp)
@@ -236,7 +225,7 @@ def test_what_ekf2_did_with_a_sample_is_found_by_its_time() -> None:
 # ---------------------------------------------------------------- stretches
 
 
-def test_a_reset_of_the_position_is_no_fusion() -> None:
+def test_a_reset_of_the_position_is_no_fusion():
     """EKF2 flies north at 2 m/s and is set 3 m east at 5 s; every third sample's fate is logged."""
     times = np.arange(0.0, 10.0, 0.1)
     state = pd.DataFrame(0.0, pd.Index(times, name="time_s"), Columns.STATE)
@@ -250,42 +239,37 @@ def test_a_reset_of_the_position_is_no_fusion() -> None:
         ekf2 = made(Ekf2, state=state, resets=resets, horizon_s=0.2, step_s=0.01)
         return _moved(ekf2, measured_s, rejected, 0.25)
 
-    np.testing.assert_allclose(moved(reset), 0.0, atol=1e-9)
+    assert_allclose(moved(reset), 0.0, atol=1e-9)
     assert np.nanmax(moved()) > 1.0
     # nothing is rejected, or all is known
     assert moved(reset, rejected=fates) is None
     assert moved(reset, rejected=np.ones(70)) is None
 
 
-@pytest.mark.parametrize(
-    ("interval_ms", "known", "ends"),
-    [
-        ([4] * 5, [], [2, 4]),
-        ([4, 9, 4, 4], [], [2, 4]),  # longer than the target before its samples are there
-        ([9, 4, 4], [], [1, 3]),
-        ([4, 4, 9, 4, 4], [], [2, 3, 5]),
-        ([4, 4, 1, 1.5, 4, 4, 4], [], [2, 5, 7]),  # by count when half of the target has passed
-        ([4] * 9, [3], [2, 3, 5, 7, 9]),  # a known end sets the count again
-        ([10] * 3, [], [1, 2, 3]),
-        ([2.75] * 7, [0, 6], [3, 6]),
-        ([3.2] * 9, [0, 2, 6], [2, 4, 6, 8]),  # of two and a half, as the log shows it
-    ],
-)
-def test_a_step_ends_after_its_samples_or_when_it_is_long(
-    interval_ms: list[float], known: list[int], ends: list[int]
-) -> None:
+@pytest.mark.parametrize(("interval_ms", "known", "ends"), [
+    ([4] * 5, [], [2, 4]),
+    ([4, 9, 4, 4], [], [2, 4]),  # longer than the target before its samples are there
+    ([9, 4, 4], [], [1, 3]),
+    ([4, 4, 9, 4, 4], [], [2, 3, 5]),
+    ([4, 4, 1, 1.5, 4, 4, 4], [], [2, 5, 7]),  # by count when half of the target has passed
+    ([4] * 9, [3], [2, 3, 5, 7, 9]),  # a known end sets the count again
+    ([10] * 3, [], [1, 2, 3]),
+    ([2.75] * 7, [0, 6], [3, 6]),
+    ([3.2] * 9, [0, 2, 6], [2, 4, 6, 8]),  # of two and a half, as the log shows it
+])  # fmt: skip
+def test_a_step_ends_after_its_samples_or_when_it_is_long(interval_ms, known, ends):
     found = step_ends(np.array(interval_ms) * 1e-3, np.array(known, int), 0.008)
     assert found.tolist() == ends
 
 
-def test_a_gain_is_seen_from_the_end_of_its_step() -> None:
+def test_a_gain_is_seen_from_the_end_of_its_step():
     """A turn of 1 mrad each sample: what was gained before lies turned by what came after."""
     turn = np.tile([0.0, 0.0, 0.001], (3, 1))
     gain = np.tile([1.0, 0.0, 0.0], (3, 1))
     total, gained = down_sampled(turn, gain, np.array([2, 3]))
-    np.testing.assert_allclose(total[:, 2], [0.002, 0.001])
-    np.testing.assert_allclose(gained[:, 0], [2.0, 1.0])
-    np.testing.assert_allclose(gained[:, 1], [-0.002, -0.0005], atol=1e-12)
+    assert_allclose(total[:, 2], [0.002, 0.001])
+    assert_allclose(gained[:, 0], [2.0, 1.0])
+    assert_allclose(gained[:, 1], [-0.002, -0.0005], atol=1e-12)
 
 
 def facing(at: Any, error: Any = 0.0) -> np.ndarray:
@@ -300,9 +284,8 @@ def turning(states: np.ndarray) -> tuple[pd.DataFrame, pd.DataFrame, Ekf2, Fusio
     imu[Columns.ANGULAR_RATE[2]] = 0.51
     imu[Columns.SPECIFIC_FORCE] = [1.0, 0.2, -9.8]
     attitude = pd.DataFrame(facing(time[::4]), index=time[::4], columns=Columns.QUATERNION)
-    delayed = pd.DataFrame(
-        facing(states, 0.1 * (states - 10.0)), index=states, columns=Columns.QUATERNION
-    )
+    turned = facing(states, 0.1 * (states - 10.0))
+    delayed = pd.DataFrame(turned, index=states, columns=Columns.QUATERNION)
     delayed = delayed.assign(**dict.fromkeys(Columns.VELOCITY, 2.0), **{
         **dict.fromkeys(Columns.POSITION, np.nan), **dict.fromkeys(Columns.GYRO_BIAS, 0.0),
         **dict.fromkeys(Columns.ACCELEROMETER_BIAS, 0.2), Columns.GYRO_BIAS[2]: 0.01,
@@ -314,59 +297,51 @@ def turning(states: np.ndarray) -> tuple[pd.DataFrame, pd.DataFrame, Ekf2, Fusio
     return imu, attitude, made(Ekf2, state=state), record
 
 
-def test_a_stretch_of_a_vehicle_that_turns() -> None:
+def test_a_stretch_of_a_vehicle_that_turns():
     flown = turning(10.0 + 0.1 * np.arange(21))
     found = _stretch(*flown, 5, 11.5)
     steps = 10.5 + 0.01 * np.arange(101)
-    np.testing.assert_allclose(found.time_s, steps, atol=1e-9)
-    np.testing.assert_allclose(found.step_s, 0.01, atol=1e-9)
+    assert_allclose(found.time_s, steps, atol=1e-9)
+    assert_allclose(found.step_s, 0.01, atol=1e-9)
     turned = matrix(facing(steps))
-    np.testing.assert_allclose(found.rotation, turned, atol=1e-6)
-    np.testing.assert_allclose(found.correction_rad, 0.0, atol=1e-6)
+    assert_allclose(found.rotation, turned, atol=1e-6)
+    assert_allclose(found.correction_rad, 0.0, atol=1e-6)
     # in the frame at the end of the step, without its bias
-    np.testing.assert_allclose(found.force_m_s2, [[0.8, 0.0, -10.0]] * 100, atol=5e-3)
-    np.testing.assert_allclose(found.state[:3], [0.0, 0.0, 0.05], atol=1e-6)
-    np.testing.assert_allclose(found.state[3:9], [2.0, 2.0, 2.0, 7.0, 7.0, 10.5])
-    np.testing.assert_allclose(found.state[9:], 0.0)
+    assert_allclose(found.force_m_s2, [[0.8, 0.0, -10.0]] * 100, atol=5e-3)
+    assert_allclose(found.state[:3], [0.0, 0.0, 0.05], atol=1e-6)
+    assert_allclose(found.state[3:9], [2.0, 2.0, 2.0, 7.0, 7.0, 10.5])
+    assert_allclose(found.state[9:], 0.0)
     expected = np.arange(1.0, 16.0)
     expected[Columns.DELAYED_VARIANCE.index("attitude_down_rad2")] = 10.5
-    np.testing.assert_allclose(found.variance, expected)
-    np.testing.assert_allclose(found.attitude_variance_rad2[:, 2], steps)
-    np.testing.assert_allclose(found.down_m, steps)
-    np.testing.assert_allclose(
-        found.attitude_error_rad[:, 2], 0.05 + 0.1 * (steps - 10.5), atol=1e-6
-    )
+    assert_allclose(found.variance, expected)
+    assert_allclose(found.attitude_variance_rad2[:, 2], steps)
+    assert_allclose(found.down_m, steps)
+    assert_allclose(found.attitude_error_rad[:, 2], 0.05 + 0.1 * (steps - 10.5), atol=1e-6)
     assert found.fusing
     flown[3].delayed[Columns.POSITION] = 3.0
-    np.testing.assert_allclose(_stretch(*flown, 5, 11.5).state[6:9], [3.0, 3.0, 10.5])
+    assert_allclose(_stretch(*flown, 5, 11.5).state[6:9], [3.0, 3.0, 10.5])
 
 
-def stretches(monkeypatch: pytest.MonkeyPatch, **parts: Any) -> list[tuple[float, float]]:
+def stretches(monkeypatch, **parts: Any) -> list[tuple[float, float]]:
     """Start and end of each, of a flight of 60 s with everything every 0.01 or 0.1 s."""
     found: list[tuple[float, float]] = []
+    tenths = np.arange(0.0, 60.0, 0.1)
     usual = {
-        "imu": np.arange(0.0, 60.0, 0.01), "vision": np.arange(0.0, 60.0, 0.1),
-        "fused": np.arange(0.0, 60.0, 0.1), "airborne": NONE, "delayed": np.arange(0.0, 60.0, 0.5),
-        "instances": ((-np.inf, 0),),
+        "imu": np.arange(0.0, 60.0, 0.01), "vision": tenths, "fused": tenths, "airborne": NONE,
+        "delayed": tenths[::5], "instances": ((-np.inf, 0),),
     }  # fmt: skip
-    given = {**usual, **parts}
+    given = SimpleNamespace(**{**usual, **parts})
 
     def keep(_imu: Any, _attitude: Any, _ekf2: Any, record: Any, at: int, high: float) -> None:
         found.append((float(record.delayed.index[at]), round(float(high), 2)))
 
     monkeypatch.setattr("px4fuse.ekf2.stretches._stretch", keep)
-    find_stretches(
-        made(Flight, airborne=given["airborne"]),
-        pd.DataFrame(index=given["imu"]),
-        pd.DataFrame(index=given["imu"]),
-        made(
-            Ekf2,
-            innovations={"north": pd.DataFrame(index=given["fused"])},
-            instances=given["instances"],
-        ),
-        made(FusionRecord, delayed=pd.DataFrame(index=given["delayed"])),
-        given["vision"],
+    imu, fused, delayed = (
+        pd.DataFrame(index=each) for each in (given.imu, given.fused, given.delayed)
     )
+    ekf2 = made(Ekf2, innovations={"north": fused}, instances=given.instances)
+    record = made(FusionRecord, delayed=delayed)
+    find_stretches(made(Flight, airborne=given.airborne), imu, imu, ekf2, record, given.vision)
     return found
 
 
@@ -374,7 +349,7 @@ def without(times: np.ndarray, low: float, high: float) -> np.ndarray:
     return times[(times < low + 1e-6) | (times > high - 1e-6)]
 
 
-def test_where_a_stretch_begins_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_a_stretch_begins_and_ends(monkeypatch):
     imu, vision = np.arange(0.0, 60.0, 0.01), np.arange(0.0, 60.0, 0.1)
     assert stretches(monkeypatch) == [(1.0, 59.99)]
     # a second of fusion, four in the air

@@ -2,7 +2,6 @@
 
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -25,8 +24,8 @@ GNSS_NOT_CARRIED = ("v1.13.3_gps_profile1", "v1.14.4_gps_magdist")
 
 
 def test_the_figures_of_the_benchmark_hold_on_every_simulated_flight(
-    shared_logs: Path, model_of: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    shared_logs, model_of, monkeypatch
+):
     monkeypatch.setattr(bench_ekf2, "opened", model_of)
     paths = bench_ekf2.flights([shared_logs / "simulated", shared_logs / "gps"])
     models = bench_ekf2.agreement_table(paths)
@@ -37,15 +36,13 @@ def test_the_figures_of_the_benchmark_hold_on_every_simulated_flight(
 
 
 @pytest.mark.parametrize("name", NOT_CARRIED)
-def test_a_simulated_flight_that_cannot_carry_the_model_says_why(
-    shared_logs: Path, name: str
-) -> None:
+def test_a_simulated_flight_that_cannot_carry_the_model_says_why(shared_logs, name):
     found = open_model(read_log(shared_logs / "simulated" / f"{name}.ulg"))
     assert isinstance(found, Unavailable)
     assert NOT_CARRIED[name] in found.reason
 
 
-def test_a_real_flight_whose_imu_was_logged_with_holes_says_so(shared_logs: Path) -> None:
+def test_a_real_flight_whose_imu_was_logged_with_holes_says_so(shared_logs):
     name = "mengchaoheng_PX4_ulog_plottools_hist_6a8cf408_test3.ulg"
     found = open_model(read_log(shared_logs / "real" / name))
     assert isinstance(found, Unavailable)

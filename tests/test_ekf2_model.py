@@ -1,11 +1,11 @@
 """The model of EKF2 against its equations written plainly, and against the log."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from conftest import LOG
 from ekf2_tools import opened, plain_replay, step_matrix, step_noise, step_state
 from exchange import replace
 
@@ -106,18 +106,15 @@ def test_the_sample_flight_agrees_with_its_log(model: Model) -> None:
 
 def test_several_settings_at_once_are_each_alone(model: Model) -> None:
     settings = [
-        {"EKF2_EVP_NOISE": 0.02},
-        {"EKF2_EV_DELAY": 80.0},
-        {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_DELAY": 40.0, "EKF2_EVP_GATE": 2.0},
-        {},
-    ]
+        {"EKF2_EVP_NOISE": 0.02}, {"EKF2_EV_DELAY": 80.0},
+        {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_DELAY": 40.0, "EKF2_EVP_GATE": 2.0}, {},
+    ]  # fmt: skip
     together = replay_settings(model, settings)
     for change, found in zip(settings, together, strict=True):
         alone = replay_settings(model, [change])[0]
         for part in ("updates", "delayed", "published"):
-            pd.testing.assert_frame_equal(
-                getattr(found, part), getattr(alone, part), rtol=0.0, atol=1e-9
-            )
+            one, other = getattr(found, part), getattr(alone, part)
+            pd.testing.assert_frame_equal(one, other, rtol=0.0, atol=1e-9)
         assert dict(found.changed) == change
     pd.testing.assert_frame_equal(together[3].published, model.flown.published, rtol=0.0, atol=1e-9)
 
@@ -145,6 +142,12 @@ def test_samples_that_arrive_after_the_horizon_are_late_or_lost(model: Model) ->
     assert (longest.late, longest.lost) == (0, 0)
 
 
+def with_copies(flight: Flight) -> Flight:
+    """With EKF2's own copies of the positions alone."""
+    copies = tuple(track for track in flight.positions if track.origin != RECEIVED)
+    return replace(flight, positions=copies)
+
+
 def unavailable(flight: Flight) -> str:
     found = open_model(flight)
     assert isinstance(found, Unavailable)
@@ -161,10 +164,8 @@ def test_a_log_that_cannot_carry_the_model_says_why(sample_flight: Flight) -> No
     assert "estimator_states" in unavailable(replace(sample_flight, ekf2=bare))
     slow = sample_flight.imu.iloc[::5]
     assert "53 Hz" in unavailable(replace(sample_flight, imu=slow))
-    copies = tuple(t for t in sample_flight.positions if t.origin != RECEIVED)
-    assert "estimator_aid_src_ev_pos holds one sample in 0.5" in unavailable(
-        replace(sample_flight, positions=copies)
-    )
+    copies = unavailable(with_copies(sample_flight))
+    assert "estimator_aid_src_ev_pos holds one sample in 0.5" in copies
     dropped = sample_flight.imu[(sample_flight.imu.index % 8.0) > 0.1]
     assert "without a gap" in unavailable(replace(sample_flight, imu=dropped))
     frame = with_vision(sample_flight, vision_of(sample_flight), frame="FRD")
@@ -174,13 +175,9 @@ def test_a_log_that_cannot_carry_the_model_says_why(sample_flight: Flight) -> No
 
 
 def test_a_mavlink_recording_gives_the_samples_that_the_log_lacks(sample_flight: Flight) -> None:
-    path = Path(__file__).parents[1] / "sample_logs" / "aisle_uwb.tlog"
-    recording = read_log(path)
+    recording = read_log(LOG.with_suffix(".tlog"))
     assert "estimator_states" in unavailable(recording)
-    log = replace(
-        sample_flight, positions=tuple(t for t in sample_flight.positions if t.origin != RECEIVED)
-    )
-    made = opened(join(log, recording))
+    made = opened(join(with_copies(sample_flight), recording))
     assert made.flown.source == "VISION_POSITION_ESTIMATE"
     assert made.agreement.good
     assert made.agreement.ev_pos["north"].innovation_correlation > 0.999
@@ -202,10 +199,7 @@ def test_a_bias_that_ekf2_does_not_learn_is_no_trouble(sample_flight: Flight) ->
     record = sample_flight.ekf2.record
     fixed = record.delayed.copy()
     fixed.loc[:, [name for name in fixed if str(name).endswith("m2_s4")]] = 0.0
-    made = opened(
-        with_record(
-            sample_flight, delayed=fixed, parameters={**record.parameters, "EKF2_ACC_B_NOISE": 0.0}
-        )
-    )
+    parameters = {**record.parameters, "EKF2_ACC_B_NOISE": 0.0}
+    made = opened(with_record(sample_flight, delayed=fixed, parameters=parameters))
     assert np.isfinite(made.flown.published.to_numpy()).all()
     assert np.isfinite(made.flown.updates.to_numpy()).all()

@@ -43,7 +43,7 @@ from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
 
-def test_side_by_side(model: Model) -> None:
+def test_side_by_side(model):
     made = what_if(model, [{"EKF2_EVP_NOISE": 0.5}, {"EKF2_EVP_NOISE": 0.02}])
     wide, narrow = made.whatif
     for axis in ("north", "east"):
@@ -67,14 +67,14 @@ def test_side_by_side(model: Model) -> None:
     assert not made.notes
 
 
-def test_without_agreement_there_is_no_what_if_and_no_why(model: Model) -> None:
+def test_without_agreement_there_is_no_what_if_and_no_why(model):
     doubtful = replace(model, agreement=replace(model.agreement, good=False, reason="no reason"))
     for result in (what_if(doubtful, [{"EKF2_EVP_NOISE": 0.5}]), walk(doubtful)):
         assert isinstance(result, Unavailable)
         assert "no reason" in result.reason
 
 
-def test_the_bars_add_up_and_little_is_left(model: Model) -> None:
+def test_the_bars_add_up_and_little_is_left(model):
     for axis in walk(model).values():
         assert axis.coast is None
         assert tuple(step.name for step in axis.steps) == STEPS
@@ -93,7 +93,7 @@ def test_the_bars_add_up_and_little_is_left(model: Model) -> None:
         assert last == pytest.approx(axis.position_rmse_to_truth_m["ekf2"], abs=0.003)
 
 
-def test_a_run_of_another_time_is_not_walked_from(model: Model) -> None:
+def test_a_run_of_another_time_is_not_walked_from(model):
     axis, steps = made(Axis, direction=np.eye(3)[0]), pd.DataFrame(index=[1e4, 1e4 + 1.0])
     result = walk(model, Settings(), {"north": made(Replay, axis=axis, steps=steps)})
     assert isinstance(result, Unavailable)
@@ -103,7 +103,7 @@ def test_a_run_of_another_time_is_not_walked_from(model: Model) -> None:
 # ---------------------------------------------------------------- on numbers whose answer is known
 
 
-def test_the_walk_changes_one_thing_after_the_other() -> None:
+def test_the_walk_changes_one_thing_after_the_other():
     flown = {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_NOISE_MD": 0.0, "EKF2_ACC_NOISE": 0.35}
     received = made(Received)
     plain = (made(Stretch, flow=None, heights=None),)
@@ -140,7 +140,7 @@ def test_the_walk_changes_one_thing_after_the_other() -> None:
     assert [one.velocity for one in variants.values()] == [False] * 7 + [True] * 3
 
 
-def test_the_longest_run_of_rejections_is_said_with_how_far_it_led() -> None:
+def test_the_longest_run_of_rejections_is_said_with_how_far_it_led():
     taken = 20.0 + np.arange(10.0)
     updates = pd.DataFrame(
         {"rejected": [0, 1, 0, 0, 1, 1, 1, 0, 1, 1], "fused_at_s": taken + 0.5}, index=taken
@@ -160,7 +160,7 @@ def test_the_longest_run_of_rejections_is_said_with_how_far_it_led() -> None:
     assert _coast(one, still, (22.4, 24.4), ((0.0, 99.0),)) is None
 
 
-def test_errors_to_the_truth_are_of_its_own_span() -> None:
+def test_errors_to_the_truth_are_of_its_own_span():
     times, direction = np.array([9.0, 10.0, 15.0, 20.0, 21.0]), np.array([0.6, 0.8, 0.0])
     frame = pd.DataFrame(0.0, index=[10.0, 20.0], columns=Columns.STATE)
     truth = made(Truth, samples=frame.assign(north_m=[0.0, 2.0], east_m=2.0))
@@ -173,7 +173,7 @@ def test_errors_to_the_truth_are_of_its_own_span() -> None:
     assert rms_to_truth(made(Flight, truth=NONE), there, direction, times) is None
 
 
-def test_the_longest_time_without_fusion_counts_both_ends() -> None:
+def test_the_longest_time_without_fusion_counts_both_ends():
     judged = ((15.0, 30.0), (40.0, 60.0))
     assert _longest(np.array([16.0, 29.0, 41.0, 59.0]), judged) == 18.0
     assert _longest(np.array([40.0]), judged) == 25.0
@@ -181,21 +181,17 @@ def test_the_longest_time_without_fusion_counts_both_ends() -> None:
 
 
 def test_a_summary_joins_north_and_east() -> None:
-    def axis(nis: float, error: Any) -> AxisSummary:
-        return AxisSummary(nis, (0.9, 1.1), 0.1, 0.1, error)
-
-    one = Summary(
-        changed={}, north=axis(1.0, 0.3), east=axis(3.0, 0.4), samples=9, rejected_share=0.0,
-        longest_without_fusion_s=0.1, resets=0,
-    )  # fmt: skip
-    assert one.nis_mean == 2.0
-    assert one.position_rmse_to_truth_m == pytest.approx(0.5)
-    assert replace(one, east=axis(3.0, NONE)).position_rmse_to_truth_m is NONE
+    north, east = (AxisSummary(nis, (0.9, 1.1), 0.1, 0.1, m) for nis, m in ((1.0, 0.3), (3.0, 0.4)))
+    one = Summary(changed={}, north=north, east=east, samples=9, rejected_share=0.0,
+                  longest_without_fusion_s=0.1, resets=0)  # fmt: skip
+    assert (one.nis_mean, one.position_rmse_to_truth_m) == pytest.approx((2.0, 0.5))
+    blind = structs.replace(east, position_rmse_to_truth_m=NONE)
+    assert replace(one, east=blind).position_rmse_to_truth_m is NONE
     why = made(Why, position_left_mean_square_m2=1.0, position_mean_square_m2=4.0)
     assert why.position_left_share == 0.25
 
 
-def test_samples_that_come_too_late_are_a_note() -> None:
+def test_samples_that_come_too_late_are_a_note():
     for by_delay, remedy in ((False, ": raise EKF2_DELAY_MAX"), (True, "")):
         rules = replace(RULES, horizon_by_delay=by_delay)
         model: Any = SimpleNamespace(inputs=SimpleNamespace(rules=rules))
@@ -219,14 +215,11 @@ def flown(tmp_path: Path, mistake: str, seed: int) -> Model:
     return opened(read_log(log))
 
 
-@pytest.mark.parametrize(
-    ("mistake", "seed", "changes"),
-    [("ekf2-noise=0.02", 1, {"EKF2_EVP_NOISE": 0.1}),
-     ("ekf2-noise=0.02", 2, {"EKF2_EVP_NOISE": 0.1}), ("ekf2-gate=1", 1, {"EKF2_EVP_GATE": 5.0})],
-)  # fmt: skip
-def test_a_flight_that_rejects_most_tells_what_its_cure_does(
-    tmp_path: Path, mistake: str, seed: int, changes: dict[str, float]
-) -> None:
+@pytest.mark.parametrize(("mistake", "seed", "changes"), [
+    ("ekf2-noise=0.02", 1, {"EKF2_EVP_NOISE": 0.1}),
+    ("ekf2-noise=0.02", 2, {"EKF2_EVP_NOISE": 0.1}), ("ekf2-gate=1", 1, {"EKF2_EVP_GATE": 5.0}),
+])  # fmt: skip
+def test_a_flight_that_rejects_most_tells_what_its_cure_does(tmp_path, mistake, seed, changes):
     """By its own gate the replay parts from these logs, with EKF2's own rejections it does not."""
     ill, well = flown(tmp_path, mistake, seed), flown(tmp_path, "", seed)
     assert ill.agreement.rejected_share_logged > 0.35
@@ -239,7 +232,7 @@ def test_a_flight_that_rejects_most_tells_what_its_cure_does(
     assert cured.position_rmse_to_truth_m == pytest.approx(truly.position_rmse_to_truth_m, rel=0.15)
 
 
-def test_where_most_would_be_rejected_nothing_is_predicted(model: Model) -> None:
+def test_where_most_would_be_rejected_nothing_is_predicted(model):
     chaotic, some, none = what_if(
         model, [{"EKF2_EVP_NOISE": 0.02}, {"EKF2_EVP_NOISE": 0.05}, {"EKF2_EVP_NOISE": 0.2}]
     ).whatif
@@ -250,9 +243,7 @@ def test_where_most_would_be_rejected_nothing_is_predicted(model: Model) -> None
     assert none.steady
 
 
-def test_a_prediction_that_a_little_noise_changes_is_not_steady(
-    model: Model, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_prediction_that_a_little_noise_changes_is_not_steady(model, monkeypatch):
     """Each of the three numbers, just inside what is allowed and just outside."""
     north = AxisSummary(1.0, (0.9, 1.1), 0.1, 0.1, 0.1)
     base = Summary(
@@ -274,17 +265,17 @@ def test_a_prediction_that_a_little_noise_changes_is_not_steady(
 
     assert judged(base)
     assert runs == [(0.002, 0), (0.002, 1), (0.002, 2), (0.002, 3)]
-    for field, inside, outside in (
-        ("nis_mean", 1.099, 1.101), ("position_rmse_to_truth_m", 0.1149, 0.1151),
+    for axes, field, value, steady in (
+        (("north",), "nis_mean", 1.099, True), (("north",), "nis_mean", 1.101, False),
+        (("east",), "nis_mean", 1.099, True), (("east",), "nis_mean", 1.101, False),
+        # the error is of both axes together
+        (("north", "east"), "position_rmse_to_truth_m", 0.1149, True),
+        (("north", "east"), "position_rmse_to_truth_m", 0.1151, False),
+        ((), "rejected_share", 0.2299, True), ((), "rejected_share", 0.2301, False),
     ):  # fmt: skip
-        for axis in ("north", "east"):
-            for value, steady in ((inside, True), (outside, False)):
-                other = structs.replace(north, **{field: value})
-                # the error is of both axes together
-                both = {"north": other, "east": other} if "rmse" in field else {axis: other}
-                assert judged(structs.replace(base, **both)) is steady
-    assert judged(structs.replace(base, rejected_share=0.2299))
-    assert not judged(structs.replace(base, rejected_share=0.2301))
+        other = structs.replace(north, **{field: value}) if axes else None
+        changed = dict.fromkeys(axes, other) if axes else {field: value}
+        assert judged(structs.replace(base, **changed)) is steady
     few, many = (structs.replace(base, rejected_share=share) for share in (0.02, 0.351))
     runs.clear()
     assert [one.steady for one in whatif._steadied(model, [few, many], (), {})] == [True, False]

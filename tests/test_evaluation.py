@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import REPOSITORY, shared
+from conftest import shared
 from exchange import replace
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -31,9 +31,6 @@ from px4fuse.trajectory.scores import (
     relative_error,
     rmse_interval,
 )
-
-SAMPLE = REPOSITORY / "sample_logs" / "loop_slam.tum"
-
 
 # -- evo -------------------------------------------------------------------------------------------
 
@@ -133,10 +130,8 @@ def test_closed_forms_are_the_minimum(kind: AlignmentKind, unknowns: int) -> Non
     got = fit(x, y, kind)
     assert got.degrees_of_freedom == unknowns
     ours = float(((y - got.apply(x)) ** 2).sum())
-    starts = [
-        np.concatenate((y.mean(axis=0), random.uniform(-3, 3, unknowns - 3))) for _ in range(8)
-    ]
-    best = min(minimize(cost, start).fun for start in starts)
+    turns = random.uniform(-3, 3, (8, unknowns - 3))
+    best = min(minimize(cost, np.concatenate((y.mean(axis=0), turn))).fun for turn in turns)
     assert ours == pytest.approx(best, rel=1e-7)
     np.testing.assert_allclose(got.apply(x[0]), got.apply(x)[0])
 
@@ -212,9 +207,8 @@ def test_nearest_pairs_and_what_is_left_out_are_those_of_the_definition(denser: 
     edges = reference.time_s[[0, 0, -1, -1]] + np.array([-1.1, -0.9, 0.9, 1.1]) * limit
     time = np.union1d(time, edges)
     estimate = Trajectory("e", "vio", time - offset_s, np.zeros((len(time), 3)), None)
-    x, y, got = associate(
-        estimate, reference, method="nearest", max_gap_s=limit, time_offset_s=offset_s
-    )
+    how = {"method": "nearest", "max_gap_s": limit, "time_offset_s": offset_s}
+    x, y, got = associate(estimate, reference, **how)
     apart = np.abs(time[:, None] - reference.time_s)
     if denser:
         kept = np.flatnonzero(apart.min(axis=0) <= limit)
@@ -327,21 +321,18 @@ def test_what_cannot_be_had_is_absent_with_the_reason() -> None:
 # -- which alignment, and doubts -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("estimate", "reference", "name", "scale", "expected", "why"),
-    [
-        (("vio", "FRD"), ("truth", "NED"), "a", 1.0, "yaw", "z is vertical"),
-        (("kf", "NED"), ("truth", "NED"), "a", 1.3, "yaw", "z is vertical"),
-        (("ekf2", "NED"), ("truth", "ENU"), "a", 1.0, "se3", "do not share a vertical"),
-        (("vio", "NED"), ("slam", "camera"), "a", 1.0, "se3", "first key frame"),
-        (("slam", "camera"), ("vio", "NED"), "a", 1.05, "se3", "first key frame"),
-        (("slam", "camera"), ("truth", "NED"), "a", 2.0, "sim3", "the scale is 0.5"),
-        (("slam", "unknown"), ("truth", "NED"), "kf_mono", 1.0, "sim3", "it is monocular"),
-        (("slam", "unknown"), ("truth", "NED"), "harmony", 1.0, "se3", "first key frame"),
-        (("unknown", "unknown"), ("truth", "unknown"), "a", 1.0, "se3", "does not say what made"),
-        (("truth", "NED"), ("truth", "NED"), "a", 1.0, "none", "ground truth"),
-    ],
-)
+@pytest.mark.parametrize(("estimate", "reference", "name", "scale", "expected", "why"), [
+    (("vio", "FRD"), ("truth", "NED"), "a", 1.0, "yaw", "z is vertical"),
+    (("kf", "NED"), ("truth", "NED"), "a", 1.3, "yaw", "z is vertical"),
+    (("ekf2", "NED"), ("truth", "ENU"), "a", 1.0, "se3", "do not share a vertical"),
+    (("vio", "NED"), ("slam", "camera"), "a", 1.0, "se3", "first key frame"),
+    (("slam", "camera"), ("vio", "NED"), "a", 1.05, "se3", "first key frame"),
+    (("slam", "camera"), ("truth", "NED"), "a", 2.0, "sim3", "the scale is 0.5"),
+    (("slam", "unknown"), ("truth", "NED"), "kf_mono", 1.0, "sim3", "it is monocular"),
+    (("slam", "unknown"), ("truth", "NED"), "harmony", 1.0, "se3", "first key frame"),
+    (("unknown", "unknown"), ("truth", "unknown"), "a", 1.0, "se3", "does not say what made"),
+    (("truth", "NED"), ("truth", "NED"), "a", 1.0, "none", "ground truth"),
+])  # fmt: skip
 def test_the_alignment_follows_from_what_the_two_are(
     estimate, reference, name, scale, expected, why
 ):
@@ -411,9 +402,8 @@ def test_an_offset_between_clocks_is_recovered(offset_s: float, rate_hz: float) 
     random = np.random.default_rng(4)
     estimate = moved(flight(40.0, rate_hz), TURN, SHIFT, 1.7, kind="slam", frame="camera")
     noise = random.normal(0.0, 0.02, (len(estimate), 3))
-    estimate = replace(
-        estimate, time_s=estimate.time_s - offset_s, position_m=estimate.position_m + noise
-    )
+    position_m = estimate.position_m + noise
+    estimate = replace(estimate, time_s=estimate.time_s - offset_s, position_m=position_m)
     got = estimate_time_offset(estimate, reference)
     assert got.determinable
     assert got.offset_s == pytest.approx(offset_s, abs=2e-3)
@@ -459,13 +449,9 @@ def test_an_offset_without_excitation_is_not_determinable(kind: str, noise_m: fl
         "circle": np.column_stack((np.cos(time / 3), np.sin(time / 3), 0.0 * time)) * 5.0,
     }[kind]
     noise = np.random.default_rng(6).normal(0.0, noise_m, (2, *position.shape))
-    estimate, reference = (
-        Trajectory(kind, "kf", time, position + one, None, "NED") for one in noise
-    )
+    estimate, reference = (Trajectory(kind, "kf", time, position + e, None, "NED") for e in noise)
     got = estimate_time_offset(estimate, reference)
-    assert not got.determinable
-    assert got.offset_s is None
-    assert got.interval_s is None
+    assert (got.determinable, got.offset_s, got.interval_s) == (False, None, None)
     assert "not determinable" in got.reason
     used = evaluate(estimate, reference, alignment="none", time_offset_s="auto")
     assert used.time_offset.offset_s == 0.0

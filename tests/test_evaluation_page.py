@@ -36,10 +36,8 @@ DELTAS = (Delta(1.0, "m"), Delta(10.0, "m"))
 @cache
 def sample() -> Evaluation:
     """The sample's odometry against its SLAM trajectory, which has a gap."""
-    return evaluate(
-        read_source(f"{LOOP}:vio").trajectory,
-        read_source(str(LOOP.with_name("loop_slam.tum"))).trajectory,
-    )
+    odometry, slam = read_source(f"{LOOP}:vio"), read_source(str(LOOP.with_name("loop_slam.tum")))
+    return evaluate(odometry.trajectory, slam.trajectory)
 
 
 def line(count: int = 2001) -> Trajectory:
@@ -89,11 +87,8 @@ def test_before_alignment_the_error_is_that_of_evo_without_alignment() -> None:
     score = evaluate(replace(estimate, kind="vio"), true)
 
     def of_evo(one: Trajectory) -> Any:
-        return PoseTrajectory3D(
-            positions_xyz=one.position_m,
-            orientations_quat_wxyz=one.rotation.as_quat(scalar_first=True),
-            timestamps=one.time_s,
-        )
+        turned = one.rotation.as_quat(scalar_first=True)
+        return PoseTrajectory3D(one.position_m, turned, one.time_s)
 
     ape = metrics.APE(metrics.PoseRelation.translation_part)
     ape.process_data(sync.associate_trajectories(of_evo(true), of_evo(estimate)))
@@ -116,11 +111,9 @@ def test_an_error_that_grows_with_distance_has_the_quarters_of_a_ramp() -> None:
     assert ", ".join(f"{q:.3f}" for q in quarters(score)) in distance_words(score)
 
 
-@pytest.mark.parametrize(
-    ("error", "share"),
-    [(np.full(2000, 0.3), "10%"), (np.arange(2000) // 100 == 7, "100%"), (np.zeros(2000), "0%")],
-    ids=["even", "a peak", "none"],
-)
+@pytest.mark.parametrize(("error", "share"), [
+    (np.full(2000, 0.3), "10%"), (np.arange(2000) // 100 == 7, "100%"), (np.zeros(2000), "0%"),
+], ids=["even", "a peak", "none"])  # fmt: skip
 def test_whether_a_few_moments_decide_is_the_share_of_the_worst_tenth(error, share) -> None:
     words = time_words(wrong_by(across(error.astype(np.float64))))
     assert f"makes {share} of the squared error" in words
@@ -145,10 +138,9 @@ def test_the_growth_of_the_rpe_tells_noise_from_drift(kind: str, times: float) -
 # -- what is drawn ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("frame", "axes"),
-    [("NED", (1, 0)), ("FRD", (1, 0)), ("ENU", (0, 1)), ("camera", (0, 2)), ("unknown", (0, 1))],
-)
+@pytest.mark.parametrize(("frame", "axes"), [
+    ("NED", (1, 0)), ("FRD", (1, 0)), ("ENU", (0, 1)), ("camera", (0, 2)), ("unknown", (0, 1)),
+])  # fmt: skip
 def test_a_flat_path_is_seen_from_above_and_another_from_the_side_too(frame, axes) -> None:
     spatial = replace(flight(), frame=frame)
     vertical = 3 - sum(axes)

@@ -1,8 +1,6 @@
 """Optical flow in the model of EKF2, and what the model cannot follow."""
 
 from functools import cache
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -68,7 +66,7 @@ def flying(noise_m_s: float = 0.3) -> Model:
     return replace(model(), inputs=replace(inputs, stretches=stretches))
 
 
-def test_what_lies_between_two_rows_is_read_as_the_mean_of_all_samples(tmp_path: Path) -> None:
+def test_what_lies_between_two_rows_is_read_as_the_mean_of_all_samples(tmp_path):
     log = gnss_log("v1.16")
     log["estimator_states"]["states"][:, :4] = [1.0, 0.0, 0.0, 0.0]
     at = stamps(20.0, 50.0)
@@ -107,7 +105,7 @@ def test_what_lies_between_two_rows_is_read_as_the_mean_of_all_samples(tmp_path:
 
 
 @pytest.mark.parametrize("every", [1, 10])
-def test_flow_tells_the_velocity_at_the_event_after_it(every: int) -> None:
+def test_flow_tells_the_velocity_at_the_event_after_it(every):
     """Where the body moved since a sample is known from the IMU: corners are no innovations."""
     (stretch,) = model().inputs.stretches
     told = with_flow(stretch, flow_of(every=every), 3.0)
@@ -122,7 +120,7 @@ def test_flow_tells_the_velocity_at_the_event_after_it(every: int) -> None:
     assert np.ptp(expected, axis=0).min() > 0.7
 
 
-def test_the_mean_counts_as_often_as_it_has_samples_and_the_gate_is_of_one() -> None:
+def test_the_mean_counts_as_often_as_it_has_samples_and_the_gate_is_of_one():
     turn = np.eye(3)[None, :2]
     x, P = np.zeros((1, 15)), np.diag(np.full(15, 1e-9))[None].copy()
     P[0, 3:5, 3:5] = 0.25 * np.eye(2)
@@ -138,7 +136,7 @@ def test_the_mean_counts_as_often_as_it_has_samples_and_the_gate_is_of_one() -> 
     np.testing.assert_array_equal(fuse_flow(x, P, none, 3.0)[0], x)
 
 
-def test_flow_carries_the_filter_without_gnss() -> None:
+def test_flow_carries_the_filter_without_gnss():
     """A minute: by flow to a metre, by the IMU alone not to ten."""
     lost = dict.fromkeys(("gnss_pos", "gnss_vel"), 40.0)
     off = []
@@ -158,7 +156,7 @@ def stretches_s(flight: Flight) -> list[tuple[float, float]]:
     return [(float(one.time_s[0]), float(one.time_s[-1])) for one in stretches]
 
 
-def test_the_model_begins_again_after_resets_of_height_and_where_much_is_clipped() -> None:
+def test_the_model_begins_again_after_resets_of_height_and_where_much_is_clipped():
     flight = model().flight
     ((start, end),) = stretches_s(flight)
     for delta, parted in (((0.0, 0.0, 1.0), True), ((1.0, 0.0, 0.0), False)):
@@ -181,7 +179,7 @@ def test_the_model_begins_again_after_resets_of_height_and_where_much_is_clipped
             assert found[1][0] > 60.5
 
 
-def test_fixes_that_come_while_ekf2_does_without_gnss_are_not_fused() -> None:
+def test_fixes_that_come_while_ekf2_does_without_gnss_are_not_fused():
     flight = model().flight
     ekf2 = flight.ekf2
     meant = pd.Series([1.0, 0.0, 1.0], index=[0.0, 50.0, 60.0])
@@ -196,7 +194,7 @@ def test_fixes_that_come_while_ekf2_does_without_gnss_are_not_fused() -> None:
     np.testing.assert_array_equal(found.stamp_s, every.stamp_s[kept])  # type: ignore[union-attr]
 
 
-def test_a_replay_begins_with_the_correlations_of_what_was_before() -> None:
+def test_a_replay_begins_with_the_correlations_of_what_was_before():
     """It stood for six seconds and rose: tilt and bias of the accelerometer are known together."""
     (stretch,) = model().inputs.stretches
     assert stretch.history is not None
@@ -212,7 +210,7 @@ def test_a_replay_begins_with_the_correlations_of_what_was_before() -> None:
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", ["v1.16.1_gps_stock_flow", "main202603_gps_outage_flow"])
-def test_flights_with_flow_are_replayed(name: str, shared_logs: Path, model_of: Any) -> None:
+def test_flights_with_flow_are_replayed(name, shared_logs, model_of):
     found = model_of(shared_logs / "gps" / f"{name}.ulg")
     agreement = found.agreement
     assert agreement.good
@@ -237,9 +235,7 @@ def test_flights_with_flow_are_replayed(name: str, shared_logs: Path, model_of: 
 
 
 @pytest.mark.reallogs
-def test_what_flow_carried_too_far_off_is_left_out(
-    shared_logs: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_flow_carried_too_far_off_is_left_out(shared_logs, monkeypatch):
     monkeypatch.setattr("px4fuse.ekf2.replay.MAX_CARRIED_OFF_M", 0.3)
     found = opened(read_log(shared_logs / "gps" / "main202603_gps_outage_flow.ulg"))
     assert set(found.agreement.doubtful) == {"optical_flow"}
@@ -250,7 +246,7 @@ def test_what_flow_carried_too_far_off_is_left_out(
 
 
 @pytest.mark.reallogs
-def test_a_flight_that_crashes_is_followed_up_to_its_tumble(shared_logs: Path) -> None:
+def test_a_flight_that_crashes_is_followed_up_to_its_tumble(shared_logs):
     """Vertical velocity was reset at 47 s, and much of the IMU clipped at 26 and at 46 s."""
     found = opened(read_log(shared_logs / "real" / "PX4_flight-review-rs_ekf_failure.ulg"))
     ends = [(one.time_s[0], one.time_s[-1]) for one in found.inputs.stretches]

@@ -1,7 +1,5 @@
 """Flights with known faults, each analysed once, and all that must be said of them."""
 
-from __future__ import annotations
-
 import json
 from typing import Any, NamedTuple
 
@@ -146,8 +144,7 @@ def test_motion_capture_flights_overstate_the_variance_and_nobody_is_blamed(
     findings = find(with_noises(comparison))
     drift = next(at for at, finding in enumerate(findings) if finding.id == "source_may_drift")
     behind = findings[drift + 1 : drift + 5]
-    assert [finding.id for finding in behind] == (
-        ["kf_variance_overstated"] * 2 + ["ekf2_variance_overstated"] * 2
-    )
+    behind_it = ["kf_variance_overstated"] * 2 + ["ekf2_variance_overstated"] * 2
+    assert [finding.id for finding in behind] == behind_it
     assert behind[2].evidence["sigma_factor"] > 2.0
     assert not [f for f in findings if f.severity == "error" and f.caused_by is None]

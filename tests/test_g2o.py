@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli_tools import run_main
+from conftest import shared
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -136,14 +137,10 @@ def made(dimension: int, count: int, seed: int = 0) -> PoseGraph:
     free = 3 if dimension == 2 else 6
     root = rng.normal(size=(count - 1, free, free))
     return PoseGraph(
-        dimension,
-        np.sort(rng.choice(10 * count, count, replace=False)),
-        lie.exp(rng.normal(size=(count, free))),
-        np.arange(count - 1),
-        np.arange(1, count),
-        lie.exp(rng.normal(size=(count - 1, free))),
-        root @ root.transpose(0, 2, 1),
-    )
+        dimension, np.sort(rng.choice(10 * count, count, replace=False)),
+        lie.exp(rng.normal(size=(count, free))), np.arange(count - 1), np.arange(1, count),
+        lie.exp(rng.normal(size=(count - 1, free))), root @ root.transpose(0, 2, 1),
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -158,10 +155,7 @@ def test_round_trip_is_exact(dimension: int, seed: int) -> None:
 
 @pytest.mark.reallogs
 def test_public_graphs_come_back_the_same() -> None:
-    folder = Path(__file__).resolve().parents[2] / "shared" / "pose_graphs"
-    if not folder.is_dir():
-        pytest.skip("the public pose graphs (../shared/pose_graphs) are not beside the repository")
-    for file in sorted(folder.glob("*.g2o")):
+    for file in sorted(shared("pose_graphs").glob("*.g2o")):
         once = read_g2o(file)
         equal(once, parse_g2o(g2o_text(once), file.name))
 

@@ -16,7 +16,7 @@ from findings_tools import made
 from px4fuse.analysis import Counterfactual
 from px4fuse.ekf2.heights import HeightFilter, barometer_samples, with_heights
 from px4fuse.ekf2.model import Model, run_variants
-from px4fuse.ekf2.recursion import Variant
+from px4fuse.ekf2.recursion import Run, Variant
 from px4fuse.ekf2.stretches import Heights, Stretch
 from px4fuse.ekf2.whatif import HEIGHT_FOLLOWS, HEIGHT_STAYS, what_if
 from px4fuse.errors import SettingsError
@@ -55,14 +55,18 @@ def sampled(
     )  # fmt: skip
 
 
+def of_baro(steps: list[int], down_m: list[float], **more: float) -> Heights:
+    """Of the barometer alone."""
+    return sampled(steps, down_m, fused=("baro_hgt",), reference="baro_hgt", **more)
+
+
 def fusing(
-    stretch: Stretch, end: np.ndarray, *, reference_until: float = np.inf, fixed: bool = False,
-    gated: bool = True, noise_m: float = 0.5, gate: float = 5.0,
-) -> HeightFilter:  # fmt: skip
+    stretch: Stretch, end: np.ndarray, *, reference_until: float = np.inf, gated: bool = True
+) -> HeightFilter:
     (samples,) = barometer_samples(stretch, [end])
-    there, time_s = np.full((len(end), 1), fixed), stretch.time_s[end][:, None]
+    there, time_s = np.zeros((len(end), 1), bool), stretch.time_s[end][:, None]
     on = {"baro_hgt": np.ones_like(there), "gnss_hgt": time_s < reference_until}
-    knob = {"EKF2_BARO_NOISE": np.array([noise_m]), "EKF2_BARO_GATE": np.array([gate])}
+    knob = {"EKF2_BARO_NOISE": np.array([0.5]), "EKF2_BARO_GATE": np.array([5.0])}
     return HeightFilter(stretch, samples[..., None], time_s, there, on, knob, np.array([gated]))
 
 
@@ -125,7 +129,7 @@ def test_a_sample_is_judged_by_where_the_vehicle_was_then() -> None:
     time = STEP_S * np.arange(401)
     down = -2.0 * time - 1.5 * time**2
     steps = [13, 17, 30, 45]
-    of = sampled(steps, [down[at] - 0.1 for at in steps], fused=("baro_hgt",), reference="baro_hgt")
+    of = of_baro(steps, [down[at] - 0.1 for at in steps])
     end = np.array([10, 20, 30, 40, 50])
     heights = fusing(climbing(of, up_m_s2=3.0), end)
     for e, at in enumerate(end):
@@ -144,10 +148,8 @@ def test_one_sample_in_the_log_weighs_as_those_that_ekf2_had() -> None:
     P[0, 8, 8] = 0.5
     variances = []
     for steps, weight in (([10], 2.0), ([10, 10], 1.0)):
-        of = sampled(
-            steps, [0.3] * len(steps), fused=("baro_hgt",), reference="baro_hgt", weight=weight
-        )
-        heights = fusing(climbing(of), np.array([10]))
+        stretch = climbing(of_baro(steps, [0.3] * len(steps), weight=weight))
+        heights = fusing(stretch, np.array([10]))
         x, after = heights.fuse(0, np.zeros((1, 9)), P, np.zeros(1), np.ones(1))
         variances.append((after[0, 8, 8], x[0, 8]))
         assert heights.told[0, 0, 1, 0] == pytest.approx(0.75)
@@ -159,15 +161,13 @@ def test_one_sample_in_the_log_weighs_as_those_that_ekf2_had() -> None:
 )
 def test_in_ground_effect_too_low_a_barometer_is_unheeded(innovation, expected) -> None:
     """baro_height_control.cpp: a dead zone of EKF2_GND_EFF_DZ."""
-    of = sampled([10], [innovation], fused=("baro_hgt",), reference="baro_hgt", dead_m=4.0)
-    _, found = standing(of)
+    _, found = standing(of_baro([10], [innovation], dead_m=4.0))
     assert found["innovation_down_m"].item() == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(("gated", "fused"), [(True, 0.0), (False, 1.0)])
 def test_beyond_its_gate_a_height_is_rejected(gated: bool, fused: float) -> None:
-    of = sampled([10], [2.6], fused=("baro_hgt",), reference="baro_hgt")
-    _, found = standing(of, gated=gated)
+    _, found = standing(of_baro([10], [2.6]), gated=gated)
     assert (found["fused"].item(), found["rejected"].item()) == (fused, 1.0 - fused)
 
 
@@ -178,10 +178,9 @@ def test_beyond_its_gate_a_height_is_rejected(gated: bool, fused: float) -> None
 def outdoors(baro_noise_m: float = 0.4) -> Flight:
     """A flight whose EKF2 takes its barometer to be so exact."""
     usual = simulated.parameters
+    noise = {"EKF2_BARO_NOISE": baro_noise_m}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            simulated, "parameters", lambda *of: usual(*of) | {"EKF2_BARO_NOISE": baro_noise_m}
-        )
+        patch.setattr(simulated, "parameters", lambda *of: usual(*of) | noise)
         return simulate_flight(scenario_of("outdoor", seed=3, passes=3), parse(()))
 
 
@@ -201,15 +200,12 @@ def test_what_if_predicts_the_height_of_the_flight_with_the_other_noise() -> Non
         for name in ("nis_mean", "innovation_std_m"):
             expected = getattr(true.replayed.heights["baro_hgt"], name)
             assert getattr(predicted.heights["baro_hgt"], name) == pytest.approx(expected, rel=0.02)
-        assert predicted.height_rmse_to_truth_m == pytest.approx(
-            logged.height_rmse_to_truth_m, rel=0.1
-        )
+        error_m = logged.height_rmse_to_truth_m
+        assert predicted.height_rmse_to_truth_m == pytest.approx(error_m, rel=0.1)
         assert HEIGHT_FOLLOWS in found.notes
     # with 25 times the variance, the barometer holds the height more loosely
-    assert (
-        found.whatif[0].heights["baro_hgt"].nis_mean
-        > 5.0 * found.logged.heights["baro_hgt"].nis_mean
-    )
+    tight, loose = (one.heights["baro_hgt"].nis_mean for one in (found.whatif[0], found.logged))
+    assert tight > 5.0 * loose
 
 
 def test_without_its_only_sensor_the_height_drifts_and_that_is_told() -> None:
@@ -226,10 +222,8 @@ def test_a_height_that_would_be_rejected_for_long_is_not_predicted() -> None:
     jump = flight.barometer.copy()
     jump.loc[40.0:50.0, "down_m"] += 3.0
     model = opened_once()
-    other = replace(flight, barometer=jump)
-    stretches = with_heights(
-        other, model.flight.ekf2, model.flight.ekf2.record, model.inputs.stretches
-    )
+    ekf2, other = model.flight.ekf2, replace(flight, barometer=jump)
+    stretches = with_heights(other, ekf2, ekf2.record, model.inputs.stretches)
     jumping = replace(model, inputs=replace(model.inputs, stretches=stretches))
     found = what_if(jumping, [{"EKF2_BARO_GATE": gate} for gate in (3.0, 50.0)])
     assert [one.steady for one in found.whatif] == [False, True]
@@ -292,23 +286,17 @@ def test_an_acceleration_that_ekf2_took_to_be_wrong_is_noise_of_4_9() -> None:
     inputs = opened_once().inputs
     (stretch,) = inputs.stretches
     spoilt = replace(stretch, shaken=np.ones(len(stretch.time_s), bool))
-    runs = [
-        run_variants(replace(inputs, stretches=(one,)), [Variant(settings)], {})[0]
-        for one, settings in (
-            (spoilt, inputs.settings),
-            (stretch, inputs.settings | {"EKF2_ACC_NOISE": 4.9}),
-        )
-    ]
-    np.testing.assert_array_equal(runs[0].state, runs[1].state)
+
+    def ran(one: Stretch, **changed: float) -> Run:
+        settings = inputs.settings | changed
+        return run_variants(replace(inputs, stretches=(one,)), [Variant(settings)], {})[0]
+
+    np.testing.assert_array_equal(ran(spoilt).state, ran(stretch, EKF2_ACC_NOISE=4.9).state)
     # one axis of three throughout is as a third of the steps
-    usual = inputs.settings["EKF2_ACC_NOISE"] ** 2
-    third = inputs.settings | {"EKF2_ACC_NOISE": float(np.sqrt((2.0 * usual + 4.9**2) / 3.0))}
+    third = np.sqrt((2.0 * inputs.settings["EKF2_ACC_NOISE"] ** 2 + 4.9**2) / 3.0)
     clipped = replace(stretch, shaken=np.full(len(stretch.time_s), 1.0 / 3.0))
-    runs = [
-        run_variants(replace(inputs, stretches=(one,)), [Variant(settings)], {})[0]
-        for one, settings in ((clipped, inputs.settings), (stretch, third))
-    ]
-    np.testing.assert_allclose(runs[0].variance, runs[1].variance, rtol=1e-9)
+    expected = ran(stretch, EKF2_ACC_NOISE=float(third)).variance
+    np.testing.assert_allclose(ran(clipped).variance, expected, rtol=1e-9)
 
 
 def test_axes_at_the_end_of_their_range_are_relied_on_less_in_their_step() -> None:
@@ -352,9 +340,8 @@ def test_heights_are_replayed(models: dict[str, Model], name: str) -> None:
         assert axis.velocity_rms_difference_m_s < 0.02
     for summary in (found := what_if(models[name], [])).logged, found.replayed:  # type: ignore[union-attr]
         assert {one.rejected_share for one in summary.heights.values()} == {0.0}
-    assert found.replayed.height_rmse_to_truth_m == pytest.approx(
-        found.logged.height_rmse_to_truth_m, abs=0.02
-    )
+    error_m = found.logged.height_rmse_to_truth_m
+    assert found.replayed.height_rmse_to_truth_m == pytest.approx(error_m, abs=0.02)
 
 
 @pytest.mark.reallogs
@@ -383,9 +370,8 @@ def test_what_other_settings_of_heights_would_have_done(models: dict[str, Model]
     # and what the barometer's bias was is then wrong for good
     drifting, flown = heights({"gnss_hgt": 60.0})
     assert drifting.height_rmse_to_truth_m > 1.5 * flown.height_rmse_to_truth_m
-    assert drifting.north.position_rmse_to_truth_m == pytest.approx(
-        flown.north.position_rmse_to_truth_m, abs=0.01
-    )
+    error_m = flown.north.position_rmse_to_truth_m
+    assert drifting.north.position_rmse_to_truth_m == pytest.approx(error_m, abs=0.01)
 
 
 @pytest.mark.reallogs

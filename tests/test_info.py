@@ -1,7 +1,5 @@
 """What ``px4fuse info`` says of logs that are whole, poor, damaged or not flights at all."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -23,7 +21,7 @@ from px4fuse.flight import Flight, Unavailable
 from px4fuse.inspect.inventory import Ability, Inventory, Source, take_inventory, to_plain
 from px4fuse.origin import GNSS
 from px4fuse.readers import read_log
-from px4fuse.recording import ClockMap, Dropout, Sender
+from px4fuse.recording import Dropout, Sender
 
 WIDTH = 80
 pytestmark = pytest.mark.usefixtures("quick_filter")
@@ -67,22 +65,16 @@ def remedies(inventory: Inventory) -> list[str]:
 
 
 def test_every_row_says_what_the_flight_holds(sample_flight):
-    inventory = take_inventory(sample_flight)
-    ekf2 = sample_flight.ekf2
+    inventory, ekf2 = take_inventory(sample_flight), sample_flight.ekf2
     frames = {
-        "IMU": sample_flight.imu,
-        "attitude": sample_flight.attitude,
-        "EKF2 state": ekf2.state,
-        "EKF2 variance": ekf2.variance,
-        "innovations": ekf2.innovations["north"],
-        "fusion flags": ekf2.fusing,
-        "truth": sample_flight.truth.samples,
-    }
+        "IMU": sample_flight.imu, "attitude": sample_flight.attitude, "EKF2 state": ekf2.state,
+        "EKF2 variance": ekf2.variance, "innovations": ekf2.innovations["north"],
+        "fusion flags": ekf2.fusing, "truth": sample_flight.truth.samples,
+    }  # fmt: skip
     for part, frame in frames.items():
         row = source(inventory, part)
-        assert (row.samples, row.start_s, row.end_s) == (
-            len(frame), frame.index[0], frame.index[-1],
-        )  # fmt: skip
+        assert (row.samples, row.start_s) == (len(frame), frame.index[0])
+        assert row.end_s == frame.index[-1]
         assert row.log == "aisle_uwb.ulg"
         assert row.topics[0] == row.name
         assert row.clock.startswith("autopilot boot clock")
@@ -105,19 +97,15 @@ def test_abilities_are_what_compare_then_does(sample_flight):
     for axis in comparison.axes.values():
         if not isinstance(axis.ekf2_innovations, Unavailable):
             assert f"{axis.axis.name} {len(axis.ekf2_innovations)}" in said
-    assert f"{len(next(iter(comparison.axes.values())).ekf2_state)} samples" in ability(
-        inventory, "EKF2 states"
-    ).reason  # fmt: skip
+        assert f"{len(axis.ekf2_state)} samples" in ability(inventory, "EKF2 states").reason
 
 
 # ---- JSON -------------------------------------------------------------------------------------
 
 
 def strict(text: str) -> dict:
-    def refuse(constant):
-        raise AssertionError(f"{constant} in JSON")
-
-    return json.loads(text, parse_constant=refuse)
+    """Without NaN and its like."""
+    return json.loads(text, parse_constant=pytest.fail)
 
 
 def test_json_is_alone_on_standard_output_or_in_a_file(
@@ -140,14 +128,11 @@ def test_json_is_alone_on_standard_output_or_in_a_file(
 # ---- logs that lack something -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("topic_", "part", "lost"),
-    [
-        ("sensor_combined", "IMU", {"acceleration", "what if"}),
-        ("vehicle_local_position", "EKF2 state",
-         {"EKF2 states", "EKF2 variances", "EKF2 innovations", "aids", "what if"}),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("topic_", "part", "lost"), [
+    ("sensor_combined", "IMU", {"acceleration", "what if"}),
+    ("vehicle_local_position", "EKF2 state",
+     {"EKF2 states", "EKF2 variances", "EKF2 innovations", "aids", "what if"}),
+])  # fmt: skip
 def test_what_a_topic_is_needed_for(tmp_path, topic_, part, lost):
     inventory = inventory_of(make_log().drop(topic_), tmp_path)
     assert topic_ in source(inventory, part).unavailable
@@ -177,10 +162,8 @@ def test_an_imu_or_an_attitude_that_is_too_slow_is_no_acceleration(tmp_path, imu
     if said is not None:
         assert said in found.reason
         assert "below the 50 Hz" in found.reason
-    slow, fast = (
-        ability(take_inventory(aisle_flight(attitude_hz=rate)), "acceleration")
-        for rate in (5.0, 9.97)
-    )
+    both = (take_inventory(aisle_flight(attitude_hz=rate_hz)) for rate_hz in (5.0, 9.97))
+    slow, fast = (ability(one, "acceleration") for one in both)
     assert (slow.possible, fast.possible) == (False, True)
     assert "vehicle_attitude was logged at 5.0 Hz, below the 10 Hz" in slow.reason
 
@@ -245,22 +228,19 @@ def test_gaps_are_counted_and_the_longest_is_given(tmp_path):
 # ---- flights of any reader --------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "flight",
-    [
-        aisle_flight(duration_s=20.0),
-        aisle_flight(duration_s=0.3),  # too short to be compared
-        aisle_flight(duration_s=20.0, imu=None),
-        aisle_flight(duration_s=20.0, attitude_hz=None),
-        aisle_flight(duration_s=20.0, ekf2=None),
-        aisle_flight(duration_s=20.0, ekf2=Estimator(variance_logged=False)),
-        aisle_flight(duration_s=20.0, ekf2=Estimator(innovations_logged=False)),
-        aisle_flight(duration_s=20.0, ekf2=Estimator(fusing=None)),
-        aisle_flight(duration_s=20.0, truth=False),
-        aisle_flight(duration_s=20.0, uwb=Uwb(name="vehicle_gps_position", origin=GNSS)),
-        replace(aisle_flight(duration_s=20.0), positions=()),
-    ],
-)
+@pytest.mark.parametrize("flight", [
+    aisle_flight(duration_s=20.0),
+    aisle_flight(duration_s=0.3),  # too short to be compared
+    aisle_flight(duration_s=20.0, imu=None),
+    aisle_flight(duration_s=20.0, attitude_hz=None),
+    aisle_flight(duration_s=20.0, ekf2=None),
+    aisle_flight(duration_s=20.0, ekf2=Estimator(variance_logged=False)),
+    aisle_flight(duration_s=20.0, ekf2=Estimator(innovations_logged=False)),
+    aisle_flight(duration_s=20.0, ekf2=Estimator(fusing=None)),
+    aisle_flight(duration_s=20.0, truth=False),
+    aisle_flight(duration_s=20.0, uwb=Uwb(name="vehicle_gps_position", origin=GNSS)),
+    replace(aisle_flight(duration_s=20.0), positions=()),
+])  # fmt: skip
 def test_abilities_follow_the_flight(flight: Flight):
     """Without streams, as a reader may give it; every no is one of compare's own."""
     inventory = take_inventory(flight)
@@ -282,24 +262,18 @@ def test_abilities_follow_the_flight(flight: Flight):
         assert ability(inventory, name).possible != isinstance(part, Unavailable), name
 
 
-def test_a_recording_names_its_senders_clocks_and_dropouts(monkeypatch, tmp_path, sample_flight):
-    log = replace(
-        sample_flight.log,
-        format="MAVLink tlog",
-        senders=(Sender(1, 1, "PX4 quadrotor", 4321, 0.125, True),
-                 Sender(1, 197, "visual odometry", 99, None, False)),
-        dropouts=(Dropout(3.0, 0.25), Dropout(7.0, 0.5)),
-        start_unix_s=1_700_000_000.0,
-    )  # fmt: skip
-    clock = ClockMap("UNIX time of system 1, component 197", "TIMESYNC", 512, -1.7e9, 2.5, 0.001)
-    flight = replace(sample_flight, log=log, clocks=(clock,))
+def test_dropouts_and_senders_that_number_nothing_are_told(monkeypatch, tmp_path, sample_flight):
+    """Others stand in the golden texts; the start here is beyond the calendar."""
+    senders = (Sender(1, 197, "visual odometry", 99, None, False),)
+    dropouts = (Dropout(3.0, 0.25), Dropout(7.0, 0.5))
+    log = replace(sample_flight.log, format="MAVLink tlog", senders=senders, dropouts=dropouts,
+                  start_unix_s=1e18)  # fmt: skip
+    flight = replace(sample_flight, log=log)
     monkeypatch.setattr("px4fuse.analysis.read_log", lambda _, **__: flight)
+    assert take_inventory(flight).start_utc is None
     text = info(tmp_path / "any.tlog")
-    beyond = replace(flight, log=replace(log, start_unix_s=1e18))  # the calendar
-    assert take_inventory(beyond).start_utc is None
     assert widest(text) <= WIDTH
-    for words in ("1/1", "PX4 quadrotor (this flight)", "12.5%", "unknown", "TIMESYNC",
-                  "2 of the logger", "2023-11-14 22:13:20 UTC", "faster SD card"):  # fmt: skip
+    for words in ("unknown", "2 of the logger", "faster SD card"):
         assert words in text
 
 

@@ -95,10 +95,8 @@ def test_either_way_round_says_the_same_on_the_boot_clock(sample_flight, tlog_fl
 
 def test_every_part_that_lacks_is_taken_and_moved(record):
     """The other recording began five seconds later."""
-    bare = record(
-        Aisle(uwb=None), "bare.tlog",
-        "HIGHRES_IMU", "ATTITUDE_QUATERNION", "EXTENDED_SYS_STATE", "ODOMETRY",
-    )  # fmt: skip
+    left_out = "HIGHRES_IMU", "ATTITUDE_QUATERNION", "EXTENDED_SYS_STATE", "ODOMETRY"
+    bare = record(Aisle(uwb=None), "bare.tlog", *left_out)
     assert bare.log.duration_s == 0.0 or isinstance(bare.imu, Unavailable)
     bare = replace(bare, log=replace(bare.log, boot_time_s=BOOT_S, duration_s=40.0))
     full = record(Aisle(seconds=40.0, start_s=BOOT_S + 5.0), "full.tlog")
@@ -106,11 +104,8 @@ def test_every_part_that_lacks_is_taken_and_moved(record):
     for part in ("imu", "attitude", "airborne", "ekf2"):
         assert isinstance(getattr(bare, part), Unavailable)
         assert not isinstance(getattr(joined, part), Unavailable)
-    for ours, theirs in (
-        (joined.imu, full.imu),
-        (joined.ekf2.state, full.ekf2.state),
-        (joined.ekf2.variance, full.ekf2.variance),
-    ):
+    parts = ((one.imu, one.ekf2.state, one.ekf2.variance) for one in (joined, full))
+    for ours, theirs in zip(*parts, strict=True):
         np.testing.assert_allclose(boot(joined, ours), boot(full, theirs), atol=1e-9)
     np.testing.assert_allclose(joined.airborne, np.array(full.airborne) + 5.0, atol=1e-9)
     assert joined.streams["imu"] == full.streams["imu"]

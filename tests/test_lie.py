@@ -96,9 +96,7 @@ def test_group(values: list[float], dimension: int) -> None:
     a, b, c = lie.exp(xi)
     left, right = lie.compose(lie.compose(a, b), c), lie.compose(a, lie.compose(b, c))
     np.testing.assert_allclose(homogeneous(left), homogeneous(right), atol=1e-11)
-    np.testing.assert_allclose(
-        homogeneous(lie.compose(a, lie.inverse(a))), np.eye(dimension + 1), atol=1e-11
-    )
-    np.testing.assert_allclose(
-        homogeneous(lie.between(a, b)), homogeneous(lie.compose(lie.inverse(a), b)), atol=1e-11
-    )
+    none = homogeneous(lie.compose(a, lie.inverse(a)))
+    np.testing.assert_allclose(none, np.eye(dimension + 1), atol=1e-11)
+    between, composed = lie.between(a, b), lie.compose(lie.inverse(a), b)
+    np.testing.assert_allclose(homogeneous(between), homogeneous(composed), atol=1e-11)

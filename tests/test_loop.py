@@ -298,11 +298,8 @@ def test_dropping_most_closures_points_to_the_drift() -> None:
     _, odometry = laps(3, 7, OdometryNoise())
     turn = Rotation.from_rotvec(np.outer(np.linspace(0.0, 0.7, len(odometry)), [0, 0, 1]))
     steps = turn[:-1].apply(np.diff(odometry.position_m, axis=0))
-    biased = replace(
-        odometry,
-        position_m=np.vstack([np.zeros(3), np.cumsum(steps, axis=0)]),
-        rotation=turn * odometry.rotation,
-    )
+    position = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+    biased = replace(odometry, position_m=position, rotation=turn * odometry.rotation)
     found = close_loop(biased, closures=TRUE, heading_drift_deg=1.0)
     assert "loop_drift_understated" in {finding.id for finding in find_loop(found)}
 
@@ -326,9 +323,8 @@ def test_reported_variances_count_where_they_grow() -> None:
     np.testing.assert_array_equal(same, default)
     assert "do not grow" in words
     growing = np.linspace(0.001, 0.4, len(odometry))[:, None].repeat(3, axis=1)
-    grown, _, words = odometry_variances(
-        replace(odometry, position_variance_m2=growing), nodes, OdometryNoise()
-    )
+    with_growing = replace(odometry, position_variance_m2=growing)
+    grown, _, words = odometry_variances(with_growing, nodes, OdometryNoise())
     np.testing.assert_allclose(grown.sum(), 0.4 - 0.001, rtol=0.05)
     assert "as the log's own position variances grow" in words
 
@@ -368,16 +364,13 @@ def test_the_slam_file_is_levelled_and_closes_better_than_the_odometry() -> None
     assert found.path_length_m == pytest.approx(86.0, abs=5.0)
 
 
-@pytest.mark.parametrize(
-    ("how", "says"),
-    [
-        ({"closures": (GivenClosure(-5.0, 50.0),)}, "closure -5,50: its times"),
-        ({"closures": (GivenClosure(20.0, 50.0, 200.0),)}, "SIGMA 200 is outside"),
-        ({"start_s": 500.0, "end_s": 600.0}, "too few"),
-        ({"start_s": 96.0, "end_s": 98.0}, "too short for a loop"),
-        ({"key_frames_m": 101.0}, "`key_frames_m` 101 is outside"),
-    ],
-)
+@pytest.mark.parametrize(("how", "says"), [
+    ({"closures": (GivenClosure(-5.0, 50.0),)}, "closure -5,50: its times"),
+    ({"closures": (GivenClosure(20.0, 50.0, 200.0),)}, "SIGMA 200 is outside"),
+    ({"start_s": 500.0, "end_s": 600.0}, "too few"),
+    ({"start_s": 96.0, "end_s": 98.0}, "too short for a loop"),
+    ({"key_frames_m": 101.0}, "`key_frames_m` 101 is outside"),
+])  # fmt: skip
 def test_impossible_parts_and_closures_are_refused(sample, how, says) -> None:
     with pytest.raises((TrajectoryError, SettingsError), match=says):
         loop_of(sample, **how)

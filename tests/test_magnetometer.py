@@ -17,15 +17,11 @@ from px4fuse.readers import read_log
 EARTH = np.array([0.21, 0.015, 0.43])
 
 
-def told(rotation: Rotation, body: np.ndarray, count: float = 1.0, size: int = 1) -> Samples:
+def told(rotation: Rotation, body: np.ndarray, size: int = 1) -> Samples:
     """What the magnetometer of a body that stands so measures."""
     turn = rotation.inv().as_matrix()
-    return Samples(
-        np.tile(turn @ EARTH + body, (size, 1)),
-        np.tile(turn, (size, 1, 1)),
-        np.full(size, count),
-        np.zeros(size),
-    )
+    value = np.tile(turn @ EARTH + body, (size, 1))
+    return Samples(value, np.tile(turn, (size, 1, 1)), np.ones(size), np.zeros(size))
 
 
 def knowing(size: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -124,9 +120,8 @@ def magnetic(generation: str = "v1.16", kept_hz: float = 2.0) -> Log:
     log["estimator_states"]["states"][:, :4] = [1.0, 0.0, 0.0, 0.0]
     at, kept = stamps(20.0, 5.0), stamps(20.0, kept_hz)
     log.add(topic("vehicle_magnetometer", at, {"magnetometer_ga": np.tile(EARTH, (len(at), 1))}))
-    log.add(topic("estimator_aid_src_mag", kept, {
-        "observation": np.tile(2.0 * EARTH, (len(kept), 1)),
-    }))  # fmt: skip
+    own = {"observation": np.tile(2.0 * EARTH, (len(kept), 1))}
+    log.add(topic("estimator_aid_src_mag", kept, own))
     flags = np.where(at < at[40], 1 << 4, 1 << 5).astype(np.uint64)
     log.drop(*({"estimator_status"} & log.names()))
     log.add(topic("estimator_status", at, {"control_mode_flags": flags}))
@@ -134,14 +129,13 @@ def magnetic(generation: str = "v1.16", kept_hz: float = 2.0) -> Log:
     return log
 
 
-def record_of(log: Log, folder: Path) -> FusionRecord:
-    ekf2 = read_log(log.write(folder / "a.ulg")).ekf2
-    return ekf2.record
+def field_of(log: Log, folder: Path) -> pd.DataFrame:
+    return read_log(log.write(folder / "a.ulg")).ekf2.record.field_gauss
 
 
 @pytest.mark.parametrize("generation", ["v1.14", "v1.16"])
 def test_the_field_is_read_with_when_ekf2_fused_all_of_it(generation: str, tmp_path: Path) -> None:
-    field = record_of(magnetic(generation), tmp_path).field_gauss
+    field = field_of(magnetic(generation), tmp_path)
     np.testing.assert_allclose(field.iloc[:, :3], np.tile(EARTH, (len(field), 1)), rtol=1e-6)
     assert field["fused_3d"].tolist() == [0.0] * 40 + [1.0] * (len(field) - 40)
 
@@ -149,7 +143,7 @@ def test_the_field_is_read_with_when_ekf2_fused_all_of_it(generation: str, tmp_p
 def test_what_ekf2_kept_is_taken_where_that_is_more(tmp_path: Path) -> None:
     """By the time of the sensor, from which EKF2 takes its delay and half a step."""
     log = magnetic(kept_hz=20.0)
-    field = record_of(log, tmp_path).field_gauss
+    field = field_of(log, tmp_path)
     np.testing.assert_allclose(field.iloc[:, :3], np.tile(2.0 * EARTH, (len(field), 1)), rtol=1e-6)
     stamped_s = seconds_of(log["estimator_aid_src_mag"]["timestamp"])[0]
     assert field.index[0] - stamped_s == pytest.approx(0.02 + 0.5 * 0.01, abs=1e-6)
@@ -160,14 +154,14 @@ def test_samples_between_two_rows_are_told_by_the_low_pass_of_innovations(tmp_pa
     log = magnetic()
     kept = log["estimator_aid_src_mag"]
     kept["innovation_filtered"] = np.linspace(0.0, 0.01, kept["timestamp"].size)[:, None] + EARTH
-    field = record_of(log, tmp_path).field_gauss
+    field = field_of(log, tmp_path)
     assert len(field) == kept["timestamp"].size
     np.testing.assert_allclose(field.iloc[:, :3], np.tile(2.0 * EARTH, (len(field), 1)), rtol=1e-6)
     np.testing.assert_allclose(field[Columns.FIELD_INNOVATION], kept["innovation_filtered"], 1e-6)
     at = stamps(20.0, 12.0)
     log.drop("vehicle_magnetometer")
     log.add(topic("vehicle_magnetometer", at, {"magnetometer_ga": np.tile(EARTH, (len(at), 1))}))
-    field = record_of(log, tmp_path).field_gauss
+    field = field_of(log, tmp_path)
     assert len(field) == len(at)
     assert list(field) == ["forward_gauss", "right_gauss", "down_gauss", "fused_3d"]
 
@@ -195,9 +189,8 @@ def test_a_mean_of_samples_is_what_was_expected_less_the_mean_innovation() -> No
     kept = np.delete(kept, [count, *range(20, 26)])  # the logger missed one, then three seconds
     fields = [*Columns.EARTH_FIELD, *Columns.BODY_FIELD]
     delayed = pd.DataFrame(dict(zip(fields, [*EARTH, *body], strict=True)), [99.0, 200.0])
-    stretch = made(
-        Stretch, time_s=time_s, rotation=rotation.as_matrix(), attitude_error_rad=error
-    )  # fmt: skip
+    matrices = rotation.as_matrix()
+    stretch = made(Stretch, time_s=time_s, rotation=matrices, attitude_error_rad=error)
     found = _mean_field(stretch, delayed, taken_s[kept], filtered[kept])
     near = np.flatnonzero(np.diff(kept) < 20) + 1
     assert found.samples.tolist() == np.diff(kept)[near - 1].tolist()

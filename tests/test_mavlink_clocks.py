@@ -44,22 +44,13 @@ def clock_error(flight: Flight, aisle: Aisle, track: int = 0) -> np.ndarray:
     return times - true
 
 
-def position_is_true(flight: Flight, aisle: Aisle, track: int = 0) -> None:
-    here = np.array([aisle.path(boot)[0] for boot in aisle.times(5.0)])
-    samples = flight.positions[track].samples.to_numpy()
-    np.testing.assert_allclose(samples[:, :3], here, atol=1e-5)
-
-
 # ---- least delay ------------------------------------------------------------------------------
 
 
 @given(
-    offset=st.floats(-1e9, 1e9),
-    drift_ppm=st.floats(-200.0, 200.0),
-    least=st.floats(0.0, 0.5),
-    scale=st.floats(0.0, 0.3),
-    seed=st.integers(0, 2**32 - 1),
-)
+    offset=st.floats(-1e9, 1e9), drift_ppm=st.floats(-200.0, 200.0), least=st.floats(0.0, 0.5),
+    scale=st.floats(0.0, 0.3), seed=st.integers(0, 2**32 - 1),
+)  # fmt: skip
 @settings(max_examples=60)
 def test_offset_and_drift_come_back_under_one_sided_delays(offset, drift_ppm, least, scale, seed):
     """1200 messages in 120 s: the least delayed of each 2 s is late by scale/20 on average."""
@@ -118,41 +109,32 @@ DAY_S, HOUR_S, WAY_S = 86_400.0, 3600.0, LEAST_DELAY_S
 # errors (s) it does so
 MEANS = {
     # the companion replies after the autopilot's question has reached it
-    "replies alone are late by the way there": (
-        Aisle(seconds=60.0), "TIMESYNC", "UNIX time", (-1.5 * WAY_S, 0.0),
-    ),
+    "replies alone are late by the way there":
+        (Aisle(seconds=60.0), "TIMESYNC", "UNIX time", (-1.5 * WAY_S, 0.0)),
     "questions alone are late the other way": (
         Aisle(seconds=60.0, replies=False, asks=True), "TIMESYNC", "UNIX time", (0.0, 1.5 * WAY_S),
     ),
-    "both directions cancel the way": (
-        Aisle(seconds=60.0, asks=True), "TIMESYNC", "UNIX time", (-0.25 * WAY_S, 0.25 * WAY_S),
-    ),
-    "TIMESYNC although the ground station's clock is an hour wrong": (
-        Aisle(receiver=lambda boot: UNIX_S + HOUR_S + boot), "TIMESYNC", "UNIX time",
-        (-1.5 * WAY_S, 1.5 * WAY_S),
-    ),
-    "SYSTEM_TIME is second": (
-        Aisle(replies=False, system_time=True), "SYSTEM_TIME", "UNIX time", (-1e-3, 1e-3),
-    ),
-    "SYSTEM_TIME is of no use to a companion with a wrong date": (
-        Aisle(replies=False, system_time=True, clock=lambda boot: UNIX_S - DAY_S + boot),
-        "receive time", "UNIX time", (-1.5 * WAY_S, 1.5 * WAY_S),
-    ),
+    "both directions cancel the way":
+        (Aisle(seconds=60.0, asks=True), "TIMESYNC", "UNIX time", (-0.25 * WAY_S, 0.25 * WAY_S)),
+    "TIMESYNC although the ground station's clock is an hour wrong":
+        (Aisle(receiver=lambda boot: UNIX_S + HOUR_S + boot), "TIMESYNC", "UNIX time",
+         (-1.5 * WAY_S, 1.5 * WAY_S)),
+    "SYSTEM_TIME is second":
+        (Aisle(replies=False, system_time=True), "SYSTEM_TIME", "UNIX time", (-1e-3, 1e-3)),
+    "SYSTEM_TIME is of no use to a companion with a wrong date":
+        (Aisle(replies=False, system_time=True, clock=lambda boot: UNIX_S - DAY_S + boot),
+         "receive time", "UNIX time", (-1.5 * WAY_S, 1.5 * WAY_S)),
     # both ways have the same least delay, which cancels
-    "the time of receipt is last": (
-        Aisle(replies=False, seconds=60.0), "receive time", "UNIX time", (-1.5e-3, 1.5e-3),
-    ),
-    "a boot clock needs no mapping": (
-        Aisle(clock=same, replies=False), "boot clock", "system 1", (-1e-6, 1e-6),
-    ),
+    "the time of receipt is last":
+        (Aisle(replies=False, seconds=60.0), "receive time", "UNIX time", (-1.5e-3, 1.5e-3)),
+    "a boot clock needs no mapping":
+        (Aisle(clock=same, replies=False), "boot clock", "system 1", (-1e-6, 1e-6)),
     # a companion's monotonic clock reads 3 s less; TIMESYNC knows
-    "a clock that started seconds after the autopilot's is another clock": (
-        Aisle(clock=lambda boot: boot - 3.0, asks=True), "TIMESYNC", "own clock", (-WAY_S, WAY_S),
-    ),
-    "an own clock hours away is mapped by receipt": (
-        Aisle(clock=lambda boot: boot + 2 * HOUR_S, replies=False), "receive time", "own clock",
-        (-1.5 * WAY_S, 1.5 * WAY_S),
-    ),
+    "a clock that started seconds after the autopilot's is another clock":
+        (Aisle(clock=lambda boot: boot - 3.0, asks=True), "TIMESYNC", "own clock", (-WAY_S, WAY_S)),
+    "an own clock hours away is mapped by receipt":
+        (Aisle(clock=lambda boot: boot + 2 * HOUR_S, replies=False), "receive time", "own clock",
+         (-1.5 * WAY_S, 1.5 * WAY_S)),
 }  # fmt: skip
 NOTES = {"SYSTEM_TIME": "agree on UNIX time", "receive time": "least delay"}
 
@@ -173,7 +155,8 @@ def test_which_means_a_clock_is_mapped_by(read, case):
         assert found.pairs == 1200
     if "second" in case and method == "SYSTEM_TIME":
         assert flight.log.start_unix_s == pytest.approx(UNIX_S + BOOT_S, abs=1e-3)
-    position_is_true(flight, aisle)
+    here = np.array([aisle.path(boot)[0] for boot in aisle.times(5.0)])
+    np.testing.assert_allclose(flight.positions[0].samples.to_numpy()[:, :3], here, atol=1e-5)
 
 
 @pytest.mark.parametrize("asks", [False, True])
@@ -265,63 +248,60 @@ def renumbered(recorder: Recorder, change) -> Recorder:
     return recorder
 
 
-@pytest.mark.parametrize("autopilot_heard", [True, False])
-def test_a_companion_that_calls_itself_an_autopilot_is_not_the_vehicle(read, autopilot_heard):
-    """As scripts do that copy a heartbeat, and set points whose boot time is a constant."""
-    aisle = Aisle(imu_hz=20.0)
+def calls_itself_autopilot(sender, made):
+    """As scripts do that copy a heartbeat."""
+    beat = made.get_type() == "HEARTBEAT" and sender == COMPANION
+    return sender, heartbeat(kind=18, autopilot=0) if beat else made
+
+
+def without_heartbeat(sender, made):
+    found = calls_itself_autopilot(sender, made)
+    return None if made.get_type() == "HEARTBEAT" and sender != COMPANION else found
+
+
+def of_component_4(sender, made):
+    if made.get_type() == "HEARTBEAT":
+        return None
+    return ((1, 4), made) if sender == AUTOPILOT else (sender, made)
+
+
+def stamped_by(boot_ms, usec):
+    """An autopilot whose stamps are made of the true ones so; None leaves those messages out."""
 
     def change(sender, made):
-        beat = made.get_type() == "HEARTBEAT"
-        if beat and sender == COMPANION:
-            return sender, heartbeat(kind=18, autopilot=0)
-        return None if beat and not autopilot_heard else (sender, made)
+        if sender == AUTOPILOT and hasattr(made, "time_boot_ms"):
+            if boot_ms is None:
+                return None
+            made.time_boot_ms = boot_ms(made.time_boot_ms)
+        if sender == AUTOPILOT and hasattr(made, "time_usec"):
+            made.time_usec = usec(made.time_usec)
+        return sender, made
 
+    return change
+
+
+UNIX_CLOCK = stamped_by(None, lambda usec: usec + us(UNIX_S))
+STANDING = stamped_by(lambda _: 1000, lambda _: 1_000_000)
+
+
+@pytest.mark.parametrize(("change", "stamped"), [
+    (calls_itself_autopilot, True), (without_heartbeat, True), (of_component_4, True),
+    (of_component_4, False), (UNIX_CLOCK, True), (UNIX_CLOCK, False), (STANDING, True),
+])  # fmt: skip
+def test_an_autopilot_is_found_by_what_it_sends_and_placed_by_what_moves(read, change, stamped):
+    """A companion that calls itself one sets points too, whose boot time is a constant."""
+    aisle = Aisle(replies=False, state=None if change is STANDING else "ODOMETRY")
     recorder = renumbered(aisle.record(), change)
-    for boot in aisle.times(100.0):
-        made = message("SET_POSITION_TARGET_LOCAL_NED", time_boot_ms=10)
-        recorder.hear(unix(boot), COMPANION, made)
-    flight = read(recorder)
-    assert flight.log.duration_s == pytest.approx(aisle.seconds, abs=0.1)
-    assert sample_rate(flight.imu) == pytest.approx(20.0, rel=0.01)
-
-
-@pytest.mark.parametrize("stamped", [True, False])
-def test_an_autopilot_of_another_component_or_clock_is_found_by_what_it_sends(read, stamped):
-    """One without a heartbeat, and one whose clock is UNIX time."""
-    aisle = Aisle(replies=False)
-
-    def other_component(sender, made):
-        if made.get_type() == "HEARTBEAT":
-            return None
-        return ((1, 4), made) if sender == AUTOPILOT else (sender, made)
-
-    def other_clock(sender, made):
-        if sender == AUTOPILOT and hasattr(made, "time_boot_ms"):
-            return None
-        if sender == AUTOPILOT and hasattr(made, "time_usec"):
-            made.time_usec += us(UNIX_S)
-        return sender, made
-
-    for change in (other_component, other_clock):
-        flight = read(renumbered(aisle.record(), change), stamped=stamped)
-        assert flight.log.duration_s == pytest.approx(aisle.seconds, abs=0.1)
-        assert len(flight.imu) == aisle.seconds * aisle.imu_hz
-        np.testing.assert_allclose(np.diff(flight.imu.index), 1.0 / aisle.imu_hz, atol=1e-5)
-
-
-def test_an_autopilot_whose_stamps_stand_still_is_placed_by_the_time_of_receipt(read):
-    aisle = Aisle(replies=False, state=None)
-
-    def change(sender, made):
-        if sender == AUTOPILOT and hasattr(made, "time_boot_ms"):
-            made.time_boot_ms = 1000
-        if sender == AUTOPILOT and hasattr(made, "time_usec"):
-            made.time_usec = 1_000_000
-        return sender, made
-
-    flight = read(renumbered(aisle.record(), change))
+    if change in (calls_itself_autopilot, without_heartbeat):
+        for boot in aisle.times(100.0):
+            point = message("SET_POSITION_TARGET_LOCAL_NED", time_boot_ms=10)
+            recorder.hear(unix(boot), COMPANION, point)
+    flight = read(recorder, stamped=stamped)
     assert flight.log.duration_s == pytest.approx(aisle.seconds, abs=0.1)
     assert sample_rate(flight.imu) == pytest.approx(aisle.imu_hz, rel=0.01)
+    if change is not STANDING:  # by the time of receipt, that one
+        assert len(flight.imu) == aisle.seconds * aisle.imu_hz
+        np.testing.assert_allclose(np.diff(flight.imu.index), 1.0 / aisle.imu_hz, atol=1e-5)
 
 
 def test_a_stream_without_any_clock_says_so(read):
@@ -429,29 +409,29 @@ def test_senders_and_what_they_lost_are_described(tmp_path):
 # ---- the map itself -----------------------------------------------------------------------------
 
 
+def mapped(received, *exchanges):
+    """The map of stamps of UNIX time, ten a second, that were received so."""
+    stamps = UNIX_S + 0.1 * np.arange(len(received))
+    line = Line(0.0, 0.0, 1.0, 0.0, 9)
+    return stamps, map_clock("x", stamps, received, line, *exchanges, None, has_receipt=True)
+
+
 def test_a_timesync_of_another_clock_is_passed_over():
     """It would put messages an hour before their receipt."""
-    stamps = UNIX_S + np.arange(0.0, 60.0, 0.2)
-    received = np.arange(0.0, 60.0, 0.2) + 0.01
-    asked = np.arange(0.0, 60.0, 0.1)
-    wrong = (asked, UNIX_S + 3600.0 + asked), NO_EXCHANGES[1]
-    mapped = map_clock(
-        "x", stamps, received, Line(0.0, 0.0, 1.0, 0.0, 9), *wrong, None, has_receipt=True
-    )
-    assert mapped.statement.method == "receive time"
-    np.testing.assert_allclose(mapped.to_boot.at(stamps), received, atol=1e-6)
+    received = np.arange(0.0, 60.0, 0.1) + 0.01
+    wrong = (received, UNIX_S + 3600.0 + received), NO_EXCHANGES[1]
+    stamps, found = mapped(received, *wrong)
+    assert found.statement.method == "receive time"
+    np.testing.assert_allclose(found.to_boot.at(stamps), received, atol=1e-6)
 
 
 def test_the_statement_says_what_the_map_does():
     """boot = stamp + offset + drift · (stamp - middle of the stamps)."""
-    stamps = UNIX_S + np.arange(0.0, 100.0, 0.1)
     received = 20.0 + 1.0001 * np.arange(0.0, 100.0, 0.1)
-    mapped = map_clock(
-        "x", stamps, received, Line(0.0, 0.0, 1.0, 0.0, 9), *NO_EXCHANGES, None, has_receipt=True
-    )
-    statement, line = mapped.statement, mapped.to_boot
+    stamps, found = mapped(received, *NO_EXCHANGES)
+    statement = found.statement
     assert statement.drift_ppm == pytest.approx(100.0, abs=0.1)
     middle = 0.5 * (stamps[0] + stamps[-1])
     by_statement = stamps + statement.offset_s + statement.drift_ppm * 1e-6 * (stamps - middle)
-    np.testing.assert_allclose(by_statement, line.at(stamps), atol=2e-6)
+    np.testing.assert_allclose(by_statement, found.to_boot.at(stamps), atol=2e-6)
     np.testing.assert_allclose(by_statement, received, atol=2e-6)

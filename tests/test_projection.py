@@ -66,9 +66,8 @@ def test_along_the_aisle_innovations_are_projected_and_variances_by_the_squares(
     for k, time in enumerate(got.index):
         n, e = NORTH.iloc[k + 1], EAST.iloc[k]
         row = got.loc[time]
-        assert row["innovation_m"] == pytest.approx(
-            COSINE * n["innovation_m"] + SINE * e["innovation_m"]
-        )
+        along = COSINE * n["innovation_m"] + SINE * e["innovation_m"]
+        assert row["innovation_m"] == pytest.approx(along)
         for column in ("innovation_variance_m2", "observation_variance_m2"):
             assert row[column] == pytest.approx(COSINE**2 * n[column] + SINE**2 * e[column])
         for column in ("test_ratio", "fused", "rejected"):
@@ -99,20 +98,16 @@ def test_a_variance_without_room_for_the_prior_leaves_it_unknown() -> None:
 GONE = Unavailable("innovations", "none logged", "Log them.")
 
 
-@pytest.mark.parametrize(
-    ("made", "axis", "segment", "says"),
-    [
-        (with_innovations(flight(), north=NORTH), "north", Segment(20.0, 30.0, ""),
-         "no sample in the segment"),
-        # the aisle needs both horizontal axes
-        (with_innovations(flight(), north=GONE), "aisle", WHOLE, "none logged"),
-        (with_innovations(flight(), east=GONE), "aisle", WHOLE, "none logged"),
-        # motion capture is never fused
-        (flight(uwb=Uwb(name="vehicle_mocap_odometry", origin=MOTION_CAPTURE)), "north", WHOLE,
-         "never fuses vehicle_mocap_odometry"),
-    ],
-    ids=["segment", "north", "east", "mocap"],
-)  # fmt: skip
+@pytest.mark.parametrize(("made", "axis", "segment", "says"), [
+    (with_innovations(flight(), north=NORTH), "north", Segment(20.0, 30.0, ""),
+     "no sample in the segment"),
+    # the aisle needs both horizontal axes
+    (with_innovations(flight(), north=GONE), "aisle", WHOLE, "none logged"),
+    (with_innovations(flight(), east=GONE), "aisle", WHOLE, "none logged"),
+    # motion capture is never fused
+    (flight(uwb=Uwb(name="vehicle_mocap_odometry", origin=MOTION_CAPTURE)), "north", WHOLE,
+     "never fuses vehicle_mocap_odometry"),
+], ids=["segment", "north", "east", "mocap"])  # fmt: skip
 def test_where_there_are_none_it_says_why(made, axis, segment, says) -> None:
     (track,) = made.positions
     got = project_innovations(made, made.ekf2, track, axes_of(made)[axis], segment)
@@ -129,18 +124,15 @@ def test_where_no_observation_noise_is_logged_the_parameters_stand_in() -> None:
     assert unknown["prior_variance_m2"].isna().all()
 
 
-@pytest.mark.parametrize(
-    ("parameters", "reported_m", "expected_m2"),
-    [
-        ({"EKF2_EVP_NOISE": 0.2}, None, 0.2**2),
-        ({"EKF2_EVP_NOISE": 0.001}, None, 0.01**2),  # EKF2 takes no less than a centimetre
-        # the sender's variance where it is the larger, along the axis by the squares
-        ({"EKF2_EVP_NOISE": 0.2}, (0.3, 0.5, 1.0), COSINE**2 * 0.3**2 + SINE**2 * 0.5**2),
-        ({"EKF2_EVP_NOISE": 0.2}, (0.1, 0.1, 1.0), 0.2**2),
-        ({"EKF2_EVP_NOISE": 0.2, "EKF2_EV_NOISE_MD": 0.0}, (0.3, 0.3, 1.0), 0.3**2),
-        ({"EKF2_EVP_NOISE": 0.2, "EKF2_EV_NOISE_MD": 1.0}, (0.3, 0.3, 1.0), 0.2**2),
-    ],
-)
+@pytest.mark.parametrize(("parameters", "reported_m", "expected_m2"), [
+    ({"EKF2_EVP_NOISE": 0.2}, None, 0.2**2),
+    ({"EKF2_EVP_NOISE": 0.001}, None, 0.01**2),  # EKF2 takes no less than a centimetre
+    # the sender's variance where it is the larger, along the axis by the squares
+    ({"EKF2_EVP_NOISE": 0.2}, (0.3, 0.5, 1.0), COSINE**2 * 0.3**2 + SINE**2 * 0.5**2),
+    ({"EKF2_EVP_NOISE": 0.2}, (0.1, 0.1, 1.0), 0.2**2),
+    ({"EKF2_EVP_NOISE": 0.2, "EKF2_EV_NOISE_MD": 0.0}, (0.3, 0.3, 1.0), 0.3**2),
+    ({"EKF2_EVP_NOISE": 0.2, "EKF2_EV_NOISE_MD": 1.0}, (0.3, 0.3, 1.0), 0.2**2),
+])  # fmt: skip
 def test_the_observation_noise_is_ekf2s_own_rule(parameters, reported_m, expected_m2) -> None:
     made = flight(parameters=parameters)
     (track,) = made.positions

@@ -11,16 +11,13 @@ from px4fuse.flight import Unavailable
 from px4fuse.recording import Stream
 
 
-@pytest.mark.parametrize(
-    ("topic", "imu_hz", "needed"),
-    [
-        ("HIGHRES_IMU", 100.0, "200 Hz"),
-        ("SCALED_IMU2", 4.0, "200 Hz"),
-        ("HIGHRES_IMU", 200.0, None),
-        ("sensor_combined", 100.0, None),
-        ("sensor_combined", 20.0, "40 Hz"),
-    ],
-)
+@pytest.mark.parametrize(("topic", "imu_hz", "needed"), [
+    ("HIGHRES_IMU", 100.0, "200 Hz"),
+    ("SCALED_IMU2", 4.0, "200 Hz"),
+    ("HIGHRES_IMU", 200.0, None),
+    ("sensor_combined", 100.0, None),
+    ("sensor_combined", 20.0, "40 Hz"),
+])  # fmt: skip
 def test_a_clock_offset_needs_the_whole_imu(topic, imu_hz, needed) -> None:
     """A sample that telemetry picks out of many is no mean over its interval."""
     flight = aisle_flight(duration_s=40.0, imu=Imu(rate_hz=imu_hz))

@@ -1,7 +1,5 @@
 """Rotations as quaternions, against closed forms and SciPy."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

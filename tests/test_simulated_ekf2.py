@@ -1,14 +1,11 @@
 """EKF2 of simulated flights against the truth, against its replay, and what it shows."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
 from exchange import replace
 from flights import unexplained
+from scipy.spatial.transform import Rotation
 
 from px4fuse.comparison.comparison import compare
 from px4fuse.ekf2.inputs import MODEL_NOTE
@@ -64,7 +61,7 @@ def clean() -> Flight:
 # --- the model, from take-off
 
 
-def test_a_clean_flight_agrees_with_its_replay_from_the_log(clean: Flight) -> None:
+def test_a_clean_flight_agrees_with_its_replay_from_the_log(clean):
     found = agreement(clean)
     assert found.good
     assert found.decisions_same == 1.0
@@ -76,16 +73,12 @@ def test_a_clean_flight_agrees_with_its_replay_from_the_log(clean: Flight) -> No
         assert axis.velocity_rms_difference_m_s < 0.03  # vehicle_attitude is not EKF2's
 
 
-@pytest.mark.parametrize(
-    ("texts", "scenario"),
-    [
-        (("nlos=5%",), AISLE),
-        (("ekf2-delay=175ms",), AISLE),
-        ((), Scenario(kind="loop", passes=1, seed=5)),
-    ],
-    ids=["outliers", "delay", "loop"],
-)
-def test_flights_with_mistakes_agree_too(texts: tuple[str, ...], scenario: Scenario) -> None:
+@pytest.mark.parametrize(("texts", "scenario"), [
+    (("nlos=5%",), AISLE),
+    (("ekf2-delay=175ms",), AISLE),
+    ((), Scenario(kind="loop", passes=1, seed=5)),
+], ids=["outliers", "delay", "loop"])  # fmt: skip
+def test_flights_with_mistakes_agree_too(texts, scenario):
     found = agreement(flown(*texts, scenario=scenario))
     assert found.good
     assert found.decisions_same > 0.99
@@ -94,7 +87,7 @@ def test_flights_with_mistakes_agree_too(texts: tuple[str, ...], scenario: Scena
         assert axis.s_ratio_median == pytest.approx(1.0, abs=0.01)
 
 
-def test_clean_flights_are_consistent_and_near_the_truth() -> None:
+def test_clean_flights_are_consistent_and_near_the_truth():
     values, inside, errors, stated = [], [], [], []
     for seed in range(8):
         flight = flown(scenario=Scenario(passes=2, seed=seed))
@@ -114,7 +107,7 @@ def test_clean_flights_are_consistent_and_near_the_truth() -> None:
     assert np.median(stated) == pytest.approx(0.06, abs=0.01)
 
 
-def test_the_horizon_state_is_as_good_as_it_says(clean: Flight) -> None:
+def test_the_horizon_state_is_as_good_as_it_says(clean):
     """Position and velocity at the horizon, their variances, and the biases that it learns."""
     record, truth = clean.ekf2.record, clean.truth.samples
     later = record.delayed[record.delayed.index > 15.0]
@@ -127,10 +120,8 @@ def test_the_horizon_state_is_as_good_as_it_says(clean: Flight) -> None:
     assert last["accelerometer_bias_down_m_s2"] == pytest.approx(bias[2], abs=0.05)
 
 
-def test_where_it_stands_still_the_attitude_is_levelled() -> None:
-    tilt = np.array(
-        [[1.0, 0.0, 0.0], [0.0, np.cos(0.1), -np.sin(0.1)], [0.0, np.sin(0.1), np.cos(0.1)]]
-    )
+def test_where_it_stands_still_the_attitude_is_levelled():
+    tilt = Rotation.from_euler("x", 0.1).as_matrix()
     gravity = np.array([0.0, 0.0, 9.80665])
     bias, rate = np.array([0.03, -0.02, 0.05]), np.array([0.002, -0.001, 0.003])
     x, P = ekf2._standing(tilt, tilt.T @ -gravity + bias, rate, 0.01)
@@ -144,7 +135,7 @@ def test_where_it_stands_still_the_attitude_is_levelled() -> None:
     assert abs(P[0, 13]) / deviation[0] / deviation[13] > 0.95
 
 
-def test_fusion_needs_ten_hertz_stops_and_resets_as_ekf2_does() -> None:
+def test_fusion_needs_ten_hertz_stops_and_resets_as_ekf2_does():
     slow = flown("decimate=2Hz")
     fusing = slow.ekf2.fusing
     assert not fusing["horizontal"].any()
@@ -165,7 +156,7 @@ def test_fusion_needs_ten_hertz_stops_and_resets_as_ekf2_does() -> None:
     assert moved == pytest.approx(resets[0].delta[0], abs=0.3)
 
 
-def test_samples_that_come_too_late_are_never_fused_and_that_is_said() -> None:
+def test_samples_that_come_too_late_are_never_fused_and_that_is_said():
     early = flown("clock-offset=-350ms")
     compared = compare(early, RIGHT, axes=("north",))
     (finding,) = (f for f in find(unexplained(compared)) if f.id == "ekf2_not_fusing")
@@ -173,15 +164,14 @@ def test_samples_that_come_too_late_are_never_fused_and_that_is_said() -> None:
     assert "EKF2_DELAY_MAX" in finding.remedy
 
 
-def test_a_step_is_the_nearest_number_of_samples() -> None:
-    assert [samples_per_step(0.01, t) for t in (0.00375, 0.004, 0.005, 0.0021, 0.05)] == [
-        3, 3, 2, 5, 1
-    ]  # fmt: skip
+def test_a_step_is_the_nearest_number_of_samples():
+    found = [samples_per_step(0.01, t) for t in (0.00375, 0.004, 0.005, 0.0021, 0.05)]
+    assert found == [3, 3, 2, 5, 1]
     # a median of stamps is never exactly 4 ms
     assert samples_per_step(0.01, 0.004 + 1e-12) == samples_per_step(0.01, 0.004 - 1e-12) == 3
 
 
-def test_a_half_is_rounded_as_the_log_shows_it() -> None:
+def test_a_half_is_rounded_as_the_log_shows_it():
     """EKF2 rounds a mean that it measures: two and a half samples are two, or three."""
     by_two, by_three = 2 * np.arange(0, 60, 7), 3 * np.arange(0, 60, 7)
     ends = by_two, by_three, [5], [0, 25, 50]
@@ -192,7 +182,7 @@ def test_a_half_is_rounded_as_the_log_shows_it() -> None:
     assert samples_per_step(0.01, 0.00375, by_two) == 3
 
 
-def test_samples_with_older_stamps_than_the_last_are_not_taken() -> None:
+def test_samples_with_older_stamps_than_the_last_are_not_taken():
     simulation = simulate(Scenario(passes=4, seed=5), parse(["clock-jump=400ms"]))
     topics = {topic.name: topic.fields for topic in simulation.topics}
     sent = topics["vehicle_visual_odometry"]["timestamp_sample"].astype(np.int64)
@@ -207,7 +197,7 @@ def test_samples_with_older_stamps_than_the_last_are_not_taken() -> None:
 # --- mistakes of EKF2's own
 
 
-def test_ekf2_that_is_not_told_to_fuse_only_looks(clean: Flight) -> None:
+def test_ekf2_that_is_not_told_to_fuse_only_looks(clean):
     flight = flown("ekf2-off")
     assert flight.log.parameters["EKF2_EV_CTRL"] == 0.0
     assert flight.ekf2.fusing["horizontal"].max() == 0.0
@@ -224,9 +214,7 @@ def test_ekf2_that_is_not_told_to_fuse_only_looks(clean: Flight) -> None:
 # --- the log
 
 
-def test_the_log_says_that_it_is_a_model_and_one_without_ekf2_has_no_note(
-    clean: Flight, tmp_path: Path
-) -> None:
+def test_the_log_says_that_it_is_a_model_and_one_without_ekf2_has_no_note(clean, tmp_path):
     path = tmp_path / "flight.ulg"
     path.write_bytes(to_ulog(simulate(AISLE)))
     assert read_log(path).log.notes == clean.log.notes == (MODEL_NOTE,)

@@ -121,10 +121,9 @@ def test_ground_truth_says_so(name: str, tmp_path: Path) -> None:
     assert read_trajectory(path).kind == "truth"
 
 
-@pytest.mark.parametrize(
-    ("axes", "tilt_deg", "frame"),
-    [("xzy", 15.0, "camera"), ("xzy", 30.0, "unknown"), ("xyz", 0.0, "unknown")],
-)
+@pytest.mark.parametrize(("axes", "tilt_deg", "frame"), [
+    ("xzy", 15.0, "camera"), ("xzy", 30.0, "unknown"), ("xyz", 0.0, "unknown"),
+])  # fmt: skip
 def test_the_camera_frame_shows_in_a_level_motion(axes, tilt_deg, frame, tmp_path) -> None:
     angle = np.linspace(0.0, 6.0, 200)
     level = np.column_stack((9 * np.sin(angle), 6 - 6 * np.cos(angle), 0.1 * np.sin(7 * angle)))
@@ -140,9 +139,8 @@ def test_gaps_key_frames_and_repeated_stamps_are_told(tmp_path: Path) -> None:
     keep = ((time < 10) | (time > 14)) & ((time < 30) | (time > 31))
     made = Trajectory("t", "unknown", time, np.tile(POSITION_M, (20, 1)), Rotation.identity(1000))
     notes = " ".join(read_trajectory(write(tmp_path, tum_text(made[keep]))).notes)
-    assert (
-        "No poses for 5.1 s in 2 gaps, the longest at 10.0 s after its start, 102 frames" in notes
-    )
+    gaps = "No poses for 5.1 s in 2 gaps, the longest at 10.0 s after its start, 102 frames"
+    assert gaps in notes
     irregular = made[np.flatnonzero(np.random.default_rng(1).random(1000) < 0.2)]
     assert "key frames" in " ".join(read_trajectory(write(tmp_path, tum_text(irregular))).notes)
     lines = tum_text(made).split("\n")
@@ -231,9 +229,8 @@ NUMBER = st.floats(-1e6, 1e6)
     quaternion=hnp.arrays(float, (8, 4), elements=st.floats(0.1, 1.0)),
 )
 def test_what_is_written_is_read_back_exactly(steps, start, position, quaternion, tmp_path) -> None:
-    made = Trajectory(
-        "t", "unknown", start + np.cumsum(steps), position, Rotation.from_quat(quaternion)
-    )
+    time_s, rotation = start + np.cumsum(steps), Rotation.from_quat(quaternion)
+    made = Trajectory("t", "unknown", time_s, position, rotation)
     once = read_trajectory(write(tmp_path, tum_text(made)))
     np.testing.assert_array_equal(once.time_s, made.time_s)
     np.testing.assert_array_equal(once.position_m, made.position_m)

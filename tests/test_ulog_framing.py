@@ -1,5 +1,6 @@
 """What of a ULog is read: cut off, overwritten, with zeros or rubbish in it and behind it."""
 
+import itertools
 import random
 import struct
 from pathlib import Path
@@ -27,13 +28,8 @@ MESSAGES = [message(b"D", bytes([n]) * (n + 1)) for n in range(60)]
 WHOLE = HEAD + b"".join(MESSAGES)
 
 
-def ends() -> list[int]:
-    """Where each message ends."""
-    at, made = HEADER_BYTES, []
-    for one in MESSAGES:
-        at += len(one)
-        made.append(at)
-    return made
+# Where each message ends
+ENDS = [*itertools.accumulate(map(len, MESSAGES), initial=HEADER_BYTES)][1:]
 
 
 def test_a_whole_file_is_what_it_is() -> None:
@@ -45,7 +41,7 @@ def test_a_whole_file_is_what_it_is() -> None:
 @given(st.integers(HEADER_BYTES, len(WHOLE)))
 def test_a_file_that_is_cut_off_keeps_its_whole_messages(cut: int) -> None:
     found = whole_messages(WHOLE[:cut])
-    whole = max((end for end in (HEADER_BYTES, *ends()) if end <= cut), default=HEADER_BYTES)
+    whole = max((end for end in (HEADER_BYTES, *ENDS) if end <= cut), default=HEADER_BYTES)
     assert found.content == WHOLE[:whole]
     assert found.lost_bytes == cut - whole
     assert found.in_message is (cut > whole)
@@ -54,14 +50,14 @@ def test_a_file_that_is_cut_off_keeps_its_whole_messages(cut: int) -> None:
 @pytest.mark.parametrize("rubbish", [bytes(100_000), RUBBISH[:100_000], b"\xff" * 777])
 @pytest.mark.parametrize("at", [20, 30, 60])
 def test_what_is_put_in_or_behind_is_lost_alone(rubbish: bytes, at: int) -> None:
-    place = ends()[at - 1]
+    place = ENDS[at - 1]
     found = whole_messages(WHOLE[:place] + rubbish + WHOLE[place:])
     assert found.content == WHOLE
     assert (found.lost_bytes, found.places) == (len(rubbish), 1)
 
 
 def test_a_size_that_was_overwritten_costs_one_message() -> None:
-    place = ends()[19]
+    place = ENDS[19]
     spoilt = WHOLE[:place] + b"\xf0" + WHOLE[place + 1 :]
     found = whole_messages(spoilt)
     assert found.content == HEAD + b"".join(MESSAGES[:20] + MESSAGES[21:])
