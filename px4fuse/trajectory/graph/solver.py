@@ -190,7 +190,7 @@ def _minimise(
                 tried_weights, costs = kernel(tried.chi2)
                 drop = cost - float(np.sum(costs))
                 flat = abs(drop) < tolerance * cost
-            accepted = drop > _LEAST_FIDELITY * promised > _EPSILON * cost
+            accepted = promised > _EPSILON * cost and drop > _LEAST_FIDELITY * promised
             if accepted or flat or damping >= _MOST_DAMPING:
                 break
             damping *= _DAMPING_FACTOR
