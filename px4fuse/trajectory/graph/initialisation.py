@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie, model
 from px4fuse.trajectory.graph.model import PoseGraph
-from px4fuse.trajectory.graph.system import BlockSystem
+from px4fuse.trajectory.graph.system import normal_equations, solve_with
 
 
 def initialise(graph: PoseGraph) -> PoseGraph:
@@ -58,33 +57,20 @@ def _chordal(graph: PoseGraph) -> PoseGraph:
     d = graph.dimension
     spin = np.trace(graph.information[:, d:, d:], axis1=1, axis2=2)
     model.require_connected(graph, spin > 0.0, "edges that tell a rotation")
-    held = graph.first == 0, graph.second == 0
-    system = BlockSystem(graph.first, graph.second, len(graph))
     measured = lie.rotation_matrix(graph.measurements)
-    transposed = measured.transpose(0, 2, 1)
-    first = lie.rotation_matrix(graph.poses[:1])[0]
-    # Unknown are the transposed rotations Y: sum of spin |Z' Y_i - Y_j|^2
-    own = spin[:, None, None] * np.eye(d)
-    weighted = spin[:, None, None] * transposed
-    right = system.vector(
-        np.where(held[1][:, None, None], weighted.transpose(0, 2, 1) @ first.T, 0.0),
-        np.where(held[0][:, None, None], weighted @ first.T, 0.0),
-    )
-    relaxed = _solved(system, system.matrix(own, own, -weighted.transpose(0, 2, 1)), right)
-    relaxed[0] = first.T
+    eye = np.broadcast_to(np.eye(d), measured.shape)
+    # of the transposed rotations Y: sum of spin |Z' Y_i - Y_j|^2
+    relaxed = _solved(
+        graph, measured.transpose(0, 2, 1), -eye, spin[:, None, None] * eye, 0.0 * measured,
+        lie.rotation_matrix(graph.poses[0]).T,
+    )  # fmt: skip
     rotation = _nearest_rotations(relaxed.transpose(0, 2, 1))
     # Residual of an edge in the axes of the measured pose: (R_i Z)' (t_j - t_i - R_i z)
     from_i = rotation[graph.first]
     axes = from_i @ measured
     information = axes @ graph.information[:, :d, :d] @ axes.transpose(0, 2, 1)
-    pull = information @ (from_i @ graph.measurements[:, :d, None])
-    start = information @ graph.poses[0, :d, None]
-    system_right = system.vector(
-        (np.where(held[1][:, None, None], start, 0.0) - pull)[..., 0],
-        (np.where(held[0][:, None, None], start, 0.0) + pull)[..., 0],
-    )
-    position = _solved(system, system.matrix(information, information, -information), system_right)
-    position[0] = graph.poses[0, :d]
+    way = from_i @ graph.measurements[:, :d, None]
+    position = _solved(graph, -eye, eye, information, way, graph.poses[0, :d, None])[..., 0]
     if d == 2:
         heading = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
         poses = np.column_stack([position, heading])
@@ -94,11 +80,15 @@ def _chordal(graph: PoseGraph) -> PoseGraph:
     return replace(graph, poses=poses, initialised=model.FROM_CHORDAL)
 
 
-def _solved(system: BlockSystem, matrix: sparse.csc_array[np.float64], right: Array) -> Array:
-    solution = system.solve(matrix, right)
-    if solution is None:
+def _solved(
+    graph: PoseGraph, of_first: Array, of_second: Array, information: Array, value: Array,
+    held: Array,
+) -> Array:  # fmt: skip
+    """Least squares as :func:`normal_equations` has them, shape (n, d, k)."""
+    found = solve_with(*normal_equations(graph, of_first, of_second, information, value, held))
+    if found is None:
         raise TrajectoryError("The edges do not determine where to start", "Give VERTEX lines.")
-    return solution
+    return np.concatenate([held[None], found.reshape(-1, *held.shape)])
 
 
 def _nearest_rotations(matrices: Array) -> Array:

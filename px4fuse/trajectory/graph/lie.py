@@ -18,7 +18,6 @@ from px4fuse.trajectory.rotation import from_elements, skew
 
 # Below this angle (rad) series replace quotients that cancel; five terms then reach 1e-14
 SMALL = 0.3
-_B = (1 / 6, -1 / 120, 1 / 5040, -1 / 362880, 1 / 39916800)
 _C = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
 _C_SLOPE = (1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520, 691 / 130767436800)
 
@@ -68,17 +67,9 @@ def compose(a: Array, b: Array) -> Array:
     a, b : ndarray, shape (..., 3) or (..., 7)
         Quaternions are normalised in the result; headings are not wrapped.
     """
-    made = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    if a.shape[-1] == 3:
-        c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
-        made[..., 0] = a[..., 0] + c * b[..., 0] - s * b[..., 1]
-        made[..., 1] = a[..., 1] + s * b[..., 0] + c * b[..., 1]
-        made[..., 2] = a[..., 2] + b[..., 2]
-        return made
-    turn = _turn(a)
-    made[..., :3] = a[..., :3] + turn.apply(b[..., :3])
-    made[..., 3:] = (turn * _turn(b)).as_quat()
-    return made
+    d = _dimension(a)
+    turn = a[..., 2:] + b[..., 2:] if d == 2 else (_turn(a) * _turn(b)).as_quat()
+    return np.concatenate([a[..., :d] + _times(rotation_matrix(a), b[..., :d]), turn], axis=-1)
 
 
 def inverse(pose: Array) -> Array:
@@ -88,31 +79,24 @@ def inverse(pose: Array) -> Array:
 
 def between(a: Array, b: Array) -> Array:
     """Poses b as seen from a: the inverse of a, composed with b."""
-    made = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    if a.shape[-1] == 3:
-        c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
-        x, y = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
-        made[..., 0], made[..., 1] = c * x + s * y, c * y - s * x
-        made[..., 2] = b[..., 2] - a[..., 2]
-        return made
-    back = _turn(a).inv()
-    made[..., :3] = back.apply(b[..., :3] - a[..., :3])
-    made[..., 3:] = (back * _turn(b)).as_quat()
-    return made
+    d, back = _dimension(a), np.swapaxes(rotation_matrix(a), -1, -2)
+    turn = b[..., 2:] - a[..., 2:] if d == 2 else (_turn(a).inv() * _turn(b)).as_quat()
+    return np.concatenate([_times(back, b[..., :d] - a[..., :d]), turn], axis=-1)
 
 
 def exp(tangent: Array) -> Array:
-    """Poses that a constant twist reaches in unit time (Barfoot 2017, 7.35; Sola 2018, 156)."""
-    if tangent.shape[-1] == 3:
-        theta = tangent[..., 2]
-        x, y = tangent[..., 0], tangent[..., 1]
-        s, c = np.sinc(theta / np.pi), theta * _a(theta)
-        return np.stack([s * x - c * y, c * x + s * y, theta], axis=-1)
-    rho, phi = tangent[..., :3], tangent[..., 3:]
-    theta = np.linalg.norm(phi, axis=-1)[..., None]
-    turned = np.cross(phi, rho)
-    position = rho + _a(theta) * turned + _b(theta) * np.cross(phi, turned)
-    return np.concatenate([position, Rotation.from_rotvec(phi).as_quat()], axis=-1)
+    """Poses that a constant twist reaches in unit time (Barfoot 2017, 7.35; Sola 2018, 156).
+
+    Parameters
+    ----------
+    tangent : ndarray, shape (..., 3) or (..., 6)
+        With a rotation below 2 pi.
+    """
+    d = _dimension(tangent)
+    rho, phi = tangent[..., :d], tangent[..., d:]
+    position = np.linalg.solve(_bent_inverse(phi), rho[..., None])[..., 0]
+    turn = phi if d == 2 else Rotation.from_rotvec(phi).as_quat()
+    return np.concatenate([position, turn], axis=-1)
 
 
 def log(pose: Array) -> Array:
@@ -123,16 +107,9 @@ def log(pose: Array) -> Array:
     pose : ndarray, shape (..., 3) or (..., 7)
         Quaternions normalised; q and -q are the same rotation.
     """
-    if pose.shape[-1] == 3:
-        theta = wrap(pose[..., 2])
-        x, y, half = pose[..., 0], pose[..., 1], 0.5 * theta
-        cotangent = 1.0 - theta * theta * _c(np.abs(theta))
-        return np.stack([cotangent * x + half * y, cotangent * y - half * x, theta], axis=-1)
-    position, phi = pose[..., :3], _turn(pose).as_rotvec()
-    turned = np.cross(phi, position)
-    theta = np.linalg.norm(phi, axis=-1)[..., None]
-    rho = position - 0.5 * turned + _c(theta) * np.cross(phi, turned)
-    return np.concatenate([rho, phi], axis=-1)
+    d = _dimension(pose)
+    phi = wrap(pose[..., 2:]) if d == 2 else _turn(pose).as_rotvec()
+    return np.concatenate([_times(_bent_inverse(phi), pose[..., :d]), phi], axis=-1)
 
 
 def adjoint(pose: Array) -> Array:
@@ -169,8 +146,7 @@ def right_jacobian_inverse(tangent: Array) -> Array:
     """
     once = _commutator(tangent)
     twice = once @ once
-    turn = tangent[..., 2 if tangent.shape[-1] == 3 else 3 :]
-    theta = np.linalg.norm(turn, axis=-1)[..., None, None]
+    theta = np.linalg.norm(tangent[..., _dimension(tangent) :], axis=-1)[..., None, None]
     c, slope = _c(theta), 0.5 * _c_slope(theta)
     # x / (1 - exp(-x)) of it, as ad^5 = -2 theta^2 ad^3 - theta^4 ad
     made: Array = np.eye(once.shape[-1]) + 0.5 * once + (c - theta * theta * slope) * twice
@@ -209,20 +185,28 @@ def chain(steps: Array) -> Array:
     return made
 
 
+def _dimension(values: Array) -> int:
+    """2 or 3, of poses or tangents."""
+    return 2 if values.shape[-1] == 3 else 3
+
+
 def _turn(pose: Array) -> Rotation:
     """Rotation of poses in space."""
     return Rotation.from_quat(pose[..., 3:])
 
 
-def _a(theta: Array) -> Array:
-    """(1 - cos theta) / theta^2."""
-    return 0.5 * np.sinc(theta / (2.0 * np.pi)) ** 2
+def _times(matrix: Array, vector: Array) -> Array:
+    return (matrix @ vector[..., None])[..., 0]
 
 
-def _b(theta: Array) -> Array:
-    """(theta - sin theta) / theta^3."""
-    t = np.where(theta < SMALL, 1.0, theta)
-    return np.where(theta < SMALL, polyval(theta * theta, _B), (t - np.sin(t)) / t**3)
+def _bent_inverse(phi: Array) -> Array:
+    """Inverse of the matrix by which a turn bends a motion (Barfoot 2017, 7.37)."""
+    if phi.shape[-1] == 1:
+        once = from_elements((0.0, -phi[..., 0]), (phi[..., 0], 0.0))
+    else:
+        once = skew(phi)
+    theta = np.linalg.norm(phi, axis=-1)[..., None, None]
+    return np.eye(once.shape[-1]) - 0.5 * once + _c(theta) * (once @ once)
 
 
 def _c(theta: Array) -> Array:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy import sparse
 from scipy.special import gammaincinv
 
 from px4fuse.arrays import Array, BoolArray
@@ -16,7 +15,7 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.record import Count, NotNegative, Record
 from px4fuse.trajectory.graph import lie, model
 from px4fuse.trajectory.graph.model import PoseGraph, Residuals
-from px4fuse.trajectory.graph.system import BlockSystem
+from px4fuse.trajectory.graph.system import normal_equations, solve_with
 
 Robust = Literal["none", "dcs", "gnc"]
 # From the squared residuals: the factors on the information, and the cost of each edge
@@ -135,19 +134,18 @@ def solve(
     """
     model.require_connected(graph, np.ones(len(graph.first), dtype=bool), "the edges")
     doubtful = ~graph.successive if loops is None else loops
-    problem = _GraphProblem(graph)
     start = model.residuals(graph, graph.poses)
     cost_initial = 0.5 * float(np.sum(start.chi2))
     if not np.isfinite(cost_initial):
         raise TrajectoryError.of("graph_not_finite")
-    plain = problem.minimise(start, _least_squares(np.ones(len(doubtful))))
+    plain = _minimise(graph, start, _least_squares(np.ones(len(doubtful))))
     weights = np.ones(len(doubtful))
     run = plain
     if robust != "none" and np.any(doubtful):
-        run, weights = _gnc(problem, start, plain, doubtful)
+        run, weights = _gnc(graph, start, plain, doubtful)
         if robust == "dcs":
             kernel = _dcs(doubtful)
-            last = problem.minimise(run.state, kernel)
+            last = _minimise(graph, run.state, kernel)
             run = _Descent(last.state, last.cost, run.iterations + last.iterations, last.converged)
             weights = kernel(run.state.chi2)[0]
     return Solution(
@@ -161,75 +159,49 @@ def solve(
     )
 
 
-class _GraphProblem:
-    """A graph with the pattern of its normal equations."""
-
-    def __init__(self, graph: PoseGraph) -> None:
-        self.graph = graph
-        self._system = BlockSystem(graph.first, graph.second, len(graph))
-
-    def minimise(
-        self,
-        start: Residuals,
-        kernel: Kernel,
-        tolerance: float = _TOLERANCE,
-        max_iterations: int = MAX_ITERATIONS,
-    ) -> _Descent:
-        """Walk down from some poses, as GTSAM's LevenbergMarquardtOptimizer does."""
-        state, damping, iterations = start, _FIRST_DAMPING, 0
-        weights, costs = kernel(state.chi2)
-        cost = float(np.sum(costs))
-        while iterations < max_iterations and cost > _TOLERANCE:
-            matrix, gradient = self._linearise(state, weights)
-            linear_cost = 0.5 * float(np.sum(weights * state.chi2))
-            while True:
-                tried, promised = self._step(state, matrix, gradient, damping)
-                drop, accepted, flat = 0.0, False, False
-                if tried is not None:
-                    tried_weights, costs = kernel(tried.chi2)
-                    drop = cost - float(np.sum(costs))
-                    worthwhile = promised > _EPSILON * linear_cost
-                    accepted = worthwhile and drop > _LEAST_FIDELITY * promised
-                    flat = abs(drop) < tolerance * cost
-                if accepted or flat or damping >= _MOST_DAMPING:
-                    break
-                damping *= _DAMPING_FACTOR
-            if tried is None or not accepted:
-                return _Descent(state, cost, iterations, flat)
-            state, weights, before, cost = tried, tried_weights, cost, cost - drop
-            iterations += 1
-            damping /= _DAMPING_FACTOR
-            if drop <= max(tolerance * before, _TOLERANCE):
-                return _Descent(state, cost, iterations, True)
-        return _Descent(state, cost, iterations, cost <= _TOLERANCE)
-
-    def _step(
-        self,
-        state: Residuals,
-        matrix: sparse.csc_array[np.float64],
-        gradient: Array,
-        damping: float,
-    ) -> tuple[Residuals | None, float]:
-        """Where a damped step leads, and how much it lowers the linearised cost."""
-        step = self._system.solve(matrix, -gradient, damping)
-        promised = 0.0 if step is None else 0.5 * float(np.sum(step * (damping * step - gradient)))
-        if step is None or promised < 0.0:
-            return None, 0.0
-        return model.residuals(self.graph, lie.compose(state.poses, lie.exp(step))), promised
-
-    def _linearise(
-        self, state: Residuals, weights: Array
-    ) -> tuple[sparse.csc_array[np.float64], Array]:
-        """Hessian in Gauss and Newton's approximation, and gradient of the cost."""
+def _minimise(
+    graph: PoseGraph,
+    state: Residuals,
+    kernel: Kernel,
+    tolerance: float = _TOLERANCE,
+    max_iterations: int = MAX_ITERATIONS,
+) -> _Descent:
+    """Walk down from some poses, as GTSAM's LevenbergMarquardtOptimizer does."""
+    damping, iterations = _FIRST_DAMPING, 0
+    weights, costs = kernel(state.chi2)
+    cost = float(np.sum(costs))
+    while iterations < max_iterations and cost > _TOLERANCE:
         # d r / d x_j = J, d r / d x_i = -J A with A the adjoint of x_j's view of x_i
         jacobian = lie.right_jacobian_inverse(state.residual)
-        transposed = jacobian.transpose(0, 2, 1)
-        back = lie.adjoint(lie.inverse(state.relative))
-        jj = transposed @ (weights[:, None, None] * self.graph.information) @ jacobian
-        ij = -back.transpose(0, 2, 1) @ jj
-        j = (transposed @ (weights[:, None] * state.weighted)[..., None])[..., 0]
-        i = -(back.transpose(0, 2, 1) @ j[..., None])[..., 0]
-        return self._system.matrix(-ij @ back, jj, ij), self._system.vector(i, j)
+        back = jacobian @ lie.adjoint(lie.inverse(state.relative))
+        matrix, downhill = normal_equations(
+            graph, -back, jacobian, weights[:, None, None] * graph.information,
+            -state.residual[..., None],
+        )  # fmt: skip
+        while True:
+            drop, promised, flat = 0.0, 0.0, False
+            step = solve_with(matrix, downhill, damping)
+            if step is not None:
+                # how much it lowers the linearised cost
+                promised = 0.5 * float(np.sum(step * (damping * step + downhill)))
+                moved = np.concatenate([np.zeros(graph.freedom), step[:, 0]])
+                turned = lie.exp(moved.reshape(len(graph), -1))
+                tried = model.residuals(graph, lie.compose(state.poses, turned))
+                tried_weights, costs = kernel(tried.chi2)
+                drop = cost - float(np.sum(costs))
+                flat = abs(drop) < tolerance * cost
+            accepted = promised > _EPSILON * cost and drop > _LEAST_FIDELITY * promised
+            if accepted or flat or damping >= _MOST_DAMPING:
+                break
+            damping *= _DAMPING_FACTOR
+        if not accepted:
+            return _Descent(state, cost, iterations, flat)
+        state, weights, before, cost = tried, tried_weights, cost, cost - drop
+        iterations += 1
+        damping /= _DAMPING_FACTOR
+        if drop <= max(tolerance * before, _TOLERANCE):
+            return _Descent(state, cost, iterations, True)
+    return _Descent(state, cost, iterations, cost <= _TOLERANCE)
 
 
 def _least_squares(weights: Array) -> Kernel:
@@ -248,10 +220,10 @@ def _dcs(doubtful: BoolArray) -> Kernel:
 
 
 def _gnc(
-    problem: _GraphProblem, start: Residuals, plain: _Descent, doubtful: BoolArray
+    graph: PoseGraph, start: Residuals, plain: _Descent, doubtful: BoolArray
 ) -> tuple[_Descent, Array]:
     """Truncated least squares over the doubtful edges, from two starts."""
-    _, scaled = model.unit_diagonal(problem.graph.information)
+    _, scaled = model.unit_diagonal(graph.information)
     freedom = np.sum(np.linalg.eigvalsh(scaled) > model.OBSERVED, axis=1)
     bound = np.full(len(doubtful), np.inf)
     price = np.zeros(len(doubtful))
@@ -264,7 +236,7 @@ def _gnc(
 
     spent, found = plain.iterations, []
     for first in (plain.state, start):
-        run, weights = _graduated(problem, first, bound)
+        run, weights = _graduated(graph, first, bound)
         spent += run.iterations
         found.append((priced(run.state, weights), run, weights))
     lowest, run, weights = min(found, key=lambda each: each[0])
@@ -272,15 +244,15 @@ def _gnc(
     for edge in dropped[np.argsort(run.state.chi2[dropped])][:_SECOND_LOOKS]:
         again = weights.copy()
         again[edge] = 1.0
-        trial = problem.minimise(run.state, _least_squares(again))
+        trial = _minimise(graph, run.state, _least_squares(again))
         spent += trial.iterations
         if (cost := priced(trial.state, again)) < lowest:
             lowest, run, weights = cost, trial, again
-    model.require_connected(problem.graph, weights > 0.0, "the edges that gnc did not set aside")
+    model.require_connected(graph, weights > 0.0, "the edges that gnc did not set aside")
     return _Descent(run.state, run.cost, spent, run.converged), weights
 
 
-def _graduated(problem: _GraphProblem, start: Residuals, bound: Array) -> tuple[_Descent, Array]:
+def _graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tuple[_Descent, Array]:
     """One descent of graduated non-convexity (Yang 2020, algorithm 1, eq. 13 and 14)."""
     state, spent = start, 0
     # Infinite bounds are edges that are not doubted
@@ -290,8 +262,8 @@ def _graduated(problem: _GraphProblem, start: Residuals, bound: Array) -> tuple[
         for _ in range(_GNC_STAGES):
             ratio = np.maximum(state.chi2 / bound, 1e-200)  # where the weight is 1 anyway
             weights = np.clip(np.sqrt(control * (control + 1.0) / ratio) - control, 0.0, 1.0)
-            stage = problem.minimise(
-                state, _least_squares(weights), _STAGE_TOLERANCE, _STAGE_ITERATIONS
+            stage = _minimise(
+                graph, state, _least_squares(weights), _STAGE_TOLERANCE, _STAGE_ITERATIONS
             )
             state, spent = stage.state, spent + stage.iterations
             if np.all((weights < 1e-6) | (weights > 1.0 - 1e-6)):
@@ -299,7 +271,7 @@ def _graduated(problem: _GraphProblem, start: Residuals, bound: Array) -> tuple[
             control *= _GNC_FACTOR
     weights = (state.chi2 <= bound).astype(float)
     for _ in range(_TLS_ROUNDS):
-        run = problem.minimise(state, _least_squares(weights))
+        run = _minimise(graph, state, _least_squares(weights))
         state, spent = run.state, spent + run.iterations
         # Lowers the truncated cost every time, so it ends
         again = (state.chi2 <= bound).astype(float)

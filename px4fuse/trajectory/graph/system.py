@@ -1,4 +1,4 @@
-"""The sparse normal equations of a pose graph: pattern once, numbers many times."""
+"""Linear least squares over the poses of a graph: sparse normal equations, and their solution."""
 
 from __future__ import annotations
 
@@ -6,99 +6,63 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from px4fuse.arrays import Array, IntArray
+from px4fuse.arrays import Array
+from px4fuse.trajectory.graph.model import PoseGraph
 
 # scipy's SuperLU writes past its work space where these exceed its own defaults (10 and 20, found
 # with valgrind on scipy 1.17); single columns as relaxed supernodes also fill in least
 _RELAX, _PANEL = 1, 4
+Matrix = sparse.csc_array[np.float64]
 
 
-class BlockSystem:
-    """Normal equations with a block of d × d for each pose but the first, which is held.
+def normal_equations(
+    graph: PoseGraph,
+    of_first: Array,
+    of_second: Array,
+    information: Array,
+    value: Array,
+    held: Array | float = 0.0,
+) -> tuple[Matrix, Array]:
+    """Normal equations of ``A x_i + B x_j = value`` for every edge; x of the first pose is held.
 
     Parameters
     ----------
-    first, second : ndarray of int, shape (m,)
-        Poses that each edge joins.
-    poses : int
-        How many there are.
+    graph : PoseGraph
+    of_first, of_second, information : ndarray, shape (m, d, d)
+        A, B, and how much the parts of each equation count.
+    value : ndarray, shape (m, d, k)
+    held : ndarray, shape (d, k), or 0
+
+    Returns
+    -------
+    matrix : csc_array, shape ((n - 1) d, (n - 1) d)
+    right : ndarray, shape ((n - 1) d, k)
     """
+    edges, d = np.arange(len(graph.first) + 1), value.shape[1]
+    ends = np.column_stack([graph.first, graph.second]).ravel()
+    blocks = np.stack([of_first, of_second], axis=1).reshape(-1, d, d)
+    rows = sparse.bsr_array((blocks, ends, 2 * edges), shape=(d * edges[-1], d * len(graph)))
+    weights = sparse.bsr_array((information, edges[:-1], edges))
+    columns = rows.tocsc()
+    of_held, free = columns[:, :d], columns[:, d:]
+    weighted = free.T @ weights
+    left = value.reshape(-1, value.shape[-1]) - of_held @ np.broadcast_to(held, value.shape[1:])
+    return (weighted @ free).tocsc(), weighted @ left
 
-    def __init__(self, first: IntArray, second: IntArray, poses: int) -> None:
-        self._first, self._second, self._poses = first, second, poses
-        # blocks H_ii, H_jj, H_ij, H_ji of all edges; the pose that is held has none
-        ends = np.concatenate([first, second]), np.concatenate([second, first])
-        row, column = np.append([first, second], ends[0]), np.append([first, second], ends[1])
-        inside = np.flatnonzero((row > 0) & (column > 0))
-        self._source = inside[np.argsort(row[inside], kind="stable")]
-        self._columns = column[self._source] - 1
-        self._starts = np.searchsorted(row[self._source], np.arange(1, poses + 1))
 
-    def matrix(self, ii: Array, jj: Array, ij: Array) -> sparse.csc_array[np.float64]:
-        """Sum the blocks of all edges.
-
-        Parameters
-        ----------
-        ii, jj, ij : ndarray, shape (m, d, d)
-            Second derivatives by first and first pose, second and second, first and second.
-        """
-        blocks = np.concatenate([ii, jj, ij, ij.transpose(0, 2, 1)])[self._source]
-        made = sparse.bsr_array((blocks, self._columns, self._starts)).tocsr()
-        made.sum_duplicates()
-        return made.T
-
-    def vector(self, i: Array, j: Array) -> Array:
-        """Sum the gradients of all edges.
-
-        Parameters
-        ----------
-        i, j : ndarray, shape (m, d, ...)
-            By the first pose and by the second.
-
-        Returns
-        -------
-        ndarray, shape (n, d, ...)
-            Zero for the pose that is held.
-        """
-        made = np.zeros((self._poses, *i.shape[1:]))
-        np.add.at(made, self._first, i)
-        np.add.at(made, self._second, j)
-        made[0] = 0.0
-        return made
-
-    def solve(
-        self, matrix: sparse.csc_array[np.float64], right: Array, damping: float = 0.0
-    ) -> Array | None:
-        """Solve with the damped matrix; the first pose stays.
-
-        Parameters
-        ----------
-        matrix : csc_array
-            From :meth:`matrix`.
-        right : ndarray, shape (n, d, ...)
-            From :meth:`vector`.
-        damping : float
-            Added to the diagonal.
-
-        Returns
-        -------
-        ndarray, shape (n, d, ...), or None
-            None where the matrix is singular.
-        """
-        damped = matrix.copy()
-        damped.setdiag(matrix.diagonal() + damping)
-        try:
-            factors = splu(
-                damped,
-                # on the graphs of the benchmark it fills in 1.1 to 1.9 times less than COLAMD
-                permc_spec="MMD_AT_PLUS_A",
-                diag_pivot_thresh=0.0,
-                relax=_RELAX,
-                panel_size=_PANEL,
-                options={"SymmetricMode": True},
-            )
-        except RuntimeError:  # exactly singular
-            return None
-        made = np.zeros(right.shape)
-        made[1:] = factors.solve(right[1:].reshape(-1, *right.shape[2:])).reshape(right[1:].shape)
-        return made if np.all(np.isfinite(made)) else None
+def solve_with(matrix: Matrix, right: Array, damping: float = 0.0) -> Array | None:
+    """Solve normal equations, with something added to their diagonal; None where singular."""
+    try:
+        factors = splu(
+            matrix + damping * sparse.eye_array(matrix.shape[0], format="csc"),
+            # on the graphs of the benchmark it fills in 1.1 to 1.9 times less than COLAMD
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            relax=_RELAX,
+            panel_size=_PANEL,
+            options={"SymmetricMode": True},
+        )
+    except RuntimeError:  # exactly singular
+        return None
+    found: Array = factors.solve(right)
+    return found if np.all(np.isfinite(found)) else None
