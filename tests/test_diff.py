@@ -6,13 +6,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from detector_rates import RIGHT
 from exchange import replace
 from msgspec import structs
 from scipy.signal import lfilter
 from scipy.special import ndtr
 from scipy.stats import chi2
 from scipy.stats import f as fisher
-from spread import SETTINGS, spread
+from spread import spread
 
 from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
@@ -238,9 +239,9 @@ def test_a_number_that_cannot_be_tested_says_so_and_one_may_be_in_one_alone():
 def flown(name: str, seed: int, *mistakes: str, with_log: bool = True, **scenario) -> DiffInput:
     """A simulated flight as an input."""
     flight = simulate_flight(Scenario(seed=seed, **scenario), parse(mistakes))
-    analysis = explain(compare(flight, SETTINGS))
+    analysis = explain(compare(flight, RIGHT))
     request = ComparisonRequest(
-        log=name, sigma_a_m_s2=SETTINGS.sigma_a_m_s2, sigma_z_m=SETTINGS.sigma_z_m
+        log=name, sigma_a_m_s2=RIGHT.sigma_a_m_s2, sigma_z_m=RIGHT.sigma_z_m
     )
     found = results(request, analysis)
     read = read_results(to_json(found).encode())
