@@ -104,15 +104,6 @@ def test_a_constant_turn_goes_round_in_a_circle() -> None:
     np.testing.assert_allclose(signals.table[:, 1, :2, 0], speed, atol=1e-4)
 
 
-def test_at_any_time_the_signals_give_the_way_of_constant_acceleration() -> None:
-    signals = felt((1.5, 0.0, -0.5))
-    at = np.array([[0.5, 0.733, 4.0, 9.0], [0.617, 0.85, 4.117, 9.117]])
-    way, speed = signals.at(at)
-    since, push = (at - signals.time_s[0])[..., None], np.array([1.5, 0.0, -0.5])
-    np.testing.assert_allclose(speed[..., 0], since * push, atol=1e-9)
-    np.testing.assert_allclose(way[..., 0], since**2 / 2.0 * push, atol=1e-9)
-
-
 def test_legs_are_the_way_beyond_what_the_velocity_makes() -> None:
     """Of sideways acceleration s over dt: s dt²/2 and s dt, at every offset, in each stretch."""
     time, stamps = np.arange(0.0, 80.0, 0.01), np.arange(0.0, 80.0, 0.25)
