@@ -122,9 +122,10 @@ def test_text_makes_no_elements(text: str) -> None:
 
 def test_pending_points_stand_apart_from_those_that_count() -> None:
     said = {"Notes": Override(9.0, "Good.")}
-    entries = [row("Ada", 10.0), row("Bo", 20.0), row("Cy", 12.0, pending="Run 0.1.1."),
+    entries = [row("Ada", 10.0, late_s=61), row("Bo", 20.0), row("Cy", 12.0, pending="Run 0.1.1."),
                row("Di", 13.0, overrides=said, total=13.0)]  # fmt: skip
     text = html_text(entries, "Class", "px4fuse 1")
+    assert "2 min late" in text  # a minute is not nothing
     assert "14.3 <small>of 20" in text  # of 10, 20 and 13
     assert "1 <small>12 points, not counted" in text
     # of 16 points for notes those that count had 6, 16 and 9
@@ -191,11 +192,6 @@ def test_an_anonymous_class_names_nobody() -> None:
     assert not {"boxes", "prose", "pictures", "links"} & {part[0] for part in parts}
     for there in ("Lovelace", ".pdf", ".png", "data:image/png"):
         assert there not in written
-
-
-def test_a_minute_late_is_not_nothing() -> None:
-    text = html_text([Entry("Ada", "1", CLASS[0].counting, late_s=61.0)], "Class", "px4fuse 1")
-    assert "2 min late" in text
 
 
 # ------------------------------------------------------------------ in a browser
