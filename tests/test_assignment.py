@@ -35,18 +35,12 @@ PINNED = ((759547191, 0.109, -14.4), ("clock-jump=53ms", "ekf2-off"))
 CLASS = tuple(Person(f"s{n:02d}", f"Name {n}") for n in range(3))
 # What names each mistake that is drawn
 FINDINGS = {
-    "clock-offset": "source_clock_offset",
-    "clock-jump": "source_stamps_of_arrival",
-    "yaw": "source_frame_turned",
-    "nlos": "source_outliers",
-    "dropout": "source_gap",
-    "imu-rate": "logging_rate_low",
-    "ekf2-noise": "ekf2_variance_understated",
-    "ekf2-gate": "ekf2_rejecting",
-    "ekf2-delay": "ekf2_ev_delay_wrong",
-    "ekf2-off": "ekf2_not_fusing",
-    "open-end": "false_loop_closure",
-}
+    "clock-offset": "source_clock_offset", "clock-jump": "source_stamps_of_arrival",
+    "yaw": "source_frame_turned", "nlos": "source_outliers", "dropout": "source_gap",
+    "imu-rate": "logging_rate_low", "ekf2-noise": "ekf2_variance_understated",
+    "ekf2-gate": "ekf2_rejecting", "ekf2-delay": "ekf2_ev_delay_wrong",
+    "ekf2-off": "ekf2_not_fusing", "open-end": "false_loop_closure",
+}  # fmt: skip
 CHOICE = {choice.mistake: choice for kind in CHOICES.values() for choice in kind}
 
 
@@ -149,11 +143,8 @@ class TestDraw:
         for choice in (choice for kind in CHOICES.values() for choice in kind):
             plain = re.compile(rf"--mistake {choice.mistake}(=([\d.]+)\D*)?$")
             rows = table[(table.finding == FINDINGS[choice.mistake]) & (table.flights >= 10)]
-            sizes = {
-                float(match[2] or 0.0): row
-                for row in rows.itertuples()
-                if (match := plain.search(row.condition))
-            }
+            matches = ((plain.search(row.condition), row) for row in rows.itertuples())
+            sizes = {float(match[2] or 0.0): row for match, row in matches if match}
             found = {size: row for size, row in sizes.items() if row.rate >= 0.95}
             if choice.limit is None:
                 assert list(found) == [0.0]
@@ -164,14 +155,7 @@ class TestDraw:
             larger = [s for s in sizes if (s < choice.limit) == choice.less_is_plainer]
             assert set(larger) <= {choice.limit, *found}
 
-    def test_difficulty_is_that_of_the_hardest_and_in_the_band(self):
-        clock, gate = (
-            next(c for c in CHOICES["aisle"] if c.mistake == name)
-            for name in ("clock-offset", "ekf2-gate")
-        )
-        # half as difficult is twice the limit; where less is plainer, half the limit
-        assert clock.typed(0.5, -1.0) == f"clock-offset=-{2 * clock.limit:g}ms"
-        assert gate.typed(0.5) == f"ekf2-gate={gate.limit / 2:g}"
+    def test_difficulties_are_spread_over_the_band(self):
         each = [draw(SECRET, f"s{n}", "loop", 1).difficulty for n in range(500)]
         counts, _ = np.histogram(each, bins=4, range=(EASIEST, HARDEST))
         assert counts.min() > 90
@@ -335,8 +319,6 @@ class TestKey:
             path.write_bytes(content)
             with pytest.raises(SettingsError):
                 read_key(path)
-        with pytest.raises(SettingsError, match="is a folder"):
-            read_key(tmp_path)
 
 
 # ------------------------------------------------------------------ command

@@ -70,9 +70,8 @@ def unpacked(tmp_path: Path, *options: str) -> Path:
     with zipfile.ZipFile(tmp_path / "a.zip") as archive:
         modes = {one.filename: one.external_attr >> 16 for one in archive.infolist()}
         archive.extractall(folder / "source")
-    assert {name for name, mode in modes.items() if mode & 0o111} == {
-        "setup.sh", "run_autograder"
-    }  # fmt: skip
+    runs = {name for name, mode in modes.items() if mode & 0o111}
+    assert runs == {"setup.sh", "run_autograder"}
     (folder / "submission").mkdir()
     (folder / "submission_metadata.json").write_text(json.dumps(METADATA))
     return folder

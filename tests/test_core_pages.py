@@ -108,9 +108,8 @@ def test_the_map_stays_and_every_finding_stands_once(count: int) -> None:
     (axes,) = axes_of(page)
     assert axes.get_aspect() == 1.0
     said = texts(page)
-    assert [sum(f"Finding number {i}." in text for text in said) for i in range(count)] == [
-        1
-    ] * count
+    told = [sum(f"Finding number {i}." in text for text in said) for i in range(count)]
+    assert told == [1] * count
     assert said.count("1.0 s to 2.0 s") == count
     sheets = set_by_typst(page)
     assert "From above" in sheets[0]
@@ -133,11 +132,8 @@ def test_the_map_lies_along_the_aisle() -> None:
 )
 def test_what_is_absent_leaves_a_line_and_no_empty_panel(changes, says: str) -> None:
     of = document(compare(aisle_flight(**changes)))
-    pages = [
-        page
-        for draw in (cover.draw, flight.draw, flight.draw_innovations, flight.draw_other_axes)
-        for page in drawn(draw, of)
-    ]
+    draws = cover.draw, flight.draw, flight.draw_innovations, flight.draw_other_axes
+    pages = [page for draw in draws for page in drawn(draw, of)]
     assert says in words(*pages)
     assert len(pages) == 4
     for axes in axes_of(*pages):

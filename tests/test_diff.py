@@ -6,13 +6,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from detector_rates import RIGHT
 from exchange import replace
 from msgspec import structs
 from scipy.signal import lfilter
 from scipy.special import ndtr
 from scipy.stats import chi2
 from scipy.stats import f as fisher
-from spread import SETTINGS, spread
+from spread import spread
 
 from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
@@ -66,11 +67,9 @@ def changed(a: Number, b: Number, *, paired: bool = False) -> NumberChange:
 def white(nis_mean: float, count: int, lag1: float = 0.0) -> FilterSummary:
     """A filter with normal innovations of this mean square."""
     return summary(
-        np.random.default_rng(1).normal(size=count),
-        nis_mean=nis_mean,
-        outside_two_sigma=float(2.0 * ndtr(-2.0 / np.sqrt(nis_mean))),
-        lag1_autocorrelation=lag1,
-    )
+        np.random.default_rng(1).normal(size=count), nis_mean=nis_mean,
+        outside_two_sigma=float(2.0 * ndtr(-2.0 / np.sqrt(nis_mean))), lag1_autocorrelation=lag1,
+    )  # fmt: skip
 
 
 def summary(values, **more) -> FilterSummary:
@@ -111,9 +110,8 @@ def test_two_intervals_are_combined_by_their_summed_variances(a, b, sigma):
 
 def test_shares_are_those_of_newcombe_1998():
     # Statistics in Medicine 17, table II: 56/70 against 48/80, method 10
-    a, b = (
-        number(k / n, share_interval(k / n, n), scale="difference") for k, n in ((48, 80), (56, 70))
-    )
+    shares = ((48 / 80, 80), (56 / 70, 70))
+    a, b = (number(p, share_interval(p, n), scale="difference") for p, n in shares)
     assert contrast(a, b).interval == pytest.approx((0.0524, 0.3339), abs=5e-5)
 
 
@@ -179,15 +177,11 @@ def test_of_many_numbers_that_did_not_change_few_are_called_significant():
 @pytest.mark.parametrize(
     ("aim", "a", "b", "judgement"),
     [
-        ("one", 1.1, 4.0, "worse"),
-        ("one", 4.0, 1.1, "better"),
-        ("one", 0.9, 0.2, "worse"),
+        ("one", 1.1, 4.0, "worse"), ("one", 4.0, 1.1, "better"), ("one", 0.9, 0.2, "worse"),
         ("one", 0.25, 4.0, "changed"),  # as far from 1, on the other side
-        ("low", 0.1, 0.2, "worse"),
-        ("low", 0.2, 0.1, "better"),
-        ("", 0.1, 0.2, "changed"),
+        ("low", 0.1, 0.2, "worse"), ("low", 0.2, 0.1, "better"), ("", 0.1, 0.2, "changed"),
     ],
-)
+)  # fmt: skip
 def test_each_number_has_its_direction(aim, a, b, judgement):
     first, second = (around(value, 1.1, aim=aim) for value in (a, b))
     change = changed(first, second)
@@ -207,11 +201,9 @@ def test_on_the_other_side_of_the_best_it_must_be_farther_by_more_than_chance():
 
 def test_significant_changes_stand_first_and_causes_before_what_they_bring():
     moved = {
-        "axes.east.filters.kf.nis_mean": 0.05,
-        "axes.down.filters.kf.nis_mean": -9.0,
-        "axes.north.filters.kf.nis_mean": 9.0,
-        "tuning.horizontal.sigma_z_m": 2.0,
-    }
+        "axes.east.filters.kf.nis_mean": 0.05, "axes.down.filters.kf.nis_mean": -9.0,
+        "axes.north.filters.kf.nis_mean": 9.0, "tuning.horizontal.sigma_z_m": 2.0,
+    }  # fmt: skip
     first = {path: normal(0.0, 0.1) for path in moved}
     second = {path: normal(by, 0.1) for path, by in moved.items()}
     paths = [change.path for change in number_changes(first, second, paired=False)]
@@ -238,9 +230,9 @@ def test_a_number_that_cannot_be_tested_says_so_and_one_may_be_in_one_alone():
 def flown(name: str, seed: int, *mistakes: str, with_log: bool = True, **scenario) -> DiffInput:
     """A simulated flight as an input."""
     flight = simulate_flight(Scenario(seed=seed, **scenario), parse(mistakes))
-    analysis = explain(compare(flight, SETTINGS))
+    analysis = explain(compare(flight, RIGHT))
     request = ComparisonRequest(
-        log=name, sigma_a_m_s2=SETTINGS.sigma_a_m_s2, sigma_z_m=SETTINGS.sigma_z_m
+        log=name, sigma_a_m_s2=RIGHT.sigma_a_m_s2, sigma_z_m=RIGHT.sigma_z_m
     )
     found = results(request, analysis)
     read = read_results(to_json(found).encode())
@@ -282,9 +274,8 @@ def test_a_doubled_noise_of_the_source_is_the_first_that_is_told(clean, noisy):
     assert "SIGMA_Z found, horizontal" in repr(found)
     # without the logs errors are not tested, and it is said
     alone = changes(*(DiffInput("r.json", "results", each.results) for each in (clean, noisy)))
-    assert {"tuning.horizontal.sigma_z_m", "axes.aisle.filters.kf.nis_mean"} <= set(
-        significant(alone)
-    )
+    told = {"tuning.horizontal.sigma_z_m", "axes.aisle.filters.kf.nis_mean"}
+    assert told <= set(significant(alone))
     errors = [c for c in alone.numbers if c.path.endswith("kf.truth.position_rmse_m")]
     assert {c.status for c in errors} == {"not tested"}
     assert any("RMSE is not tested without the logs" in note for note in alone.notes)
@@ -311,11 +302,9 @@ def test_another_noise_of_ekf2_is_named_as_setting_and_in_its_nis(clean):
 
 def test_the_spread_is_what_varies_beyond_the_intervals():
     rng = np.random.default_rng(5)
+    sigmas = {"axes.a": np.hypot(0.3, 0.4), "axes.b": 0.4}
     told = [
-        {
-            "axes.a": normal(rng.normal(0.0, np.hypot(0.3, 0.4)), 0.4, kind="axes.*"),
-            "axes.b": normal(rng.normal(0.0, 0.4), 0.4, kind="axes.*"),
-        }
+        {name: normal(rng.normal(0.0, s), 0.4, kind="axes.*") for name, s in sigmas.items()}
         for _ in range(4000)
     ]
     table = spread(told).set_index("kind")

@@ -102,9 +102,8 @@ def test_the_range_is_that_in_which_the_next_flight_is_expected():
     half = student.ppf(0.975, 11) * logs.std(ddof=1) * np.sqrt(1.0 + 1.0 / 12.0)
     low, high = (number_words(float(np.exp(logs.mean() + end))) for end in (-half, half))
     said = changes_of(fleet(flight(50, sigma_z_m=0.2)))["50.ulg", "north"]
-    assert said == (
-        f"SIGMA_Z found 0.2 m, {low} m to {high} m expected from 12 flights of the vehicle"
-    )
+    expected = f"{low} m to {high} m expected from 12 flights of the vehicle"
+    assert said == f"SIGMA_Z found 0.2 m, {expected}"
 
 
 def test_some_differences_say_nothing():
@@ -186,9 +185,8 @@ def test_a_log_is_a_test_case_which_fails_where_it_is_worse_or_failed():
     suite = made(marked(table, BEFORE)[0])
     cases = {case.attrib["name"]: case for case in suite}
     assert list(cases) == ["50.ulg", "51.ulg", "52.ulg", "53.ulg"]
-    assert [child.tag for case in cases.values() for child in case] == [
-        "failure", "failure", "skipped",
-    ]  # fmt: skip
+    told = [child.tag for case in cases.values() for child in case]
+    assert told == ["failure", "failure", "skipped"]
     worse, failed = (cases[name].find("failure") for name in ("51.ulg", "52.ulg"))
     assert worse.attrib["type"] == "worse"
     assert worse.text.splitlines()[1].startswith("east: SIGMA_Z found 0.3 m")

@@ -38,10 +38,8 @@ PEOPLE = (Person("1", "Ada Lovelace", login="ada"), Person("2", "Grace Hopper", 
 def laid_out(files, term=LATEST, overrides=None, people=PEOPLE, packed=None):
     """Entries by id, of reports by the names of their files."""
     reports = [replace(one, submission=name, sha256=name) for name, one in files.items()]
-    found = [
-        Submission(Path("x.zip"), name, name, (packed or {}).get(name), origin_of(name))
-        for name in files
-    ]
+    zipped, times = Path("x.zip"), packed or {}
+    found = [Submission(zipped, name, name, times.get(name), origin_of(name)) for name in files]
     return class_entries(reports, found, replace(term, roster=people), overrides or {})
 
 
@@ -221,18 +219,12 @@ def test_the_instructors_word_is_the_last(tmp_path) -> None:
         "": Override(None, "Come and\nsee me."),
     }  # fmt: skip
     assert (ada.counting.points, ada.total, grace.total) == (15.5, 8.0, 3.0)
-    assert notes == (
-        "overrides.csv: 1 has no item 'C'.",
-        "overrides.csv: 2 has no item 'B'.",
-        "overrides.csv: nobody has the id 3.",
-    )
-    text = returned_text(ada, "Lab")
-    assert (
-        "9.5 of 10  A\n    Because. Your instructor: A good idea. (Your instructor gave 9.5" in text
-    )
-    assert text.endswith(
-        "Total    8 of 20\n\nFrom your instructor:\n\nCome and\nsee me.\nAgreed.\n"
-    )
+    told = ("1 has no item 'C'", "2 has no item 'B'", "nobody has the id 3")
+    assert notes == tuple(f"overrides.csv: {one}." for one in told)
+    text, reason = returned_text(ada, "Lab"), "Because. Your instructor: A good idea."
+    assert f"9.5 of 10  A\n    {reason} (Your instructor gave 9.5" in text
+    end = "Total    8 of 20\n\nFrom your instructor:\n\nCome and\nsee me.\nAgreed.\n"
+    assert text.endswith(end)
 
 
 @pytest.mark.parametrize(
@@ -335,29 +327,24 @@ def test_without_a_zone_it_is_this_computers(monkeypatch) -> None:
         time.tzset()
 
 
-@pytest.mark.parametrize("text", ["", "tomorrow", "20.11.2026", "2026-11-20 23:59 Mars/Base", "Z"])
-def test_what_is_no_time_is_one_line(text) -> None:
-    with pytest.raises(SettingsError, match="--due") as caught:
-        due_time(text)
-    assert "\n" not in str(caught.value)
-
-
 @pytest.mark.parametrize(
-    ("late_s", "off"), [(0.0, 0), (1.0, 12), (86_400.0, 12), (86_400.5, 24), (1e9, 120)]
-)
-def test_every_started_day_costs_and_never_more_than_all(late_s, off) -> None:
-    assert late_rule("10%/day").deduction(late_s, 120.0) == off
+    ("read", "said", "texts"),
+    [(due_time, "--due", ("", "tomorrow", "20.11.2026", "2026-11-20 23:59 Mars/Base", "Z")),
+     (late_rule, "--late", ("", "10", "10%", "-1%/day", "110%/day", "10%/week", "x%/day"))],
+)  # fmt: skip
+def test_what_is_no_time_and_no_rule_is_one_line(read, said, texts) -> None:
+    for text in texts:
+        with pytest.raises(SettingsError, match=said) as caught:
+            read(text)
+        assert "\n" not in str(caught.value)
 
 
-def test_a_rule_may_name_its_limit_and_hours() -> None:
+def test_every_started_day_costs_and_never_more_than_all() -> None:
+    for late_s, off in ((0.0, 0), (1.0, 12), (86_400.0, 12), (86_400.5, 24), (1e9, 120)):
+        assert late_rule("10%/day").deduction(late_s, 120.0) == off
+    # a rule may name its limit and hours
     assert late_rule("1 % / hour up to 5%").deduction(3600.0 * 3.5, 100.0) == 4.0
     assert late_rule("1%/hour up to 5%").deduction(1e6, 100.0) == 5.0
-
-
-@pytest.mark.parametrize("text", ["", "10", "10%", "-1%/day", "110%/day", "10%/week", "x%/day"])
-def test_what_is_no_rule_is_one_line(text) -> None:
-    with pytest.raises(SettingsError, match="--late"):
-        late_rule(text)
 
 
 def test_platforms_times_without_a_zone_are_in_that_of_the_due_time() -> None:

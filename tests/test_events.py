@@ -59,11 +59,9 @@ def test_a_gap_is_longer_than_a_second_and_five_intervals() -> None:
 def test_all_that_happened_is_listed_and_cut_to_the_segment() -> None:
     resets = tuple(Reset(time, "position", (1.0, 0.0, 0.0)) for time in (5.0, 30.0, 30.0, 95.0))
     flight = aisle_flight(
-        duration_s=100.0,
-        uwb=Uwb(gap_s=(60.0, 65.0)),
-        ekf2=Estimator(resets=resets),
+        duration_s=100.0, uwb=Uwb(gap_s=(60.0, 65.0)), ekf2=Estimator(resets=resets),
         dropouts=(Dropout(9.0, 2.0), Dropout(50.0, 0.5), Dropout(98.0, 1.0)),
-    )
+    )  # fmt: skip
     flight = replace(flight, airborne=((20.0, 70.0), (80.0, 99.0)), modes=MODES)
     comparison = compare(flight, start_s=10.0, end_s=90.0)
     found = happened(comparison)

@@ -349,22 +349,17 @@ def test_a_box_on_the_track_is_a_time(page: Browser) -> None:
 
 
 def test_two_flights_stand_on_the_same_axes(browser: Browser, tmp_path: Path) -> None:
-    pair = [
-        replace(
-            bare(aisle_flight(duration_s=length, length_m=length)),
-            request=ComparisonRequest(log=name),
-        )
-        for length, name in ((20.0, "first.ulg"), (30.0, "second.ulg"))
-    ]
+    pair = []
+    for length, name in ((20.0, "first.ulg"), (30.0, "second.ulg")):
+        one = bare(aisle_flight(duration_s=length, length_m=length))
+        pair.append(replace(one, request=ComparisonRequest(log=name)))
     file = tmp_path / "two.html"
     file.write_bytes(html_text(pair).encode())
     show(browser, file)
     drag(browser, "sigma-z", 0.6)
-    ranges = ask(
-        browser,
-        "Explore.then((e) => [0, 1].map((n) => { const r = e.model(`position-${n}`);"
-        "return [r.x_range.start, r.x_range.end, r.y_range.start, r.y_range.end]; }))",
-    )
+    get = "const r = e.model(`position-${n}`), {x_range: x, y_range: y} = r;"
+    get += "return [x.start, x.end, y.start, y.end];"
+    ranges = ask(browser, f"Explore.then((e) => [0, 1].map((n) => {{ {get} }}))")
     assert ranges[0] == ranges[1]
     assert ranges[0][0] == 0.0
     z = float(browser.ask("document.getElementById('sigma-z-value').value"))

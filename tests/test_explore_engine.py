@@ -124,9 +124,8 @@ def test_the_page_replays_as_python_does(engine: Browser, sample_log: Path, name
     comparison = flights(name, sample_log)
     rng = np.random.default_rng(len(name))
     imu = comparison.settings.input == "imu"
-    tries = [
-        (int(rng.integers(len(comparison.axes))), some_settings(rng, imu)) for _ in range(TRIES)
-    ]
+    axes = len(comparison.axes)
+    tries = [(int(rng.integers(axes)), some_settings(rng, imu)) for _ in range(TRIES)]
     gaps = 0
     for (at, settings), made in zip(tries, in_browser(engine, comparison, tries), strict=True):
         run = in_python(comparison, at, settings)

@@ -12,11 +12,11 @@ import pytest
 from browser import Browser
 from explore_tools import ask, axe, open_view, serious, settle, show
 
-from px4fuse.analysis import Analysis, run
+from px4fuse.analysis import Analysis, run, run_comparison
 from px4fuse.comparison.interventions import beyond_claim
 from px4fuse.ekf2.model import replay_settings
 from px4fuse.explore.page import html_text
-from px4fuse.filter.kalman import replay
+from px4fuse.filter.kalman import replay, state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import within
 from px4fuse.findings import find
@@ -90,19 +90,18 @@ def test_on_a_phone_knobs_and_a_plot_stay(
 
 def test_what_leaves_an_axis_is_marked_at_its_edge(page: Browser) -> None:
     put(page, sigmaA=0.002)
-    drawn, low, high = ask(
-        page,
-        "Explore.then((e) => { const r = e.model('innovation-0').y_range;"
-        "const take = (name, ...columns) => {"
-        "const d = e.model(`innovation:${name}-source-0`).data;"
-        "return columns.map((column) => Array.from(d[column])); };"
-        "return [{nu: take('updates', 't', 'nu'), marks: take('beyond', 't', 'y', 'turn')},"
-        "r.start, r.end]; })",
-    )
-    t, nu = map(np.array, drawn["nu"])
+
+    def drawn(name: str, *columns: str) -> list[Any]:
+        data = f"e.model('innovation:{name}-source-0').data"
+        lists = ", ".join(f"Array.from({data}.{column})" for column in columns)
+        return [np.array(each) for each in ask(page, f"Explore.then((e) => [{lists}])")]
+
+    ends = "(({start, end}) => [start, end])(e.model('innovation-0').y_range)"
+    low, high = ask(page, f"Explore.then((e) => {ends})")
+    t, nu = drawn("updates", "t", "nu")
     out = (nu < low) | (nu > high)
     assert 50 < out.sum() < len(nu)
-    at, y, turn = map(np.array, drawn["marks"])
+    at, y, turn = drawn("beyond", "t", "y", "turn")
     np.testing.assert_array_equal(at, t[out])
     assert ((y > low) & (y < high)).all()
     np.testing.assert_array_equal(turn > 0.0, nu[out] < low)  # those below point down
@@ -166,9 +165,7 @@ def test_findings_of_the_settings_follow_and_the_others_stay(
     put(browser, sigmaZ=0.1)
     after = browser.ask(said)
     assert all(one.startswith("The knobs stand elsewhere now: Along the aisle") for one in after)
-    stale = browser.ask(
-        "[...document.querySelectorAll('.stale')].map((one) => one.textContent).join(' ')"
-    )
+    stale = browser.ask(said.replace(".now-said", ".stale") + ".join(' ')")
     assert "SIGMA_Z" in stale
     assert "reset its height" not in stale
     assert browser.complaints() == []
@@ -193,9 +190,8 @@ def test_ekf2s_knobs_move_its_position_and_its_sigma(
         ("filter", "sigma_v:variance", "sv", np.sqrt(rows["velocity_variance_north_m2_s2"])),
     ):  # fmt: skip
         open_view(page, view)
-        drawn = ask(
-            page, f"Explore.then((e) => Array.from(e.model('{name}-source-0').data.{column}))"
-        )
+        data = f"e.model('{name}-source-0').data.{column}"
+        drawn = ask(page, f"Explore.then((e) => Array.from({data}))")
         np.testing.assert_allclose(drawn, expected, rtol=0.0, atol=3e-3)
     result = next(one for one in analysis.axes.values() if one.axis.name == "north")
     ours = replay(result.axis, analysis.settings)
@@ -204,8 +200,6 @@ def test_ekf2s_knobs_move_its_position_and_its_sigma(
         "[row.cells[0].textContent, row.cells[1].textContent])"
     )
     # between ours and this EKF2, no longer the logged one
-    from px4fuse.filter.kalman import state_at
-
     position, _ = state_at(ours, times)
     apart = position - np.interp(times, done.published.index, done.published["north_m"])
     told = float(dict(shown)["Position: RMS to EKF2"].split()[0])
@@ -319,17 +313,14 @@ def test_the_tour_from_end_to_end(page: Browser, explored: tuple[Path, Analysis]
     assert seen[6][1].startswith("EKF2's mean NIS is 0.86, ours ")
 
 
-def _shifted(analysis: Analysis, offset_s: float) -> Analysis:
+def _shifted(analysis: Analysis, offset_s: float) -> Any:
     """The same flight with its stamps corrected."""
-    from px4fuse.analysis import run_comparison
-
     request = ComparisonRequest(
         log=str(Path("sample_logs") / analysis.flight.log.name), clock_offset_s=offset_s,
         start_s=analysis.segment.start_s, end_s=analysis.segment.end_s,
         heading_deg=analysis.main.axis.heading_deg,
     )  # fmt: skip
-    made: Any = run_comparison(request, flight=analysis.flight)
-    return made  # type: ignore[no-any-return]
+    return run_comparison(request, flight=analysis.flight)
 
 
 # ------------------------------------------------------------------ everybody

@@ -188,12 +188,10 @@ def test_sorts_filters_and_unfolds(page: Browser) -> None:
 def test_what_is_pressed_above_filters_below(page: Browser) -> None:
     table = made_up(240).drop_duplicates("log")
     page.choose("#filter-3", "finding:ekf2_rejecting")
-    found = table["findings"].fillna("").str.contains("ekf2_rejecting").sum()
-    assert page.ask(COUNT) == f"Showing {found} of 240"
+    rejecting = table["findings"].fillna("").str.contains("ekf2_rejecting")
+    assert page.ask(COUNT) == f"Showing {rejecting.sum()} of 240"
     page.click(f'[data-tag="vehicle:{VEHICLES[1]}"]')
-    both = table["findings"].fillna("").str.contains("ekf2_rejecting") & (
-        table["vehicle"] == VEHICLES[1]
-    )
+    both = rejecting & (table["vehicle"] == VEHICLES[1])
     assert page.ask(COUNT) == f"Showing {both.sum()} of 240"
     page.click("#all")
     page.click(f'[data-tag="remedy:{NOT_LOGGED[1]}"]')

@@ -29,14 +29,10 @@ pytestmark = pytest.mark.usefixtures("quick_filter")
 LATE = Wrong("clock-offset", 0.2, 0.17, 0.23)
 GAP = Wrong("dropout", 3.0, 2.55, 3.45, 50.0, 53.0)
 TRUTH = FormTruth(
-    (LATE, GAP),
-    0.1,
-    VerdictTruth("understated", 2.0),
-    VerdictTruth("overstated", 1.2),
-    ("followed the wrong positions", "coasted, then reset"),
-    ("fused at the wrong time",),
+    (LATE, GAP), 0.1, VerdictTruth("understated", 2.0), VerdictTruth("overstated", 1.2),
+    ("followed the wrong positions", "coasted, then reset"), ("fused at the wrong time",),
     (0.5, (3.0, 7.0), -0.2),
-)
+)  # fmt: skip
 RIGHT = Answers(
     log_sha256=SHA256,
     mistakes=(
@@ -194,26 +190,17 @@ def answers_of(form: dict[str, Any]) -> Answers:
         unit = one["value_unit"] if one["value_unit"] in CURES.get(parameter, {}) else ""
         claims.append(
             Claim(
-                one["kind"],
-                one["size"],
+                one["kind"], one["size"],
                 "" if one["unit"] == next(iter(MISTAKES[one["kind"]].units), "") else one["unit"],
-                "whole flight" if when["text"] == "whole flight" else "",
-                when["from_s"],
-                when["until_s"],
-                parameter,
-                distance(one["value"]),
-                unit,
-                one["where"]["panel"],
+                "whole flight" if when["text"] == "whole flight" else "", when["from_s"],
+                when["until_s"], parameter, distance(one["value"]), unit, one["where"]["panel"],
             )
-        )
+        )  # fmt: skip
     return Answers(
-        log_sha256=SHA256,
-        mistakes=tuple(claims),
-        verdict_ours=form["verdict_ours"],
-        verdict_ekf2=form["verdict_ekf2"],
-        ekf2_did=tuple(form["ekf2_did"]),
+        log_sha256=SHA256, mistakes=tuple(claims), verdict_ours=form["verdict_ours"],
+        verdict_ekf2=form["verdict_ekf2"], ekf2_did=tuple(form["ekf2_did"]),
         quantities=tuple(given(one["given"]) for one in form["quantities"]),
-    )
+    )  # fmt: skip
 
 
 def distance(value: Any) -> Any:

@@ -38,9 +38,7 @@ LATE = "clock-offset=0.25"
 
 
 @cache
-def flown(
-    *mistakes: str, sigma_a: float = 0.27, sigma_z: float = 0.10, passes: int = 4
-) -> Analysis:
+def flown(*mistakes: str, sigma_a=0.27, sigma_z=0.10, passes=4) -> Analysis:
     flight = simulate_flight(Scenario(seed=5, passes=passes), parse(mistakes))
     return explain(compare(flight, Settings(sigma_a, sigma_z), axes=("aisle", "north", "east")))
 
@@ -190,9 +188,8 @@ def test_outliers_are_left_out_of_stamps_that_are_moved() -> None:
 def test_a_parameter_that_is_not_px4s_is_tried() -> None:
     analysis = flown("ekf2-noise=0.03")
     settings = {**analysis.ekf2_model.inputs.settings, "EKF2_ACC_NOISE": 0.5, "EKF2_GYR_NOISE": 0.1}
-    model = replace(
-        analysis.ekf2_model, inputs=replace(analysis.ekf2_model.inputs, settings=settings)
-    )
+    inputs = replace(analysis.ekf2_model.inputs, settings=settings)
+    model = replace(analysis.ekf2_model, inputs=inputs)
     rows = interventions(analysis, analysis.tuning, analysis.clock, analysis.heading,
                          analysis.explained, model)  # fmt: skip
     tried = [one.change for one in rows if (one.axis, one.of) == ("aisle", "nis")]

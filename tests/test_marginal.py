@@ -1,5 +1,7 @@
 """The banded likelihood against dense linear algebra, and the noises that it finds."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from exchange import replace
@@ -63,9 +65,8 @@ def test_the_system_is_that_of_the_dense_normal_equations(seed: int) -> None:
     precision = np.stack([rng.uniform(1.0, 100.0, count), np.zeros(count)], 1)
     precision[[0, second], 1] = 0.5, 2.0
     precision[rng.integers(1, count), 0] = 0.0
-    signals = measured, dp, dv = [
-        rng.normal(size=(3, width)) for width in (count, count - 1, count - 1)
-    ]
+    widths = count, count - 1, count - 1
+    signals = measured, dp, dv = [rng.normal(size=(3, width)) for width in widths]
     # rows of what is known, over their standard deviations
     rows = np.diag(np.sqrt(precision.ravel()))
     known = np.zeros((2 * count, 3))
@@ -119,18 +120,9 @@ START, COUNT = np.array([0, 11]), 24
 WEAK = np.array([1e-6, 1e-4])  # of position and velocity where a stretch starts
 WEIGHT = np.random.default_rng(2).uniform(0.1, 1.0, COUNT)
 SOME_NOISES = [
-    Noises(*each)
-    for each in (
-        (0.5, 0.1),
-        (0.05, 0.1),
-        (2.0, 0.1),
-        (0.5, 0.02),
-        (0.5, 1.0),
-        (0.5, 0.1, 0.3),
-        (0.5, 0.1, 0.0, 0.3, 0.7),
-        (0.5, 0.1, 0.3, 0.05, 3.0),
-    )
-]
+    Noises(0.5, 0.1), Noises(0.05, 0.1), Noises(2.0, 0.1), Noises(0.5, 0.02), Noises(0.5, 1.0),
+    Noises(0.5, 0.1, 0.3), Noises(0.5, 0.1, 0.0, 0.3, 0.7), Noises(0.5, 0.1, 0.3, 0.05, 3.0),
+]  # fmt: skip
 
 
 def with_constants(offsets: int = 3) -> Positions:
@@ -148,21 +140,16 @@ def with_constants(offsets: int = 3) -> Positions:
     initial = np.zeros((COUNT, 2))
     initial[START] = WEAK
     return Positions(
-        measurement_m=measured,
-        start=START,
-        length_s=length,
+        measurement_m=measured, start=START, length_s=length,
         noise_unit=0.1 * np.stack(noise_of_many_steps(length)),
         noise_fixed=np.outer([0.3, 0.0, 0.2], rng.choice([0.0, 0.01], COUNT - 1)),
-        initial=initial,
-        constant_sigma=np.array([0.3, 1.0, 0.1]),
+        initial=initial, constant_sigma=np.array([0.3, 1.0, 0.1]),
         delta_position_m=rng.normal(0.0, 0.3, (3, offsets, 4, COUNT - 1)),
         delta_velocity_m_s=rng.normal(0.0, 0.3, (3, offsets, 4, COUNT - 1)),
-    )
+    )  # fmt: skip
 
 
-def arguments(
-    positions: Positions, noises: Noises, weight: Array
-) -> tuple[Positions, float, Array]:
+def arguments(positions: Positions, noises: Noises, weight: Array) -> tuple[Any, float, Array]:
     """What :func:`fit` takes."""
     if noises.slow_m:
         positions = replace(positions, slow=(noises.slow_m, noises.tau_s))
@@ -217,11 +204,9 @@ def test_marginal_constants_are_a_covariance() -> None:
     part = with_constants()
 
     def dense(noises: Noises, at: int) -> float:
-        total = 0.0
+        total, variance = 0.0, noises.sigma_z_m**2 / WEIGHT
         for stretch in range(2):
-            data, covariance, _ = joint_normal(
-                part, noises, noises.sigma_z_m**2 / WEIGHT, stretch, at
-            )
+            data, covariance, _ = joint_normal(part, noises, variance, stretch, at)
             total += 0.5 * data @ np.linalg.solve(covariance, data)
             total += 0.5 * np.linalg.slogdet(covariance)[1]
         return float(total)
@@ -244,10 +229,8 @@ def test_an_axis_that_is_hardly_measured_says_nothing(start_known: bool) -> None
     without = part.measurement_m.copy()
     without[15, 2] = np.nan
     for noises in SOME_NOISES:
-        one, none = (
-            fit(*arguments(each, noises, np.ones(COUNT)))
-            for each in (part, replace(part, measurement_m=without))
-        )
+        both = part, replace(part, measurement_m=without)
+        one, none = (fit(*arguments(each, noises, np.ones(COUNT))) for each in both)
         np.testing.assert_allclose(one.totals(), none.totals(), rtol=1e-12)
         np.testing.assert_allclose(one.constants(), none.constants(), rtol=1e-9, atol=1e-12)
 
@@ -309,11 +292,8 @@ def test_a_smooth_path_taken_out_changes_nothing() -> None:
     np.testing.assert_allclose(ours, plain, rtol=1e-7)
     # a scale's signal is the path to which each offset leads
     scaled = fit(*arguments(centred(part, scaled=True), SOME_NOISES[0], WEIGHT)).gram
-    alone = replace(
-        part,
-        delta_position_m=part.delta_position_m[:, 1:2],
-        delta_velocity_m_s=part.delta_velocity_m_s[:, 1:2],
-    )
+    way, speed = part.delta_position_m[:, 1:2], part.delta_velocity_m_s[:, 1:2]
+    alone = replace(part, delta_position_m=way, delta_velocity_m_s=speed)
     one = fit(*arguments(centred(alone, scaled=True), SOME_NOISES[0], WEIGHT)).gram
     assert np.ptp(scaled[..., -1, -1]) > 1.0
     np.testing.assert_allclose(scaled[:, [1]], one, rtol=1e-7, atol=1e-7)
@@ -334,9 +314,8 @@ def test_the_likelihood_between_its_nodes_is_the_likelihood(which: str) -> None:
         score = Likelihood(parts, WEIGHT, 0.1, rough)
         assert score.tabulated
         ours = np.array([score(Noises(*pair)) for pair in some])
-        np.testing.assert_allclose(
-            ours - ours[0], np.array(direct) - direct[0], rtol=error, atol=1e-3
-        )
+        expected = np.array(direct) - direct[0]
+        np.testing.assert_allclose(ours - ours[0], expected, rtol=error, atol=1e-3)
 
 
 # --- the filter's own likelihood ---
@@ -457,9 +436,8 @@ def test_noise_is_as_uncertain_as_the_likelihood_of_the_mixture_is_curved(axes, 
     """Of measurements without any motion, whose likelihood can be written down."""
     rng = np.random.default_rng(axes)
     wrong = rng.random(4000) < share
-    square = np.sum(
-        rng.normal(0.0, np.where(wrong, width, 1.0)[:, None], (4000, axes)) ** 2, axis=1
-    )
+    error = rng.normal(0.0, np.where(wrong, width, 1.0)[:, None], (4000, axes))
+    square = np.sum(error**2, axis=1)
 
     def score(parameters: Array) -> Array:
         log_sigma, log_width, odds = (

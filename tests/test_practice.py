@@ -21,20 +21,12 @@ from explore_tools import ask, axe, serious, settle, show
 from hypothesis import given
 from hypothesis import strategies as st
 
+from px4fuse import practice
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import Flight
-from px4fuse.practice import (
-    CHOICES,
-    FLOWN,
-    NOISY_UWB,
-    SIGMA_A_M_S2,
-    TRICKS,
-    Trick,
-    draw,
-    practice_text,
-)
+from px4fuse.practice import CHOICES, NOISY_UWB, Trick, draw
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
@@ -75,14 +67,14 @@ def flown(trick: Trick | None, level: int, seed: int) -> Flight:
     """With one mistake of a level, or without."""
     size = "" if trick is None else trick.sizes[level - 1]
     noisy = trick is not None and trick.mistake == NOISY_UWB
-    scenario = Scenario(**FLOWN, length_m=9.0 + 0.7 * seed, heading_deg=50.0 * seed, seed=seed,
-                        sigma_uwb_m=float(size) if noisy else 0.1)  # fmt: skip
+    scenario = Scenario(**practice.FLOWN, length_m=9.0 + 0.7 * seed, heading_deg=50.0 * seed,
+                        seed=seed, sigma_uwb_m=float(size) if noisy else 0.1)  # fmt: skip
     named = [] if trick is None or noisy else [f"{trick.mistake}={size}"]
     return simulate_flight(scenario, parse(named))
 
 
 def judged(flight: Flight, **settings: float) -> Comparison:
-    return compare(flight, Settings(**({"sigma_a_m_s2": SIGMA_A_M_S2} | settings)))
+    return compare(flight, Settings(**({"sigma_a_m_s2": practice.SIGMA_A_M_S2} | settings)))
 
 
 def ours(flight: Flight, **settings: float) -> Any:
@@ -94,7 +86,7 @@ LEVELS_AND_SEEDS = [(1, 1), (3, 3)]
 
 
 def trick(mistake: str) -> Trick:
-    return next(one for one in TRICKS if one.mistake == mistake)
+    return next(one for one in practice.TRICKS if one.mistake == mistake)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -182,7 +174,7 @@ def test_a_small_gate_rejects_what_fits_ours(level: int, seed: int) -> None:
 @pytest.fixture(scope="module")
 def quiz(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("practice") / "quiz.html"
-    file.write_bytes(practice_text(SEED, 1, COUNT).encode())
+    file.write_bytes(practice.practice_text(SEED, 1, COUNT).encode())
     return file
 
 
@@ -279,9 +271,8 @@ def test_flights_with_right_and_wrong_answers(browser: Browser, quiz: Path) -> N
 
 def test_half_of_two_is_half_and_nothing_excludes_the_rest(browser: Browser, quiz: Path) -> None:
     page = show(browser, quiz)
-    page.click("[name=choice][value=gate]")
-    page.click("[name=choice][value=clock]")
-    page.click("[name=choice][value=nothing]")
+    for name in ("gate", "clock", "nothing"):
+        page.click(f"[name=choice][value={name}]")
     chosen = "[...document.querySelectorAll('[name=choice]:checked')].map((b) => b.value)"
     assert page.ask(chosen) == ["nothing"]
     page.click("[name=choice][value=gate]")

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import ast
 import dataclasses
-import string
-import tomllib
 from collections.abc import Iterator
 from importlib import import_module
-from pathlib import Path
 from pkgutil import walk_packages
 
 import msgspec
@@ -46,27 +42,3 @@ def test_a_frozen_record_refuses() -> None:
     flight = px4fuse.Settings()
     with pytest.raises(dataclasses.FrozenInstanceError):
         flight.sigma_a_m_s2 = 1.0  # type: ignore[misc]
-
-
-def test_what_is_lacking_has_words_for_all_that_is_told() -> None:
-    """Every row of ``lacking.toml`` is used, and whoever uses one tells what its braces ask for."""
-    used: dict[str, set[frozenset[str | None]]] = {}
-    for file in Path(px4fuse.__file__).parent.rglob("*.py"):
-        for call in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            if isinstance(call, ast.Call) and ast.unparse(call.func) == "lacking":
-                (name,) = call.args
-                assert isinstance(name, ast.Constant)
-                used.setdefault(name.value, set()).add(frozenset(k.arg for k in call.keywords))
-    rows = tomllib.loads(Path(px4fuse.__file__).with_name("lacking.toml").read_text("utf-8"))
-    asked = {
-        name: {
-            frozenset(
-                field
-                for text in row.values()
-                for _, field, _, _ in string.Formatter().parse(text)
-                if field
-            )
-        }
-        for name, row in rows.items()
-    }
-    assert used == asked

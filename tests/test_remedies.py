@@ -7,19 +7,10 @@ import pytest
 from exchange import replace
 
 from px4fuse.analysis import Analysis, explain
+from px4fuse.comparison import remedy as remedies
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.remedy import (
-    asked_of_ekf2,
-    delay_change,
-    delay_helps,
-    filter_words,
-    noise_change,
-    noise_helps,
-    noise_used_m,
-    rejects_less,
-    remedy_words,
-)
+from px4fuse.comparison.remedy import asked_of_ekf2, noise_used_m
 from px4fuse.ekf2.model import replay_settings
 from px4fuse.ekf2.whatif import AxisSummary, Summary, what_if
 from px4fuse.filter.settings import Settings
@@ -64,16 +55,10 @@ def parameters(remedy: str) -> dict[str, float]:
 
 @pytest.mark.parametrize(
     ("settings", "mistakes"),
-    [
-        ({}, ()),
-        ({"sigma_z_m": 0.02}, ()),
-        ({}, ("ekf2-noise=4cm",)),
-        ({}, ("ekf2-delay=175ms",)),
-        ({}, ("clock-offset=250ms",)),
-        ({}, ("nlos=5%",)),
-    ],
+    [({}, ()), ({"sigma_z_m": 0.02}, ()), ({}, ("ekf2-noise=4cm",)), ({}, ("ekf2-delay=175ms",)),
+     ({}, ("clock-offset=250ms",)), ({}, ("nlos=5%",))],
     ids=str,
-)
+)  # fmt: skip
 def test_no_remedy_increases_the_error_to_the_truth(settings, mistakes) -> None:
     analysis = flown(AISLE, Settings(**settings), *mistakes)
     comparison, model = analysis, analysis.ekf2_model
@@ -115,23 +100,17 @@ def test_on_a_loop_of_vio_the_truth_is_told_first_and_no_noise_is_lowered(seed, 
 
 def test_a_remedy_of_our_filter_that_the_truth_contradicts_is_not_given() -> None:
     comparison = flown(AISLE, Settings())
-    worse = filter_words(comparison, {"sigma_z_m": 3.0})
+    worse = remedies.filter_words(comparison, {"sigma_z_m": 3.0})
     assert worse.startswith("Leave it: --sigma-z 3 fits")
     truth = Unavailable("ground truth", "none", "")
-    blind = replace(
-        comparison,
-        axes={
-            name: replace(
-                a,
-                truth=truth,
-                filters={each: replace(one, truth=truth) for each, one in a.filters.items()},
-            )
-            for name, a in comparison.axes.items()
-        },
-    )
+    axes = {}
+    for name, axis in comparison.axes.items():
+        filters = {each: replace(one, truth=truth) for each, one in axis.filters.items()}
+        axes[name] = replace(axis, truth=truth, filters=filters)
+    blind = replace(comparison, axes=axes)
     typed = "px4fuse compare LOG --sigma-z 0.2."
-    assert filter_words(blind, {"sigma_z_m": 0.2}, unseen_nats=0.1) == typed
-    assert filter_words(blind, {"sigma_z_m": 0.2}, unseen_nats=-0.1).startswith("Leave")
+    assert remedies.filter_words(blind, {"sigma_z_m": 0.2}, unseen_nats=0.1) == typed
+    assert remedies.filter_words(blind, {"sigma_z_m": 0.2}, unseen_nats=-0.1).startswith("Leave")
 
 
 # ---------------------------------------------------------------- of EKF2
@@ -180,21 +159,16 @@ def summary(
     ],
 )  # fmt: skip
 def test_a_remedy_must_help_and_not_harm(after, noise, fewer, delay) -> None:
-    before = summary(
-        10.0,
-        0.25,
-        0.1 if isinstance(after.axes["north"].position_rmse_to_truth_m, float) else NO_TRUTH,
-        0.1,
-    )
-    assert noise_helps(before, after) is noise
-    assert rejects_less(before, after) is fewer
-    assert delay_helps(before, after) is delay
+    known = isinstance(after.axes["north"].position_rmse_to_truth_m, float)
+    before = summary(10.0, 0.25, 0.1 if known else NO_TRUTH, 0.1)
+    assert remedies.noise_helps(before, after) is noise
+    assert remedies.rejects_less(before, after) is fewer
+    assert remedies.delay_helps(before, after) is delay
 
 
 def words(analysis: Analysis, **changes: float) -> str:
-    return remedy_words(
-        analysis.ekf2_model, changes, noise_helps, why="Because: ", otherwise="Look elsewhere:"
-    )
+    model, why, otherwise = analysis.ekf2_model, "Because: ", "Look elsewhere:"
+    return remedies.remedy_words(model, changes, remedies.noise_helps, why=why, otherwise=otherwise)
 
 
 def test_confirmed_refused_and_not_replayed(sample: Analysis) -> None:
@@ -241,14 +215,14 @@ def test_a_noise_that_the_sender_reports_is_overruled(sample: Analysis) -> None:
     model = sample.ekf2_model
     assert noise_used_m(model) == pytest.approx(0.1)
     flown = model.inputs.aid, model.inputs.settings, noise_used_m(model)
-    assert noise_change(*flown, 0.0012345) == {"EKF2_EVP_NOISE": 0.01}
+    assert remedies.noise_change(*flown, 0.0012345) == {"EKF2_EVP_NOISE": 0.01}
     settings = {**model.inputs.settings, "EKF2_EVP_NOISE": 0.02, "EKF2_EV_NOISE_MD": 0.0}
     reported = replace(model, inputs=replace(model.inputs, settings=settings))
     used = reported.inputs.aid, settings, noise_used_m(reported)
-    assert noise_change(*used, 0.05) == {"EKF2_EVP_NOISE": 0.05, "EKF2_EV_NOISE_MD": 1.0}
-    assert noise_change(*used, 0.2) == {"EKF2_EVP_NOISE": 0.2}
-    assert delay_change(model.inputs, -40.0) == {}
-    assert delay_change(model.inputs, 400.0) == {}
+    assert remedies.noise_change(*used, 0.05) == {"EKF2_EVP_NOISE": 0.05, "EKF2_EV_NOISE_MD": 1.0}
+    assert remedies.noise_change(*used, 0.2) == {"EKF2_EVP_NOISE": 0.2}
+    assert remedies.delay_change(model.inputs, -40.0) == {}
+    assert remedies.delay_change(model.inputs, 400.0) == {}
 
 
 def only(name: str, analysis: Analysis) -> Finding:

@@ -57,11 +57,8 @@ def with_font(monkeypatch: pytest.MonkeyPatch, name: str, characters: str) -> No
     """A machine with one more font, which has these characters."""
     monkeypatch.setattr(fonts, "_others", lambda: ((name, "path"),))
     own = fonts._characters
-    monkeypatch.setattr(
-        fonts,
-        "_characters",
-        lambda path: frozenset(map(ord, characters)) if path == "path" else own(path),
-    )
+    with_one_more = {"path": frozenset(map(ord, characters))}
+    monkeypatch.setattr(fonts, "_characters", lambda path: with_one_more.get(path) or own(path))
 
 
 @pytest.mark.usefixtures("_fresh")
@@ -204,12 +201,8 @@ def offset(**changes: Any) -> ClockOffset:
 
 def with_clock(found: ClockOffset | Unavailable, delay_ms: float = 0.0) -> Any:
     log = SimpleNamespace(name="x.ulg", parameters={"EKF2_EV_DELAY": delay_ms})
-    return SimpleNamespace(
-        clock=found,
-        settings=SimpleNamespace(clock_offset_s=0.0),
-        flight=SimpleNamespace(log=log),
-        source=source(),
-    )
+    settings, flight = SimpleNamespace(clock_offset_s=0.0), SimpleNamespace(log=log)
+    return SimpleNamespace(clock=found, settings=settings, flight=flight, source=source())
 
 
 def test_the_clock_has_its_page_when_there_is_something_to_say() -> None:
@@ -232,14 +225,10 @@ def test_the_clock_has_its_page_when_there_is_something_to_say() -> None:
     [
         ({}, 0.0, {"Reading": "the stamps are right", "PX4": "0 ms fits"}),
         ({}, 175.0, {"PX4": "EKF2_EV_DELAY is 175 ms, the data ask for 0 ms (0 to 20)"}),
-        (
-            {"offset_s": -0.25, "interval_s": (-0.28, -0.22)}, 250.0,
-            {"Reading": "late by 0.250 s", "Re-run": "--clock-offset -0.250", "PX4": "fits"},
-        ),
-        (
-            {"offset_s": 0.25, "interval_s": (0.22, 0.28)}, 0.0,
-            {"Reading": "early by 0.250 s", "PX4": "cannot be negative"},
-        ),
+        ({"offset_s": -0.25, "interval_s": (-0.28, -0.22)}, 250.0,
+         {"Reading": "late by 0.250 s", "Re-run": "--clock-offset -0.250", "PX4": "fits"}),
+        ({"offset_s": 0.25, "interval_s": (0.22, 0.28)}, 0.0,
+         {"Reading": "early by 0.250 s", "PX4": "cannot be negative"}),
         ({"offset_s": 0.009, "interval_s": (0.008, 0.0095)}, 0.0, {"Reading": "are right"}),
         ({"change_p": 0.001}, 0.0, {"Changes": "+0.00 s from 10 s"}),
         ({"drift_ppm": 1000.0}, 0.0, {"Drift": "+1000 ± 588 ppm"}),
@@ -264,10 +253,7 @@ def test_only_the_ratio_moves_the_gain_and_the_track() -> None:
         assert gains[one] == pytest.approx(gains[other], rel=1e-6)
         assert sigmas[one] / sigmas[other] == pytest.approx(scale, rel=1e-6)
         half = slice(300, None)
-        np.testing.assert_allclose(
-            run.velocity_m_s[half, one], run.velocity_m_s[half, other], atol=1e-6
-        )
-        np.testing.assert_allclose(
-            run.nis[half, one] * scale**2, run.nis[half, other], rtol=1e-4, atol=1e-9
-        )
+        v, nis = run.velocity_m_s[half], run.nis[half]
+        np.testing.assert_allclose(v[:, one], v[:, other], atol=1e-6)
+        np.testing.assert_allclose(nis[:, one] * scale**2, nis[:, other], rtol=1e-4, atol=1e-9)
     assert gains[1] > gains[0] > gains[3]

@@ -9,20 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from px4fuse import request as requests
 from px4fuse.cli.compare import compare
 from px4fuse.cli.inputs import comparison_request
 from px4fuse.cli.loop import loop, loop_request
-from px4fuse.request import (
-    LOOP_OPTIONS,
-    OPTIONS,
-    ComparisonRequest,
-    GivenClosure,
-    Landing,
-    LoopRequest,
-    PositionFile,
-    Request,
-    command_line,
-)
+from px4fuse.request import ComparisonRequest, LoopRequest, PositionFile, Request, command_line
 
 NAMES = st.text("abc ü'\"$-_.", min_size=1, max_size=12).map(lambda text: f"f{text}x")
 NUMBERS = st.integers(-10_000, 10_000).map(lambda number: number / 1000.0)
@@ -40,9 +31,7 @@ COMPARISONS = st.builds(
     system=maybe(st.integers(0, 255)),
     position=maybe(
         st.builds(
-            PositionFile,
-            path=NAMES,
-            frame=maybe(st.sampled_from(["ned", "enu", "nwu"])),
+            PositionFile, path=NAMES, frame=maybe(st.sampled_from(["ned", "enu", "nwu"])),
             yaw_deg=maybe(NUMBERS | st.just("auto")),
             columns=maybe(st.lists(st.sampled_from("tabcd"), min_size=1).map(tuple)),
             time_unit=maybe(st.sampled_from(["s", "ms", "us", "ns"])),
@@ -60,22 +49,17 @@ COMPARISONS = st.builds(
     start_s=maybe(NUMBERS),
     end_s=maybe(NUMBERS),
     clock_offset_s=maybe(NUMBERS | st.just("auto")),
-)
+)  # fmt: skip
 LOOPS = st.builds(
-    LoopRequest,
-    source=NAMES,
-    frame=maybe(st.sampled_from(["NED", "FRD", "ENU", "camera"])),
-    system=maybe(st.integers(0, 255)),
-    reference=maybe(NAMES),
-    start_s=maybe(NUMBERS),
-    end_s=maybe(NUMBERS),
-    landed_at=maybe(st.builds(Landing, NUMBERS, NUMBERS, maybe(NUMBERS))),
-    came_back=st.booleans(),
-    closures=st.lists(st.builds(GivenClosure, NUMBERS, NUMBERS, POSITIVE), max_size=3).map(tuple),
-    position_drift_m=POSITIVE,
-    heading_drift_deg=POSITIVE,
-    key_frames_m=maybe(POSITIVE),
-)
+    LoopRequest, source=NAMES, frame=maybe(st.sampled_from(["NED", "FRD", "ENU", "camera"])),
+    system=maybe(st.integers(0, 255)), reference=maybe(NAMES), start_s=maybe(NUMBERS),
+    end_s=maybe(NUMBERS), came_back=st.booleans(),
+    landed_at=maybe(st.builds(requests.Landing, NUMBERS, NUMBERS, maybe(NUMBERS))),
+    closures=st.lists(
+        st.builds(requests.GivenClosure, NUMBERS, NUMBERS, POSITIVE), max_size=3
+    ).map(tuple),
+    position_drift_m=POSITIVE, heading_drift_deg=POSITIVE, key_frames_m=maybe(POSITIVE),
+)  # fmt: skip
 
 
 def parsed(command: str) -> Request:
@@ -132,7 +116,10 @@ def test_what_px4fuse_cannot_have_recorded_is_refused(recorded: object, says: st
 
 @pytest.mark.parametrize(
     ("command", "declared", "kinds"),
-    [(compare, OPTIONS, (ComparisonRequest, PositionFile)), (loop, LOOP_OPTIONS, (LoopRequest,))],
+    [
+        (compare, requests.OPTIONS, (ComparisonRequest, PositionFile)),
+        (loop, requests.LOOP_OPTIONS, (LoopRequest,)),
+    ],
 )
 def test_every_option_of_an_analysis_is_in_the_request(command, declared, kinds) -> None:
     """An option that the request forgets would be missing from every record."""

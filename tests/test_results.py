@@ -4,8 +4,8 @@ import json
 import math
 
 import jsonschema
-import msgspec
 import pytest
+from exchange import replace
 from flights import unexplained
 from results_tools import EXAMPLE, LOOP, changed, decoded
 
@@ -18,8 +18,6 @@ from px4fuse.request import ComparisonRequest
 from px4fuse.results import build
 from px4fuse.results.contract import KINDS, schema, to_json
 from px4fuse.results.reading import read_results
-
-NOTHING = {"what": "noises", "reason": "too short", "remedy": ""}
 
 
 def document(flight: px4fuse.Flight, explained: bool = True, **options: object):
@@ -39,9 +37,8 @@ def assert_valid(text: str) -> None:
 
 def test_schema_is_itself_valid_and_says_what_it_knows():
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
-    assert [one["$ref"] for one in SCHEMA["oneOf"]] == [
-        f"#/$defs/{kind.__name__}" for kind in KINDS.values()
-    ]
+    kinds = [f"#/$defs/{kind.__name__}" for kind in KINDS.values()]
+    assert [one["$ref"] for one in SCHEMA["oneOf"]] == kinds
 
 
 @pytest.mark.parametrize("one", [EXAMPLE, LOOP], ids=["compare", "loop"])
@@ -49,15 +46,10 @@ def test_schema_takes_results_and_nothing_else(one):
     validator = jsonschema.Draft202012Validator(SCHEMA)
     assert validator.is_valid(json.loads(json.dumps(one)))
     for wrong in (
-        changed(one, extra=1),
-        changed(one, provenance=...),
-        changed(one, schema__name="px4fuse-tuning"),
-        changed(one, schema__version="1.0"),
-        changed(one, loop={}),
-        changed(one, loop={"what": "loop"}),
-        changed(one, student__name=7),
-    ):
-        assert not validator.is_valid(json.loads(json.dumps(wrong)))
+        {"extra": 1}, {"provenance": ...}, {"schema__name": "px4fuse-tuning"}, {"loop": {}},
+        {"schema__version": "1.0"}, {"loop": {"what": "loop"}}, {"student__name": 7},
+    ):  # fmt: skip
+        assert not validator.is_valid(json.loads(json.dumps(changed(one, **wrong)))), wrong
 
 
 @pytest.mark.parametrize(
@@ -86,12 +78,10 @@ def test_nothing_that_could_not_be_computed_is_zero(sample_flight):
     assert_valid(to_json(made))
 
 
-def test_no_number_is_written_that_is_none(sample_flight):
+def test_no_number_is_written_that_is_none():
     made = decoded(EXAMPLE)
     for number in (math.nan, math.inf):
-        broken = msgspec.structs.replace(
-            made, settings=msgspec.structs.replace(made.settings, dt_s=number)
-        )
+        broken = replace(made, settings=replace(made.settings, dt_s=number))
         with pytest.raises(ValueError, match="not JSON compliant"):
             to_json(broken)
 
@@ -145,10 +135,7 @@ def test_what_is_no_results(given, said):
         ({"log__sha256": "x"}, "matching regex"),
         ({"axes": {}}, "length >= 1"),
         ({"axes__up": EXAMPLE["axes"]["down"]}, "Invalid enum value 'up'"),
-        (
-            {"axes__north__filters__kf__nis_mean": "1"},
-            r"at `\$.nis_mean` - at `\$.axes\[...\].filters\[...\]`",
-        ),
+        ({"axes__north__filters__kf__nis_mean": "1"}, r"at `\$.nis_mean` - at `\$.axes\[...\].f"),
         ({"clock": {"what": "", "reason": ""}}, "missing required field"),
         ({"request__log": ...}, "missing required field `log`"),
         ({"provenance__px4fuse": "1 2"}, "matching regex"),
@@ -161,4 +148,5 @@ def test_what_breaks_the_contract(values, said):
 
 
 def test_names_are_cleaned_as_texts_are():
-    assert list(decoded(changed(tuning={"a\u202eb": NOTHING})).tuning) == ["ab"]
+    nothing = {"what": "noises", "reason": "too short", "remedy": ""}
+    assert list(decoded(changed(tuning={"a\u202eb": nothing})).tuning) == ["ab"]

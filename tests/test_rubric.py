@@ -63,10 +63,7 @@ BAD = {
     "bounds exchanged": (NUMBER + "at_least = 2\nat_most = 1", "in this order"),
     "zero on the good side": (NUMBER + "at_most = 2\nzero_at = 1", "zero_at beyond"),
     "zero on the other good side": (NUMBER + "at_least = 0\nzero_at = 1", "zero_at beyond"),
-    "a parameter of an earlier rubric": (
-        ITEM + 'check = "consistent"\naxes = []',
-        "unknown field `axes` - at item 1",
-    ),
+    "a parameter of an earlier rubric": (ITEM + 'check = "consistent"\naxes = []', "field `axes`"),
     "but for capitals": (NOTES + NOTES.replace("T", "t"), "the title 't' is another item's"),
     "as the sum": (NOTES.replace("T", "Total"), "the title 'Total' is that of the sum"),
     "two alike": (NOTES + NOTES, "the title 'T' is another item's"),

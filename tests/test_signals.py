@@ -10,6 +10,7 @@ from filter_tools import attitude_table, imu_table
 from flights import Uwb, aisle_flight, table
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.integrate import trapezoid
 from scipy.spatial.transform import Rotation
 
 from px4fuse.comparison.preparation import choose_segment, shift_clock
@@ -113,16 +114,13 @@ intervals = st.lists(st.integers(1, 50), min_size=3, max_size=40)
 def test_step_means_of_piecewise_linear_signals_are_exact(gaps_ms, data):
     """Between samples the signal is a straight line; steps that end on samples average exactly."""
     time = np.concatenate([[0.0], np.cumsum(gaps_ms) * 1e-3])
-    values = np.array(
-        data.draw(st.lists(st.floats(-20, 20), min_size=len(time), max_size=len(time)))
-    )
+    count = len(time)
+    values = np.array(data.draw(st.lists(st.floats(-20, 20), min_size=count, max_size=count)))
     ends = data.draw(st.sets(st.integers(0, len(time) - 1), min_size=2))
     at = sorted(ends)
     mean, _ = step_means(acceleration_of(time, values), time[at])
     for step, (first, last) in enumerate(pairwise(at)):
-        area = sum(
-            (values[i] + values[i + 1]) / 2 * (time[i + 1] - time[i]) for i in range(first, last)
-        )
+        area = trapezoid(values[first : last + 1], time[first : last + 1])
         assert mean[step] == pytest.approx(area / (time[last] - time[first]), abs=1e-9)
 
 
@@ -130,16 +128,13 @@ def test_step_means_of_piecewise_linear_signals_are_exact(gaps_ms, data):
     ("time", "edges", "gaps"),
     [
         # nothing strictly between 2 s and 3 s
-        (
-            np.r_[0.0:2.005:0.01, 3.0:10.0:0.01],
-            [0.0, 1.0, 1.5, 2.5, 2.7, 2.9, 4.0, 5.0],
-            [0.0, 0.0, 0.5, 1.0, 1.0, 0.1 / 1.1, 0.0],
-        ),
+        (np.r_[0.0:2.005:0.01, 3.0:10.0:0.01], [0.0, 1.0, 1.5, 2.5, 2.7, 2.9, 4.0, 5.0],
+         [0.0, 0.0, 0.5, 1.0, 1.0, 0.1 / 1.1, 0.0]),
         (np.r_[1.0:2.001:0.01], [0.0, 0.5, 1.5, 2.5, 3.0], [1.0, 0.5, 0.5, 1.0]),
         # 8.6 Hz as in a real log: every interval is long, none is longer than the rest
         (np.r_[0.0 : 20.0 : 1 / 8.6], np.arange(0.0, 19.0, 0.1), np.zeros(189)),
     ],
-)
+)  # fmt: skip
 def test_a_gap_is_the_share_of_the_step_without_imu(time, edges, gaps):
     """A gap between equal values says the same value; outside the mean is zero."""
     mean, gap = step_means(acceleration_of(time, np.ones(len(time))), edges)
@@ -206,11 +201,10 @@ def test_positions_and_acceleration_are_projected_on_a_given_heading():
     assert "--heading" in axis.note
 
 
-@pytest.mark.parametrize("offset_s", [0.25, -0.1, 0.0])
-def test_a_clock_offset_moves_the_times_and_nothing_else(offset_s):
+def test_a_clock_offset_moves_the_times_and_nothing_else():
     track, _ = line_track(30.0)
-    moved = shift_clock(track, offset_s)
-    np.testing.assert_allclose(moved.samples.index, track.samples.index + offset_s, atol=1e-12)
+    moved = shift_clock(track, -0.1)
+    np.testing.assert_allclose(moved.samples.index, track.samples.index - 0.1, atol=1e-12)
     np.testing.assert_array_equal(moved.samples, track.samples)
     assert replace(moved, samples=track.samples) == track
 
@@ -363,9 +357,6 @@ def test_resets_outside_the_segment_change_nothing(reset_s, said):
     assert bool(said) == bool(statement)
 
 
-# ---- inputs stay as they are ------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("across_m", "heading_deg", "called"),
     [(1.0, None, "the aisle"), (4.0, None, "the longest direction"), (4.0, 30.0, "the aisle")],
@@ -378,11 +369,8 @@ def test_an_aisle_is_what_was_flown_as_one_or_asked_for(across_m, heading_deg, c
     phase = 2.0 * np.pi * samples.index.to_numpy() / 20.0
     samples["north_m"], samples["east_m"] = 5.0 * np.cos(phase), across_m / 2.0 * np.sin(phase)
     round_trip = replace(track, samples=samples)
-    found = {
-        axis.name: axis for axis in make_axes(flight, round_trip, ALL, heading_deg=heading_deg)
-    }
-    assert found["aisle"].called == called
-    assert found["north"].called == "north"
-    assert found["aisle"].elongation == (
-        None if heading_deg else pytest.approx(10.0 / across_m, rel=0.02)
-    )
+    axes = make_axes(flight, round_trip, ALL, heading_deg=heading_deg)
+    north, aisle = (next(one for one in axes if one.name == name) for name in ("north", "aisle"))
+    assert (north.called, aisle.called) == ("north", called)
+    longer = None if heading_deg else pytest.approx(10.0 / across_m, rel=0.02)
+    assert aisle.elongation == longer

@@ -56,6 +56,11 @@ def log(number: int) -> bytes:
     return f"the log of {number}".encode()
 
 
+def report(number: int) -> bytes:
+    made = hashlib.sha256(log(number)).hexdigest()
+    return report_of(name(number), student_id(number), made)
+
+
 def table(path: Path, head: list[str], rows: list[list[str]], separator: str = ",") -> Path:
     with path.open("w", newline="", encoding="utf-8-sig") as file:
         writer = csv.writer(file, delimiter=separator)
@@ -77,13 +82,8 @@ class Lab:
             for n in STUDENTS
         )  # fmt: skip
         self.key = AnswerKey("aisle", tuple(answers))
-        self.pdf = {
-            n: report_of(name(n), student_id(n), hashlib.sha256(log(n)).hexdigest())
-            for n in STUDENTS
-        }
-        self.better = report_of(
-            name(RESUBMITTED), student_id(RESUBMITTED), self.key.answers[RESUBMITTED - 1].sha256
-        )
+        self.pdf = {one: report(one) for one in STUDENTS}
+        self.better = report(RESUBMITTED)
         self.exports = [self.moodle(), self.canvas(), self.blackboard()]
         rows = [[student_id(n), first(n), last(n), f"s{n}@x.edu"] for n in STUDENTS]
         roster = table(folder / "roster.csv", ["id", "first name", "last name", "email"], rows)

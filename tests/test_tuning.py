@@ -85,10 +85,9 @@ def test_bad_settings_lose_on_unseen_data() -> None:
     # nor do noises depend on what was chosen
     other = tuned(modelled(1), chosen=Settings(sigma_a_m_s2=0.01, sigma_z_m=5.0, input="zero"))
     for name in ("sigma_a", "sigma_z"):
-        one, two = (getattr(each, name) for each in (found, other))
-        assert [one.value, one.low, one.high] == pytest.approx(
-            [two.value, two.low, two.high], rel=1e-4
-        )
+        one, two = ([getattr(getattr(each, name), of) for of in ("value", "low", "high")]
+                    for each in (found, other))  # fmt: skip
+        assert one == pytest.approx(two, rel=1e-4)
 
 
 def test_horizontal_axes_together_know_more_than_each_alone() -> None:

@@ -106,10 +106,9 @@ def test_doubtful_and_absent_replays_conclude_nothing(sample: Analysis) -> None:
 def test_most_is_at_least_half_and_no_share_above_all(sample, share, words) -> None:
     why = of(sample)
     first, whole = why.steps[0], why.position_mean_square_m2
-    steps = tuple(
-        replace(step, position_mean_square_m2=(share if step is first else 1e-3) * whole)
-        for step in why.steps
-    )
+    shares = [share, *[1e-3] * (len(why.steps) - 1)]
+    steps = tuple(replace(one, position_mean_square_m2=of * whole)
+                  for one, of in zip(why.steps, shares, strict=True))  # fmt: skip
     because = {step.name: f"so {step.name} is" for step in steps}
     told = with_words(replace(why, steps=steps), "the aisle", because)
     assert re.match(words.format(first.name), told.cause)

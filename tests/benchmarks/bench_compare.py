@@ -24,12 +24,12 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import statistics
 import sys
 import tempfile
 from pathlib import Path
 
-from measured import Measured, measured
+import numpy as np
+from measured import measured
 
 LOG = Path(__file__).parents[2] / "sample_logs" / "aisle_uwb.ulg"
 FLOOR = """
@@ -67,15 +67,11 @@ with PdfPages(sys.argv[2]) as pdf:
 
 def print_ratio(name: str, ours: list[str], peer: list[str], runs: int, more: str = "") -> None:
     """Run both in turn, and print the medians of their ratios."""
-    pairs: list[tuple[Measured, Measured]] = [(measured(ours), measured(peer)) for _ in range(runs)]
-    told = []
+    pairs = [[measured(ours), measured(peer)] for _ in range(runs)]
     for what in ("wall", "cpu"):
-        a, b = ([getattr(side, f"{what}_s") for side in both] for both in zip(*pairs, strict=True))
-        ratio = statistics.median(x / y for x, y in zip(a, b, strict=True))
-        told.append(
-            f"{ratio:.2f} {what} ({statistics.median(a):.2f} s / {statistics.median(b):.2f} s)"
-        )
-    print(f"{name}: {', '.join(told)}, {runs} pairs{more}")
+        a, b = np.transpose([[getattr(side, f"{what}_s") for side in both] for both in pairs])
+        told = f"{np.median(a / b):.2f} {what} ({np.median(a):.2f} s / {np.median(b):.2f} s)"
+        print(f"{name}: {told}, {runs} pairs{more}")
 
 
 def main() -> None:
@@ -97,12 +93,8 @@ def main() -> None:
         floor_pdf = str(Path(folder) / "floor.pdf")
         floor = [python, "-c", FLOOR, str(LOG), floor_pdf, ",".join(topics()), str(pages)]
         print_ratio("compare / floor", compare, floor, given.runs, f", {pages} pages")
-        print_ratio(
-            "--help / python with click",
-            [python, "-m", "px4fuse", "--help"],
-            [python, "-c", "import click"],
-            given.runs,
-        )
+        ours, click = [python, "-m", "px4fuse", "--help"], [python, "-c", "import click"]
+        print_ratio("--help / python with click", ours, click, given.runs)
         if given.log is None:
             return
         log = Path(shutil.copy(given.log, folder))

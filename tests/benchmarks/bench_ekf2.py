@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import sys
 import time
+import timeit
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -94,22 +95,14 @@ def waterfalls(models: dict[str, Model]) -> dict[str, float]:
     for name, model in models.items():
         found = walk(model)
         assert isinstance(found, dict), found
-        axes = found.values()
+        axes, bars = found.values(), dict.fromkeys(steps, 0.0)
         total = sum(axis.position_mean_square_m2 for axis in axes)
-        bars = [
-            sum(
-                step.position_mean_square_m2
-                for axis in axes
-                for step in axis.steps
-                if step.name == name_of_step
-            )
-            / total
-            for name_of_step in steps
-        ]
+        for step in (step for axis in axes for step in axis.steps):
+            bars[step.name] += step.position_mean_square_m2 / total
         left = sum(axis.position_left_mean_square_m2 for axis in axes) / total
-        print(f"{name} | {np.sqrt(total):.3f} | " + " | ".join(f"{b:.1%}" for b in bars), end="")
-        print(f" | {left:.1%}")
-        assert abs(sum(bars) + left - 1.0) < 1e-9, name
+        told = " | ".join(f"{share:.1%}" for share in (*bars.values(), left))
+        print(f"{name} | {np.sqrt(total):.3f} | {told}")
+        assert abs(sum(bars.values()) + left - 1.0) < 1e-9, name
         assert left < (0.1 if model.agreement.gnss_pos else 0.03), name
         unexplained[name] = left
     return unexplained
@@ -123,14 +116,15 @@ def agreement_page(models: dict[str, Model], left: dict[str, float]) -> str:
         "|---|---|---|---|---|---|---|---|",
     ]
     for name, model in models.items():
-        a, (north, east) = model.agreement, model.agreement.axes.values()
-        lines.append(
-            f"| {name} | {a.samples} | {north.innovation_correlation:.4f} / "
-            f"{east.innovation_correlation:.4f} | {min(north.s_ratio_p5, east.s_ratio_p5):.3f} to "
-            f"{max(north.s_ratio_p95, east.s_ratio_p95):.3f} | {a.rejected_share_replayed:.1%} / "
-            f"{a.rejected_share_logged:.1%} | {north.position_rms_difference_m:.3f} / "
-            f"{east.position_rms_difference_m:.3f} | {left[name]:.1%} | {height_cell(a)} |"
-        )
+        a, axes = model.agreement, model.agreement.axes.values()
+        cells = (
+            name, a.samples, " / ".join(f"{axis.innovation_correlation:.4f}" for axis in axes),
+            f"{min(x.s_ratio_p5 for x in axes):.3f} to {max(x.s_ratio_p95 for x in axes):.3f}",
+            f"{a.rejected_share_replayed:.1%} / {a.rejected_share_logged:.1%}",
+            " / ".join(f"{axis.position_rms_difference_m:.3f}" for axis in axes),
+            f"{left[name]:.1%}", height_cell(a),
+        )  # fmt: skip
+        lines.append(f"| {' | '.join(map(str, cells))} |")
     return "\n".join(lines)
 
 
@@ -151,8 +145,7 @@ def in_page() -> str:
 def write_page(table: str) -> None:
     """Put the table into the PAGE."""
     text = PAGE.read_text(encoding="utf-8")
-    before, end = text.split(BEGIN)[0], text.split(END)[1]
-    PAGE.write_text(f"{before}{BEGIN}\n{table}\n{END}{end}", encoding="utf-8")
+    PAGE.write_text(text.replace(in_page(), table), encoding="utf-8")
 
 
 def horizontal_rmse(summary: Summary) -> float:
@@ -199,12 +192,7 @@ def counterfactuals(models: dict[str, Model]) -> None:
 
 def cpu_s(work: Callable[[], object], runs: int = 5) -> float:
     """Least CPU time over some runs: what else the machine does only adds to it."""
-    took = []
-    for _ in range(runs):
-        start = time.process_time()
-        work()
-        took.append(time.process_time() - start)
-    return min(took)
+    return min(timeit.repeat(work, number=1, repeat=runs, timer=time.process_time))
 
 
 def speed(flight: Flight, model: Model) -> None:

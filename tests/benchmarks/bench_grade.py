@@ -104,9 +104,8 @@ def main() -> None:
         logs.mkdir()
         reports.mkdir()
         with ProcessPoolExecutor(os.cpu_count()) as pool:
-            taken = list(
-                pool.map(make, [(seed, logs, reports) for seed in range(min(count, FLIGHTS))])
-            )
+            jobs = [(seed, logs, reports) for seed in range(min(count, FLIGHTS))]
+            taken = list(pool.map(make, jobs))
         alone = sum(taken[4:]) / len(taken[4:])  # the first ones import
         first, other = folder / "first.toml", folder / "other.toml"
         first.write_text(rubric_text(), encoding="utf-8")

@@ -32,13 +32,9 @@ def main() -> None:
             passes, length = FLIGHTS[minutes]
             flight = ["--passes", str(passes), "--length", str(length), "-o", str(log)]
             measured([*px4fuse, "simulate", *flight])
-            commands = {
-                "compare": ["compare", str(log), "-o", str(Path(folder) / "report.pdf")],
-                "tune": ["tune", str(log)],
-                "sync": ["sync", str(log)],
-            }
-            for name, words in commands.items():
-                took = measured([*px4fuse, *words])
+            for name in ("compare", "tune", "sync"):
+                more = ["-o", str(Path(folder) / "report.pdf")] if name == "compare" else []
+                took = measured([*px4fuse, name, str(log), *more])
                 read = measured([sys.executable, "-c", READ, str(log), ",".join(topics())])
                 found.setdefault(name, []).append((minutes, took))
                 print(

@@ -10,13 +10,15 @@ read it.
 from __future__ import annotations
 
 import os
-import statistics
 import sys
 import tempfile
-import time
 import tracemalloc
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+
+import numpy as np
+from measured import seconds
 
 os.environ["MAVLINK20"] = "1"
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -28,8 +30,6 @@ RATE_HZ = 200
 
 def ours(path: Path) -> int:
     """Frames, and every message type into columns."""
-    import numpy as np
-
     from px4fuse.readers.mavlink_frames import message_name, read_frames
 
     frames = read_frames(path.name, path.read_bytes())
@@ -57,18 +57,11 @@ def synthetic(path: Path) -> Path:
 
     # 68 messages per second beside the IMU, over a link that keeps their order
     aisle = Aisle(
-        seconds=60.0 * MINUTES,
-        imu_hz=RATE_HZ - 68.0,
+        seconds=60.0 * MINUTES, imu_hz=RATE_HZ - 68.0,
         delay=lambda rng: 0.002 + rng.exponential(0.0003),
-    )
+    )  # fmt: skip
     path.write_bytes(aisle.record().tlog())
     return path
-
-
-def seconds(work: Callable[[Path], object], path: Path) -> float:
-    start = time.perf_counter()
-    work(path)
-    return time.perf_counter() - start
 
 
 def memory(work: Callable[[Path], object], path: Path) -> float:
@@ -90,13 +83,12 @@ def main() -> None:
         for path in files:
             count, theirs = ours(path), pymavlinks(path)
             read_log(path)  # tables that are made once
-            pairs = [(seconds(pymavlinks, path), seconds(ours, path)) for _ in range(runs)]
-            whole = statistics.median(seconds(read_log, path) for _ in range(runs))
-            ratio = statistics.median(a / b for a, b in pairs)
-            a = statistics.median(a for a, _ in pairs)
-            b = statistics.median(b for _, b in pairs)
+            readers = [partial(read, path) for read in (pymavlinks, ours, read_log)]
+            took = np.array([[seconds(read) for read in readers] for _ in range(runs)])
+            a, b, whole = np.median(took, axis=0)
+            ratio = np.median(took[:, 0] / took[:, 1])
             print(
-                f"{path.name}: recv_match / ours: {ratio:.1f} ({a:.2f} s / {b:.3f} s, {runs} pairs,"
+                f"{path.name}: recv_match / ours: {ratio:.1f} ({a:.2f} s / {b:.3f} s, {runs} runs,"
                 f" {theirs} and {count} messages); read_log {whole:.3f} s, peak memory "
                 f"{memory(read_log, path):.2f} times the file's {path.stat().st_size / 1e6:.1f} MB"
             )

@@ -9,7 +9,6 @@ Nothing here can fail: run it, read it. Needs GTSAM and ../shared/pose_graphs.
 
 from __future__ import annotations
 
-import statistics
 import sys
 from pathlib import Path
 
@@ -53,17 +52,16 @@ def main() -> None:
         file = FOLDER / f"{name}.g2o"
         reading = seconds(lambda file=file: read_g2o(file))
         graph = read_g2o(file)
-        ours, theirs, ratios = [], [], []
-        for _ in range(runs):
-            ours.append(seconds(lambda graph=graph: solve(graph)))
+        ours, theirs = np.empty((2, runs))
+        for run in range(runs):
+            ours[run] = seconds(lambda graph=graph: solve(graph))
             factors, optimiser = gtsam_optimiser(gtsam, graph)
-            theirs.append(seconds(optimiser.optimize))
-            ratios.append(ours[-1] / theirs[-1])
+            theirs[run] = seconds(optimiser.optimize)
         found, other = solve(graph), factors.error(optimiser.values())
         print(
             f"{name}: {len(graph)} poses, {len(graph.first)} edges, {graph.initialised}, read in "
-            f"{reading:.2f} s; {statistics.median(ratios):.2f} x GTSAM "
-            f"({statistics.median(ours):.3f} s / {statistics.median(theirs):.3f} s, {runs} pairs); "
+            f"{reading:.2f} s; {np.median(ours / theirs):.2f} x GTSAM "
+            f"({np.median(ours):.3f} s / {np.median(theirs):.3f} s, {runs} pairs); "
             f"steps {found.iterations} / {optimiser.iterations()}; cost {cost(graph):.6g} -> "
             f"{found.cost:.9g}, {found.cost / other - 1.0:+.0e} of GTSAM's"
         )

@@ -6,6 +6,7 @@ import os
 import statistics
 import subprocess
 import time
+import timeit
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -37,9 +38,4 @@ def measured(command: list[str]) -> Measured:
 
 def seconds(work: Callable[[], object], runs: int = 1) -> float:
     """Median over some runs."""
-    took = []
-    for _ in range(runs):
-        start = time.perf_counter()
-        work()
-        took.append(time.perf_counter() - start)
-    return statistics.median(took)
+    return statistics.median(timeit.repeat(work, number=1, repeat=runs))

@@ -46,13 +46,9 @@ NOT_ASKED = Unavailable("EKF2 replay", "the condition is not about EKF2", "Fly w
 OF_EKF2 = ("ekf2_", "source_stamps_of_arrival")
 # Options of ``px4fuse simulate`` that a scenario may have, and their fields
 OPTIONS = {
-    "--kind": "kind",
-    "--passes": "passes",
-    "--pause": "pause_s",
-    "--yaw": "yaw",
-    "--uwb-rate": "uwb_rate_hz",
-    "--sigma-uwb": "sigma_uwb_m",
-}
+    "--kind": "kind", "--passes": "passes", "--pause": "pause_s", "--yaw": "yaw",
+    "--uwb-rate": "uwb_rate_hz", "--sigma-uwb": "sigma_uwb_m",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -81,9 +77,7 @@ SCENARIOS: Mapping[str, Flown] = MappingProxyType({
     "10 Hz, 0.05 m, yaw follows": Flown(
         "--uwb-rate 10 --sigma-uwb 0.05 --yaw follow", Settings(0.27, 0.05)
     ),
-    "30 Hz, 0.03 m": Flown(
-        "--uwb-rate 30 --sigma-uwb 0.03", Settings(0.27, 0.03)
-    ),
+    "30 Hz, 0.03 m": Flown("--uwb-rate 30 --sigma-uwb 0.03", Settings(0.27, 0.03)),
     "0.30 m": Flown("--sigma-uwb 0.3", Settings(0.27, 0.30)),
     "hover": Flown("--passes 2 --pause 30", Settings(0.27, 0.10)),
     "yaw follows": Flown("--yaw follow", Settings(0.27, 0.10)),
@@ -221,14 +215,9 @@ def _explain(flight: Flight, condition: Condition) -> Analysis:
     model = open_model(flight) if condition.ekf2 else NOT_ASKED
     heading = turned_frame(comparison, tuning, clock)
     return Analysis(
-        **vars(comparison),
-        tuning=tuning,
-        clock=clock,
-        ekf2_model=model,
-        why={},
-        loop=loop_in(flight),
-        heading=heading,
-    )
+        **vars(comparison), tuning=tuning, clock=clock, ekf2_model=model, why={},
+        loop=loop_in(flight), heading=heading,
+    )  # fmt: skip
 
 
 def _named(condition: Condition, ids: Iterable[str]) -> tuple[str, ...]:
@@ -246,19 +235,13 @@ def jobs(
 
     Conditions that differ in settings only share their flights.
     """
-    made = [
-        Job(seed, (clean(scenario),)) for scenario in scenarios for seed in range(clean_flights)
-    ]
+    made = [Job(seed, (clean(name),)) for name in scenarios for seed in range(clean_flights)]
     shared: dict[tuple[str, tuple[str, ...], bool], list[Condition]] = {}
     for condition in conditions:
         key = condition.scenario, condition.mistakes, condition.ekf2
         shared.setdefault(key, []).append(condition)
-    made += [
-        Job(FAULTY_SEED + seed, tuple(group))
-        for group in shared.values()
-        for seed in range(faulty_flights)
-    ]
-    return made
+    seeds = range(FAULTY_SEED, FAULTY_SEED + faulty_flights)
+    return made + [Job(seed, tuple(group)) for group in shared.values() for seed in seeds]
 
 
 def measure(flown: list[Job]) -> pd.DataFrame:
@@ -307,17 +290,14 @@ def _rows(flown: list[Job], results: list[list[tuple[str, ...]]]) -> Iterator[di
 
 def _row(name: str, scenario: str, condition: str, own: list[tuple[str, ...]]) -> dict[str, object]:
     hits, first = sum(name in ids for ids in own), sum(ids[:1] == (name,) for ids in own)
-    interval = binomtest(hits, len(own)).proportion_ci()
-    return {
-        "finding": name,
-        "scenario": scenario,
-        "condition": condition,
-        "flights": len(own),
-        "rate": round(hits / len(own), 4),
-        "low": round(float(interval.low), 4),
-        "high": round(float(interval.high), 4),
-        "first": round(first / len(own), 4),
-    }
+    what = {"finding": name, "scenario": scenario, "condition": condition, "flights": len(own)}
+    return {**what, **rate(hits, len(own)), "first": round(first / len(own), 4)}
+
+
+def rate(hits: int, of: int) -> dict[str, float]:
+    """A share with its 95 % interval (Clopper and Pearson 1934)."""
+    low, high = binomtest(hits, of).proportion_ci()
+    return {"rate": round(hits / of, 4), "low": round(float(low), 4), "high": round(float(high), 4)}
 
 
 def _main() -> None:

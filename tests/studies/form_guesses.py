@@ -9,7 +9,6 @@ answers), and forms filled in with the truth. ``--students`` gives another numbe
 from __future__ import annotations
 
 import argparse
-import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -98,16 +97,11 @@ def right(one: FormTruth) -> Answers:
         whole = wrong.from_s is None and wrong.until_s is None
         claims.append(
             Claim(
-                wrong.kind,
-                wrong.size,
-                when="whole flight" if whole else "",
-                from_s=wrong.from_s,
-                until_s=wrong.until_s,
-                parameter=parameter,
-                value=value,
+                wrong.kind, wrong.size, when="whole flight" if whole else "", parameter=parameter,
+                from_s=wrong.from_s, until_s=wrong.until_s, value=value,
                 panel=panels(wrong.kind)[0],
             )
-        )
+        )  # fmt: skip
     return Answers(
         log_sha256=SHA256,
         mistakes=tuple(claims) or (Claim("none"),),
@@ -122,7 +116,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--students", type=int, default=300)
     given = parser.parse_args()
-    with ProcessPoolExecutor(os.cpu_count()) as pool:
+    with ProcessPoolExecutor() as pool:
         truths = list(pool.map(truth, range(given.students), chunksize=5))
     rng = np.random.default_rng(1)
     none = Answers(log_sha256=SHA256, mistakes=(Claim("none"),))
@@ -135,15 +129,13 @@ def main() -> None:
                           for form in constants(group, kind))
                 for kind in kinds}  # fmt: skip
         kind = max(best, key=lambda each: best[each])
-        random = fmean(
-            form_points(at_random(rng), one).share for one in group for _ in range(GUESSES)
-        )
-        print(
-            f"{name:7} right {fmean(form_points(right(one), one).share for one in group):.3f}  "
-            f"random {random:.3f}  "
-            f"none {fmean(form_points(none, one).share for one in group):.3f}  "
-            f"best constant {best[kind]:.3f} ({kind})"
-        )
+        for what, form, times in (
+            ("right", right, 1), ("random", lambda _: at_random(rng), GUESSES),
+            ("none", lambda _: none, 1),
+        ):  # fmt: skip
+            shares = [form_points(form(one), one).share for one in group for _ in range(times)]
+            print(f"{name:7} {what:7} {fmean(shares):.3f}")
+        print(f"{name:7} best constant {best[kind]:.3f} ({kind})")
 
 
 if __name__ == "__main__":

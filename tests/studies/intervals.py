@@ -49,15 +49,10 @@ def measured(job: Job) -> tuple[float, ...] | None:
     false = abs(clock.offset_s) > max(clock.chance_s, OFFSET_S)
     return (
         (tuned.sigma_z.value or np.nan) / flown.source_sigma_m - 1.0,
-        covers(tuned.sigma_z, flown.source_sigma_m),
-        covers(tuned.sigma_a, flown.sigma_a_m_s2),
-        clock.offset_s,
-        low <= 0.0 <= high,
-        clock.offset_s / clock.sigma_s,
-        clock.determinable,
-        clock.determinable and false,
-        clock.change_p is not None and clock.change_p < CHANGE_P,
-    )
+        covers(tuned.sigma_z, flown.source_sigma_m), covers(tuned.sigma_a, flown.sigma_a_m_s2),
+        clock.offset_s, low <= 0.0 <= high, clock.offset_s / clock.sigma_s, clock.determinable,
+        clock.determinable and false, clock.change_p is not None and clock.change_p < CHANGE_P,
+    )  # fmt: skip
 
 
 def lines(flights: int) -> Iterator[str]:

@@ -23,7 +23,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -31,28 +30,17 @@ from pathlib import Path
 from queue import Queue
 from typing import NamedTuple
 
+import pandas as pd
+
 ROOT = Path(__file__).resolve().parents[2]
 SWAPPED = {
-    ast.Lt: ("<", "<="),
-    ast.LtE: ("<=", "<"),
-    ast.Gt: (">", ">="),
-    ast.GtE: (">=", ">"),
-    ast.Eq: ("==", "!="),
-    ast.NotEq: ("!=", "=="),
-    ast.Is: ("is", "is not"),
-    ast.IsNot: ("is not", "is"),
-    ast.In: ("in", "not in"),
-    ast.NotIn: ("not in", "in"),
-    ast.Add: ("+", "-"),
-    ast.Sub: ("-", "+"),
-    ast.Mult: ("*", "/"),
-    ast.Div: ("/", "*"),
-    ast.Pow: ("**", "*"),
-    ast.FloorDiv: ("//", "*"),
-    ast.Mod: ("%", "*"),
-    ast.And: ("and", "or"),
-    ast.Or: ("or", "and"),
-}
+    ast.Lt: ("<", "<="), ast.LtE: ("<=", "<"), ast.Gt: (">", ">="), ast.GtE: (">=", ">"),
+    ast.Eq: ("==", "!="), ast.NotEq: ("!=", "=="), ast.Is: ("is", "is not"),
+    ast.IsNot: ("is not", "is"), ast.In: ("in", "not in"), ast.NotIn: ("not in", "in"),
+    ast.Add: ("+", "-"), ast.Sub: ("-", "+"), ast.Mult: ("*", "/"), ast.Div: ("/", "*"),
+    ast.Pow: ("**", "*"), ast.FloorDiv: ("//", "*"), ast.Mod: ("%", "*"),
+    ast.And: ("and", "or"), ast.Or: ("or", "and"),
+}  # fmt: skip
 
 # Changes that no test can tell, by file and what they make of a line
 EQUIVALENT = {
@@ -116,23 +104,19 @@ def mutants(path: Path) -> Iterator[Mutant]:
 
     tree = ast.parse(source)
     # zip(..., strict=False) shows only where another mistake was made first
-    left_out = {
-        id(keyword.value)
-        for keyword in ast.walk(tree)
-        if isinstance(keyword, ast.keyword) and keyword.arg == "strict"
-    }
+    keywords = (node for node in ast.walk(tree) if isinstance(node, ast.keyword))
+    left_out = {id(keyword.value) for keyword in keywords if keyword.arg == "strict"}
     for node in ast.walk(tree):
         if id(node) in left_out:
             continue
         match node:
             case ast.Compare(left=left, ops=operators, comparators=others):
-                for before, operator, after in zip(
-                    [left, *others], operators, others, strict=False
-                ):
-                    yield from between(before, after, operator)
-            case ast.BinOp(left=left, op=operator, right=right):
-                yield from between(left, right, operator)
-            case ast.BoolOp(op=operator, values=[left, right, *_]):
+                for one in zip([left, *others], others, operators, strict=False):
+                    yield from between(*one)
+            case (
+                ast.BinOp(left=left, op=operator, right=right)
+                | ast.BoolOp(op=operator, values=[left, right, *_])
+            ):
                 yield from between(left, right, operator)
             case ast.UnaryOp(op=ast.Not() | ast.USub(), operand=operand):
                 yield replaced(node, segment(operand))
@@ -163,13 +147,11 @@ def passes(folder: Path, *arguments: str, before: Sequence[str] = (), seconds: f
     """Whether tests pass in a copy; those that take too long do not."""
     environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, *before, "-m", "pytest", "-n", "0", "-q", "-x", *arguments]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     try:
-        run = subprocess.run(
-            command, cwd=folder, env=environment, capture_output=True, timeout=seconds, check=False
-        )
+        return not subprocess.call(command, cwd=folder, env=environment, timeout=seconds, **quiet)
     except subprocess.TimeoutExpired:
         return False
-    return run.returncode == 0
 
 
 def make_map(out: Path, workers: int, only: str) -> None:
@@ -221,9 +203,8 @@ class Cover:
             for test, lines in json.loads(path.read_text())["lines"].items():
                 file = f"tests/{path.stem}.py"
                 into = self.lines if test else self.fixtures
-                into[f"{file}::{test}" if test else file] = {
-                    name: set(some) for name, some in lines.items()
-                }
+                covered = {name: set(some) for name, some in lines.items()}
+                into[f"{file}::{test}" if test else file] = covered
         self.width = {test: sum(map(len, lines.values())) for test, lines in self.lines.items()}
 
     def of(self, mutant: Mutant) -> list[str]:
@@ -240,12 +221,8 @@ class Cover:
         first, last = [], files if len(files) < FEW else []
         in_order = sorted(tests, key=self.width.__getitem__)
         if not in_function(path, mutant.line):
-            share = {
-                test: len(lines[path]) / self.width[test]
-                for test, lines in self.lines.items()
-                if path in lines
-            }
-            in_order = sorted(share, key=share.__getitem__, reverse=True)
+            some = [test for test, lines in self.lines.items() if path in lines]
+            in_order = sorted(some, key=lambda t: self.width[t] / len(self.lines[t][path]))
             first, last = [RECORDS], []
         # what keeps all that is printed and drawn covers much and misses little: after the nearest
         kept = [test for test in in_order[NEAREST:] if "test_golden" in test]
@@ -274,7 +251,7 @@ NEAREST = 4
 PORTIONS = (NEAREST + 1, 16, 40, 120, 10_000)
 
 
-def main() -> None:  # noqa: PLR0915 (options, work and table of one script)
+def main() -> None:
     """Make the map, or draw, test and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
@@ -283,11 +260,8 @@ def main() -> None:  # noqa: PLR0915 (options, work and table of one script)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--begin", type=int, default=0, help="how many of the draw to pass over")
     parser.add_argument("--seconds", type=float, default=300.0)
-    parser.add_argument(
-        "--only",
-        default="",
-        help="part of the path of the files to change; of the map pattern of its tests",
-    )
+    only = "part of the path of the files to change; of the map pattern of its tests"
+    parser.add_argument("--only", default="", help=only)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     given = parser.parse_args()
     if given.map:
@@ -297,7 +271,6 @@ def main() -> None:  # noqa: PLR0915 (options, work and table of one script)
     files = [path for path in sorted((ROOT / "px4fuse").rglob("*.py")) if given.only in str(path)]
     every = [one for path in files for one in mutants(path)]
     drawn = random.Random(given.seed).sample(every, min(given.number, len(every)))[given.begin :]
-    verdicts: Counter[tuple[str, str]] = Counter()
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(given.workers) as pool:
         trees: Queue[Path] = Queue()
         for number in range(given.workers):
@@ -330,16 +303,12 @@ def main() -> None:  # noqa: PLR0915 (options, work and table of one script)
                 file.write_text(source, encoding="utf-8")
                 trees.put(tree)
 
+        verdicts = []
         for mutant, verdict in zip(drawn, pool.map(judge, drawn), strict=True):
-            room = mutant.path.split("/")[1]
-            verdicts[room, verdict] += 1
+            verdicts.append((mutant.path.split("/")[1], verdict))
             print(f"{verdict:9} {mutant.told()}", flush=True)
-    kinds = ("killed", "survived", "uncovered", "equivalent")
-    print(f"\n{'room':22}" + "".join(f"{kind:>12}" for kind in kinds))
-    for room in sorted({room for room, _ in verdicts}):
-        print(f"{room:22}" + "".join(f"{verdicts[room, kind]:12}" for kind in kinds))
-    totals = [sum(n for (_, kind), n in verdicts.items() if kind == wanted) for wanted in kinds]
-    print(f"{'all':22}" + "".join(f"{total:12}" for total in totals))
+    rooms, kinds = zip(*verdicts, strict=True)
+    print(pd.crosstab(pd.Series(rooms, name="room"), pd.Series(kinds, name=""), margins=True))
 
 
 if __name__ == "__main__":

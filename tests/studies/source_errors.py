@@ -16,10 +16,6 @@ on average at 0.1 m, is the estimate's: half its σ, as late with an IMU made of
 noise, and within 5 ms of zero with one without noise. Several logs of PX4's simulation share one
 sequence of IMU noise (it is seeded), so that what the IMU adds is no fresh chance in each. At 2 Hz
 errors of 0.2 s are white to all purposes: 92 % of them is forgotten from one position to the next.
-
-``--possible`` prints for slow errors how often they can be told at all: by the likelihood ratio of
-the very process that made them, its numbers known, against white noise. No test with as few false
-alarms does better (Neyman and Pearson 1933), but for what the IMU's unknown constants hide.
 """
 
 from __future__ import annotations
@@ -41,8 +37,6 @@ from scipy.interpolate import CubicSpline
 
 from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
-from px4fuse.filter.fitting import Noises, fitted, most_likely
-from px4fuse.filter.motion import motion
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
 from px4fuse.findings.story import story
@@ -51,18 +45,17 @@ from px4fuse.readers import read_log
 
 Values = NDArray[np.float64]
 SIGMA_M = 0.10
-# Of a model: errors (m) and what is added to the stamps (s), from true positions at the times
-Model = Callable[[np.random.Generator, Values, Values], tuple[Values, Values | float]]
+Rng = np.random.Generator
+# Errors (m), and what is added to the stamps (s); of a model, from true positions at the times
+Made = tuple[Values, Values | float]
+Model = Callable[[Rng, Values, Values], Made]
 
 
-def white(rng: np.random.Generator, time: Values, true: Values, sigma: Values | float = SIGMA_M,
-          ) -> tuple[Values, float]:  # fmt: skip
+def white(rng: Rng, time: Values, true: Values, sigma: Values | float = SIGMA_M) -> Made:
     return rng.normal(size=true.shape) * sigma, 0.0
 
 
-def coloured(
-    rng: np.random.Generator, time: Values, true: Values, tau_s: float, share: float = 0.5
-) -> tuple[Values, float]:
+def coloured(rng: Rng, time: Values, true: Values, tau_s: float, share: float = 0.5) -> Made:
     """White, and a first-order process of time constant tau that has this share of the variance."""
     slow = np.zeros_like(true)
     keep = np.exp(-np.diff(time) / tau_s)
@@ -73,9 +66,7 @@ def coloured(
     return SIGMA_M * (np.sqrt(share) * slow + np.sqrt(1.0 - share) * fast), 0.0
 
 
-def held(
-    rng: np.random.Generator, time: Values, true: Values, share: float
-) -> tuple[Values, float]:
+def held(rng: Rng, time: Values, true: Values, share: float) -> Made:
     """Some positions are the one before, sent again."""
     sent = true + rng.normal(size=true.shape) * SIGMA_M
     again = rng.random(len(time)) < share
@@ -85,9 +76,7 @@ def held(
     return sent - true, 0.0
 
 
-def low_pass(
-    rng: np.random.Generator, time: Values, true: Values, tau_s: float
-) -> tuple[Values, float]:
+def low_pass(rng: Rng, time: Values, true: Values, tau_s: float) -> Made:
     sent = true + rng.normal(size=true.shape) * SIGMA_M
     for i, dt in enumerate(np.diff(time)):
         rho = np.exp(-dt / tau_s)
@@ -95,57 +84,43 @@ def low_pass(
     return sent - true, 0.0
 
 
-def with_outliers(
-    rng: np.random.Generator, time: Values, true: Values, share: float
-) -> tuple[Values, float]:
+def with_outliers(rng: Rng, time: Values, true: Values, share: float) -> Made:
     error = rng.normal(size=true.shape) * SIGMA_M
     far = rng.random(len(time)) < share
-    error[far, :2] += rng.choice([-1.0, 1.0], (far.sum(), 2)) * rng.uniform(
-        1.0, 3.0, (far.sum(), 2)
-    )
+    size = far.sum(), 2
+    error[far, :2] += rng.choice([-1.0, 1.0], size) * rng.uniform(1.0, 3.0, size)
     return error, 0.0
 
 
-def two_levels(
-    rng: np.random.Generator, time: Values, true: Values, factor: float
-) -> tuple[Values, float]:
+def two_levels(rng: Rng, time: Values, true: Values, factor: float) -> Made:
     """Three times as noisy in the middle third."""
     middle = (time > time[len(time) // 3]) & (time < time[2 * len(time) // 3])
     sigma = np.where(middle, factor * SIGMA_M, SIGMA_M)[:, None]
     return rng.normal(size=true.shape) * sigma, 0.0
 
 
-def scaled(
-    rng: np.random.Generator, time: Values, true: Values, scale: float
-) -> tuple[Values, float]:
+def scaled(rng: Rng, time: Values, true: Values, scale: float) -> Made:
     return rng.normal(size=true.shape) * SIGMA_M + scale * (true - true[0]), 0.0
 
 
-def jumped(
-    rng: np.random.Generator, time: Values, true: Values, size: float
-) -> tuple[Values, float]:
+def jumped(rng: Rng, time: Values, true: Values, size: float) -> Made:
     error = rng.normal(size=true.shape) * SIGMA_M
     error[2 * len(time) // 3 :, 0] += size
     return error, 0.0
 
 
-def clock(
-    rng: np.random.Generator, time: Values, true: Values, late: float
-) -> tuple[Values, float]:
+def clock(rng: Rng, time: Values, true: Values, late: float) -> Made:
     return rng.normal(size=true.shape) * SIGMA_M, late
 
 
-def clock_jump(
-    rng: np.random.Generator, time: Values, true: Values, late: float
-) -> tuple[Values, Values]:
+def clock_jump(rng: Rng, time: Values, true: Values, late: float) -> Made:
     return rng.normal(size=true.shape) * SIGMA_M, np.where(time > time[len(time) // 2], late, 0.0)
 
 
 MODELS: dict[str, tuple[Model, str]] = {
     "white 0.1 m": (white, ""),
     "white 0.05, 0.2 m north, east": (
-        partial(white, sigma=np.array([0.05, 0.2, 0.1])), "source_axes_unequal"
-    ),
+        partial(white, sigma=np.array([0.05, 0.2, 0.1])), "source_axes_unequal"),
     "AR(1) 0.2 s": (partial(coloured, tau_s=0.2), "source_coloured"),
     "AR(1) 1 s": (partial(coloured, tau_s=1.0), "source_coloured"),
     "AR(1) 5 s": (partial(coloured, tau_s=5.0), "source_coloured"),
@@ -171,16 +146,13 @@ PAIRS = (
     ("AR(1) 1 s", "outliers 5 %"),
 )  # fmt: skip
 BOTH = " + "
-TELLS_NATS = np.log(100.0)  # by chance in one flight of a hundred, at most
 
 
 def model_of(name: str) -> Model:
     """The model of that name, or of two."""
     models = [MODELS[each][0] for each in name.split(BOTH)]
 
-    def added(
-        rng: np.random.Generator, time: Values, true: Values
-    ) -> tuple[Values, Values | float]:
+    def added(rng: Rng, time: Values, true: Values) -> Made:
         made = [model(rng, time, true) for model in models]
         return sum(error for error, _ in made), sum(late for _, late in made)
 
@@ -196,13 +168,9 @@ def truth_of(log: Path, flight: Flight) -> CubicSpline:
 
 
 def laid_over(
-    flight: Flight,
-    known: CubicSpline,
-    model: Model,
-    rate_hz: float,
-    seed: int,
+    flight: Flight, known: CubicSpline, model: Model, rate_hz: float, seed: int,
     sigma_m: float = SIGMA_M,
-) -> Flight:
+) -> Flight:  # fmt: skip
     """The flight with a source of such errors, and without EKF2."""
     rng = np.random.default_rng(seed)
     first = next(track for track in flight.positions if track.origin.automatic)
@@ -243,30 +211,6 @@ def told(job: tuple[str, str, float, int], *, truth: bool = True) -> tuple[str, 
     )
 
 
-def possible(job: tuple[str, str, float, int]) -> tuple[str, float, float]:
-    """Log-likelihood (nats) of the process that made the errors above that of white noise."""
-    log, name, rate_hz, seed = job
-    flight = read_log(Path(log))
-    made = MODELS[name][0]
-    assert isinstance(made, partial)
-    flight = laid_over(flight, truth_of(Path(log), flight), made, rate_hz, seed)
-    lines = compare(flight, axes=("north", "east")).lines[:2]
-    moved = motion(
-        flight, lines[0].measurement_time_s, np.column_stack([x.measurement_m for x in lines]),
-        directions=np.array([line.direction for line in lines]), dt_s=Settings().dt_s,
-    )  # fmt: skip
-    assert not isinstance(moved, Unavailable)
-    positions, share = moved.at(0.0), made.keywords.get("share", 0.5)
-    white = most_likely([positions], Noises(0.1, SIGMA_M), moved.weight, outliers=False)
-    true = Noises(0.1, SIGMA_M * (1 - share) ** 0.5, 0.0, SIGMA_M * share**0.5,
-                  made.keywords["tau_s"])  # fmt: skip
-    totals = [
-        fitted([positions], replace(true, sigma_a_m_s2=sigma_a), moved.weight).totals()[0, 0]
-        for sigma_a in np.geomspace(0.005, 0.5, 12)
-    ]
-    return name, rate_hz, white.score(white.noises) - float(min(totals))
-
-
 def right(name: str, ids: tuple[str, ...]) -> bool:
     """Whether the first finding is the model's own; of a pair, whether both are told."""
     wanted = {MODELS[each][1] for each in name.split(BOTH)} - {""}
@@ -291,22 +235,12 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--only", default="")
     parser.add_argument("--no-truth", action="store_true", help="as on a flight without one")
-    parser.add_argument("--processes", type=int)
     parser.add_argument("--pairs", action="store_true", help="two models at once")
-    parser.add_argument("--possible", action="store_true", help="what can be told of slow errors")
     given = parser.parse_args()
-    if given.possible:
-        slow = [job for job in jobs(given.logs, given.flights, given.only, pairs=False)
-                if MODELS[job[1]][1] == "source_coloured"]  # fmt: skip
-        with ProcessPoolExecutor() as pool:
-            gains = pd.DataFrame(pool.map(possible, slow), columns=["model", "rate_hz", "nats"])
-        gains["told"] = gains["nats"] >= TELLS_NATS
-        print(gains.groupby(["model", "rate_hz"]).agg({"nats": "median", "told": "mean"}).round(2))
-        return
     found: dict[str, Counter[str]] = {}
     counts: Counter[str] = Counter()
     good: Counter[str] = Counter()
-    with ProcessPoolExecutor(given.processes) as pool:
+    with ProcessPoolExecutor() as pool:
         flown = jobs(given.logs, given.flights, given.only, pairs=given.pairs, first=given.first)
         for name, ids in pool.map(partial(told, truth=not given.no_truth), flown):
             counts[name] += 1

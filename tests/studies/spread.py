@@ -22,11 +22,10 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from scipy.stats import binomtest
+from detector_rates import RIGHT, rate
 
 from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
-from px4fuse.filter.settings import Settings
 from px4fuse.fleet.changes import number_changes
 from px4fuse.fleet.measures import SPREAD_TABLE, Z95, Number, numbers
 from px4fuse.request import ComparisonRequest
@@ -37,8 +36,6 @@ from px4fuse.simulation.scenario import Scenario
 
 RATES_TABLE = Path(__file__).with_name("change_rates.csv")
 FLIGHTS, PAIRS = 60, 40
-# What such flights ask for, as in detector_rates.py
-SETTINGS = Settings(0.27, 0.10)
 # Seeds of the flights that the spread is measured on, that pairs are of, and that are changed
 SPREAD_SEED, PAIR_SEED, CHANGED_SEED = 0, 20_000, 30_000
 
@@ -70,9 +67,9 @@ def fly(change: Change, seed: int) -> tuple[Numbers, Numbers]:
     """Numbers of one simulated flight: with the log at hand, and from its results alone."""
     scenario = Scenario(passes=change.passes, sigma_uwb_m=change.sigma_uwb_m, seed=seed)
     flight = simulate_flight(scenario, parse(change.mistakes))
-    analysis = explain(compare(flight, SETTINGS))
+    analysis = explain(compare(flight, RIGHT))
     request = ComparisonRequest(
-        log=flight.log.name, sigma_a_m_s2=SETTINGS.sigma_a_m_s2, sigma_z_m=SETTINGS.sigma_z_m
+        log=flight.log.name, sigma_a_m_s2=RIGHT.sigma_a_m_s2, sigma_z_m=RIGHT.sigma_z_m
     )
     found = results(request, analysis)
     return numbers(found, analysis), numbers(found)
@@ -98,14 +95,11 @@ def spread(flown: Iterable[Numbers]) -> pd.DataFrame:
             value, sigma = np.array(pairs).T
             beyond[kind].append(float(np.var(value, ddof=1) - np.mean(sigma**2)))
             count[kind].append(len(pairs))
-    return pd.DataFrame(
-        {
-            "kind": kind,
-            "numbers": sum(count[kind]),
-            "spread": round(max(0.0, *parts, 0.0) ** 0.5, 4),
-        }
+    rows = [
+        (kind, sum(count[kind]), round(max(0.0, *parts, 0.0) ** 0.5, 4))
         for kind, parts in sorted(beyond.items())
-    )
+    ]
+    return pd.DataFrame(rows, columns=["kind", "numbers", "spread"])
 
 
 def _value_and_sigma(number: Number) -> tuple[float, float]:
@@ -135,19 +129,12 @@ def rates(
             made = number_changes(a[at], b[at], paired=False)
             shown.append([change.path for change in made if change.status == "significant"])
         hits = sum(map(bool, shown))
-        interval = binomtest(hits, len(shown)).proportion_ci()
         leads = pd.Series([paths[0] for paths in shown if paths], dtype=str)
         rows.append(
-            {
-                "given": given,
-                "pairs": len(shown),
-                "rate": round(hits / len(shown), 4),
-                "low": round(float(interval.low), 4),
-                "high": round(float(interval.high), 4),
-                "changes": round(float(np.mean([len(paths) for paths in shown])), 2),
-                "first": leads.mode()[0] if len(leads) else "",
-            }
-        )
+            {"given": given, "pairs": len(shown), **rate(hits, len(shown)),
+             "changes": round(float(np.mean([len(paths) for paths in shown])), 2),
+             "first": leads.mode()[0] if len(leads) else ""}
+        )  # fmt: skip
     return rows
 
 
