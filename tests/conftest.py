@@ -37,6 +37,7 @@ from px4fuse.comparison import comparison
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.filter.quick import quick_replay
 from px4fuse.flight import Flight, Unavailable
+from px4fuse.loop import tracks
 from px4fuse.notebook import commands
 from px4fuse.readers import read_log
 from px4fuse.report import pdf
@@ -238,6 +239,10 @@ def _read_once(request: ComparisonRequest, progress: analysis.Progress = analysi
     return _once(_known_flight(request), lambda: _read(request, progress))
 
 
+def _log_once(path: str | Path, *, system: int | None = None) -> Flight:
+    return _read_once(ComparisonRequest(log=str(path), system=system))
+
+
 def _run_once(
     request: ComparisonRequest,
     progress: analysis.Progress = analysis.silent,
@@ -253,6 +258,7 @@ def analysed_once() -> Iterator[None]:
     """The same request on the same files is read and analysed once; where nothing is patched."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(analysis, "read_flight", _read_once)
+        patch.setattr(tracks, "read_log", _log_once)
         for place in (analysis, commands):
             patch.setattr(place, "run", _run_once)
         yield

@@ -63,8 +63,12 @@ def in_this_process(monkeypatch) -> None:
 @pytest.fixture
 def remembered(monkeypatch, memory: Path) -> None:
     """For tests of what surrounds an analysis."""
-    monkeypatch.setenv(batch_tools.MEMORY, str(memory))
-    monkeypatch.setattr(run, "analyse", batch_tools.analyse_once)
+    remember(monkeypatch, memory)
+
+
+def remember(patch: pytest.MonkeyPatch, memory: Path) -> None:
+    patch.setenv(batch_tools.MEMORY, str(memory))
+    patch.setattr(run, "analyse", batch_tools.analyse_once)
 
 
 @pytest.fixture(scope="module")
@@ -78,8 +82,11 @@ def flights(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(flights, tmp_path_factory) -> pd.DataFrame:
-    return px4fuse.batch(flights, tmp_path_factory.mktemp("undisturbed"), workers=1)
+def undisturbed(flights, memory, tmp_path_factory) -> pd.DataFrame:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "run_bounded", in_turn)
+        remember(patch, memory)
+        return px4fuse.batch(flights, tmp_path_factory.mktemp("undisturbed"), workers=1)
 
 
 def assert_same(table: pd.DataFrame, expected: pd.DataFrame) -> None:

@@ -36,6 +36,7 @@ from px4fuse.simulation.scenario import Scenario, scenario_of
 from px4fuse.trajectory.rotation import interpolate, matrix
 
 OUTDOOR = scenario_of("outdoor", seed=5)
+pytestmark = pytest.mark.usefixtures("quick_filter")
 
 
 @cache

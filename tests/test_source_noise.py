@@ -17,14 +17,23 @@ from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding, find
 from px4fuse.findings.causes import SETTINGS
 from px4fuse.findings.source_noise import detect, levels
-from px4fuse.flight import Columns, Unavailable
+from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.scenario import Scenario
 
 RIGHT = Settings(0.27, 0.10)
 NONE = np.zeros(0)
+pytestmark = pytest.mark.usefixtures("quick_filter")
 NEW = {"source_coloured", "source_repeats", "source_axes_unequal", "source_noise_changes"}
+
+
+@cache
+def flown(seed: int, passes: int) -> tuple[Flight, CubicSpline]:
+    """A simulated flight and its true way, which all models are laid over."""
+    flight = simulate_flight(Scenario(seed=seed, passes=passes, ekf2=False))
+    truth = flight.truth.samples[Columns.POSITION].dropna()
+    return flight, CubicSpline(truth.index.to_numpy(), truth.to_numpy())
 
 
 @cache
@@ -36,10 +45,7 @@ def judged(
 
     With its truth where there is a SIGMA_Z (m) to try for that.
     """
-    passes = passes or PASSES.get(model, 3)
-    flight = simulate_flight(Scenario(seed=seed, passes=passes, ekf2=False))
-    truth = flight.truth.samples[Columns.POSITION].dropna()
-    known = CubicSpline(truth.index.to_numpy(), truth.to_numpy())
+    flight, known = flown(seed, passes or PASSES.get(model, 3))
     flight, chosen = errors.laid_over(flight, known, model, rate_hz, seed), RIGHT
     if truth_for is None:
         flight = replace(flight, truth=Unavailable("truth", "", ""))
