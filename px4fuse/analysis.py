@@ -24,14 +24,16 @@ from px4fuse.comparison.estimates import (
     turned_frame,
 )
 from px4fuse.comparison.events import Events, happened
-from px4fuse.comparison.interventions import Intervention, interventions
+from px4fuse.comparison.interventions import Intervention, interventions, to_try
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.comparison.preparation import no_source, prepare
 from px4fuse.comparison.remedy import asked_of_ekf2
-from px4fuse.comparison.why import why_ekf2_differs
+from px4fuse.comparison.why import to_walk, why_ekf2_differs
 from px4fuse.display import brief
 from px4fuse.ekf2.aids import AidResult, judge_aids
+from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, open_model
+from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import Ekf2Replay
 from px4fuse.ekf2.walk import Why
 from px4fuse.ekf2.whatif import WhatIf, sweep_values, what_if
@@ -110,6 +112,7 @@ class Analysis(Comparison):
         model = self.ekf2_model
         tried = interventions(self, self.tuning, self.clock, self.heading, self.explained, model)
         if isinstance(model, Model):  # most of its memory; what is asked for later is made again
+            model.runs.clear()
             model.intervals.clear()
         return tried
 
@@ -480,7 +483,12 @@ def explain(comparison: Comparison, progress: Progress = silent) -> Analysis:
     tuning, clock = noises_and_clock(comparison, progress, names)
     heading = turned_frame(comparison, tuning, clock, progress)
     progress("replaying EKF2")
-    model = open_model(comparison.flight)
+
+    def asked(inputs: Inputs) -> list[Variant]:
+        tried = to_try(comparison, tuning, clock, heading, inputs)
+        return [*to_walk(comparison, inputs), *tried]
+
+    model = open_model(comparison.flight, asked)
     why = why_ekf2_differs(comparison, model, clock)
     progress("looking for a loop")
     from px4fuse.loop.analysis import loop_in  # noqa: PLC0415 (tune and sync have none)

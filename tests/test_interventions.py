@@ -20,9 +20,11 @@ from px4fuse.comparison.interventions import (
     Intervention,
     cause_of,
     interventions,
+    to_try,
 )
 from px4fuse.comparison.interventions import RIGHT as TO_RIGHT
 from px4fuse.ekf2.model import disturbed, moved, replay_settings
+from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.heading import HeadingError
 from px4fuse.filter.settings import Settings
@@ -139,11 +141,13 @@ def test_a_number_of_ekf2_is_that_of_a_what_if() -> None:
     analysis = flown("ekf2-noise=0.03")
     found = [cause_of(analysis.causes, "ekf2", axis) for axis in ("north", "east")]
     model, change = analysis.ekf2_model, found[0].change  # type: ignore[union-attr]
-    asked = what_if(model, [change])
+    asked = what_if(replace(model), [change])  # which has not run before
     for one, axis in zip(found, ("north", "east"), strict=True):
         assert one.before == analysis.axes[axis].filters["ekf2"].nis_mean
         assert one.after == pytest.approx(asked.whatif[0].axes[axis].nis_mean, rel=1e-9)
-    # of other positions it is another
+    # it was run along with EKF2 as flown; of other positions it is another
+    known = analysis, analysis.tuning, analysis.clock, analysis.heading
+    assert Variant({**model.inputs.settings, **change}) in to_try(*known, model.inputs)
     once, other = (replay_settings(of, [change])[0] for of in (model, disturbed(model, 0.01, 1)))
     assert not once.updates.equals(other.updates)
 

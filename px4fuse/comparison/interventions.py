@@ -32,9 +32,10 @@ from px4fuse.comparison.model import (
     UnjudgedFilter,
 )
 from px4fuse.comparison.projection import project, project_truth
-from px4fuse.comparison.remedy import delay_asked, fused, noise_change, noise_used_m
+from px4fuse.comparison.remedy import delay_asked, fused, noise_change
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, moved, replay_settings
+from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import HORIZONTAL as LEVEL
 from px4fuse.ekf2.replay import UPDATE_COLUMNS, Ekf2Replay, settled
 from px4fuse.ekf2_parameters import EV_POS, GNSS_VEL, PARAMETERS
@@ -212,7 +213,7 @@ def interventions(
     known = comparison, tuning, clock, heading
     filters: list[_Changed] = [_Ours(*known, explained)]
     if isinstance(model, Model) and model.agreement.good and fused(comparison, model.inputs):
-        filters.append(_Ekf2(*known, model))
+        filters.append(_Ekf2(*known, model.inputs, model))
     rows: list[Intervention] = []
     for changed in filters:
         for result, of in changed.asked():
@@ -221,6 +222,24 @@ def interventions(
             if cause := cause_of(tried, changed.owner, result.axis.name, of):
                 rows += _apart(cause, result, changed)
     return tuple(rows)
+
+
+def to_try(
+    comparison: Comparison,
+    tuning: Tuning,
+    clock: ClockOffset | Unavailable,
+    heading: HeadingError | Unavailable,
+    inputs: Inputs,
+) -> list[Variant]:
+    """The variants of EKF2 that :func:`interventions` will ask for, as far as can be told before.
+
+    One that is not among them is replayed when it is asked for.
+    """
+    if not fused(comparison, inputs):
+        return []
+    tried, flown = _Ekf2(comparison, tuning, clock, heading, inputs), inputs.settings
+    changes = [change for one in tried.asked() for change in tried.candidates(*one)]
+    return [Variant({**flown, **change}) for change in changes if change.keys() <= flown.keys()]
 
 
 def _apart(cause: Intervention, result: AxisComparison, changed: _Changed) -> list[Intervention]:
@@ -300,10 +319,6 @@ def _nees(judged: AgainstTruth | Unavailable) -> tuple[float, int] | None:
 def tuned_for(tuning: Tuning, axis: str) -> AxisTuning | None:
     """What was tuned for an axis: both horizontal ones together, where there are both."""
     return known_noises(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
-
-
-def _key(change: Change) -> tuple[tuple[str, float], ...]:
-    return tuple(sorted(change.items()))
 
 
 def _turned(direction: Array, turned_deg: float) -> Array:
@@ -450,25 +465,24 @@ class _Ours(_Changed):
 
 @dataclass(frozen=True)
 class _Ekf2(_Changed):
-    """EKF2 with changes, where it fused what was analysed and the model agrees with the log."""
+    """EKF2 with changes, where it fused what was analysed.
 
-    model: Model
+    Without a model, which must agree with the log, it only has candidates.
+    """
+
+    inputs: Inputs
+    model: Model | None = None
     replays: dict[tuple[tuple[str, float], ...], Ekf2Replay] = field(default_factory=dict)
 
     owner = "ekf2"
 
-    def __post_init__(self) -> None:
-        """Replay together what will be asked for, as far as it is of parameters alone."""
-        asked = (change for one in self.asked() for change in self.candidates(*one))
-        flown = self.inputs.settings.keys()
-        settings = {_key(change): change for change in asked if change.keys() <= flown}
-        replays = replay_settings(self.model, list(settings.values()))
-        self.replays.update(zip(settings, replays, strict=True))
-
     @property
-    def inputs(self) -> Inputs:
-        """What the model of EKF2 runs on."""
-        return self.model.inputs
+    def used_m(self) -> float:
+        """Median √R (m) as flown."""
+        aid, flown = self.inputs.aid, self.inputs.settings
+        takes_stated = not aid.noise_mode or flown[aid.noise_mode] != 1.0
+        stated = self.inputs.received.variance_m2[:, :2] * takes_stated
+        return float(np.sqrt(np.median(np.maximum(stated, flown[aid.noise] ** 2))))
 
     def of_stamps(self) -> list[Change]:
         """A delay is EKF2's own to set; there is none for stamps that are early."""
@@ -504,18 +518,19 @@ class _Ekf2(_Changed):
 
     def of_noise(self, statement: FilterSummary, tuned: AxisTuning, over: bool) -> list[Change]:
         """The source's noise."""
-        noise, used_m = tuned.sigma_z, noise_used_m(self.model)
-        if (noise.low or 0.0) <= used_m <= (noise.high or np.inf):
+        noise = tuned.sigma_z
+        if (noise.low or 0.0) <= self.used_m <= (noise.high or np.inf):
             return []
         asked_m = noise.value
         if asked_m is None:  # EKF2's own innovations bound it too, and less tightly
             asked_m = float(np.hypot(statement.innovation_std_m, statement.innovation_mean_m))
-        return [noise_change(self.inputs.aid, self.inputs.settings, used_m, asked_m)]
+        return [noise_change(self.inputs.aid, self.inputs.settings, self.used_m, asked_m)]
 
     def number(self, result: AxisComparison, of: Of, change: Change) -> tuple[float, int] | None:
         """By a replay, along a horizontal axis; unchanged how far apart by the log."""
+        assert self.model is not None
         judged_s, axis = self.model.flown.judged_s, result.axis
-        made = self._replayed(change)
+        made = self._replayed(self.model, change)
         if TURN in change and self.comparison.source.origin.is_gnss:
             # what is put right is the attitude: its frame is turned, north is where it was
             axis = replace(axis, direction=_turned(axis.direction, -change[TURN]))
@@ -538,14 +553,14 @@ class _Ekf2(_Changed):
         horizon = pd.DataFrame(stated, index=pd.Index(at_s))
         return _nees(against_truth(state, result.ekf2_variance, result.truth, horizon))
 
-    def _replayed(self, change: Change) -> Ekf2Replay:
+    def _replayed(self, model: Model, change: Change) -> Ekf2Replay:
         """EKF2 with a change, each replayed once."""
         if not change:
-            return self.model.flown
-        key = _key(change)
+            return model.flown
+        key = tuple(sorted(change.items()))
         if key not in self.replays:
             settings = {name: value for name, value in change.items() if name in PARAMETERS}
-            model = moved(self.model, change.get(TURN, 0.0), change.get(CLOCK, 0.0))
+            model = moved(model, change.get(TURN, 0.0), change.get(CLOCK, 0.0))
             left_out_s, tuned = None, tuned_for(self.tuning, HORIZONTAL)
             if OUTLIERS in change and tuned is not None:
                 stamp = 1e-3 * self.inputs.settings[self.inputs.aid.delay]

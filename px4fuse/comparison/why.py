@@ -16,6 +16,7 @@ from px4fuse.comparison.remedy import noise_used_m
 from px4fuse.ekf2 import walk as ways
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model
+from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import Spans, settled
 from px4fuse.ekf2.walk import Outside, Step, Why
 from px4fuse.filter.clock import ClockOffset
@@ -67,6 +68,11 @@ def why_ekf2_differs(
         outside = structs.replace(why, outside=_outside(results[name], why.spans_s))
         found[name] = with_words(outside, comparison.axes[name].axis.called, because)
     return found
+
+
+def to_walk(comparison: Comparison, inputs: Inputs) -> list[Variant]:
+    """The variants of EKF2 that :func:`why_ekf2_differs` asks for."""
+    return list(ways.on_the_way(inputs, _settings(comparison, inputs)).values())
 
 
 def _settings(comparison: Comparison, inputs: Inputs) -> Settings:

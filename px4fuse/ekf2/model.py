@@ -7,8 +7,8 @@ It is not EKF2: what else EKF2 fuses (height, else the heading) is taken from it
 far it can be believed is measured on each log, see :mod:`px4fuse.ekf2.replay`.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -62,6 +62,8 @@ MAX_HORIZON_S = 1.0  # EKF2_DELAY_MAX
 # What an agreement says of an aid by another name
 DOUBTED = {FLOW.name: "carried_difference_m"}
 
+Besides = Callable[[Inputs], Sequence[Variant]]
+
 
 @dataclass(frozen=True)
 class Model:
@@ -77,6 +79,9 @@ class Model:
         With the parameters of the log.
     agreement : Agreement
         Of ``flown`` with what the log holds.
+    runs : list of Run
+        Through each stretch, of these inputs: as flown, the same rejecting and resetting where EKF2
+        did, and the variants that were asked for besides. What is not there is run when needed.
     """
 
     flight: Flight
@@ -84,26 +89,31 @@ class Model:
     intervals: dict[Timing, tuple[Intervals, ...]]
     flown: Ekf2Replay
     agreement: Agreement
+    runs: list[Run] = field(default_factory=list, init=False)
 
     __repr__ = brief
 
 
-def open_model(flight: Flight) -> Model | Unavailable:
+def open_model(flight: Flight, besides: Besides = lambda _: ()) -> Model | Unavailable:
     """Make a flight ready for replays and replay it as flown, or say why the log cannot carry it.
 
     Parameters
     ----------
     flight : Flight
+    besides : callable
+        Gives the variants that will be asked for, which cost little when they run along.
     """
     doubted: dict[str, Agreement] = {}
-    while not isinstance(model := _open(flight, doubted), Unavailable):
+    while not isinstance(model := _open(flight, besides, doubted), Unavailable):
         if not (more := model.agreement.doubtful.keys() - doubted.keys()):
             break
         doubted |= dict.fromkeys(more, model.agreement)
     return model
 
 
-def _open(flight: Flight, doubted: Mapping[str, Agreement]) -> Model | Unavailable:
+def _open(
+    flight: Flight, besides: Besides, doubted: Mapping[str, Agreement]
+) -> Model | Unavailable:
     """The model without the aids that are doubted, each by an agreement that says why."""
     doubtful = {name: found.doubtful[name] for name, found in doubted.items()}
     inputs = prepare(flight, doubtful)
@@ -120,6 +130,8 @@ def _open(flight: Flight, doubted: Mapping[str, Agreement]) -> Model | Unavailab
     )
     inputs = replace(inputs, stretches=stretches)
     variants = [flown, replace(flown, as_logged=True)]
+    for each in besides(inputs):
+        variants += [] if each in variants else [each]
     known = {timing: intervals}
     runs = run_variants(inputs, variants, known)
     replay = _assemble(inputs, runs, flown, {})
@@ -139,7 +151,15 @@ def _open(flight: Flight, doubted: Mapping[str, Agreement]) -> Model | Unavailab
         **{of: getattr(doubted[name], of) for of, name in of_doubted.items()},
     )
     replay = structs.replace(replay, agreement=agreement)
-    return Model(flight, inputs, known, replay, agreement)
+    model = Model(flight, inputs, known, replay, agreement)
+    model.runs.extend(runs)
+    return model
+
+
+def obedient(model: Model) -> Ekf2Replay:
+    """EKF2 as flown, rejecting and resetting where it did itself, as far as the log tells."""
+    variant = Variant(model.inputs.settings, as_logged=True)
+    return _assemble(model.inputs, _run_model(model, [variant]), variant, {})
 
 
 def replay_settings(
@@ -203,7 +223,7 @@ def replay_settings(
         Variant({**inputs.settings, **change}, as_logged=obeys, without=without)
         for change in changes
     ]
-    runs = run_variants(inputs, variants, model.intervals)
+    runs = _run_model(model, variants)
     replays = [_assemble(inputs, runs, *each) for each in zip(variants, changes, strict=True)]
     if left_out_s is not None:
         replays = [_without(inputs, each, left_out_s) for each in replays]
@@ -274,17 +294,21 @@ def moved(model: Model, turned_deg: float, later_s: float) -> Model:
     return replace(model, inputs=replace(model.inputs, received=received), intervals=known)
 
 
-def delayed_variants(
-    model: Model, variants: Sequence[Variant]
-) -> tuple[Iterator[pd.DataFrame], Ekf2Replay]:
-    """Tracks of all at their horizon, one at a time, and the whole replay of the last.
+def delayed_variants(model: Model, variants: Sequence[Variant]) -> Iterator[pd.DataFrame]:
+    """Tracks of all at their horizon, one at a time.
 
     What a filter publishes is as long again, and takes as long to make.
     """
-    runs = run_variants(model.inputs, variants, model.intervals)
-    states = ((delayed_states(part, at)[0] for part in runs) for at in range(len(variants)))
-    tracks = (pd.concat(map(_track, runs, of_parts)) for of_parts in states)
-    return tracks, _assemble(model.inputs, runs, variants[-1], {})
+    runs = _run_model(model, variants)
+    for at in map(runs[0].variants.index, variants):
+        yield pd.concat([_track(part, delayed_states(part, at)[0]) for part in runs])
+
+
+def _run_model(model: Model, variants: Sequence[Variant]) -> list[Run]:
+    """Runs that hold these variants: those of the model, where they are among them."""
+    if model.runs and all(variant in model.runs[0].variants for variant in variants):
+        return model.runs
+    return run_variants(model.inputs, variants, model.intervals)
 
 
 def run_variants(

@@ -22,7 +22,7 @@ import pandas as pd
 from px4fuse.arrays import Array
 from px4fuse.display import Shown
 from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.model import Model, aids_of, delayed_variants
+from px4fuse.ekf2.model import Model, aids_of, delayed_variants, obedient
 from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import Ekf2Replay, Spans, along, rms_to_truth, settled
 from px4fuse.ekf2_parameters import EV_POS, FLOW, GNSS_POS, MAG
@@ -197,7 +197,7 @@ def walk(
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
     variants = on_the_way(model.inputs, settings or Settings())
-    delayed, flown = delayed_variants(model, list(variants.values()))
+    delayed, flown = delayed_variants(model, list(variants.values())), obedient(model)
     judged, times = model.flown.judged_s, ekf2.state.index.to_numpy()
     inside = settled(times, judged)
     # all stages have the replay's times
