@@ -23,6 +23,7 @@ from px4fuse.trajectory.graph.model import (
     PoseGraph,
     composed,
     cost,
+    observed_directions,
     residuals,
 )
 from px4fuse.trajectory.graph.solver import solve
@@ -424,3 +425,12 @@ def test_gate_needs_odometry() -> None:
         with pytest.raises(TrajectoryError, match=said):
             gate(replace(graph, information=information), [edge])
     assert gate(graph, []) == []
+
+
+def test_what_is_observed_and_how_well_is_the_whole_information() -> None:
+    """In metres and radians of very different sizes, with correlations, and a direction untold."""
+    rng = np.random.default_rng(4)
+    root = rng.normal(size=(6, 4)) * np.array([3.0, 2.0, 5.0, 40.0, 70.0, 20.0])[:, None]
+    directions, variance = observed_directions(root @ root.T)
+    assert variance.shape == (4,)
+    np.testing.assert_allclose((directions / variance) @ directions.T, root @ root.T, rtol=1e-9)
