@@ -151,7 +151,8 @@ def grade_one(
         content = submissions.read(submission)
         sha256 = hashlib.sha256(content).hexdigest()
         results, verdict, recalled = verified(records, content, logs, handed_out)
-        one = assess(results, verdict, rubric, key, owner_id)
     except ResultsError as error:
         one = refused(rubric, key, f"{error.reason}.", error.remedy)
+    else:
+        one = assess(results, verdict, rubric, key, owner_id)
     return replace(one, sha256=sha256), recalled
