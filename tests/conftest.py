@@ -46,7 +46,7 @@ from px4fuse.request import ComparisonRequest
 REPOSITORY = Path(__file__).resolve().parents[1]
 SAMPLES = REPOSITORY / "sample_logs"
 LOG = SAMPLES / "aisle_uwb.ulg"
-REPORT = REPOSITORY / "reports" / "aisle_uwb.pdf"
+REPORT = REPOSITORY / "reports" / "example" / "aisle_uwb.pdf"
 SHARED = REPOSITORY.parent / "shared"
 
 # A shell's background jobs ignore Ctrl-C, and so would all that the tests start

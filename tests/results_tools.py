@@ -18,7 +18,7 @@ from px4fuse.trajectory.model import Track
 from px4fuse.trajectory.offset import TimeOffset
 from px4fuse.trajectory.scores import Interval, RelativeError, Statistics
 
-SHIPPED = Path(__file__).parent.parent / "reports" / "aisle_uwb.json"
+SHIPPED = Path(__file__).parent.parent / "reports" / "example" / "aisle_uwb.json"
 EXAMPLE: dict[str, Any] = json.loads(SHIPPED.read_text(encoding="utf-8"))
 SHA256 = EXAMPLE["log"]["sha256"]
 NONE = Unavailable("it", "nobody asked", "Ask.")

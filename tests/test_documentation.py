@@ -116,7 +116,7 @@ def test_the_lab_has_a_command_for_each_step(page: str, most: int) -> None:
     for number, step in enumerate(steps, 1):
         step = step.split("\n## ")[0]  # noqa: PLW2901 - what follows the lab
         assert 1 <= len(re.findall(r"^px4fuse ", step, re.MULTILINE)) <= most
-        assert page == "README.md" or f"reports/lab_{number}.png)" in step
+        assert page == "README.md" or f"reports/example/lab_{number}.png)" in step
 
 
 def test_pictures_are_small_and_made_by_the_script() -> None:
@@ -124,7 +124,7 @@ def test_pictures_are_small_and_made_by_the_script() -> None:
     pictures = re.findall(r"!\[[^]]+\]\((\S+\.png)\)", README + PAGES["docs/lab.md"])
     assert len({Path(picture).name for picture in pictures}) == 7
     for picture in pictures:
-        file = ROOT / "reports" / Path(picture).name
+        file = ROOT / "reports" / "example" / Path(picture).name
         assert file.stat().st_size <= 100_000
         assert f'Picture("{file.stem}"' in script
 

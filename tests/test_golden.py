@@ -145,7 +145,7 @@ def test_a_command_shows_what_it_showed(
     shutil.copytree(REPOSITORY / "sample_logs", tmp_path / "sample_logs")
     (tmp_path / "notes.md").write_text(NOTES)
     (tmp_path / "shifted.tum").write_text(shifted(REPOSITORY / "sample_logs" / "loop_slam.tum"))
-    shutil.copy(REPOSITORY / "reports" / "aisle_uwb.pdf", tmp_path / "report.pdf")
+    shutil.copy(REPOSITORY / "reports" / "example" / "aisle_uwb.pdf", tmp_path / "report.pdf")
     monkeypatch.chdir(tmp_path)
     for command in COMMANDS[name]:
         before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.json")}

@@ -27,8 +27,8 @@ from px4fuse.verification import intake
 from px4fuse.verification.intake import read_report
 
 ROOT = Path(__file__).parent.parent
-REAL = (ROOT / "reports" / "aisle_uwb.pdf").read_bytes()
-JSON = (ROOT / "reports" / "aisle_uwb.json").read_bytes()
+REAL = (ROOT / "reports" / "example" / "aisle_uwb.pdf").read_bytes()
+JSON = (ROOT / "reports" / "example" / "aisle_uwb.json").read_bytes()
 DAMAGED = "damaged: it cannot be read as a PDF"
 
 

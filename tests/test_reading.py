@@ -27,7 +27,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     folder = tmp_path_factory.mktemp("desk")
     shutil.copy(SAMPLES / "aisle_uwb.ulg", folder / "l.ulg")
     shutil.copy(SAMPLES / "loop_slam.tum", folder / "s.tum")
-    shutil.copy(REPOSITORY / "reports" / "aisle_uwb.pdf", folder / "r.pdf")
+    shutil.copy(REPOSITORY / "reports" / "example" / "aisle_uwb.pdf", folder / "r.pdf")
     (folder / "roster.csv").write_text("id,name\n1,A\n")
     (folder / "folder").mkdir()
     with (folder / "sparse").open("wb") as file:

@@ -16,7 +16,7 @@ from px4fuse.ekf2_parameters import PARAMETERS
 pytestmark = pytest.mark.usefixtures("analysed_once")
 
 SAMPLES = REPOSITORY / "sample_logs"
-REPORT = REPOSITORY / "reports" / "aisle_uwb.pdf"
+REPORT = REPOSITORY / "reports" / "example" / "aisle_uwb.pdf"
 LINES = (SAMPLES / "loop_slam.tum").read_text().splitlines()
 ROWS = [line for line in LINES if not line.startswith("#")]
 

@@ -150,3 +150,12 @@ def test_what_breaks_the_contract(values, said):
 def test_names_are_cleaned_as_texts_are():
     nothing = {"what": "noises", "reason": "too short", "remedy": ""}
     assert list(decoded(changed(tuning={"a\u202eb": nothing})).tuning) == ["ab"]
+
+
+def test_to_json_numbers_have_ten_significant_digits():
+    """Further digits depend on the processor; times of the UNIX clock keep microseconds."""
+    written = json.loads(to_json({"a": [1 / 3, 2e-7 / 3], "unix_s": 1795251250.2020127, "n": 3}))
+    assert written == {"a": [0.3333333333, 6.666666667e-8], "unix_s": 1795251250.202013, "n": 3}
+    for text in (EXAMPLE, LOOP):
+        once = to_json(text)
+        assert to_json(json.loads(once)) == once

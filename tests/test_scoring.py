@@ -61,7 +61,7 @@ def filled(kinds, results=EXAMPLE, **values):
 
 
 def test_a_file_that_is_not_at_hand():
-    pdf = (ROOT / "reports" / "aisle_uwb.pdf").read_bytes()
+    pdf = (ROOT / "reports" / "example" / "aisle_uwb.pdf").read_bytes()
     verdict = verify(read_report(pdf, "a.pdf"), pdf, {})
     assert checked("verified", verdict=verdict)[0] == 0.0
     assert "Hand in aisle_uwb.ulg" in fed_back(graded(verdict=verdict))

@@ -40,6 +40,8 @@ LOOP = "px4fuse-loop"
 WHATIF = "px4fuse-whatif"
 AIDS = "px4fuse-aids"
 CHANGES = "px4fuse-changes"
+# Of the numbers that are written
+SIGNIFICANT_DIGITS = 10
 
 
 class Log(LogInfo, frozen=True, kw_only=True):
@@ -402,6 +404,8 @@ def schema() -> dict[str, Any]:
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "$id": f"px4fuse-results-{VERSION}",
         "title": "Results of px4fuse",
+        "description": f"Numbers have {SIGNIFICANT_DIGITS} significant digits at most, or six "
+        "decimals where that is finer.",
         "oneOf": [
             {
                 "$ref": f"#/$defs/{kind.__name__}",
@@ -417,6 +421,26 @@ def to_plain(results: msgspec.Struct) -> dict[str, Any]:
     """Results as dicts, lists and numbers, by the names that they have in JSON."""
     found: dict[str, Any] = msgspec.to_builtins(results, enc_hook=_plain)
     return found
+
+
+def round_number(value: float) -> float:
+    """Round to ten significant digits, or to 1e-6 where that is finer (times of the UNIX clock).
+
+    Digits beyond those depend on the processor: linear algebra libraries add in another order.
+
+    >>> round_number(0.1 + 0.2), round_number(1795251250.2020123)
+    (0.3, 1795251250.202012)
+    """
+    return round(value, 6) if abs(value) >= 1e4 else float(f"{value:.{SIGNIFICANT_DIGITS}g}")
+
+
+def _round_numbers(value: Any) -> Any:
+    """Return plain results with every float rounded by :func:`round_number`."""
+    if isinstance(value, dict):
+        return {name: _round_numbers(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_round_numbers(part) for part in value]
+    return round_number(value) if isinstance(value, float) else value
 
 
 def _plain(value: Any) -> float | dict[str, Any]:
@@ -435,7 +459,7 @@ def _plain(value: Any) -> float | dict[str, Any]:
 
 
 def to_json(results: msgspec.Struct | dict[str, Any]) -> str:
-    """Text of results: stable order, one trailing newline.
+    """Text of results: stable order, numbers as :func:`round_number`, one trailing newline.
 
     Raises
     ------
@@ -443,7 +467,8 @@ def to_json(results: msgspec.Struct | dict[str, Any]) -> str:
         A number in them is not finite.
     """
     found = to_plain(results) if isinstance(results, msgspec.Struct) else results
-    return json.dumps(found, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    plain = _round_numbers(found)
+    return json.dumps(plain, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def files_named(text: str) -> list[str]:

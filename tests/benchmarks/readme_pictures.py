@@ -3,7 +3,7 @@
     python tests/benchmarks/readme_pictures.py
 
 It takes a minute, needs Chromium and what ``pip install -e ".[test]"`` installs, and writes
-``reports/*.png``: the part of a page named below, on a palette, below 100 kB each.
+``reports/example/*.png``: the part of a page named below, on a palette, below 100 kB each.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ sys.path.insert(0, str(REPOSITORY / "tests"))
 from browser import BROWSERS  # noqa: E402 - it stands among the tests
 
 WINDOW = "1360,1010"
-REPORTS = REPOSITORY / "reports"
+REPORTS = REPOSITORY / "reports" / "example"
 AISLE = "compare sample_logs/aisle_uwb.ulg"
 DPI, COLOURS, MAX_BYTES = 96, 64, 100_000
 # Head and foot of a page, as shares of its height, are left out; a margin (pixels) stays

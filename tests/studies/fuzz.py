@@ -65,6 +65,7 @@ from px4fuse.trajectory.graph.analysis import analyse_graph  # noqa: E402
 from px4fuse.verification.intake import read_report  # noqa: E402
 
 REPOSITORY = TESTS.parent
+REPORT = REPOSITORY / "reports" / "example" / "aisle_uwb.pdf"
 SLOW_S, COMMAND_S = 5.0, 15.0
 # Numbers and words that parsers stumble over
 ODD = (
@@ -164,7 +165,7 @@ def _recordings() -> list[bytes]:
 
 def _reports() -> list[bytes]:
     """The shipped report, and one of its results on an empty page."""
-    report = REPOSITORY / "reports/aisle_uwb.pdf"
+    report = REPORT
     return [report.read_bytes(), page_of(None, report.with_suffix(".json").read_text())]
 
 
@@ -229,7 +230,7 @@ TARGETS = (
         ".toml", True, 900, 8.0,
     ),
     Target(
-        "results", lambda: [(REPOSITORY / "reports/aisle_uwb.json").read_bytes()],
+        "results", lambda: [(REPORT.with_suffix(".json")).read_bytes()],
         lambda path: read_results(path.read_bytes()), ".json", True, 100, 2.0,
     ),
     Target("report", _reports, _report, ".pdf", False, 60, 0.2),
@@ -264,7 +265,7 @@ def _command(*words: str) -> Callable[[Path], object]:
 
 
 def _handed_in() -> list[bytes]:
-    report = (REPOSITORY / "reports/aisle_uwb.pdf").read_bytes()
+    report = (REPORT).read_bytes()
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in ("Ada Lovelace_7", "Grace_8"):
@@ -288,9 +289,9 @@ COMMANDS = (
     Target("grade", _handed_in, _command("grade", "{path}", "--logs", LOG, "-o", "{out}"), ".zip",
            False, 2, 1.0, COMMAND_S),
     Target("grade by rubric", lambda: [rubric_text().encode()],
-           _command("grade", str(REPOSITORY / "reports/aisle_uwb.pdf"), "--logs", LOG, "--rubric",
+           _command("grade", str(REPORT), "--logs", LOG, "--rubric",
                     "{path}", "-o", "{out}"), ".toml", True, 2, 1.0, COMMAND_S),
-    Target("verify", lambda: [(REPOSITORY / "reports/aisle_uwb.pdf").read_bytes()],
+    Target("verify", lambda: [(REPORT).read_bytes()],
            _command("verify", "{path}", LOG), ".pdf", False, 2, 1.0, COMMAND_S),
     Target("assign", _text(_ROSTER, _MOODLE),
            _command("simulate", "--assignment", "{path}", "--secret-file", "{path}", "--preview",
