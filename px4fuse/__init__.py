@@ -30,7 +30,6 @@ def __getattr__(name: str) -> _typing.Any:
         raise AttributeError(
             f"module {__name__!r} has no attribute {name!r}", name=name, obj=_sys.modules[__name__]
         )
-    _importlib.import_module(f"{__name__}.notebook")  # by which results show themselves
     value = getattr(_importlib.import_module(_HOMES[name]), name)
     globals()[name] = value
     return value

@@ -3,6 +3,13 @@
 from px4fuse.analysis import Analysis as Analysis
 from px4fuse.analysis import explain as explain
 from px4fuse.analysis import run as run
+from px4fuse.api import close_loop as close_loop
+from px4fuse.api import compare as compare
+from px4fuse.api import evaluate as evaluate
+from px4fuse.api import explore as explore
+from px4fuse.api import report as report
+from px4fuse.api import table as table
+from px4fuse.api import what_if as what_if
 from px4fuse.comparison.model import Comparison as Comparison
 from px4fuse.ekf2.model import Model as Model
 from px4fuse.ekf2.model import open_model as open_model
@@ -22,12 +29,6 @@ from px4fuse.fleet.run import batch as batch
 from px4fuse.flight import Flight as Flight
 from px4fuse.flight import Unavailable as Unavailable
 from px4fuse.loop.model import Loop as Loop
-from px4fuse.notebook.commands import close_loop as close_loop
-from px4fuse.notebook.commands import compare as compare
-from px4fuse.notebook.commands import evaluate as evaluate
-from px4fuse.notebook.commands import explore as explore
-from px4fuse.notebook.commands import report as report
-from px4fuse.notebook.commands import what_if as what_if
 from px4fuse.readers import read_log as read_log
 from px4fuse.readers.trajectory import read_trajectory as read_trajectory
 from px4fuse.request import ComparisonRequest as ComparisonRequest

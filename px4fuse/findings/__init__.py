@@ -19,11 +19,11 @@ from px4fuse.ekf2.aids import AidResult
 from px4fuse.findings.aids import find_in as find_in_aids
 from px4fuse.findings.causes import by_cause
 from px4fuse.findings.loops import find_in
-from px4fuse.findings.model import NAMES, SEVERITIES, Finding, Found, Severity, by_root
+from px4fuse.findings.model import NAMES, Finding, Found, Severity, by_root
 from px4fuse.loop.model import Loop
 
 __all__ = [
-    "NAMES", "SEVERITIES", "Finding", "Severity", "by_root", "find", "find_aids", "find_loop",
+    "NAMES", "Finding", "Severity", "by_root", "find", "find_aids", "find_loop",
     "named",
 ]  # fmt: skip
 
