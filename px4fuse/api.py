@@ -90,7 +90,8 @@ def compare(
     Returns
     -------
     Analysis
-        Input of :func:`px4fuse.table`, :func:`px4fuse.find` and :func:`px4fuse.report`.
+        Input of :func:`px4fuse.table`, :func:`px4fuse.find`, :func:`px4fuse.write_report` and
+        :func:`px4fuse.write_page`.
 
     Raises
     ------
@@ -230,7 +231,7 @@ def close_loop(
     return analyse(flown, request.LoopRequest(**asked), against, progress)
 
 
-def report(analysis: Analysis, path: Pathlike) -> Path:
+def write_report(analysis: Analysis, path: Pathlike) -> Path:
     """Write the PDF report of ``px4fuse compare``, and the JSON results beside it.
 
     Parameters
@@ -261,7 +262,7 @@ def report(analysis: Analysis, path: Pathlike) -> Path:
     return target
 
 
-def explore(analysis: Analysis, path: Pathlike) -> Path:
+def write_page(analysis: Analysis, path: Pathlike) -> Path:
     """Write the web page of ``px4fuse explore``.
 
     Parameters

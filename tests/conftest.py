@@ -30,7 +30,6 @@ from hypothesis import HealthCheck, settings
 from pypdf import PdfWriter
 from ulog_tools import Log
 
-import px4fuse
 from px4fuse import analysis, api
 from px4fuse.assignment import truth
 from px4fuse.comparison import comparison
@@ -199,7 +198,7 @@ def drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 # Of the unchanged program: they are there before any test patches them
-_run, _read = px4fuse.run, analysis.read_flight
+_run, _read = analysis.run, analysis.read_flight
 _kept: dict[tuple[str | bytes, ...] | None, Any] = {}
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import json
+import subprocess
 import sys
 from pathlib import Path
 
@@ -29,19 +31,30 @@ def analysis(sample_log) -> px4fuse.Analysis:
 # -- names -----------------------------------------------------------------------------------------
 
 
-def test_dir_shows_the_public_names_alone():
-    source = Path(px4fuse.__file__).with_suffix(".pyi").read_text(encoding="utf-8")
+def test_dir_lists_the_public_names_alone() -> None:
     assert dir(px4fuse) == sorted(px4fuse.__all__)
     assert {"compare", "find", "read_log", "Settings"} <= set(dir(px4fuse))
     for name in dir(px4fuse):
         assert getattr(px4fuse, name).__name__ == name
-        assert f"import {name} as {name}\n" in source  # what a type checker reads
-    # what completes by reading the source sees no other name either
+    # completion that reads the module has no other name
     names = {name for name in vars(px4fuse) if not name.startswith("_")}
     modules = {name for name in names if f"px4fuse.{name}" in sys.modules}
+    assert modules.isdisjoint(px4fuse.__all__)
     assert names - modules <= set(px4fuse.__all__)
     with pytest.raises(AttributeError, match="has no attribute 'comapre'"):
         px4fuse.comapre  # noqa: B018
+
+
+def test_type_checkers_read_the_same_names_and_modules() -> None:
+    tree = ast.parse(Path(px4fuse.__file__).read_text(encoding="utf-8"))
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    read = {one.asname: node.module for node in imports for one in node.names}
+    assert read == px4fuse._MODULES
+
+
+def test_import_loads_no_library() -> None:
+    code = "import px4fuse, sys; print({'numpy', 'pandas', 'msgspec'} & sys.modules.keys())"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True) == "set()\n"
 
 
 # -- compare and find ------------------------------------------------------------------------------
@@ -174,12 +187,10 @@ def test_what_if_noise_changes_the_mean_nis(analysis) -> None:
 def test_report_and_page_are_written_as_by_the_commands(
     analysis: px4fuse.Analysis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import px4fuse.report.pdf  # a room of the same name as the function
-
     in_this_process(monkeypatch)
 
-    report = px4fuse.report(analysis, tmp_path / "x.pdf")
-    page = px4fuse.explore(analysis, str(tmp_path / "x.html"))
+    report = px4fuse.write_report(analysis, tmp_path / "x.pdf")
+    page = px4fuse.write_page(analysis, str(tmp_path / "x.html"))
     assert report == tmp_path / "x.pdf"
     assert report.read_bytes().startswith(b"%PDF")
     assert page.read_bytes().startswith(b"<!DOCTYPE html>")
@@ -190,10 +201,10 @@ def test_report_and_page_are_written_as_by_the_commands(
 
 
 def test_what_cannot_be_written_is_said(analysis: px4fuse.Analysis, tmp_path: Path) -> None:
-    for function, name in ((px4fuse.report, "x.html"), (px4fuse.explore, "x.pdf")):
+    for function, name in ((px4fuse.write_report, "x.html"), (px4fuse.write_page, "x.pdf")):
         with pytest.raises(px4fuse.Px4FuseError, match="give a name that ends in"):
             function(analysis, tmp_path / name)
     bare = dataclasses.replace(analysis, request=None)
     with pytest.raises(px4fuse.Px4FuseError, match="does not say what was asked for"):
-        px4fuse.report(bare, tmp_path / "x.pdf")
+        px4fuse.write_report(bare, tmp_path / "x.pdf")
     assert list(tmp_path.iterdir()) == []
