@@ -27,20 +27,15 @@ project = "px4fuse"
 author = copyright = "The px4fuse authors"  # noqa: A001 - as Sphinx calls it
 release = metadata.version("px4fuse")
 extensions = [
-    "myst_nb",  # Markdown, and the notebook, which is executed
+    "myst_parser",  # Markdown
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",  # numpydoc's sections
 ]
-exclude_patterns = ["_build", "jupyter_execute"]
+exclude_patterns = ["_build"]
 html_theme = "furo"
-html_static_path = ["style.css"]
-html_css_files = ["style.css"]
 smartquotes = False  # two dashes begin an option
 html_title = f"px4fuse {release}"
 myst_heading_anchors = 3
-nb_execution_mode = "force"
-nb_execution_raise_on_error = True
-nb_execution_timeout = 300
 autodoc_typehints = "none"  # the docstrings say them, with units
 autodoc_member_order = "bysource"
 napoleon_use_rtype = False

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import matplotlib as mpl
@@ -39,7 +40,14 @@ from px4fuse.filter.heading import HeadingPart, turned  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402
 from px4fuse.findings import NAMES, Finding, find, find_aids, find_loop, source_frame  # noqa: E402
 from px4fuse.findings.causes import CONSEQUENCES, RECORDING, SETTINGS  # noqa: E402
-from px4fuse.flight import Columns  # noqa: E402
+from px4fuse.flight import Columns, Unavailable  # noqa: E402
+from px4fuse.report.panels import (  # noqa: E402
+    ERROR,
+    INNOVATIONS,
+    POSITION,
+    SIGMA_P,
+    error_reference,
+)
 from px4fuse.simulation.flights import simulate_flight  # noqa: E402
 from px4fuse.simulation.mistakes import parse  # noqa: E402
 from px4fuse.simulation.scenario import Scenario  # noqa: E402
@@ -48,6 +56,7 @@ slow, louder = partial(coloured, tau_s=0.5, share=1.0), partial(two_levels, fact
 UNEQUAL_M = (0.05, 0.2, 0.1)
 MEANINGS = tomllib.loads(Path(__file__).with_name("meanings.toml").read_text(encoding="utf-8"))
 FINDINGS = ROOT / "px4fuse" / "findings"
+LABEL_WIDTH = 26  # characters per line of an axis label
 # What `px4fuse simulate` is told, with the settings of the comparison, to show a finding
 SIMULATED: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
     "accelerometer_bias": (("accel-bias",), {}),
@@ -236,7 +245,14 @@ def picture(name: str, example: Example, folder: Path) -> str:
     axis = example.finding.evidence.get("axis")
     assert example.analysis is not None
     shown = example.analysis.axes.get(str(axis)) or example.analysis.main
-    shown.plot()[0].figure.savefig(folder / f"{name}.png", dpi=70)
+    error = POSITION if isinstance(error_reference(shown), Unavailable) else ERROR
+    figure, panels = pyplot.subplots(3, sharex=True, figsize=(8, 7), layout="constrained")
+    for axes, panel in zip(panels, (error, INNOVATIONS, SIGMA_P), strict=True):
+        panel.draw(axes, shown)
+        axes.set_ylabel(fill(panel.named(shown), LABEL_WIDTH))
+    panels[0].set_title(shown.axis.name)
+    panels[-1].set_xlabel("time (s)")
+    figure.savefig(folder / f"{name}.png", dpi=70)
     return f"{name}.png"
 
 

@@ -7,40 +7,58 @@
 """
 
 import importlib as _importlib
-import pathlib as _pathlib
-import re as _re
-import sys as _sys
-import types as _types
 import typing as _typing
 
-# What type checkers read is where every public name is at home
-_STUB = _pathlib.Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
-_HOMES = {name: home for home, name in _re.findall(r"^from (\S+) import (\w+)", _STUB, _re.M)}
-__all__ = list(_HOMES)
+# Module of each public name; imported at first use, so that ``px4fuse --help`` is fast
+_MODULES = {
+    "Analysis": "px4fuse.analysis",
+    "Px4FuseError": "px4fuse.errors",
+    "Settings": "px4fuse.filter.settings",
+    "Unavailable": "px4fuse.record",
+    "batch": "px4fuse.fleet.run",
+    "close_loop": "px4fuse.api",
+    "compare": "px4fuse.api",
+    "diff": "px4fuse.fleet.changes",
+    "evaluate": "px4fuse.api",
+    "find": "px4fuse.findings",
+    "read_log": "px4fuse.readers",
+    "read_trajectory": "px4fuse.readers.trajectory",
+    "replay": "px4fuse.filter.kalman",
+    "table": "px4fuse.api",
+    "what_if": "px4fuse.api",
+    "write_page": "px4fuse.api",
+    "write_report": "px4fuse.api",
+}
+__all__ = list(_MODULES)
 
+if _typing.TYPE_CHECKING:
+    from px4fuse.analysis import Analysis as Analysis
+    from px4fuse.api import close_loop as close_loop
+    from px4fuse.api import compare as compare
+    from px4fuse.api import evaluate as evaluate
+    from px4fuse.api import table as table
+    from px4fuse.api import what_if as what_if
+    from px4fuse.api import write_page as write_page
+    from px4fuse.api import write_report as write_report
+    from px4fuse.errors import Px4FuseError as Px4FuseError
+    from px4fuse.filter.kalman import replay as replay
+    from px4fuse.filter.settings import Settings as Settings
+    from px4fuse.findings import find as find
+    from px4fuse.fleet.changes import diff as diff
+    from px4fuse.fleet.run import batch as batch
+    from px4fuse.readers import read_log as read_log
+    from px4fuse.readers.trajectory import read_trajectory as read_trajectory
+    from px4fuse.record import Unavailable as Unavailable
+else:
 
-def __dir__() -> list[str]:
-    """The public names, which are imported when they are first used."""
-    return sorted(_HOMES)
+    def __dir__():
+        """List the public names."""
+        return sorted(__all__)
 
-
-def __getattr__(name: str) -> _typing.Any:
-    """Import a public name when it is first used, so that ``px4fuse --help`` is instant."""
-    if name not in _HOMES:
-        raise AttributeError(
-            f"module {__name__!r} has no attribute {name!r}", name=name, obj=_sys.modules[__name__]
-        )
-    _importlib.import_module(f"{__name__}.notebook")  # by which results show themselves
-    value = getattr(_importlib.import_module(_HOMES[name]), name)
-    globals()[name] = value
-    return value
-
-
-class _Package(_types.ModuleType):
-    """The package, of which two functions have the names of rooms: attributes are the functions."""
-
-    explore = property(lambda _: __getattr__("explore"), lambda *_: None)
-    report = property(lambda _: __getattr__("report"), lambda *_: None)
-
-
-_sys.modules[__name__].__class__ = _Package
+    def __getattr__(name):
+        """Import a public name at its first use."""
+        if name not in _MODULES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        value = getattr(_importlib.import_module(_MODULES[name]), name)
+        globals()[name] = value
+        return value

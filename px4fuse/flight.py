@@ -20,7 +20,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray
-from px4fuse.display import Shown, brief
+from px4fuse.display import brief
 from px4fuse.ekf2_parameters import BAROMETER, Aid
 from px4fuse.origin import Origin
 from px4fuse.record import NotNegative, Record, Vector, lacking
@@ -429,8 +429,8 @@ MODES_NOT_LOGGED = lacking("modes_not_logged")
 
 
 # equal to itself only: what is made of it is kept by it
-@dataclass(frozen=True, repr=False, eq=False)
-class Flight(Shown):
+@dataclass(frozen=True, eq=False)
+class Flight:
     """One recorded flight.
 
     Attributes
@@ -481,6 +481,8 @@ class Flight(Shown):
     modes: tuple[FlightMode, ...] | Unavailable = MODES_NOT_LOGGED
     tumbled: tuple[tuple[float, float], ...] = ()
     barometer: pd.DataFrame | None = None
+
+    __repr__ = brief
 
 
 def best_first(tracks: Iterable[PositionTrack]) -> tuple[PositionTrack, ...]:

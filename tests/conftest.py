@@ -30,15 +30,13 @@ from hypothesis import HealthCheck, settings
 from pypdf import PdfWriter
 from ulog_tools import Log
 
-import px4fuse
-from px4fuse import analysis
+from px4fuse import analysis, api
 from px4fuse.assignment import truth
 from px4fuse.comparison import comparison
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.filter.quick import quick_replay
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop import tracks
-from px4fuse.notebook import commands
 from px4fuse.readers import read_log
 from px4fuse.report import pdf
 from px4fuse.request import ComparisonRequest
@@ -200,7 +198,7 @@ def drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 # Of the unchanged program: they are there before any test patches them
-_run, _read = px4fuse.run, analysis.read_flight
+_run, _read = analysis.run, analysis.read_flight
 _kept: dict[tuple[str | bytes, ...] | None, Any] = {}
 
 
@@ -259,7 +257,7 @@ def analysed_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(analysis, "read_flight", _read_once)
         patch.setattr(tracks, "read_log", _log_once)
-        for place in (analysis, commands):
+        for place in (analysis, api):
             patch.setattr(place, "run", _run_once)
         yield
 

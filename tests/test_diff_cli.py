@@ -58,8 +58,7 @@ def test_two_settings_of_one_flight_are_exact(settings, changed):
     # Python gives the same
     found = px4fuse.diff(*settings)
     assert [c.path for c in found.numbers] == [n["path"] for n in changed["numbers"]]
-    assert repr(found).startswith(changed["summary"][0])
-    assert len(found.to_frame()) == len(numbers)
+    assert found.summary[0] == changed["summary"][0]
 
 
 def test_json_and_pdf_of_one_run_are_the_same_and_worse_is_exit_code_1(settings, changed):

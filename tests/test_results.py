@@ -10,9 +10,11 @@ from flights import unexplained
 from results_tools import EXAMPLE, LOOP, changed, decoded
 
 import px4fuse
+from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import UnjudgedFilter
 from px4fuse.errors import ResultsError
+from px4fuse.flight import Flight
 from px4fuse.report.pdf import render
 from px4fuse.request import ComparisonRequest
 from px4fuse.results import build
@@ -20,9 +22,9 @@ from px4fuse.results.contract import KINDS, schema, to_json
 from px4fuse.results.reading import read_results
 
 
-def document(flight: px4fuse.Flight, explained: bool = True, **options: object):
+def document(flight: Flight, explained: bool = True, **options: object):
     comparison = compare(flight, **options)
-    analysis = px4fuse.explain(comparison) if explained else unexplained(comparison)
+    analysis = explain(comparison) if explained else unexplained(comparison)
     return analysis, build.results(ComparisonRequest(log=flight.log.name), analysis)
 
 

@@ -10,6 +10,7 @@ from flights import line
 from scipy.interpolate import CubicSpline
 from scipy.stats import binom, norm
 
+from px4fuse.cli.tune import noise_text
 from px4fuse.comparison.comparison import compare
 from px4fuse.filter.likelihood import PROFILE_DROP, innovations, preintegrate
 from px4fuse.filter.settings import Settings
@@ -237,3 +238,17 @@ def test_a_source_that_wanders_has_a_walk_of_its_own() -> None:
 )
 def test_a_noise_at_an_end_of_the_search_is_a_bound(noise: Noise, said: str) -> None:
     assert noise_words(noise, "m") == said
+
+
+@pytest.mark.parametrize(
+    ("noise", "expected"),
+    [
+        (Noise(None, None, None), "not determinable"),
+        (Noise(None, None, 0.25), "at most 0.25"),
+        (Noise(None, 8.0, None), "at least 8"),
+        (Noise(0.1, None, 0.2), "0.1 (0-0.2)"),
+        (Noise(0.1, 0.05, None), "0.1 (0.05-?)"),
+    ],
+)
+def test_tune_noise_text_has_interval_or_bound(noise: Noise, expected: str) -> None:
+    assert noise_text(noise) == expected

@@ -13,7 +13,7 @@ from px4fuse.record import Unavailable
 
 if TYPE_CHECKING:
     from px4fuse.comparison.model import Comparison
-    from px4fuse.filter.tuning import AxisTuning
+    from px4fuse.filter.tuning import AxisTuning, Noise
     from px4fuse.report.page import Page
 
 HEAD = (
@@ -51,8 +51,18 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
         raise MissingDataError(f"{compared.flight.log.name}: no noise could be determined.")
 
 
+def noise_text(noise: Noise) -> str:
+    """Format a noise and its 95 % interval, without the unit."""
+    if noise.value is None:
+        ends = (("at most", noise.high), ("at least", noise.low))
+        known = (f"{word} {end:.2g}" for word, end in ends if end is not None)
+        return next(known, "not determinable")
+    low = "0" if noise.low is None else f"{noise.low:.2g}"
+    high = "?" if noise.high is None else f"{noise.high:.2g}"
+    return f"{noise.value:.3g} ({low}-{high})"
+
+
 def _page(compared: Comparison, tuned: dict[str, AxisTuning | Unavailable]) -> Page:
-    from px4fuse.notebook.tables import noise_words
     from px4fuse.report.page import Page
     from px4fuse.report.style import MUTED
     from px4fuse.report.words import settings_words, tuning_advice
@@ -68,7 +78,7 @@ def _page(compared: Comparison, tuned: dict[str, AxisTuning | Unavailable]) -> P
         ]
         white = " ".join(lags) if len(lags) == len(judged) else ""
         gain = "" if isinstance(held, Unavailable) else f"{held.gain_nats:+.3f}"
-        noises = [noise_words(noise) for noise in (found.filter_sigma_a, found.sigma_z)]
+        noises = [noise_text(noise) for noise in (found.filter_sigma_a, found.sigma_z)]
         rows.append([name, *noises, f"{found.gain_nats:.3f}", gain, white])
     page.labelled("Chosen", settings_words(compared.settings))
     if rows:

@@ -6,7 +6,7 @@ from typing import Literal
 
 import pandas as pd
 
-from px4fuse.display import Shown
+from px4fuse.display import brief
 from px4fuse.errors import MissingDataError, did_you_mean
 from px4fuse.filter.consistency import Consistency, HorizontalNis
 from px4fuse.filter.kalman import Replay
@@ -122,7 +122,7 @@ class AxisResult(Record, frozen=True, kw_only=True):
     rejected_share: Share | None = None
 
 
-class AxisComparison(Shown, AxisResult, frozen=True, kw_only=True, eq=False):
+class AxisComparison(AxisResult, frozen=True, kw_only=True, eq=False):
     """:class:`AxisResult`, with the tracks.
 
     Attributes
@@ -148,9 +148,11 @@ class AxisComparison(Shown, AxisResult, frozen=True, kw_only=True, eq=False):
     ekf2_innovations: pd.DataFrame | Unavailable
     truth: pd.DataFrame | Unavailable
 
+    __repr__ = brief
 
-@dataclass(frozen=True, repr=False)
-class Comparison(Shown):
+
+@dataclass(frozen=True)
+class Comparison:
     """What is compared and, once the filters ran, what they did.
 
     Attributes
@@ -181,6 +183,8 @@ class Comparison(Shown):
     missing: tuple[Unavailable, ...]
     axes: Mapping[str, AxisComparison] = field(default_factory=dict)
     horizontal: Mapping[FilterName, HorizontalNis] = field(default_factory=dict)
+
+    __repr__ = brief
 
     def __getitem__(self, axis: str) -> AxisComparison:
         """Everything about one axis, by its name.

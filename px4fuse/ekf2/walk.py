@@ -20,7 +20,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array
-from px4fuse.display import Shown
+from px4fuse.display import brief
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, aids_of, delayed_variants, obedient
 from px4fuse.ekf2.recursion import Variant
@@ -155,7 +155,7 @@ class WhySteps(Record, frozen=True, kw_only=True):
         return self.position_left_mean_square_m2 / self.position_mean_square_m2
 
 
-class Why(Shown, WhySteps, frozen=True, kw_only=True, eq=False):
+class Why(WhySteps, frozen=True, kw_only=True, eq=False):
     """:class:`WhySteps`, with the tracks.
 
     Attributes
@@ -171,6 +171,8 @@ class Why(Shown, WhySteps, frozen=True, kw_only=True, eq=False):
     apart_m: Array
     left_m: Array
     cause: str = ""
+
+    __repr__ = brief
 
 
 def walk(

@@ -12,7 +12,7 @@ import pandas as pd
 from msgspec.structs import replace
 
 from px4fuse.arrays import Array
-from px4fuse.display import Shown
+from px4fuse.display import brief
 from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.ekf2.model import Model, aids_of, disturbed, replay_settings
 from px4fuse.ekf2.replay import (
@@ -175,8 +175,8 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
         return float(np.sqrt(squares))
 
 
-@dataclass(frozen=True, repr=False)
-class WhatIf(Shown):
+@dataclass(frozen=True)
+class WhatIf:
     """Side by side.
 
     Attributes
@@ -199,6 +199,8 @@ class WhatIf(Shown):
     whatif: tuple[Summary, ...]
     judged: Spans
     notes: tuple[str, ...]
+
+    __repr__ = brief
 
 
 def what_if(

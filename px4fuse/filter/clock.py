@@ -20,7 +20,7 @@ from scipy.interpolate import CubicSpline
 from scipy.special import chdtrc
 
 from px4fuse.arrays import Array
-from px4fuse.display import Shown
+from px4fuse.display import brief
 from px4fuse.filter.fitting import Noises, fitted, most_likely, of_ratios
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
 from px4fuse.filter.marginal import Fitted, paired_products
@@ -116,7 +116,7 @@ class Clock(Record, frozen=True, kw_only=True):
         return SURE_SIGMAS * self.sigma_s
 
 
-class ClockOffset(Shown, Clock, frozen=True, kw_only=True, eq=False):
+class ClockOffset(Clock, frozen=True, kw_only=True, eq=False):
     """:class:`Clock`, with the likelihood that it was found from.
 
     Attributes
@@ -132,6 +132,8 @@ class ClockOffset(Shown, Clock, frozen=True, kw_only=True, eq=False):
     curve_drop: Array
     sigma_a_m_s2: float
     sigma_z_m: float
+
+    __repr__ = brief
 
 
 def estimate_clock_offset(

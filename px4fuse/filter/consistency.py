@@ -10,7 +10,6 @@ import numpy as np
 from scipy.special import chdtrc, gammaincinv, stdtr
 
 from px4fuse.arrays import Array
-from px4fuse.display import Shown
 from px4fuse.record import (
     Correlation,
     Count,
@@ -61,7 +60,7 @@ class NisVerdict(Record, frozen=True, kw_only=True):
         return float(max(self.nis_mean, 1.0 / self.nis_mean) ** 0.5)
 
 
-class Consistency(Shown, NisVerdict, frozen=True, kw_only=True):
+class Consistency(NisVerdict, frozen=True, kw_only=True):
     """Whether a filter's innovations are what its own variances say.
 
     Attributes

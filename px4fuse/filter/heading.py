@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
 from px4fuse.arrays import Array, cumulative_integral
-from px4fuse.display import Shown
+from px4fuse.display import brief
 from px4fuse.filter.model import INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, noise_of_many_steps
 from px4fuse.filter.motion import MAX_IMU_INTERVAL_S
 from px4fuse.filter.settings import Settings
@@ -66,7 +66,7 @@ class HeadingPart(Record, frozen=True):
     sigma_deg: NotNegative
 
 
-class HeadingError(Shown, Record, frozen=True):
+class HeadingError(Record, frozen=True):
     """By how much the source's frame is turned against the logged attitude, over the flight.
 
     Attributes
@@ -92,6 +92,8 @@ class HeadingError(Shown, Record, frozen=True):
     parts: tuple[HeadingPart, ...]
     drift_p: Share
     by: Literal["orientation", "positions"]
+
+    __repr__ = brief
 
     @property
     def ends(self) -> tuple[HeadingPart, HeadingPart]:

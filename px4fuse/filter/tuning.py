@@ -17,7 +17,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from px4fuse.arrays import Array, BoolArray
-from px4fuse.display import Shown, brief
+from px4fuse.display import brief
 from px4fuse.filter.consistency import Consistency, assess
 from px4fuse.filter.fitting import (
     SIGMA_A_SEARCH_M_S2,
@@ -170,7 +170,7 @@ class Tuned(Record, frozen=True, kw_only=True):
         return Noise.of(self.sigma_z_m, self.sigma_z_m_interval)
 
 
-class AxisTuning(Shown, Tuned, frozen=True, kw_only=True, eq=False, dict=True):
+class AxisTuning(Tuned, frozen=True, kw_only=True, eq=False, dict=True):
     """:class:`Tuned`, with what it was found from.
 
     Attributes
@@ -188,6 +188,8 @@ class AxisTuning(Shown, Tuned, frozen=True, kw_only=True, eq=False, dict=True):
     outlier_time_s: Array
     noises: Noises
     make_map: Callable[[], LikelihoodMap]
+
+    __repr__ = brief
 
     @cached_property
     def map(self) -> LikelihoodMap:

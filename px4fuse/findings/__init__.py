@@ -4,35 +4,58 @@ A file declares thresholds with unit and source and, in ``detect``, the conditio
 its findings; their words stand in ``words.toml``. A detector never prints and never guesses: what
 it cannot see it does not mention.
 
-To add a finding: its file with a ``detect``, its words in ``words.toml``, and the flights on which
-its rate is measured in ``tests/studies/rates.csv``.
+To add a finding: its file with a ``detect``, the file in :data:`DETECTORS`, its words in
+``words.toml``, and the flights on which its rate is measured in ``tests/studies/rates.csv``.
 """
 
 from collections.abc import Callable, Mapping
-from functools import cache
-from importlib import import_module
-from pkgutil import iter_modules
 
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.aids import AidResult
-from px4fuse.findings.aids import find_in as find_in_aids
+from px4fuse.findings import (
+    aids,
+    ekf2_not_fusing,
+    ekf2_rejecting,
+    ekf2_resets,
+    hidden_errors,
+    imu,
+    loops,
+    missing,
+    noises,
+    recording,
+    source_clock,
+    source_frame,
+    source_intervals,
+    source_noise,
+    source_positions,
+    source_stamps,
+)
 from px4fuse.findings.causes import by_cause
-from px4fuse.findings.loops import find_in
-from px4fuse.findings.model import NAMES, SEVERITIES, Finding, Found, Severity, by_root
+from px4fuse.findings.model import NAMES, Finding, Found, Severity, by_root
 from px4fuse.loop.model import Loop
 
-__all__ = [
-    "NAMES", "SEVERITIES", "Finding", "Severity", "by_root", "find", "find_aids", "find_loop",
-    "named",
-]  # fmt: skip
+__all__ = ["NAMES", "Finding", "Severity", "by_root", "find", "find_aids", "find_loop", "named"]
 
-
-@cache
-def detectors() -> tuple[Callable[[Analysis], Found], ...]:
-    """``detect`` of every file of this package that has one."""
-    files = [import_module(f"{__name__}.{file.name}") for file in iter_modules(__path__)]
-    return tuple(file.detect for file in files if hasattr(file, "detect"))
+# Detectors of a comparison; by_cause orders their findings
+DETECTORS: tuple[Callable[[Analysis], Found], ...] = (
+    aids.detect,
+    ekf2_not_fusing.detect,
+    ekf2_rejecting.detect,
+    ekf2_resets.detect,
+    hidden_errors.detect,
+    imu.detect,
+    loops.detect,
+    missing.detect,
+    noises.detect,
+    recording.detect,
+    source_clock.detect,
+    source_frame.detect,
+    source_intervals.detect,
+    source_noise.detect,
+    source_positions.detect,
+    source_stamps.detect,
+)
 
 
 def find(subject: Analysis | Comparison) -> tuple[Finding, ...]:
@@ -46,17 +69,17 @@ def find(subject: Analysis | Comparison) -> tuple[Finding, ...]:
         A comparison is explained first, which takes some seconds.
     """
     analysis = subject if isinstance(subject, Analysis) else explain(subject)
-    return by_cause(found for detect in detectors() for found in detect(analysis))
+    return by_cause(found for detect in DETECTORS for found in detect(analysis))
 
 
 def find_loop(loop: Loop) -> tuple[Finding, ...]:
     """All findings about a loop, most severe first."""
-    return by_cause(find_in(loop))
+    return by_cause(loops.find_in(loop))
 
 
-def find_aids(aids: Mapping[str, AidResult]) -> tuple[Finding, ...]:
+def find_aids(results: Mapping[str, AidResult]) -> tuple[Finding, ...]:
     """All findings about EKF2's aids alone, most severe first."""
-    return by_cause(find_in_aids(aids))
+    return by_cause(aids.find_in(results))
 
 
 def named(finding: str) -> str:

@@ -119,7 +119,7 @@ def batch(
     progress : callable
         Told what is being done, how many logs are done, and of how many.
     **how
-        The above by name, and fields of :class:`px4fuse.ComparisonRequest`, as ``sigma_z_m``.
+        The above by name, and arguments of :func:`px4fuse.compare`, as ``sigma_z_m``.
 
     Returns
     -------

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from px4fuse.arrays import Array, IntArray
-from px4fuse.display import Shown, brief
+from px4fuse.display import brief
 from px4fuse.errors import MissingDataError
 from px4fuse.record import Count, Maybe, NotNegative, Record, Share, Unavailable
 from px4fuse.trajectory.evaluation import Evaluation, Score
@@ -187,7 +187,7 @@ class LoopPart(Record, frozen=True, kw_only=True):
     notes: tuple[str, ...]
 
 
-class Loop(Shown, LoopPart, frozen=True, kw_only=True, eq=False):
+class Loop(LoopPart, frozen=True, kw_only=True, eq=False):
     """The result of ``px4fuse loop``: what is written, and the paths.
 
     Attributes
@@ -211,6 +211,8 @@ class Loop(Shown, LoopPart, frozen=True, kw_only=True, eq=False):
     graph: PoseGraph | Unavailable
     references: tuple[Trajectory, ...]
     given_frame: Frame
+
+    __repr__ = brief
 
     @property
     def odometry(self) -> CorrectedPath:

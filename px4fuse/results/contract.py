@@ -14,7 +14,6 @@ from msgspec import Meta
 
 from px4fuse.comparison.interventions import Intervention
 from px4fuse.comparison.model import AxisResult, FilterName
-from px4fuse.display import Shown
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.replay import Agreement, Replayed
 from px4fuse.ekf2.walk import WhySteps
@@ -322,7 +321,7 @@ class WhatIfResults(Record, frozen=True, kw_only=True):
     provenance: Provenance
 
 
-class ChangeResults(Shown, Record, frozen=True, kw_only=True):
+class ChangeResults(Record, frozen=True, kw_only=True):
     """Results of ``px4fuse diff``: what changed from A to B.
 
     Attributes

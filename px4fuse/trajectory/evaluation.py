@@ -14,7 +14,7 @@ from msgspec import structs
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array
-from px4fuse.display import Shown
+from px4fuse.display import brief
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight import Unavailable
 from px4fuse.record import Maybe, Record
@@ -73,7 +73,7 @@ class Score(Record, frozen=True, kw_only=True):
     warnings: tuple[str, ...]
 
 
-class Evaluation(Shown, Score, frozen=True, kw_only=True, eq=False):
+class Evaluation(Score, frozen=True, kw_only=True, eq=False):
     """An estimate's scores against a reference, with the error of each pose.
 
     Attributes
@@ -106,6 +106,8 @@ class Evaluation(Shown, Score, frozen=True, kw_only=True, eq=False):
     position_error_m: Array
     rotation_error_deg: Array | None
     body_rotation: Rotation | None
+
+    __repr__ = brief
 
 
 def evaluate(

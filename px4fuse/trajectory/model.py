@@ -11,7 +11,7 @@ from msgspec import Meta
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.display import Shown
+from px4fuse.display import brief
 from px4fuse.record import Count, Record
 
 # What made it; "slam" is a system whose world is its first key frame (ORB-SLAM3 and the like)
@@ -72,8 +72,8 @@ class Track(Record, frozen=True):
     notes: tuple[str, ...]
 
 
-@dataclass(frozen=True, repr=False)
-class Trajectory(Shown):
+@dataclass(frozen=True)
+class Trajectory:
     """Poses over time.
 
     Attributes
@@ -113,6 +113,8 @@ class Trajectory(Shown):
     sha256: str = ""
     size_bytes: int = 0
     notes: tuple[str, ...] = ()
+
+    __repr__ = brief
 
     @property
     def of_log(self) -> bool:

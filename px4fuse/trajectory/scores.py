@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, stdtrit
 
 from px4fuse.arrays import Array, IntArray
-from px4fuse.display import Shown
+from px4fuse.display import brief
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Unavailable
 from px4fuse.record import Count, Maybe, NotNegative, Record, lacking
@@ -103,7 +103,7 @@ class RelativeError(Record, frozen=True):
         return str(Delta(self.delta, self.unit))
 
 
-class PairwiseError(Shown, RelativeError, frozen=True, kw_only=True, eq=False):
+class PairwiseError(RelativeError, frozen=True, kw_only=True, eq=False):
     """RPE over one delta, with its pairs.
 
     Attributes
@@ -119,6 +119,8 @@ class PairwiseError(Shown, RelativeError, frozen=True, kw_only=True, eq=False):
     end: IntArray
     translation_error_m: Array
     rotation_error_deg: Array
+
+    __repr__ = brief
 
 
 def statistics(errors: Array) -> Statistics:

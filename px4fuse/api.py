@@ -1,13 +1,17 @@
-"""``compare``, ``close_loop``, ``evaluate``, ``what_if``, ``report`` and ``explore`` in Python."""
+"""The commands as functions: paths and options as arguments, the analysis as the result."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+import pandas as pd
+from msgspec import structs
+
 from px4fuse import request
 from px4fuse.analysis import Analysis, run, run_what_if
+from px4fuse.comparison.model import FilterSummary, UnjudgedFilter
 from px4fuse.ekf2 import whatif
-from px4fuse.ekf2.model import Model, open_model
+from px4fuse.ekf2.model import open_model
 from px4fuse.ekf2.whatif import WhatIf
 from px4fuse.errors import MissingDataError, OutputError, SettingsError
 from px4fuse.flight import Flight, Unavailable
@@ -22,6 +26,13 @@ from px4fuse.writing import write_all
 
 Pathlike = str | Path
 Progress = Callable[[str], None]
+# Columns of table() and their types: fields of FilterSummary and AgainstTruth, and nis_band in two
+COLUMNS = {
+    "count": "Int64", "nis_mean": "float64", "nis_low": "float64", "nis_high": "float64",
+    "verdict": "object", "sigma_factor": "float64", "innovation_std_m": "float64",
+    "sqrt_s_median_m": "float64", "sigma_p_median_m": "float64", "position_rmse_m": "float64",
+    "velocity_rmse_m_s": "float64", "nees_position_mean": "float64",
+}  # fmt: skip
 
 
 def compare(
@@ -44,46 +55,48 @@ def compare(
     system: int | None = None,
     progress: Progress = lambda _: None,
 ) -> Analysis:
-    """Compare a flight's EKF2 with the two-state filter, and explain it, as the command line does.
+    """Compare KF with EKF2 on one flight, as ``px4fuse compare`` does.
 
     Parameters
     ----------
     log : str, Path or Flight
-        A ULog or a MAVLink recording, or a flight that was read.
+        ULog or MAVLink recording, or a flight from :func:`px4fuse.read_log`.
     sigma_a_m_s2, sigma_z_m, dt_s, input
-        See :class:`Settings`; by default SIGMA_Z is 0.1 m, of GNSS what EKF2 takes.
+        See :class:`px4fuse.Settings`. Default of SIGMA_Z: 0.1 m; with GNSS the measurement noise
+        of EKF2.
     clock_offset_s : float or "auto", optional
-        Added to the source's stamps; "auto" finds it.
+        Time offset to add to the timestamps of the position source; "auto" estimates it.
     axes : str or sequence of str
-        From "north", "east", "down", "aisle"; by default all that the source supports.
+        "north", "east", "down" or "aisle"; default: all axes of the source.
     heading_deg : float, optional
-        Of the aisle.
+        Heading of the aisle axis.
     start_s, end_s : float, optional
-        Segment, seconds from the first data.
+        Segment to analyse, seconds from the first data.
     position_source : str, optional
-        Name of a track of the flight.
+        Name of a position track of the flight.
     source_kind : {"uwb", "vio", "mocap", "gnss"}, optional
-        What the source is, where its messages do not tell.
+        Kind of the position source if its messages do not state it.
     height : {"gnss", "barometer"}, optional
-        What "down" is from where the source is GNSS; by default the one that EKF2 fused.
-    position : str, Path or PositionFile, optional
-        The positioning system's own recording.
+        Height source of the axis "down" with GNSS; default: the one that EKF2 fused.
+    position : str, Path or px4fuse.request.PositionFile, optional
+        Recording of the positioning system.
     mavlink : str or Path, optional
         MAVLink recording of the same flight.
     system : int, optional
         MAVLink system id of the vehicle.
     progress : callable
-        Told what is being done.
+        Called with the name of each step.
 
     Returns
     -------
     Analysis
-        :func:`px4fuse.find` names the mistakes in it.
+        Input of :func:`px4fuse.table`, :func:`px4fuse.find`, :func:`px4fuse.write_report` and
+        :func:`px4fuse.write_page`.
 
     Raises
     ------
     LogError, MissingDataError, SettingsError
-        A file cannot be read, the flight lacks what was asked for, or a setting is out of range.
+        A file cannot be read, the flight lacks required data, or a setting is out of range.
     """
     given = locals()  # arguments are called as the fields of the request
     known, named = get_args(request.AxisName), (axes,) if isinstance(axes, str) else tuple(axes)
@@ -105,25 +118,50 @@ def compare(
     return run(request.ComparisonRequest(**asked), progress, flight)
 
 
+def table(analysis: Analysis) -> pd.DataFrame:
+    """Tabulate the main numbers of an analysis.
+
+    Returns
+    -------
+    DataFrame
+        One row per axis and filter ("kf", "ekf2"), which are the index. The columns have the names
+        of the JSON results; ``nis_low`` and ``nis_high`` are the 95 % band of the mean NIS. RMSE
+        and NEES are against ground truth. A number that is not available is NaN.
+    """
+    rows = {
+        (axis_name, filter_name): _row(summary)
+        for axis_name, axis in analysis.axes.items()
+        for filter_name, summary in axis.filters.items()
+    }
+    index = pd.MultiIndex.from_tuples(rows, names=["axis", "filter"])
+    return pd.DataFrame(list(rows.values()), index, list(COLUMNS)).astype(COLUMNS)
+
+
+def _row(summary: FilterSummary | UnjudgedFilter) -> dict[str, Any]:
+    truth = {} if isinstance(summary.truth, Unavailable) else structs.asdict(summary.truth)
+    numbers = {"verdict": "", **truth, "count": None, **structs.asdict(summary)}
+    numbers["nis_low"], numbers["nis_high"] = numbers.get("nis_band", (None, None))
+    return numbers
+
+
 def evaluate(
     estimate: Pathlike | Trajectory, reference: Pathlike | Trajectory, **how: Any
 ) -> Evaluation:
-    """Score an estimate against a reference: ATE and RPE, with intervals.
+    """Compute ATE and RPE of a trajectory against a reference, with 95 % intervals.
 
     Parameters
     ----------
     estimate, reference : str, Path or Trajectory
-        A trajectory file, or a part of a flight log as "LOG:vio", "LOG:ekf2", "LOG:kf" (our
-        filter) or "LOG:truth".
+        Trajectory file, or part of a flight log: "LOG:vio", "LOG:ekf2", "LOG:kf" or "LOG:truth".
     **how
-        As :func:`px4fuse.trajectory.evaluation.evaluate` takes it: ``alignment``,
+        Arguments of :func:`px4fuse.trajectory.evaluation.evaluate`: ``alignment``,
         ``association``, ``max_gap_s``, ``time_offset_s``, ``rpe_deltas``, ``all_pairs``.
 
     Raises
     ------
     TrajectoryError, LogError, MissingDataError, SettingsError
-        A file cannot be read, the two do not overlap in time, the motion does not determine the
-        alignment, or a delta is not above zero.
+        A file cannot be read, the times do not overlap, the motion is too small for the alignment,
+        or a delta is not above zero.
     """
     if not isinstance(estimate, Trajectory):
         estimate = read_source(str(estimate)).trajectory
@@ -151,36 +189,36 @@ def close_loop(
     frame: request.FrameName | None = None,
     progress: Progress = lambda _: None,
 ) -> Loop:
-    """Measure how far a loop fails to close, and correct its path.
+    """Measure the loop closure error of odometry and correct the path.
 
     Parameters
     ----------
     source : str, Path or Trajectory
-        A trajectory file or a flight log, as :func:`evaluate` takes it.
+        Trajectory file or flight log, as in :func:`px4fuse.evaluate`.
     start_s, end_s : float, optional
-        Override take-off and landing.
+        Times of take-off and landing; default: detected.
     landed_at : tuple of float, optional
-        Where it landed, m along its nose at take-off and m to the right of it, and degrees that it
-        was turned clockwise.
+        Place of landing in metres forward and right of the take-off, and degrees of clockwise
+        rotation there.
     came_back : bool
-        False where the landing closes no loop.
-    closures : sequence of GivenClosure
-        Further times at which it was at the same place.
+        False if the landing closes no loop.
+    closures : sequence of px4fuse.request.GivenClosure
+        Further pairs of times at the same place.
     reference : str, Path or Trajectory, optional
-        What the paths are scored against, besides the log's ground truth.
+        Reference of the scores in addition to the ground truth of the log.
     position_drift_m, heading_drift_deg : float
-        What the odometry drifts in 100 m (1 σ).
+        Drift of the odometry per 100 m (1 σ).
     key_frames_m : float, optional
         Distance between key frames.
     frame : str, optional
-        What a trajectory file's axes are: "NED", "FRD", "ENU" or "camera".
+        Frame of a trajectory file: "NED", "FRD", "ENU" or "camera".
     progress : callable
-        Told what is being done.
+        Called with the name of each step.
 
     Raises
     ------
     TrajectoryError, LogError, MissingDataError, SettingsError
-        A file cannot be read or lacks what was asked for, or a number is out of range.
+        A file cannot be read or lacks required data, or a number is out of range.
     """
     asked = {name: value for name, value in locals().items() if name != "progress"}
     asked |= {"source": str(source), "reference": None, "closures": tuple(closures)}
@@ -193,27 +231,27 @@ def close_loop(
     return analyse(flown, request.LoopRequest(**asked), against, progress)
 
 
-def report(analysis: Analysis, path: Pathlike) -> Path:
-    """Write the report that ``px4fuse compare`` writes: a PDF, and its results beside it.
+def write_report(analysis: Analysis, path: Pathlike) -> Path:
+    """Write the PDF report of ``px4fuse compare``, and the JSON results beside it.
 
     Parameters
     ----------
     analysis : Analysis
-        From :func:`px4fuse.compare` or :func:`px4fuse.run`.
+        From :func:`px4fuse.compare`.
     path : str or Path
-        Ends in .pdf.
+        Path that ends in .pdf.
 
     Returns
     -------
     Path
-        The PDF.
+        Path of the PDF.
 
     Raises
     ------
     OutputError, SettingsError
-        It cannot be written, or the analysis was made without a request.
+        A file cannot be written, or the analysis has no request.
     """
-    from px4fuse.report.pdf import render  # noqa: PLC0415 - for who writes a report
+    from px4fuse.report.pdf import render  # noqa: PLC0415 - slow import
     from px4fuse.results.build import results  # noqa: PLC0415
     from px4fuse.results.contract import to_json  # noqa: PLC0415
 
@@ -224,27 +262,27 @@ def report(analysis: Analysis, path: Pathlike) -> Path:
     return target
 
 
-def explore(analysis: Analysis, path: Pathlike) -> Path:
-    """Write the page that ``px4fuse explore`` writes.
+def write_page(analysis: Analysis, path: Pathlike) -> Path:
+    """Write the web page of ``px4fuse explore``.
 
     Parameters
     ----------
     analysis : Analysis
-        From :func:`px4fuse.compare` or :func:`px4fuse.run`.
+        From :func:`px4fuse.compare`.
     path : str or Path
-        Ends in .html.
+        Path that ends in .html.
 
     Returns
     -------
     Path
-        The page.
+        Path of the page.
 
     Raises
     ------
     OutputError, SettingsError
-        It cannot be written, or the analysis was made without a request.
+        The page cannot be written, or the analysis has no request.
     """
-    from px4fuse.explore.page import html_text  # noqa: PLC0415 - Bokeh takes its time
+    from px4fuse.explore.page import html_text  # noqa: PLC0415 - slow import
 
     target = _ending(path, ".html")
     _request(analysis)
@@ -266,34 +304,32 @@ def _request(analysis: Analysis) -> request.ComparisonRequest:
 
 
 def what_if(
-    log: Pathlike | Flight | Model,
+    log: Pathlike | Flight,
     changes: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
     without: Mapping[str, float] | None = None,
 ) -> WhatIf:
-    """What EKF2 would have done with other parameters.
+    """Replay EKF2 with other parameters.
 
     Parameters
     ----------
-    log : str, Path, Flight or Model
-        A model is a flight made ready for several questions, see :func:`px4fuse.open_model`.
+    log : str, Path or Flight
+        ULog or MAVLink recording, or a flight from :func:`px4fuse.read_log`.
     changes : mapping or sequence of mappings, optional
-        Values by PX4 name, in PX4's units; by default the noise and the delay that the data ask
-        for.
+        Parameter values by PX4 name, in PX4's units; one replay per mapping. Default: the
+        maximum-likelihood estimates of noise and delay.
     without : mapping from PX4's name of an aid to float, optional
-        From when on (s) EKF2 does not fuse it, as ``{"gnss_pos": 60.0}``.
+        Time (s) from which EKF2 does not fuse the aid, as ``{"gnss_pos": 60.0}``.
 
     Raises
     ------
     LogError, MissingDataError, SettingsError
-        The log cannot be read, EKF2 cannot be replayed from it or the replay does not agree with
-        the log, or a parameter or an aid is unknown or a value out of range.
+        The log cannot be read, the replay is not possible or does not agree with the log, or a
+        parameter, value or aid is not valid.
     """
-    flight = log.flight if isinstance(log, Model) else log
-    if not isinstance(flight, Flight):
-        flight = read_log(flight)
+    flight = log if isinstance(log, Flight) else read_log(log)
     if changes is None and not without:
         return run_what_if(request.WhatIfRequest(log=flight.log.name), flight=flight).whatif
-    model = log if isinstance(log, Model) else open_model(flight)
+    model = open_model(flight)
     if isinstance(model, Unavailable):
         raise MissingDataError(f"{model.what}: {model.reason}", model.remedy)
     changes = {} if changes is None else changes
