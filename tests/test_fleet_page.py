@@ -27,7 +27,6 @@ HOSTILE = (MARKUP, BREAKOUT, "\0\x1b\u202e", "$title", "javascript:alert(1)", "/
 TEXTS = (
     "name", "log_sha256", "px4fuse", "settings", "reason", "remedy", "vehicle", "firmware",
     "firmware_hash", "airframe", "hardware", "source", "kf_verdict", "story", "results", "report",
-    "change",
 )  # fmt: skip
 
 

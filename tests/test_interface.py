@@ -18,15 +18,11 @@ from cli_tools import done, refused
 from conftest import LOG
 from exchange import replace
 from matplotlib.axes import Axes
-from results_tools import SHIPPED
 
 import px4fuse
 from px4fuse.comparison.model import Comparison, UnjudgedFilter
 from px4fuse.display import Shown
 from px4fuse.filter.consistency import Consistency
-from px4fuse.fleet.changes import changes
-from px4fuse.fleet.inputs import DiffInput
-from px4fuse.results.build import results as build
 from px4fuse.results.reading import read_results
 
 pytestmark = pytest.mark.usefixtures("analysed_once")
@@ -60,13 +56,10 @@ def results(sample_log, analysis) -> dict[str, Shown]:
     comparison = Comparison(**{name: getattr(analysis, name) for name in names})
     ours = analysis["aisle"].filters["kf"]
     consistency = {name: getattr(ours, name) for name in Consistency.__struct_fields__}
-    request = px4fuse.ComparisonRequest(log="aisle_uwb.ulg", sigma_z_m=0.2)
-    before = DiffInput("aisle_uwb.json", "results", read_results(SHIPPED.read_bytes()))
-    after = DiffInput("small.ulg", "log", build(request, analysis), analysis)
     shown = (
         analysis.flight, comparison, analysis, analysis["aisle"], Consistency(**consistency),
         analysis.why["aisle"], analysis.tuning["horizontal"], analysis.clock, loop,
-        loop.odometry.trajectory, evaluation, evaluation.rpe[0], changes(before, after),
+        loop.odometry.trajectory, evaluation, evaluation.rpe[0],
         px4fuse.what_if(analysis.ekf2_model, {"EKF2_EVP_NOISE": 0.3}), analysis.heading,
     )  # fmt: skip
     return {type(one).__name__: one for one in shown}

@@ -30,7 +30,7 @@ BY_AXIS = [name for name, place in PLACES.items() if "{" in place]
 OF_LOG = [
     name for name, place in PLACES.items()
     if name not in (*BY_AXIS, "axis", "status", "reason", "remedy", "story", "findings", "results",
-                    "report", "change")
+                    "report")
 ]  # fmt: skip
 FILTERS = (
     ("Status", "status", "Every status"),
@@ -45,8 +45,8 @@ MAIN = (("aisle",), ("north", "east"), ("down",))
 #: One log: every column that its rows have something in, from the main axes first, and
 #: ``factors`` ("kf" and "ekf2": how many times √S is overstated, by the mean NIS of all updates
 #: of the main axes), ``status`` (the best of its axes), ``lacking`` (why something could not be
-#: judged, and what to set), ``changes`` (what is worse than before), ``axes`` (their rows),
-#: ``findings`` (ids) and ``tags`` (what filters look for, with the words for it)
+#: judged, and what to set), ``axes`` (their rows), ``findings`` (ids) and ``tags`` (what filters
+#: look for, with the words for it)
 Log = Mapping[str, Any]
 
 
@@ -83,8 +83,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
             frame.words(log.get("date", "")[:10]),
             frame.words(names.get(vehicle, str(vehicle))),
             frame.words(log.get("firmware", "")),
-            Cell(log["status"], log["status"], "worse than before" * bool(log["changes"]),
-                 LOOKS[log["status"]]),
+            Cell(log["status"], log["status"], look=LOOKS[log["status"]]),
             *(_factor(log["factors"].get(whose), factor) for whose in ("kf", "ekf2")),
             _interval(log, SIGMA_Z, sigma_z),
             _interval(log, CLOCK, clock),
@@ -143,7 +142,6 @@ def _details(log: Log) -> tuple[Part, ...]:
     return (
         frame.listed("Not judged", [reason for reason, _ in log["lacking"] if reason], warn=True),
         frame.listed("What to set", list(dict.fromkeys(r for _, r in log["lacking"] if r))),
-        frame.listed("Worse than in the baseline", log["changes"], warn=True),
         frame.listed("What happened", list(filter(None, log.get("story", "").splitlines()))),
         frame.listed("Findings", [f"{named(one)} ({one})" for one in log["findings"]]),
         frame.tabled("Axes", heads if axes else (), axes, range(1, len(heads))),
@@ -206,7 +204,6 @@ def _log(rows: Sequence[Mapping[str, Any]]) -> Log:
         },
         "status": DONE if any(row["status"] == DONE for row in rows) else rows[0]["status"],
         "lacking": tuple(dict.fromkeys(one for one in lacking if any(one))),
-        "changes": tuple(dict.fromkeys(row["change"] for row in rows if "change" in row)),
         "axes": axes,
         "findings": [part for part in log.get("findings", "").split(BETWEEN_FINDINGS) if part],
     }  # fmt: skip
@@ -221,8 +218,6 @@ def _overstated(axes: Sequence[Mapping[str, Any]], name: str) -> float | None:
 
 def _tags(log: Log) -> dict[str, str]:
     tags = {f"status:{log['status']}": log["status"]}
-    if log["changes"]:
-        tags["status:worse"] = "worse than in the baseline"
     for name in ("vehicle", "firmware"):
         tags[f"{name}:{log.get(name, '')}"] = log.get(name, f"no {name} named")
     tags |= {f"finding:{finding}": named(finding) for finding in log["findings"]}
@@ -288,7 +283,6 @@ def _summary(logs: Sequence[Log]) -> list[tuple[str, object]]:
         ("Vehicles", len({log["vehicle"] for log in logs if "vehicle" in log})),
         ("From", dates[0] if dates else ""),
         ("To", dates[-1] if dates else ""),
-        ("Worse than the baseline", sum(bool(log["changes"]) for log in logs) or ""),
     )
     return [entry for entry in entries if entry[1] != ""]
 

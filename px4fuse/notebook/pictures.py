@@ -25,7 +25,6 @@ from px4fuse.report.panels import ERROR, INNOVATIONS, POSITION, SIGMA_P, error_r
 from px4fuse.report.style import EKF2 as EKF2_COLOUR
 from px4fuse.report.style import EKF2_LINE, OURS_DOTS
 from px4fuse.report.style import OURS as OURS_COLOUR
-from px4fuse.results.contract import ChangeResults
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.model import Trajectory
 from px4fuse.trajectory.scores import PairwiseError
@@ -34,7 +33,6 @@ from px4fuse.trajectory.scores import PairwiseError
 REGION_DROP, SHOWN_DROP = 3.0, 12.0
 # Characters in a line of what stands beside an axis
 LABEL_WIDTH = 26
-MAX_DRAWN = 20
 
 
 def _map(ax: Axes, right: str, up: str) -> Axes:
@@ -149,17 +147,6 @@ def what_if(result: WhatIf, ax: Any) -> Any:
     return ax
 
 
-def changes(result: ChangeResults, ax: Axes) -> Axes:
-    """The first ratios with their intervals."""
-    table = frame(result)
-    table = table[(table["scale"] == "ratio") & table["change"].notna()].head(MAX_DRAWN).iloc[::-1]
-    ends = table[["change_low", "change_high"]].sub(table["change"], axis=0).abs().fillna(0.0)
-    ax.errorbar(table["change"], table["label"], xerr=ends.to_numpy().T, fmt="o", color="black")
-    ax.axvline(1.0, color="black", lw=0.8)
-    ax.set(xscale="log", xlabel="B / A, with 95 % intervals")
-    return ax
-
-
 # Of each result how it is drawn, and in which figure where no axes are given
 ONE: dict[str, Any] = {}
 OVER_TIME: dict[str, Any] = {"nrows": 3, "sharex": True, "figsize": (8, 7)}
@@ -175,7 +162,6 @@ PICTURES: dict[type, tuple[Callable[..., Any], dict[str, Any]]] = {
     Trajectory: (trajectory, ONE),
     Evaluation: (evaluation, {"nrows": 2, "figsize": (7, 8)}),
     PairwiseError: (relative_error, ONE),
-    ChangeResults: (changes, ONE),
     WhatIf: (what_if, {"ncols": 2, "sharey": True, "figsize": (10, 3.5)}),
 }
 

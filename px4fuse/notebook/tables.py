@@ -1,7 +1,7 @@
 """Results in words and as tables; importing this module teaches them both."""
 
 from collections.abc import Iterator
-from textwrap import shorten, wrap
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -22,11 +22,9 @@ from px4fuse.findings.story import story
 from px4fuse.flight import Columns, Ekf2, Flight, Truth, Unavailable, sample_rate
 from px4fuse.loop.model import Loop
 from px4fuse.record import Record, written
-from px4fuse.report.changes import change_line
 from px4fuse.report.evaluation import interval_words, summary
 from px4fuse.report.loop import closure_words
 from px4fuse.report.words import settings_words, verdict_words
-from px4fuse.results.contract import ChangeResults
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Trajectory
 from px4fuse.trajectory.scores import PairwiseError
@@ -34,7 +32,6 @@ from px4fuse.trajectory.scores import PairwiseError
 EKF2 = "EKF2"
 OURS = "our filter"
 WIDTH = 100
-MAX_LINE, MAX_CHANGES = 160, 4
 # Standard deviations, by the columns of their squares
 SIGMAS = {"position_variance_m2": "sigma_p_m", "velocity_variance_m2_s2": "sigma_v_m_s"}
 
@@ -388,23 +385,3 @@ def _(found: WhatIf) -> str:
 @frame.register
 def _(found: WhatIf) -> pd.DataFrame:
     return pd.DataFrame({"ekf2": name} | row(part) for name, part in variants(found))
-
-
-# -- what changed ----------------------------------------------------------------------------------
-
-
-@words.register
-def _(found: ChangeResults) -> str:
-    judged = [change_line(change) for change in found.numbers if change.judgement]
-    # a few lines: the table has them all
-    lines = [*found.summary, *judged[:MAX_CHANGES]]
-    return "\n".join(shorten(line, MAX_LINE) for line in lines)
-
-
-@frame.register
-def _(found: ChangeResults) -> pd.DataFrame:
-    table = pd.DataFrame(map(structs.asdict, found.numbers))
-    for name in ("a_interval", "b_interval", "change_interval"):
-        ends = table.pop(name).map(lambda span: span or (np.nan, np.nan))
-        table[[f"{name[:-8]}low", f"{name[:-8]}high"]] = ends.tolist()
-    return table
