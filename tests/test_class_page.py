@@ -20,7 +20,7 @@ from PIL import Image
 from pypdf import PdfReader
 
 from px4fuse.answers import Answers, Claim
-from px4fuse.grading.class_page import html_text
+from px4fuse.grading.class_page import html_text, tenths
 from px4fuse.grading.model import Entry, Graded, Item, Override
 from px4fuse.grading.outputs import nameless
 from px4fuse.verification.model import Mismatch, PageDifference, Verdict
@@ -132,7 +132,7 @@ def test_pending_points_stand_apart_from_those_that_count() -> None:
     assert "10.3&nbsp;/&nbsp;16" in text
     cells = [row[0][3] for row in content(text)["rows"]]
     assert cells[2:] == [["pending", "", "12 proposed"],
-                         ["13 / 20", 13.0, "said by you", "", [0.65]]]  # fmt: skip
+                         ["13 / 20", 13.0, "said by you", "", 0.65]]  # fmt: skip
 
 
 def test_what_is_not_finite_too_long_or_too_much() -> None:
@@ -236,6 +236,10 @@ def test_filters_by_text_and_status_with_a_count(page: Browser) -> None:
 
 def test_a_row_unfolds_with_all_its_pages(page: Browser) -> None:
     assert page.ask("document.images.length") == 0
+    assert page.ask("[...document.querySelectorAll('.bar')].every((one) => one.ariaHidden)")
+    assert page.ask("document.querySelector('tr:first-child .bar').closest('td').innerText") == (
+        "18.5 / 20"
+    )
     page.click("tbody tr:first-child .name")
     assert page.ask("document.querySelector('.unfold').ariaExpanded") == "true"
     assert "There." in page.ask("document.querySelector('.more').innerText")
@@ -287,6 +291,12 @@ def test_a_page_that_differs_stands_beside_the_redrawn_one() -> None:
     assert [to for _, to in leads[2]] == ["reports/1.pdf"]
     (only,) = made["rows"][1][3]
     assert [said for said, *_ in only[2]] == ["Page 1, as handed in: not verified"]
+
+
+def test_tenths_count_values_by_lower_edge() -> None:
+    assert tenths([0, 5, 5.5, 9, 99], 10) == [
+        (count, f"{edge}") for edge, count in enumerate((1, 0, 0, 0, 0, 2, 0, 0, 0, 2))
+    ]
 
 
 def test_what_students_wrote_stays_text(page: Browser) -> None:

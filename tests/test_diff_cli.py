@@ -1,17 +1,15 @@
-"""``px4fuse diff`` as it is typed: what it takes, writes, prints and refuses."""
+"""``px4fuse diff`` on the command line: inputs, output, exit codes and errors."""
 
 from __future__ import annotations
 
-import io
 import json
-from collections import Counter
 from pathlib import Path
 
 import jsonschema
 import pytest
 from cli_tools import contents, done, refused
 from conftest import LOG, page_of
-from pypdf import PdfReader, PdfWriter
+from pypdf import PdfWriter
 from results_tools import LOOP
 from ulog_tools import gnss_log
 
@@ -36,69 +34,50 @@ def settings(tmp_path_factory) -> tuple[Path, Path]:
 
 @pytest.fixture(scope="module")
 def changed(settings) -> dict[str, object]:
-    return json.loads(done("diff", *settings, "--json", "-").stdout)
+    return json.loads(done("diff", *settings, "--json", "-", code=1).stdout)
 
 
-def judgements(found: dict[str, object]) -> Counter[str]:
-    return Counter(number.get("judgement", "") for number in found["numbers"])
-
-
-def test_two_settings_of_one_flight_are_exact(settings, changed):
+def test_diff_of_two_settings_lists_setting_and_numbers(settings, changed):
     jsonschema.validate(changed, schema())
     assert changed["schema"]["name"] == "px4fuse-changes"
     assert [changed[side]["kind"] for side in "ab"] == ["report", "report"]
-    numbers = {number["path"]: number for number in changed["numbers"]}
-    nis = numbers["axes.aisle.filters.kf.nis_mean"]
-    assert (nis["status"], nis["judgement"]) == ("differs", "worse")
-    assert "q" not in nis
-    assert numbers["axes.aisle.filters.ekf2.nis_mean"]["status"] == "same"
-    assert changed["paired"]
-    assert {"SIGMA_Z (m)"} == {text["what"] for text in changed["texts"]}
-    assert changed["summary"][0].startswith("Both are of aisle_uwb.ulg:")
+    (setting,) = changed["settings"]
+    assert setting == {"name": "SIGMA_Z (m)", "a": 0.1, "b": 0.03}
+    paths = {number["path"] for number in changed["numbers"]}
+    assert "axes.aisle.filters.kf.nis_mean" in paths
+    assert "axes.aisle.filters.ekf2.nis_mean" not in paths
     # Python gives the same
     found = px4fuse.diff(*settings)
-    assert [c.path for c in found.numbers] == [n["path"] for n in changed["numbers"]]
-    assert found.summary[0] == changed["summary"][0]
+    assert {one.path for one in found.numbers} == paths
+    assert list(found.worse) == changed["worse"]
 
 
-def test_json_and_pdf_of_one_run_are_the_same_and_worse_is_exit_code_1(settings, changed):
+def test_diff_exit_code_is_1_if_verdict_is_worse(settings, changed):
     first, second = (path.with_suffix(".json") for path in settings)
-    fail = ("--json", "-", "--fail-on", "worse")
-    beside = json.loads(done("diff", first, second, *fail, code=1).stdout)
+    beside = json.loads(done("diff", first, second, "--json", "-", code=1).stdout)
     assert beside["numbers"] == changed["numbers"]
-    nothing = json.loads(done("diff", settings[0], first, *fail).stdout)
-    assert set(judgements(nothing)) == {""}
-    back = json.loads(done("diff", *settings[::-1], "--json", "-").stdout)
-    assert judgements(back)["better"] > 0
+    assert any(text.startswith("Mean NIS of KF, aisle: ") for text in beside["worse"])
+    said = done("diff", first, second, code=1).stdout
+    assert "Worse    Mean NIS of KF, aisle: " in said
+    nothing = json.loads(done("diff", settings[0], first, "--json", "-").stdout)
+    assert [nothing[part] for part in ("settings", "numbers", "findings", "worse")] == [[]] * 4
+    assert "No verdict is worse in B." in done("diff", *settings[::-1]).stdout
 
 
-def test_a_log_is_analysed_with_the_settings_of_the_other_ones_results(settings, tmp_path):
-    """The same bytes each time."""
-    made = []
-    for name in ("one.pdf", "two.pdf"):
-        said = done("diff", settings[1], LOG, "-o", tmp_path / name).stdout
-        made.append((tmp_path / name).read_bytes())
-    assert made[0] == made[1]
-    assert "0 of" in said
-    assert "Flights are drawn from their logs. Give aisle_uwb.ulg for A." in said
-    attached = json.loads(PdfReader(io.BytesIO(made[0])).attachments["results.json"][0])
-    assert set(judgements(attached)) == {""}
-    assert attached["texts"] == []
-
-
-def test_the_same_pair_again_is_written_over(settings, monkeypatch, tmp_path):
+def test_diff_of_log_and_report_uses_settings_of_report(settings, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for _ in range(2):
-        assert "Wrote    reports/usual_to_small.pdf" in done("diff", *settings).stdout
-    assert contents(Path("reports")).keys() == {"usual_to_small.json", "usual_to_small.pdf"}
+    found = json.loads(done("diff", settings[1], LOG, "--json", "-").stdout)
+    assert found["b"]["kind"] == "log"
+    assert [found[part] for part in ("settings", "numbers", "findings", "worse")] == [[]] * 4
+    assert contents(tmp_path) == {}
 
 
-def test_a_report_of_aids_alone_is_taken_as_its_results_are(tmp_path):
+def test_diff_takes_report_of_aids_alone(tmp_path):
     log = gnss_log("v1.16").write(tmp_path / "a.ulg")
     done("compare", log, "-o", tmp_path / "a.pdf")
     found = json.loads(done("diff", tmp_path / "a.pdf", tmp_path / "a.json", "--json", "-").stdout)
     assert [found[side]["kind"] for side in "ab"] == ["report", "results"]
-    assert {number["status"] for number in found["numbers"]} == {"same"}
+    assert found["numbers"] == []
 
 
 # -- bad input -------------------------------------------------------------------------------------
@@ -117,6 +96,8 @@ def test_what_cannot_be_compared_is_refused(settings, tmp_path):
     found = json.loads(usual.with_suffix(".json").read_text(encoding="utf-8"))
     old.write_text(json.dumps({**found, "schema": {**found["schema"], "version": "1.0"}}))
     other.write_text("{}")
+    done("diff", usual, code=2)  # exactly two
+    done("diff", usual, usual, usual, code=2)
     for a, b, said in (
         (usual, usual, "the same file"),
         (usual, link, "the same file"),

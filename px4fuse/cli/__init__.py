@@ -18,7 +18,7 @@ from px4fuse.writing import STOPPING
 COMMANDS = {
     "compare": "Compare a flight's EKF2 with a two-state Kalman filter.",
     "batch": "Compare many logs, on this computer or a cluster.",
-    "diff": "Say what changed between two flights or two settings.",
+    "diff": "List differences between two flights or two settings.",
     "answers": "Write the form about a flight, to be filled in.",
     "explore": "Turn the filter's knobs on a flight, in a web page.",
     "practice": "Find what is wrong with simulated flights, in a web page.",

@@ -15,7 +15,7 @@ from px4fuse.cli.compare import SEVERITIES, Severity
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.fleet import TIMEOUT_S
 
-FAILED, WORSE = "failed", "worse"
+FAILED = "failed"
 # How a cluster of each kind is started, for people who have one: beside this file, as NAME.txt
 CLUSTERS = ("slurm", "kubernetes")
 
@@ -35,9 +35,7 @@ def batch(
     workers: int | None,
     memory: float = 4.0,
     scheduler: str | None,
-    baseline: Path | None,
-    junit: Path | None,
-    fail_on: Literal["failed", "worse", Severity] | None,
+    fail_on: Literal["failed", Severity] | None,
     **given: Any,
 ) -> None:
     """Compare many logs, as px4fuse compare does each, into one table.
@@ -55,11 +53,6 @@ def batch(
         raise OutputError(f"-o {output}: is not a folder. Give another place.")
     if scheduler is not None and workers is not None:
         raise SettingsError("--workers is for this computer, and --scheduler for a cluster.")
-    outputs.check_targets([junit])  # before the work, not after it
-    if fail_on == WORSE and baseline is None:
-        raise SettingsError("--fail-on worse requires --baseline: worse than what?")
-    from px4fuse.fleet.junit import junit as as_junit
-    from px4fuse.fleet.regressions import read_baseline
     from px4fuse.fleet.run import run
     from px4fuse.fleet.terminal import summary
 
@@ -71,7 +64,6 @@ def batch(
                 output,
                 reports=reports,
                 timeout_s=timeout,
-                baseline=None if baseline is None else read_baseline(baseline),
                 scheduler=scheduler,
                 workers=workers,
                 memory_gb=memory,
@@ -81,11 +73,9 @@ def batch(
     except KeyboardInterrupt as stopped:
         left = f"what is done is kept in {output}. The same command goes on from there."
         raise outputs.Interrupted(stopped, left) from None
-    contents = {} if junit is None else {junit: as_junit(fleet.table)}
-    outputs.finish(contents, summary(fleet), written=fleet.written)
+    outputs.finish({}, summary(fleet), written=fleet.written)
     severities = SEVERITIES[: SEVERITIES.index(fail_on) + 1] if fail_on in SEVERITIES else ()
     failed = fail_on is not None and bool((fleet.table["status"] == FAILED).any())
-    failed |= fail_on == WORSE and bool((fleet.table["change"] != "").any())
     if failed or fleet.severities & set(severities):
         sys.exit(1)
 

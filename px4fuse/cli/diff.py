@@ -1,45 +1,34 @@
-"""``px4fuse diff``: what changed between two flights, or two settings of one."""
+"""``px4fuse diff``: settings, numbers and findings that differ."""
 
 import sys
 from pathlib import Path
-from typing import Literal
 
 import click
 
 from px4fuse.cli import inputs, outputs
-from px4fuse.writing import STANDARD_OUTPUT
 
 
 @click.command()
 @click.argument("a", type=inputs.Named())
 @click.argument("b", type=inputs.Named())
 @inputs.max_size_option
-@inputs.report_options("The report.  [default: reports/A_to_B.pdf]")
-@inputs.options("diff")
-@inputs.open_option
-def diff(
-    a: Path,
-    b: Path,
-    output: Path | None,
-    json_path: Path | None,
-    fail_on: Literal["worse"] | None,
-) -> None:
-    """Say what changed from A to B, number by number, significant changes first.
+@inputs.json_option
+def diff(a: Path, b: Path, json_path: Path | None) -> None:
+    """List the settings, numbers and findings that differ from A to B.
 
-    A and B are each a flight log, a report that px4fuse compare wrote, or its results (JSON). Two
-    reports of one log show what other settings change. For example, px4fuse diff monday.ulg
-    tuesday.ulg --fail-on worse ends with exit code 1 where a number is worse by more than chance.
-    Writes a PDF report and its results as JSON.
+    A and B are each a flight log, a report (PDF) that px4fuse compare wrote, or its results (JSON).
+
+    The exit code is 1 if a verdict is worse in B: the mean NIS or mean NEES of KF or EKF2 along an
+    axis is consistent in A and not in B, or B has a new finding of severity error. A mean NIS is
+    consistent inside its 95 % band, or if σ is less than 1.25 times too small or too large; a mean
+    NEES if σ is at most 1.5 times too small or too large. Otherwise the exit code is 0; 2 for bad
+    input.
     """
     from px4fuse.fleet.changes import diff as compared
-    from px4fuse.report.changes import summary
+    from px4fuse.fleet.terminal import differences
 
-    outputs.report_paths(output, json_path)  # before the work, not after it
     with outputs.progress(json_path) as step:
         results = compared(a, b, progress=step)
-        if output is None and json_path != STANDARD_OUTPUT:
-            output = outputs.free_report(f"{a.stem}_to_{b.stem}", "", results)
-        contents = outputs.result_files(results, json_path, output, results, step)
-    outputs.finish(contents, summary(results))
-    if fail_on is not None and results.is_worse:
+    outputs.finish(outputs.result_files(results, json_path), differences(results))
+    if results.worse:
         sys.exit(1)

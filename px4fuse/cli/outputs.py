@@ -29,7 +29,7 @@ UNWRAPPED = 10_000
 # Parameters that name files to read; some name a part of a log after a colon
 INPUTS = (
     "log", "logs", "report", "mavlink", "position", "notes", "source", "estimate", "reference",
-    "a", "b", "baseline",
+    "a", "b",
 )  # fmt: skip
 # Under it a run keeps which files it has written, for what is said where it then ends early
 WRITTEN = "px4fuse.written"

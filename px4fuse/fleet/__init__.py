@@ -1,4 +1,4 @@
-"""Many logs: one table with a row per log and axis; and what changed between two."""
+"""Many logs: one table with a row per log and axis; and the differences between two."""
 
 # For one log, by default
 TIMEOUT_S = 600.0

@@ -1,42 +1,57 @@
-"""What changed between two flights, or two settings of one flight: ``px4fuse diff``."""
+"""Settings, numbers and findings that differ between two comparisons: ``px4fuse diff``."""
 
+import math
 import shlex
-from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Literal
 
-import msgspec
-
-from px4fuse.findings import named
-from px4fuse.fleet import measures
-from px4fuse.fleet.inputs import DiffInput, Progress, read_inputs
-from px4fuse.fleet.measures import FALSE_DISCOVERY_RATE, LEAST_RATIO, Contrast, Number, at
-from px4fuse.report.changes import change_line
+from px4fuse.comparison.interventions import is_off
+from px4fuse.comparison.model import FilterSummary
+from px4fuse.fleet.inputs import DiffInput, Progress, Results, read_inputs
+from px4fuse.fleet.measures import (
+    ABSOLUTE_TOLERANCE,
+    RELATIVE_TOLERANCE,
+    Number,
+    numbers,
+)
+from px4fuse.fleet.rows import at
+from px4fuse.plain import factor_words, number_words
 from px4fuse.results import contract
 from px4fuse.results.model import provenance, schema_of
 
-# What stands first of the significant changes; and of these, causes before what they bring
-_ORDER: tuple[contract.Judgement, ...] = ("worse", "better", "changed", "")
-_CAUSES = ("tuning", "clock", "heading")
-# What is compared as text, and where it stands in the results; the segment of one flight alone
-_TEXTS = measures.read_rows("texts.csv")
-
-Results = contract.ComparisonResults | contract.AidsResults
+# Limits of √(mean NEES) of a consistent filter, as a factor; errors of one flight are correlated,
+# so that no 95 % band is known
+NEES_SIGMA_OFF = 1.5
+NAMES = {"kf": "KF", "ekf2": "EKF2"}
+# Settings and facts about the flight, and their path in the results
+SETTINGS = {
+    "SIGMA_A (m/s²)": "settings.sigma_a_m_s2",
+    "SIGMA_Z (m)": "settings.sigma_z_m",
+    "DT (s)": "settings.dt_s",
+    "input": "settings.input",
+    "time offset added (s)": "settings.clock_offset_s",
+    "start (s)": "settings.start_s",
+    "end (s)": "settings.end_s",
+    "position source": "source.name",
+    "firmware": "log.firmware",
+    "firmware hash": "log.firmware_hash",
+    "hardware": "log.hardware",
+    "px4fuse": "provenance.px4fuse",
+}
 
 
 def diff(
     a: str | Path, b: str | Path, *, progress: Progress = lambda _: None
 ) -> contract.ChangeResults:
-    """What changed from A to B, number by number.
+    """List the settings, numbers and findings that differ from A to B.
 
     Parameters
     ----------
     a, b : str or Path
         Each a flight log, a report of ``px4fuse compare`` or its results as JSON. A log is
-        analysed with the settings of the other one's results, where it has some.
+        analysed with the settings of the other one's results, if there are any.
     progress : callable
-        Told what is being done.
+        Receives the name of each step.
 
     Raises
     ------
@@ -47,101 +62,18 @@ def diff(
 
 
 def changes(a: DiffInput, b: DiffInput) -> contract.ChangeResults:
-    """Hold two comparisons against each other."""
-    paired = a.results.log.sha256 == b.results.log.sha256
-    found = contract.ChangeResults(
+    """List the differences of two comparisons."""
+    findings = tuple(_findings(a.results, b.results))
+    return contract.ChangeResults(
         schema=schema_of(contract.CHANGES),
         a=_compared(a),
         b=_compared(b),
-        paired=paired,
-        summary=(),
-        numbers=number_changes(
-            measures.numbers(a.results, a.analysis),
-            measures.numbers(b.results, b.analysis),
-            paired=paired,
-        ),
-        texts=tuple(_texts(a.results, b.results, paired=paired)),
-        findings=tuple(_findings(a.results, b.results)),
-        notes=tuple(_notes(a, b, paired=paired)),
+        settings=tuple(_settings(a.results, b.results)),
+        numbers=tuple(number_changes(numbers(a.results), numbers(b.results))),
+        findings=findings,
+        worse=tuple(_worse(a.results, b.results, findings)),
         provenance=provenance(shlex.join(["px4fuse", "diff", a.given, b.given])),
     )
-    return msgspec.structs.replace(found, summary=tuple(_sentences(found)))
-
-
-def number_changes(
-    first: Mapping[str, Number], second: Mapping[str, Number], *, paired: bool
-) -> tuple[contract.NumberChange, ...]:
-    """How each number of two changed, significant changes first.
-
-    Parameters
-    ----------
-    first, second : mapping
-        Numbers of A and B, by where they stand in the results.
-    paired : bool
-        Both are of one flight, so that nothing is left to chance.
-    """
-    spread_of: Mapping[str, float] = {} if paired else measures.spreads()
-    contrasts = {
-        path: measures.contrast(a, second[path], spread_of.get(a.measure.path, 0.0))
-        for path, a in first.items()
-        if path in second
-    }
-    ps = {path: c.p for path, c in contrasts.items() if c and c.interval and not paired}
-    qs = dict(zip(ps, measures.corrected(list(ps.values())), strict=True))
-    made = [
-        _change(path, first.get(path), second.get(path), contrasts.get(path), qs.get(path), paired)
-        for path in {**first, **second}
-    ]
-    return tuple(sorted(made, key=lambda change: _rank(change, contrasts.get(change.path))))
-
-
-def _change(
-    path: str, a: Number | None, b: Number | None, found: Contrast | None, q: float | None,
-    paired: bool,
-) -> contract.NumberChange:  # fmt: skip
-    number = a or b
-    assert number is not None
-    measure = number.measure
-    status: contract.Status = "not tested"
-    if a is None or b is None:
-        status = "only in A" if b is None else "only in B"
-    elif paired:
-        moved = a.value != b.value if found is None else abs(found.delta) >= measure.least
-        status = "differs" if moved else "same"
-    elif q is not None:
-        status = "significant" if q < FALSE_DISCOVERY_RATE else "within chance"
-    judgement: contract.Judgement = ""
-    if status in ("differs", "significant"):
-        # between two flights the distance from the best must differ by more than chance too
-        least = found.half if found and not paired else 0.0
-        judgement = "changed"
-        if found and abs(found.farther) > least:
-            judgement = "worse" if found.farther > 0.0 else "better"
-    within = None if found is None or q is None else found.interval
-    return contract.NumberChange(
-        path=path,
-        label=measure.label,
-        unit=measure.unit,
-        a=None if a is None else a.value,
-        b=None if b is None else b.value,
-        a_interval=None if a is None else a.interval,
-        b_interval=None if b is None else b.interval,
-        scale=measure.scale,
-        change=None if found is None else measure.unscaled(found.delta),
-        change_interval=within and (measure.unscaled(within[0]), measure.unscaled(within[1])),
-        q=q,
-        status=status,
-        judgement=judgement,
-    )
-
-
-def _rank(change: contract.NumberChange, found: Contrast | None) -> tuple[int, bool, float]:
-    is_cause = change.path.startswith(_CAUSES)
-    # what is the same differs by the last digits of a machine, if at all
-    moved = 0.0
-    if found is not None and change.status != "same":
-        moved = found.z or abs(found.delta)
-    return _ORDER.index(change.judgement), not is_cause, -moved
 
 
 def _compared(side: DiffInput) -> contract.Compared:
@@ -155,96 +87,89 @@ def _compared(side: DiffInput) -> contract.Compared:
     )
 
 
-# ------------------------------------------------------------- what else is not the same, in words
-
-
-def _texts(a: Results, b: Results, *, paired: bool) -> Iterator[contract.TextChange]:
-    """Settings, parameters of PX4 and facts about the flight that are not the same."""
-    for row in _TEXTS:
-        place = row["place"]
-        if (first := at(a, place)) != (second := at(b, place)) and (
-            paired or row["of"] != "segment"
-        ):
-            kind: Literal["setting", "flight"]
-            kind = "flight" if row["of"] == "flight" else "setting"
-            yield contract.TextChange(kind, row["what"], _plain(first), _plain(second))
-    one, other = _parameters(a), _parameters(b)
-    for name in sorted(one.keys() | other.keys()):
-        if (first := one.get(name)) != (second := other.get(name)):
-            yield contract.TextChange("parameter", name, _plain(first), _plain(second))
+def _settings(a: Results, b: Results) -> Iterator[contract.SettingChange]:
+    """Settings, facts about the flight and parameters of PX4 that differ."""
+    one, other = (
+        {what: at(side, place) for what, place in SETTINGS.items()} | _parameters(side)
+        for side in (a, b)
+    )
+    for what in {**one, **other}:
+        if (first := one.get(what)) != (second := other.get(what)):
+            yield contract.SettingChange(what, first, second)
 
 
 def _parameters(found: Results) -> dict[str, float]:
-    """Of PX4: those that EKF2 was replayed with, and those that the log has."""
-    replayed, logged = at(found, "ekf2_replay.settings") or {}, found.log.parameters
-    return {name: float(value) for name, value in (*replayed.items(), *logged.items())}
+    """Parameters of PX4 in the log, and those of the EKF2 replay, to six digits (float32)."""
+    known = (at(found, "ekf2_replay.settings") or {}) | dict(found.log.parameters)
+    return {name: float(f"{known[name]:.6g}") for name in sorted(known)}
 
 
-def _plain(value: object) -> str:
-    if value is None:
-        return "not logged"
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+def number_changes(
+    first: Mapping[str, Number], second: Mapping[str, Number]
+) -> Iterator[contract.NumberChange]:
+    """Numbers that differ, and those that only one side has.
+
+    Parameters
+    ----------
+    first, second : mapping
+        Numbers of A and B by their path in the results.
+    """
+    for path in {**first, **second}:
+        a, b = first.get(path), second.get(path)
+        if a and b and math.isclose(
+            a.value, b.value, rel_tol=RELATIVE_TOLERANCE, abs_tol=ABSOLUTE_TOLERANCE
+        ):  # fmt: skip
+            continue
+        known = a or b
+        assert known is not None
+        yield contract.NumberChange(
+            path=path,
+            label=known.label,
+            unit=known.unit,
+            a=None if a is None else a.value,
+            b=None if b is None else b.value,
+            a_interval=None if a is None else a.interval,
+            b_interval=None if b is None else b.interval,
+        )
 
 
 def _findings(a: Results, b: Results) -> Iterator[contract.FindingChange]:
-    """Findings that only one of the two has, as a cause or as a consequence."""
+    """Findings that only one of the two has, by id and severity."""
     both: tuple[tuple[Results, Results, contract.Which], ...]
     both = ((b, a, "B"), (a, b, "A"))
     for mine, other, only_in in both:
-        known = {one.id for one in other.findings}
+        known = {(one.id, one.severity) for one in other.findings}
         for one in mine.findings:
-            if one.id not in known:
+            if (one.id, one.severity) not in known:
                 yield contract.FindingChange(one.id, one.severity, one.message, only_in)
 
 
-def _sentences(found: contract.ChangeResults) -> Iterator[str]:
-    """What changed, in a few sentences."""
-    judgements = Counter(change.judgement for change in found.numbers)
-    changed = judgements.total() - judgements[""]
-    judged = [f"{n} {word}" for word in ("worse", "better") if (n := judgements[word])]
-    of_these = f" ({', '.join(judged)})" if judged else ""
-    tested = sum(change.q is not None for change in found.numbers)
-    if found.paired:
-        compared = sum(not change.status.startswith("only") for change in found.numbers)
-        yield f"Both are of {found.a.log}: {changed} of {compared} numbers differ{of_these}."
-    elif not tested:
-        yield "No number has an interval in both, so none can be tested."
-    else:
-        yield (
-            f"{changed or 'None'} of {tested} tested numbers changed by more than chance from A to "
-            f"B{of_these}."
-        )
-    if changed:
-        yield f"The first of them: {change_line(found.numbers[0])}."
-    for only_in, word in (("B", "New"), ("A", "Gone")):
-        if those := dict.fromkeys(named(f.id) for f in found.findings if f.only_in == only_in):
-            yield f"{word} findings: {', '.join(those)}."
-    if found.texts:
-        yield f"Not the same: {', '.join(text.what for text in found.texts)}."
+def _worse(a: Results, b: Results, findings: Iterable[contract.FindingChange]) -> Iterator[str]:
+    """Verdicts that are worse in B, a sentence each."""
+    before, after = _verdicts(a), _verdicts(b)
+    for what, (was, was_consistent) in before.items():
+        value, consistent = after.get(what, (was, True))
+        if was_consistent and not consistent:
+            ratio = value**0.5
+            off = f"{factor_words(max(ratio, 1.0 / ratio))} times too"
+            said = (
+                f"overconfident, σ {off} small" if ratio > 1.0 else f"underconfident, σ {off} large"
+            )
+            yield f"{what}: {number_words(was)} (consistent) → {number_words(value)} ({said})."
+    errors = [one.id for one in findings if (one.only_in, one.severity) == ("B", "error")]
+    for error in dict.fromkeys(errors):
+        yield f"New finding of severity error: {error}."
 
 
-def _notes(a: DiffInput, b: DiffInput, *, paired: bool) -> Iterator[str]:
-    """What to mind, and how significance was decided, a sentence each."""
-    lacking = [(name, side) for name, side in (("A", a), ("B", b)) if side.analysis is None]
-    logs = " and ".join(f"{side.results.log.name} for {name}" for name, side in lacking)
-    if lacking:
-        untested = "" if paired else "RMSE is not tested without the logs. "
-        yield f"{untested}Flights are drawn from their logs. Give {logs}."
-    if paired:
-        yield (
-            "Both are of one flight: each difference is exact for it, and nothing says whether "
-            f"another flight would show it too. Less than {LEAST_RATIO:.0%} counts as the same."
-        )
-        return
-    settings = [row["place"] for row in _TEXTS if row["of"] == "settings"]
-    if any(at(a.results, place) != at(b.results, place) for place in settings):
-        yield "The filter's settings are not the same: numbers of ours differ by them too."
-    yield (
-        f"Of the changes that are called significant, {FALSE_DISCOVERY_RATE:.0%} are expected to "
-        "be chance (Benjamini and Hochberg 1995); q is the p-value after that correction. "
-        "Intervals are from the likelihood, of innovations and errors from a bootstrap over blocks "
-        "(without the log of innovations from chi-square), of shares from Wilson's formula; they "
-        "are combined after Zou and Donner (2008), and widened by what flights of one simulated "
-        "vehicle differ by. A real one may vary more: px4fuse batch --baseline takes that from "
-        "your own flights."
-    )
+def _verdicts(found: Results) -> dict[str, tuple[float, bool]]:
+    """Mean NIS and mean NEES by filter and axis, and True if consistent."""
+    verdicts: dict[str, tuple[float, bool]] = {}
+    for axis, result in (at(found, "axes") or {}).items():
+        for name, label in NAMES.items():
+            one = result.filters[name]
+            if isinstance(one, FilterSummary):
+                verdicts[f"Mean NIS of {label}, {axis}"] = one.nis_mean, not is_off(one)
+            if (nees := at(one, "truth.nees_position_mean")) is not None:
+                consistent = NEES_SIGMA_OFF**-2 <= nees <= NEES_SIGMA_OFF**2
+                verdicts[f"Mean NEES of {label}, {axis}"] = nees, consistent
+    return verdicts

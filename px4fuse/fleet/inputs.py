@@ -7,8 +7,7 @@ from typing import Literal
 
 from msgspec.structs import replace
 
-from px4fuse.analysis import Analysis, run_or_judge_aids
-from px4fuse.display import brief
+from px4fuse.analysis import run_or_judge_aids
 from px4fuse.errors import LogError, ResultsError
 from px4fuse.reading import files_by_sha256, read_head, read_whole, shown
 from px4fuse.request import ComparisonRequest
@@ -21,30 +20,20 @@ from px4fuse.verification.intake import attached_results
 
 Kind = Literal["log", "report", "results"]
 Progress = Callable[[str], None]
+Results = ComparisonResults | AidsResults
 # A log is analysed with these settings of the other one's results, and with more of them where
 # they are of the same log
 _FILTER = ("sigma_a_m_s2", "sigma_z_m", "dt_s", "input", "axes", "clock_offset_s")
 _PART = ("heading_deg", "start_s", "end_s", "position_source", "source_kind", "height")
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class DiffInput:
-    """One of two comparisons.
-
-    Attributes
-    ----------
-    given : str
-        Name of the file.
-    analysis : Analysis or None
-        Where the log is at hand.
-    """
+    """One of two comparisons; ``given`` is the name of the file."""
 
     given: str
     kind: Kind
-    results: ComparisonResults | AidsResults
-    analysis: Analysis | None = None
-
-    __repr__ = brief
+    results: Results
 
 
 def read_inputs(
@@ -78,7 +67,7 @@ def _read(path: Path) -> DiffInput | None:
     advice = "Reports are below 2 MB" if is_report else "Give results of px4fuse compare"
     content = read_whole(path, ResultsError, limit, smaller=advice)
     found = (attached_results if is_report else read_results)(content, name)
-    if not isinstance(found, ComparisonResults | AidsResults):
+    if not isinstance(found, Results):
         raise ResultsError.of("not_to_compare", name=name, found=found)
     return DiffInput(name, "report" if is_report else "results", found)
 
@@ -92,5 +81,4 @@ def _analysed(path: Path, other: DiffInput | None, progress: Progress) -> DiffIn
             request, **{name: getattr(other.results.request, name) for name in fields}
         )
     found = run_or_judge_aids(request, progress)
-    analysis = found if isinstance(found, Analysis) else None
-    return DiffInput(shown(path), "log", judged_results(request, found), analysis)
+    return DiffInput(shown(path), "log", judged_results(request, found))

@@ -1,13 +1,15 @@
 """Results of a comparison → rows of the fleet's table, and how that table is written."""
 
+import csv
 from collections.abc import Iterable, Mapping
+from functools import reduce
+from importlib.resources import files
 from typing import Any
 
 import pandas as pd
 
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.findings import Finding
-from px4fuse.fleet.measures import at, read_rows
 from px4fuse.plain import utc_time
 from px4fuse.record import Unavailable
 from px4fuse.results.contract import ComparisonResults, Log
@@ -17,6 +19,14 @@ DONE, NOT_JUDGED, FAILED = "done", "not judged", "failed"
 BETWEEN_FINDINGS = ";"
 # Which tuning speaks for an axis
 _TUNED_AS = {"north": "horizontal", "east": "horizontal"}
+
+
+def read_rows(name: str) -> list[dict[str, str]]:
+    """Rows of a table of this folder, by the titles of its columns."""
+    with files("px4fuse.fleet").joinpath(name).open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
 _COLUMNS = read_rows("columns.csv")
 #: Columns of the table and where each stands in the results; empty where it is put together
 PLACES = {row["column"]: row["place"] for row in _COLUMNS}
@@ -24,6 +34,17 @@ PLACES = {row["column"]: row["place"] for row in _COLUMNS}
 COLUMNS = {row["column"]: row["type"] for row in _COLUMNS}
 
 Row = dict[str, Any]
+
+
+def at(found: object, path: str) -> Any:
+    """What stands at a place in the results; None where there is nothing."""
+
+    def below(part: Any, name: str) -> Any:
+        if isinstance(part, tuple):
+            return part[int(name)]
+        return part.get(name) if isinstance(part, Mapping) else getattr(part, name, None)
+
+    return reduce(below, path.split("."), found)
 
 
 def rows_of(found: ComparisonResults) -> list[Row]:

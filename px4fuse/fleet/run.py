@@ -22,7 +22,6 @@ from px4fuse.fleet.engine import connected, outcomes
 from px4fuse.fleet.job import Job, Outcome, analyse, file_stem, refused
 from px4fuse.fleet.logs import FoundLog, find_logs
 from px4fuse.fleet.page import html_text
-from px4fuse.fleet.regressions import marked
 from px4fuse.fleet.rows import FAILED, NOT_JUDGED, Row, csv_bytes, table_of, writable
 from px4fuse.reading import max_log_bytes
 from px4fuse.request import ComparisonRequest, command_line
@@ -48,15 +47,12 @@ class Fleet:
         How many logs an earlier run has compared.
     severities : frozenset of str
         Of all findings.
-    against : str
-        What the logs were held against; empty without a baseline.
     """
 
     table: pd.DataFrame
     reused: int
     severities: frozenset[str]
     written: tuple[Path, ...]
-    against: str = ""
 
 
 class Kept(msgspec.Struct, frozen=True):
@@ -108,8 +104,6 @@ def batch(
         Also every log's PDF.
     timeout_s : float
         For one log.
-    baseline : DataFrame, optional
-        An earlier table: the column ``change`` says what is worse than in it.
     scheduler : str, optional
         Address of a Dask scheduler.
     workers : int, optional
@@ -146,7 +140,6 @@ def run(
     *,
     reports: bool = False,
     timeout_s: float = TIMEOUT_S,
-    baseline: pd.DataFrame | None = None,
     scheduler: str | None = None,
     workers: int | None = None,
     memory_gb: float = MEMORY_BYTES / 1e9,
@@ -197,7 +190,7 @@ def run(
                     _keep(now, of_address[job.address], outcome)
                     progress(f"comparing, {len(now.lost)} failed", number, len(jobs))
             finally:
-                fleet = _written(now, logs, baseline)
+                fleet = _written(now, logs)
         except Px4FuseError as error:
             raise type(error)(f"{error} {_GOES_ON}") from error
     return fleet
@@ -253,7 +246,7 @@ def _write(now: _Run, log: FoundLog, outcome: Outcome) -> None:
     write_all({now.output / name: content for name, content in contents.items() if content})
 
 
-def _written(now: _Run, logs: Iterable[FoundLog], baseline: pd.DataFrame | None) -> Fleet:
+def _written(now: _Run, logs: Iterable[FoundLog]) -> Fleet:
     """Make the table of all that is known by now, and write it."""
     severities: set[str] = set()
     rows_of = {kept.sha256: kept.rows for kept in kept_in(now.output, now.px4fuse, now.settings)}
@@ -278,9 +271,7 @@ def _written(now: _Run, logs: Iterable[FoundLog], baseline: pd.DataFrame | None)
                 severities.update(row.get("severities", ()))
                 yield row | common
 
-    table, against = table_of(rows()), ""
-    if baseline is not None:
-        table, against = marked(table, baseline)
+    table = table_of(rows())
     page = html_text(table, now.output.resolve().name, f"px4fuse {now.px4fuse}")
     parquet = io.BytesIO()
     table.to_parquet(parquet, index=False)
@@ -290,4 +281,4 @@ def _written(now: _Run, logs: Iterable[FoundLog], baseline: pd.DataFrame | None)
         now.output / "fleet.html": page.encode(),
     }
     write_all(contents)
-    return Fleet(table, len(now.reused), frozenset(severities), tuple(contents), against)
+    return Fleet(table, len(now.reused), frozenset(severities), tuple(contents))

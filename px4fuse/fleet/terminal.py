@@ -1,19 +1,28 @@
-"""What ``px4fuse batch`` says when it is done."""
+"""Terminal output of ``px4fuse batch`` and ``px4fuse diff``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 from px4fuse.findings import named
+from px4fuse.fleet.measures import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE
 from px4fuse.fleet.rows import BETWEEN_FINDINGS, FAILED
-from px4fuse.fleet.run import Fleet
-from px4fuse.plain import factor_words
-from px4fuse.report.page import Page
+from px4fuse.plain import factor_words, number_words
+from px4fuse.report.page import Page, words
 from px4fuse.report.style import MUTED, SEVERITY_COLOURS
+from px4fuse.results.contract import ChangeResults, Interval
 
-# Reasons why logs are not compared, findings and what is worse
+if TYPE_CHECKING:
+    from px4fuse.fleet.run import Fleet
+
+# Reasons why logs are not compared, and findings
 SHOWN = 8
 RED, YELLOW = SEVERITY_COLOURS["error"], SEVERITY_COLOURS["warning"]
+NUMBER_HEADS = ("number", "A", "95 %", "B", "95 %", "unit")
 
 
 def summary(fleet: Fleet) -> Page:
-    """What could not be compared, both filters by axis, findings and what is worse."""
+    """What could not be compared, both filters by axis, and findings."""
     page, logs = Page(), fleet.table.drop_duplicates("log")
     alone = logs[logs["axis"] == ""].groupby(["status", "reason", "remedy"], sort=False)["log"]
     causes = alone.agg(["count", "first"]).reset_index()
@@ -38,14 +47,63 @@ def summary(fleet: Fleet) -> Page:
     found = logs["findings"].str.split(BETWEEN_FINDINGS).explode()
     for finding, count in found[found != ""].value_counts().head(SHOWN).items():
         page.write(f"{count} × {named(str(finding))}")
-    worse = fleet.table[fleet.table["change"] != ""]
-    for row in worse.head(SHOWN).itertuples():
-        page.write(f"worse: {row.log} {row.axis}: {row.change}", colour=RED)
-    if len(worse) > SHOWN:
-        page.write(f"and {len(worse) - SHOWN} more in the column change")
-    page.write(fleet.against)
     counts = logs["status"].value_counts()
     said = ", ".join(f"{count} {status}" for status, count in counts.items())
     again = " The same command tries those that failed again." if FAILED in counts else ""
     page.write(f"{len(logs)} logs: {said}; {fleet.reused} as before.{again}")
     return page
+
+
+def differences(results: ChangeResults) -> Page:
+    """Settings, numbers and findings that differ, and verdicts that are worse in B."""
+    page = Page()
+    for name, side in (("A", results.a), ("B", results.b)):
+        of = "" if side.given == side.log else f", {side.kind} of {side.log}"
+        said = f"{side.given}{of}; SHA-256 {side.log_sha256[:12]}, px4fuse {side.px4fuse}"
+        page.labelled(name, said)
+    if results.settings:
+        settings = [(one.name, _plain(one.a), _plain(one.b)) for one in results.settings]
+        page.table(("setting", "A", "B"), settings)
+    rows = []
+    for one in results.numbers:
+        factor, unit = (100.0, "%") if one.unit == "share" else (1.0, one.unit)
+        cells = [
+            cell
+            for value, interval in ((one.a, one.a_interval), (one.b, one.b_interval))
+            for cell in (_value(value, factor), _range(interval))
+        ]
+        rows.append((one.label, *cells, unit))
+    if rows:
+        page.table(NUMBER_HEADS, rows, right=(1, 2, 3, 4))
+    least = f"{100.0 * RELATIVE_TOLERANCE:g} % or {ABSOLUTE_TOLERANCE:g}"
+    page.write(f"Numbers that differ by less than {least} are not listed.", colour=MUTED)
+    for found in results.findings:
+        label = "New" if found.only_in == "B" else "Gone"
+        colour = SEVERITY_COLOURS[found.severity]
+        page.labelled(label, words(f"{found.severity}: {found.message}", 8.0, colour))
+    for text in results.worse:
+        page.labelled("Worse", words(text, 8.0, RED))
+    if not results.worse:
+        page.write("No verdict is worse in B.")
+    return page
+
+
+def _plain(value: float | str | None) -> str:
+    if value is None:
+        return "–"
+    return value if isinstance(value, str) else f"{value:.6g}"
+
+
+def _value(value: float | None, factor: float) -> str:
+    return "" if value is None else number_words(factor * value)
+
+
+def _range(interval: Interval | None) -> str:
+    if interval is None:
+        return ""
+    low, high = interval
+    return (
+        f"above {number_words(low)}"
+        if high is None
+        else f"{number_words(low)} to {number_words(high)}"
+    )

@@ -10,15 +10,17 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from px4fuse.answers import form_rows
 from px4fuse.assignment.sheet import number
 from px4fuse.grading.model import TOTAL, Entry, Graded, Item, Override, columns
 from px4fuse.plain import number_words
 from px4fuse.webpage import frame
-from px4fuse.webpage.charts import tenths
 from px4fuse.webpage.frame import Cell, Column, Part, Row
 from px4fuse.webpage.safe import local_link, template
 
+BINS = 10
 MISSING = "nothing handed in"
 # How each status looks, and its sign, from the best to what says nothing
 LOOKS: dict[str, tuple[str, str]] = {
@@ -106,6 +108,17 @@ def _items(graded: Sequence[Graded]) -> Iterator[tuple[Any, ...]]:
         yield title, tenths(shares, 1.0), mean, number(most), none, full
 
 
+def tenths(values: Sequence[float], most: float) -> list[tuple[int, str]]:
+    """How many values lie in each tenth from 0 to ``most``, and where it begins, in words.
+
+    >>> tenths([0.0, 5.0, 5.5, 9.0], 10.0)[5]
+    (2, '5')
+    """
+    counts, edges = np.histogram(np.clip(values, 0.0, most), BINS, (0.0, most))
+    words = (number_words(round(edge, 2)) for edge in edges.tolist())
+    return list(zip(counts.tolist(), words, strict=False))
+
+
 def _tags(entry: Entry) -> list[str]:
     one = entry.counting
     tags = [one.status if one else MISSING]
@@ -176,7 +189,7 @@ def _points(entry: Entry) -> Cell:
     if entry.total is None:
         proposed = f"{number(one.points)} proposed" if one and one.counted is None else ""
         return Cell("pending" if proposed else "–", None, proposed)
-    share = (min(max(entry.total / entry.of, 0.0), 1.0),) if entry.of > 0.0 else ()
+    share = min(max(entry.total / entry.of, 0.0), 1.0) if entry.of > 0.0 else None
     said = [f"{number(entry.deduction)} off for being late"] * bool(entry.deduction)
     said += ["said by you"] * any(each.points is not None for each in entry.overrides.values())
     text = f"{number(entry.total)} / {number(entry.of)}"

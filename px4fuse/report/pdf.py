@@ -16,7 +16,6 @@ import typst
 from px4fuse.memory import give_back
 from px4fuse.report import (
     aids,
-    changes,
     clock,
     consistency,
     cover,
@@ -49,7 +48,6 @@ PAGES: Mapping[type, tuple[Callable[[Any, Any], Iterator[Page]], ...]] = {
     contract.LoopResults: (loop.draw_report, notes.draw, provenance.draw_loop),
     contract.WhatIfResults: (whatif.draw,),
     contract.EvaluationResults: (evaluation.draw,),
-    contract.ChangeResults: (changes.draw,),
 }  # fmt: skip
 
 
@@ -60,9 +58,6 @@ def _named(results: Any) -> tuple[str, str, str]:
             return f"px4fuse loop {track.name}", track.name, track.sha256
         case contract.EvaluationResults(estimate=one, reference=other):
             return f"px4fuse evaluate {one.name} {other.name}", one.name, one.sha256
-        case contract.ChangeResults(a=a, b=b):
-            name = f"A {a.log}, SHA-256 {a.log_sha256[:12]} · B {b.log}"
-            return f"px4fuse diff {a.given} {b.given}", name, b.log_sha256
     log, command = results.log, results.request.__struct_config__.tag
     return f"px4fuse {command} {log.name}", log.name, log.sha256
 
@@ -72,7 +67,7 @@ def render(found: Any, results: Any, results_json: str) -> bytes:
 
     Parameters
     ----------
-    found : Analysis, AidsAlone, Loop, Counterfactual, Evaluation or ChangeResults
+    found : Analysis, AidsAlone, Loop, Counterfactual or Evaluation
         What is drawn.
     results : Results
         What is written of it; each kind has its :data:`PAGES`.

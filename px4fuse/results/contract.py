@@ -26,7 +26,7 @@ from px4fuse.findings import Finding
 from px4fuse.flight import Alignment
 from px4fuse.loop.model import LoopPart
 from px4fuse.origin import Passage, PositionKind
-from px4fuse.record import Count, Maybe, Positive, Record, Sha256, Share, Span, Unavailable
+from px4fuse.record import Count, Maybe, Positive, Record, Sha256, Span, Unavailable
 from px4fuse.recording import ClockMap, InputFile, LogInfo
 from px4fuse.request import AxisName, ComparisonRequest, InputName, LoopRequest, WhatIfRequest
 from px4fuse.results.model import VERSION, Provenance, Schema, Student, Version
@@ -103,10 +103,8 @@ ASKED = {"sigma_a_m_s2": "filter_sigma_a_m_s2", "sigma_z_m": "sigma_z_m"}
 
 
 Which = Literal["A", "B"]
-Status = Literal[
-    "significant", "within chance", "not tested", "differs", "same", "only in A", "only in B"
-]
-Judgement = Literal["better", "worse", "changed", ""]
+# 95 %; the upper end is None if nothing bounds it
+Interval = tuple[float, float | None]
 
 
 class Compared(Record, frozen=True, kw_only=True):
@@ -120,30 +118,18 @@ class Compared(Record, frozen=True, kw_only=True):
 
 
 class NumberChange(Record, frozen=True, kw_only=True):
-    """One number of both.
+    """One number that differs.
 
     Attributes
     ----------
     path : str
-        Where it stands in the results of both: ``axes.aisle.filters.ekf2.nis_mean``.
+        Path in the results of both: ``axes.aisle.filters.ekf2.nis_mean``.
     label, unit : str
+        The unit "share" is for 0 to 1.
     a, b : float
-        Absent where only the other one has it.
-    a_interval, b_interval : (float, float)
-        95 %; absent where there is none.
-    scale : {"ratio", "difference"}
-        What ``change`` is: b/a or b - a.
-    change : float
-        Absent where it is a ratio to zero.
-    change_interval : (float, float)
-        95 %, with what two flights with the same equipment are apart by.
-    q : float
-        p-value of "no change", corrected for the number of tests.
-    status : str
-        "significant", "within chance" or "not tested" between two flights; "differs" or "same"
-        between two settings of one flight, where nothing is left to chance.
-    judgement : {"better", "worse", "changed", ""}
-        "changed" where B is neither; "" where the change is not significant.
+        Absent if only the other one has it.
+    a_interval, b_interval : (float, float or None)
+        95 %; absent if none is recorded.
     """
 
     path: str
@@ -151,23 +137,16 @@ class NumberChange(Record, frozen=True, kw_only=True):
     unit: str
     a: float | None = None
     b: float | None = None
-    a_interval: Span | None = None
-    b_interval: Span | None = None
-    scale: Literal["ratio", "difference"]
-    change: float | None = None
-    change_interval: Span | None = None
-    q: Share | None = None
-    status: Status
-    judgement: Judgement = ""
+    a_interval: Interval | None = None
+    b_interval: Interval | None = None
 
 
-class TextChange(Record, frozen=True):
-    """A setting, a parameter of PX4 or a fact about the flight that is not the same."""
+class SettingChange(Record, frozen=True):
+    """A setting, a parameter of PX4 or a fact about the flight that differs; absent if unknown."""
 
-    kind: Literal["setting", "parameter", "flight"]
-    what: str
-    a: str
-    b: str
+    name: str
+    a: float | str | None = None
+    b: float | str | None = None
 
 
 class FindingChange(Record, frozen=True):
@@ -322,41 +301,28 @@ class WhatIfResults(Record, frozen=True, kw_only=True):
 
 
 class ChangeResults(Record, frozen=True, kw_only=True):
-    """Results of ``px4fuse diff``: what changed from A to B.
+    """Results of ``px4fuse diff``: differences from A to B.
 
     Attributes
     ----------
     schema : Schema
     a, b : Compared
-    paired : bool
-        Both are of one flight, so that nothing is left to chance.
-    summary : tuple of str
-        Sentences.
+    settings : tuple of SettingChange
     numbers : tuple of NumberChange
-        Significant ones first, worse before better.
-    texts : tuple of TextChange
     findings : tuple of FindingChange
-    notes : tuple of str
-        How significance was decided, and what to mind, a sentence each.
+    worse : tuple of str
+        Verdicts that are worse in B, a sentence each; the exit code is 1 if there are any.
     provenance : Provenance
     """
 
     schema: Schema
     a: Compared
     b: Compared
-    paired: bool
-    summary: tuple[str, ...]
+    settings: tuple[SettingChange, ...]
     numbers: tuple[NumberChange, ...]
-    texts: tuple[TextChange, ...]
     findings: tuple[FindingChange, ...]
-    notes: tuple[str, ...]
+    worse: tuple[str, ...]
     provenance: Provenance
-
-    @property
-    def is_worse(self) -> bool:
-        """Whether a number is significantly worse, or B has an error that A has not."""
-        worse = any(change.judgement == "worse" for change in self.numbers)
-        return worse or any((f.only_in, f.severity) == ("B", "error") for f in self.findings)
 
 
 Reported = ComparisonResults | LoopResults

@@ -7,7 +7,6 @@
   const frame = document.querySelector(".frame");
   const selects = [...document.querySelectorAll(".controls select")];
   const shownGroups = [...document.querySelectorAll("[data-group]")];
-  const tagged = [...document.querySelectorAll("button[data-tag]")];
 
   // Text from data only ever becomes a text node
   const make = (tag, text = "", kind = "") => {
@@ -96,11 +95,8 @@
       picture.width = 700;
       picture.height = 990;
       picture.src = source;
-      if (source.startsWith("data:")) large.append(picture);
-      else {
-        large.href = source;
-        large.append(picture);
-      }
+      large.href = source;
+      large.append(picture);
       sheet.append(large, make("figcaption", said));
       made.append(sheet);
     }
@@ -174,34 +170,24 @@
 
   // ------------------------------------------------------------ the table
 
-  const sketch = (parts, mark) => {
-    const made = drawn("svg", { width: 72, height: 10, "aria-hidden": "true", class: "sketch" });
-    const x = (share) => 2 + 68 * Math.min(Math.max(share, 0), 1);
-    if (parts.length === 1) {
-      made.append(drawn("rect", { x: 2, y: 3, width: 68, height: 4, class: "all" }),
-        drawn("rect", { x: 2, y: 3, width: x(parts[0]) - 2, height: 4 }));
-      return made;
-    }
-    if (mark !== null) {
-      made.append(drawn("rect", { x: x(mark) - .5, y: 0, width: 1, height: 10, class: "mark" }));
-    }
-    const [low, value, high] = parts;
-    made.append(drawn("rect", { x: x(low), y: 4, width: Math.max(x(high) - x(low), 1), height: 2,
-      class: "span" }), drawn("circle", { cx: x(value), cy: 5, r: 3 }));
+  const bar = (share) => {
+    const made = drawn("svg", { width: 72, height: 10, "aria-hidden": "true", class: "bar" });
+    made.append(drawn("rect", { x: 2, y: 3, width: 68, height: 4, class: "all" }),
+      drawn("rect", { x: 2, y: 3, width: 68 * share, height: 4 }));
     return made;
   };
 
   const classes = (kind, narrow, group) =>
     [{ number: "n", line: "line" }[kind], narrow, group && "g-" + group].filter(Boolean);
-  const cell = ([text = "", , below = "", look = "", parts = []], column) => {
-    const [, kind, group, narrow, mark] = columns[column];
+  const cell = ([text = "", , below = "", look = "", share = ""], column) => {
+    const [, kind, group, narrow] = columns[column];
     const made = make(column ? "td" : "th", "",
       [...classes(kind, narrow, group), look === "flags" ? look : ""].join(" "));
     if (look === "flags") {
       made.append(list(text ? text.split("\n") : [], false));
     } else if (look) made.append(make("span", text, "chip " + look));
     else if (text) made.append(isolated("span", text));
-    if (parts.length) made.append(sketch(parts, mark));
+    if (share !== "") made.append(bar(share));
     if (below) made.append(isolated("span", below, "file"));
     return made;
   };
@@ -305,9 +291,6 @@
       "Showing " + fitting.length + " of " + entries.length;
     document.querySelector(".none").hidden = fitting.length > 0;
     at("all").hidden = fitting.length === entries.length;
-    for (const button of tagged) {
-      button.setAttribute("aria-pressed", String(tags.includes(button.dataset.tag)));
-    }
     draw();
   };
 
@@ -381,25 +364,6 @@
   for (const box of shownGroups) {
     box.checked = false;
     box.addEventListener("change", groups);
-  }
-  for (const button of tagged) {
-    button.addEventListener("click", () => {
-      const tag = button.dataset.tag;
-      const select = selects.find((one) => [...one.options].some((each) => each.value === tag));
-      select.value = select.value === tag ? "" : tag;
-      filter();
-      frame.scrollIntoView({ block: "start" });
-    });
-  }
-  for (const button of document.querySelectorAll("button[data-open]")) {
-    button.addEventListener("click", () => {
-      clear();
-      show(entries[Number(button.dataset.open)]);
-    });
-  }
-  for (const box of document.querySelectorAll("[data-parts]")) {
-    const { parts, mark } = box.dataset;
-    box.append(sketch(parts.split(" ").map(Number), mark ? Number(mark) : null));
   }
   window.addEventListener("resize", fit);
   window.addEventListener("beforeprint", () => {

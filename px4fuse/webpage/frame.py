@@ -28,15 +28,12 @@ class Column:
         Shown only while the box of this group is ticked; "" for always.
     narrow : {"always", "tablet", "desk"}
         The smallest screen on which it is shown.
-    mark : float or None
-        Where the pictures of its cells have a line, from 0 to 1.
     """
 
     title: str
     kind: Literal["text", "line", "number", "rank"] = "text"
     group: str = ""
     narrow: Literal["always", "tablet", "desk"] = "always"
-    mark: float | None = None
 
 
 @dataclass(frozen=True)
@@ -51,15 +48,15 @@ class Cell:
         A second, small line.
     look : str
         "" for text, "flags" for one flag per line, else the class of a chip.
-    picture : tuple of float
-        From 0 to 1 of the column's scale: (value,) is a bar, (low, value, high) an interval.
+    bar : float or None
+        Length of a bar below the text, from 0 to 1.
     """
 
     text: str = ""
     value: float | str | None = None
     below: str = ""
     look: str = ""
-    picture: tuple[float, ...] = ()
+    bar: float | None = None
 
 
 def words(text: str, below: str = "") -> Cell:
@@ -67,13 +64,11 @@ def words(text: str, below: str = "") -> Cell:
     return Cell(text, text or None, below)
 
 
-def figure(
-    value: float | None, text: str | None = None, picture: tuple[float, ...] = (), below: str = ""
-) -> Cell:
+def figure(value: float | None, text: str | None = None, below: str = "") -> Cell:
     """A cell that is sorted by a number; empty for what is absent or not finite."""
     if value is None or not math.isfinite(value):
         return Cell()
-    return Cell(f"{value:.4g}" if text is None else text, value, below, "", picture)
+    return Cell(f"{value:.4g}" if text is None else text, value, below)
 
 
 Part = list[Any]
@@ -134,7 +129,7 @@ def links(title: str, rows: Sequence[tuple[str, str]]) -> Part:
 
 
 def pictures(title: str, rows: Sequence[tuple[str, str, str]]) -> Part:
-    """Caption, words for who does not see it, and address (local, or data:image/png)."""
+    """Caption, words for who does not see it, and address (local)."""
     return ["pictures", title, rows]
 
 
@@ -164,7 +159,7 @@ def page(
     *,
     title: str,
     subtitle: str,
-    above: str,
+    above: str = "",
     noun: tuple[str, str],
     columns: Sequence[Column],
     rows: Sequence[Row],
@@ -178,7 +173,7 @@ def page(
     Parameters
     ----------
     above : str
-        HTML for above the table, of a :func:`~px4fuse.webpage.safe.template`.
+        HTML above the table, of a :func:`~px4fuse.webpage.safe.template`.
     noun : (str, str)
         What a row is, one and many.
     filters : sequence of (label, ((tag, words), ...))
@@ -198,7 +193,7 @@ def page(
     style = part("base.css") + part("frame.css")
     script = part("frame.js")
     content = {
-        "columns": [(c.title, c.kind, c.group, c.narrow, c.mark) for c in columns],
+        "columns": [(c.title, c.kind, c.group, c.narrow) for c in columns],
         "rows": [
             (
                 [_compact(cell) for cell in row.cells],
@@ -233,7 +228,8 @@ def page(
 def _compact(cell: Cell) -> list[Any]:
     """Its fields without those at the end that are empty; true stands for a value like its text."""
     value = True if cell.value == cell.text else "" if cell.value is None else cell.value
-    fields = [cell.text, value, cell.below, cell.look, [round(part, 3) for part in cell.picture]]
-    while fields and fields[-1] in ("", []):
+    bar = "" if cell.bar is None else round(cell.bar, 3)
+    fields = [cell.text, value, cell.below, cell.look, bar]
+    while fields and fields[-1] == "":
         fields.pop()
     return fields

@@ -13,7 +13,6 @@ from urllib.parse import quote
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 MAX_CHARACTERS = 20_000
-PICTURE = "data:image/png;base64,"
 # Controls but for tab and line end, surrogates, and what turns the direction of all that follows
 HARMFUL = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff\u202a-\u202e\u2066-\u2069]")
 
@@ -29,12 +28,9 @@ def clean(text: str, most: int = MAX_CHARACTERS) -> str:
 
 
 def cleaned(value: Any, most: int = MAX_CHARACTERS) -> Any:
-    """The same with every text in it clean, and numbers of numpy as Python's.
-
-    A picture in an address is not cut.
-    """
+    """The same with every text in it clean, and numbers of numpy as Python's."""
     if isinstance(value, str):
-        return clean(value, len(value) if value.startswith(PICTURE) else most)
+        return clean(value, most)
     if isinstance(value, dict):
         return {clean(str(name), most): cleaned(part, most) for name, part in value.items()}
     if isinstance(value, list | tuple):

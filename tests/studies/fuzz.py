@@ -39,7 +39,6 @@ import mavlink_tools  # noqa: E402
 import ulog_tools  # noqa: E402
 from class_tools import in_turn  # noqa: E402
 from conftest import page_of  # noqa: E402
-from made_up_fleet import made_up  # noqa: E402
 
 from px4fuse import answers, workers  # noqa: E402
 from px4fuse.analysis import run_or_judge_aids  # noqa: E402
@@ -48,8 +47,6 @@ from px4fuse.assignment.roster import people_of_sheet, read_roster  # noqa: E402
 from px4fuse.assignment.sheet import read_sheet  # noqa: E402
 from px4fuse.cli import cli  # noqa: E402
 from px4fuse.errors import Px4FuseError  # noqa: E402
-from px4fuse.fleet.regressions import read_baseline  # noqa: E402
-from px4fuse.fleet.rows import table_of  # noqa: E402
 from px4fuse.grading import grade as grading  # noqa: E402
 from px4fuse.grading.entries import read_overrides  # noqa: E402
 from px4fuse.grading.rubric import read_rubric, rubric_text  # noqa: E402
@@ -205,10 +202,6 @@ _MOODLE = "Identifier,Full name,ID number,Email address,Grade\nParticipant 7,Ada
 _OVERRIDES = "id,item,points,comment\ns1,total,80,good\ns2,,,see me\n"
 
 
-def _fleet() -> list[bytes]:
-    return [table_of(made_up(3).to_dict("records")).to_csv(index=False).encode()]
-
-
 def _key() -> list[bytes]:
     people = (Answer("s1", "Ada", "s1.ulg", "0" * 64), Answer("s2", "山田", "s2.ulg", "1" * 64))
     return [key_text(AnswerKey("aisle", people)).encode()]
@@ -239,7 +232,6 @@ TARGETS = (
     Target("roster", _text(_ROSTER, _MOODLE), read_roster, ".csv", True, 900, 6.0),
     Target("class list", _text(_ROSTER, _MOODLE), _class_list, ".csv", True, 900, 6.0),
     Target("answer key", _key, read_key, ".json", True, 300, 2.0),
-    Target("earlier table", _fleet, read_baseline, ".csv", True, 120, 1.0),
 )  # fmt: skip
 
 
