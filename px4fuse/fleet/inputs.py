@@ -12,7 +12,7 @@ from px4fuse.errors import LogError, ResultsError
 from px4fuse.reading import files_by_sha256, read_head, read_whole, shown
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import judged_results
-from px4fuse.results.contract import AidsResults, ComparisonResults
+from px4fuse.results.contract import AidsResults, ComparisonResults, to_json
 from px4fuse.results.reading import MAX_BYTES as MAX_RESULTS_BYTES
 from px4fuse.results.reading import read_results
 from px4fuse.verification.intake import MAX_BYTES as MAX_REPORT_BYTES
@@ -81,4 +81,7 @@ def _analysed(path: Path, other: DiffInput | None, progress: Progress) -> DiffIn
             request, **{name: getattr(other.results.request, name) for name in fields}
         )
     found = run_or_judge_aids(request, progress)
-    return DiffInput(shown(path), "log", judged_results(request, found))
+    text = to_json(judged_results(request, found))  # the same digits as in a report
+    results = read_results(text.encode())
+    assert isinstance(results, Results)
+    return DiffInput(shown(path), "log", results)
