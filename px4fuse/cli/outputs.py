@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import click
 
 from px4fuse.errors import OutputError, ResultsError, on_one_line
-from px4fuse.writing import STANDARD_OUTPUT, write_all
+from px4fuse.writing import STANDARD_OUTPUT, write_all, written_before
 
 if TYPE_CHECKING:
     from msgspec import Struct
@@ -208,7 +208,7 @@ def result_files(
 
 
 def write_outputs(contents: Mapping[Path, bytes]) -> None:
-    """Write results, all or none, and never over a file that this run has read.
+    """Write results, and never over a file that this run has read.
 
     Raises
     ------
@@ -221,9 +221,9 @@ def write_outputs(contents: Mapping[Path, bytes]) -> None:
 
 
 def written_so_far(context: click.Context) -> str:
-    """Which files this run has put in their places, for a run that ends early."""
+    """List the files that this run has written, for a run that ends early."""
     written: list[Path] = context.meta.get(WRITTEN, [])
-    return f"{', '.join(map(str, written))} written before." if written else "nothing was written."
+    return f"{written_before(written)}." if written else "nothing was written."
 
 
 def write_new(path: Path, content: bytes) -> None:
@@ -274,7 +274,7 @@ def finish(
     request: Request | None = None,
     written: Iterable[Path] = (),
 ) -> None:
-    """Write all outputs or none; then tell people what was found and written, and open it if asked.
+    """Write all outputs; then print the results and the names of the files; open one on request.
 
     Nothing is told where the results have standard output to themselves. Commands in the words are
     printed so that they run, where the request is given. ``written`` is what is there already.
