@@ -38,7 +38,7 @@ def diff(
     with outputs.progress(json_path) as step:
         results = compared(a, b, progress=step)
         if output is None and json_path != STANDARD_OUTPUT:
-            output = outputs.free_report(f"{a.stem}_to_{b.stem}", "", results)
+            output = outputs.default_report(f"{a.stem}_to_{b.stem}", "", results)
         contents = outputs.result_files(results, json_path, output, results, step)
     outputs.finish(contents, summary(results))
     if fail_on is not None and results.is_worse:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import signal
 from collections.abc import Iterable, Iterator, Mapping
@@ -22,8 +23,10 @@ if TYPE_CHECKING:
     from px4fuse.request import Request
     from px4fuse.results.contract import Results
 
-# Of a report with and without the settings in its name: file systems take 255 bytes
-LONGEST_NAME, LONGEST_STEM = 200, 240
+# Limit of the name of a report in bytes, and what is kept of a longer one: file systems take 255
+LONGEST_NAME, LONGEST_STEM = 200, 180
+# Name and id on a report without a student
+NOBODY = ("", "")
 # Columns of a line that no paragraph fills
 UNWRAPPED = 10_000
 # Parameters that name files to read; some name a part of a log after a colon
@@ -96,47 +99,42 @@ def progress(output: Path | None = None) -> Iterator[ShowStep]:
         yield show
 
 
-def free_report(stem: str, settings: str, mine: Results) -> Path:
-    """Where a report goes that was given no name: what is not at its default is in its name.
+def default_report(stem: str, settings: str, results: Results) -> Path:
+    """Path of a report without -o: the name of the log and the settings that are not defaults.
 
-    What an earlier run wrote of the same files, settings and student is written over. Where another
-    file has the name, a number is added.
+    Raises
+    ------
+    OutputError
+        A file of that name exists that is not a report of the same files and student.
     """
-    name = f"{stem}{settings}"
-    if len(os.fsencode(name)) > LONGEST_NAME:
-        name = os.fsencode(stem)[:LONGEST_STEM].decode(errors="ignore")
-    number, path = 1, Path("reports", f"{name}.pdf")
-    while not all(_is_ours(file, mine) for file in (path, path.with_suffix(".json"))):
-        number += 1
-        path = Path("reports", f"{name}_{number}.pdf")
-    return path
-
-
-def _is_ours(file: Path, mine: Results) -> bool:
-    """Whether a report or its results are of the same, or not there yet."""
+    from px4fuse.results.contract import files_named, to_json
     from px4fuse.results.reading import read_results
     from px4fuse.verification.intake import attached_results
 
-    if not file.exists():
-        return True
-    read = read_results if file.suffix == ".json" else attached_results
-    try:
-        found = read(file.read_bytes(), file.name)
-        (asked, names), (ours, our_names) = map(_of_what, (found, mine))
-    except (OSError, ResultsError):
-        return False  # not a report, or not one that this version reads
-    return asked == ours and names in ((), our_names)  # a name is added to what had none
+    name = f"{stem}{settings}"
+    if len(os.fsencode(name)) > LONGEST_NAME:
+        kept = os.fsencode(name)[:LONGEST_STEM].decode(errors="ignore")
+        name = f"{kept}_{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}"
+    path = Path("reports", f"{name}.pdf")
+    for file, read in ((path, attached_results), (path.with_suffix(".json"), read_results)):
+        if not file.exists():
+            continue
+        try:
+            old = read(file.read_bytes(), file.name)
+        except (OSError, ResultsError):
+            is_same = False
+        else:
+            is_same = files_named(to_json(old)) == files_named(to_json(results))
+            is_same &= _person(old) in (NOBODY, _person(results))
+        if not is_same:
+            raise OutputError.of("default_name_taken", file=file)
+    return path
 
 
-def _of_what(results: Results) -> tuple[object, tuple[str, ...]]:
-    """What was asked of which files, and whose report it is."""
-    from px4fuse.results.contract import files_named, to_json
-
+def _person(results: Results) -> tuple[str, str]:
+    """Name and id on a report."""
     student = getattr(results, "student", None)
-    names = (student.name, student.id) if student is not None else ()
-    asked = getattr(results, "request", results.provenance.command)
-    files = files_named(to_json(results))
-    return (type(results), asked, files), names if any(names) else ()
+    return NOBODY if student is None else (student.name, student.id)
 
 
 def web_page(output: Path | None, default: Path) -> Path:
