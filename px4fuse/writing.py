@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import IO
 
 from px4fuse.errors import OutputError
+from px4fuse.input_files import check_outputs
 
 STANDARD_OUTPUT = Path("-")
 # Wait for a reader of a named pipe, in s
@@ -40,10 +41,12 @@ def write_all(
     Raises
     ------
     OutputError
-        An output cannot be written. The text lists the outputs that were written before it.
+        An output is an input of this command, and nothing is written; or an output cannot be
+        written, and the text lists the outputs that were written before it.
     BrokenPipeError
         The reader of a pipe has left. All other outputs are written.
     """
+    check_outputs(path for path in contents if path != STANDARD_OUTPUT)
     written: list[Path] = []
     gone = None
     for path, content in contents.items():

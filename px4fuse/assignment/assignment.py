@@ -12,6 +12,7 @@ from px4fuse.assignment.key import Answer, AnswerKey, key_text, read_key
 from px4fuse.assignment.roster import Person, folded
 from px4fuse.assignment.truth import truth_of
 from px4fuse.errors import OutputError, SettingsError
+from px4fuse.input_files import own_files
 from px4fuse.plain import plain
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
@@ -99,7 +100,8 @@ def assign(
     OutputError
         A file is there already with other content, or cannot be written.
     """
-    key = read_key(key_file) if key_file.exists() else AnswerKey(kind, ())
+    with own_files():
+        key = read_key(key_file) if key_file.exists() else AnswerKey(kind, ())
     answers = {folded(answer.student_id): answer for answer in key.answers}
     _check_extends(
         key_file, key.kind == kind and answers.keys() <= {folded(s.student_id) for s in students}

@@ -15,7 +15,7 @@ SEVERITIES = get_args(Severity)
 
 
 @click.command()
-@click.argument("log", type=inputs.Named())
+@click.argument("log", type=inputs.InputPath())
 @inputs.analysis_options
 @inputs.person_options
 @inputs.report_options(

@@ -11,8 +11,8 @@ from px4fuse.writing import STANDARD_OUTPUT
 
 
 @click.command()
-@click.argument("a", type=inputs.Named())
-@click.argument("b", type=inputs.Named())
+@click.argument("a", type=inputs.InputPath())
+@click.argument("b", type=inputs.InputPath())
 @inputs.max_size_option
 @inputs.report_options("The report.  [default: reports/A_to_B.pdf]")
 @inputs.options("diff")

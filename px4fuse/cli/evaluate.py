@@ -35,8 +35,8 @@ def delta(text: str) -> Delta:
 
 
 @click.command()
-@click.argument("estimate", type=inputs.Named())
-@click.argument("reference", type=inputs.Named())
+@click.argument("estimate", type=inputs.InputPath())
+@click.argument("reference", type=inputs.InputPath())
 @inputs.options("evaluate", rpe={"type": delta, "multiple": True})
 @inputs.request_options(EvaluationRequest, EVALUATION_OPTIONS)
 @inputs.max_size_option

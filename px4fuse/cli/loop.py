@@ -52,7 +52,7 @@ def closure(text: str) -> GivenClosure:
 
 
 @click.command()
-@click.argument("source", type=inputs.Named())
+@click.argument("source", type=inputs.InputPath())
 @inputs.options(
     "loop",
     landed_at={"type": landing},

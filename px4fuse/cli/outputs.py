@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import signal
+import stat
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import click
 
 from px4fuse.errors import OutputError, ResultsError, on_one_line
+from px4fuse.input_files import check_outputs
 from px4fuse.writing import STANDARD_OUTPUT, write_all, written_before
 
 if TYPE_CHECKING:
@@ -29,11 +31,6 @@ LONGEST_NAME, LONGEST_STEM = 200, 180
 NOBODY = ("", "")
 # Columns of a line that no paragraph fills
 UNWRAPPED = 10_000
-# Parameters that name files to read; some name a part of a log after a colon
-INPUTS = (
-    "log", "logs", "report", "mavlink", "position", "notes", "source", "estimate", "reference",
-    "a", "b", "baseline",
-)  # fmt: skip
 # Under it a run keeps which files it has written, for what is said where it then ends early
 WRITTEN = "px4fuse.written"
 # And under this one whether what was written is to be opened
@@ -206,12 +203,12 @@ def result_files(
 
 
 def write_outputs(contents: Mapping[Path, bytes]) -> None:
-    """Write results, and never over a file that this run has read.
+    """Write results.
 
     Raises
     ------
     OutputError
-        A target is one of the inputs, or cannot be written.
+        As :func:`check_targets`, or a target cannot be written.
     """
     check_targets(contents)
     written: list[Path] = click.get_current_context().meta.setdefault(WRITTEN, [])
@@ -238,32 +235,26 @@ def write_new(path: Path, content: bytes) -> None:
 
 
 def check_targets(targets: Iterable[Path | None]) -> None:
-    """Refuse outputs that name the same file, or one that this command reads.
+    """Refuse outputs before the analysis.
 
     Raises
     ------
     OutputError
-        Two targets are the same file, or a target is one of the inputs.
+        Two targets are the same file, a target is a folder or one of the inputs so far, or its
+        path is not possible.
     """
     files = [target for target in targets if target not in (None, STANDARD_OUTPUT)]
     if len({file.resolve() for file in files}) < len(files):
         raise OutputError("two outputs name the same file. Give each a name of its own.")
-    params = click.get_current_context().params
-    given = [params[name] for name in INPUTS if params.get(name) is not None]
-    several = [one if isinstance(one, tuple) else (one,) for one in given]
-    paths = [Path(path) for some in several for path in some]  # URLs are texts
-    read = [path if path.exists() else Path(str(path).rpartition(":")[0]) for path in paths]
     for target in files:
-        there = False
         try:
-            there = bool(target.stat())
+            if stat.S_ISDIR(target.stat().st_mode):
+                raise OutputError(f"{target}: is a folder. Give a file name.")
         except FileNotFoundError:
-            pass
+            continue
         except OSError as error:  # a name that is too long, a file in the place of a folder
             raise OutputError.of("cannot_be_written", target=target, error=error) from error
-        for source in read:
-            if there and source.exists() and target.samefile(source):
-                raise OutputError.of("output_is_input", target=target)
+    check_outputs(files)
 
 
 def finish(
