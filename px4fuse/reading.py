@@ -1,5 +1,7 @@
 """Reading the files that a person names: regular ones only, within a limit, and in one line if not.
 
+Every file that is read is registered as an input, which no output replaces.
+
 A device, a named pipe or a socket may never end or may block; a sparse file may be larger than any
 memory. So a file is looked at before it is opened, and no more than its limit is read.
 """
@@ -13,6 +15,7 @@ from contextvars import ContextVar
 from pathlib import Path
 
 from px4fuse.errors import LogError, Px4FuseError, did_you_mean, on_one_line
+from px4fuse.input_files import add_input
 
 #: Largest flight log that is read, in bytes; ``--max-size`` sets it for one command
 max_log_bytes: ContextVar[int] = ContextVar("max_log_bytes", default=2_000_000_000)
@@ -30,7 +33,7 @@ def shown(path: Path) -> str:
 
 
 def size_of(path: Path, refuse: type[Px4FuseError], name: str = "") -> int:
-    """Size of a regular file in bytes.
+    """Size of a regular file in bytes; the file is registered as an input.
 
     Parameters
     ----------
@@ -59,6 +62,7 @@ def size_of(path: Path, refuse: type[Px4FuseError], name: str = "") -> int:
         raise refuse(f"{name}: is a folder", "Give a file.")
     if not stat.S_ISREG(status.st_mode):
         raise refuse.of("not_regular", name=name)
+    add_input(path)
     return status.st_size
 
 

@@ -255,18 +255,23 @@ class TestAssign:
         assert len(read_key(key_file).answers) == 2
         assert assign(CLASS, folder, key_file, None, "aisle", 2) == (read_key(key_file), 1)
 
-    def test_what_cannot_be_written_leaves_nothing(self, tmp_path):
+    def test_run_with_blocked_folder_goes_on_in_another(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
         key_file.mkdir()
         with pytest.raises(SettingsError):
             assign(CLASS[:1], folder, key_file, SECRET, "aisle", 2)
         blocked = tmp_path / "file"
         blocked.write_bytes(b"")
-        for where, key in ((folder, blocked / "key.json"), (blocked, tmp_path / "k.json")):
+        kept = tmp_path / "k.json"
+        for where, key, secret in (
+            (folder, blocked / "key.json", SECRET),
+            (blocked, kept, None),
+        ):
             with pytest.raises(OutputError, match="cannot be written"):
-                assign(CLASS[:1], where, key, SECRET, "aisle", 2)
+                assign(CLASS[:1], where, key, secret, "aisle", 2)
         assert not any(path.is_file() for path in folder.rglob("*"))
-        assert not (tmp_path / "k.json").exists()
+        assert stat.S_IMODE(kept.stat().st_mode) == 0o600 or os.name == "nt"
+        assert assign(CLASS[:1], folder, kept, None, "aisle", 2) == (read_key(kept), 1)
 
     def test_place_of_the_key(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)

@@ -168,7 +168,6 @@ REFUSED = {
             ("too many for a loop", "--kind mixed --mistakes 2", "0 to 1"),
             ("preview without a secret", "--preview", "requires --secret-file"),
             ("key inside", "--answer f/k.json", "students' folder"),
-            ("key is the roster", "--answer roster.csv", "is the roster"),
         )
     },
     "mistakes alone": ("simulate -o f.ulg --mistakes 1", "requires --assignment"),
@@ -225,6 +224,7 @@ SPARED = {
     "sync over positions": "sync a.ulg --position c.csv --json c.csv",
     "compare by hard link": "compare a.ulg -o r.pdf --json hard.json",
     "compare over positions": "compare a.ulg --position c.csv -o r.pdf --json ../{folder}/c.csv",
+    "key over roster": "simulate -o f --assignment roster.csv --answer roster.csv",
     "compare over notes": "compare a.ulg --notes n.md -o r.pdf --json n.md",
 }
 

@@ -6,19 +6,21 @@ import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from cli_tools import done
+from cli_tools import done, refused
 from conftest import page_of
 from exchange import replace
 from rich.console import Console
 
 from px4fuse.analysis import Analysis
 from px4fuse.analysis import run as analyse
-from px4fuse.cli.outputs import free_report, progress, terminal
+from px4fuse.cli.outputs import default_report, progress, terminal
+from px4fuse.errors import OutputError
 from px4fuse.report import screen
 from px4fuse.report.screen import paragraph, runnable
 from px4fuse.report.terminal import summary
@@ -191,36 +193,56 @@ def reported(made: ComparisonResults, **changes: object) -> str:
     student = Student(name=str(changes.pop("student", "")))
     request = replace(made.request, **changes)
     changed = replace(made, request=request.recorded(), student=student)
-    path = free_report(Path(request.log).stem, settings_name(request), changed)
+    path = default_report(Path(request.log).stem, settings_name(request), changed)
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(page_of(None, to_json(changed)))
     path.with_suffix(".json").write_text(to_json(changed), encoding="utf-8")
     return path.name
 
 
-def test_other_settings_do_not_overwrite_a_report_and_the_same_do(made) -> None:
+def test_default_report_of_same_run_is_replaced(made) -> None:
     assert reported(made) == reported(made) == "aisle_uwb.pdf"
     assert reported(made, sigma_z_m=0.05) == "aisle_uwb_sigma-z-0.05.pdf"
-    assert reported(made) == "aisle_uwb.pdf"
-    # a name is added to what had none; another student's is kept
-    assert reported(made, student="Ana") == "aisle_uwb.pdf"
-    assert reported(made, student="Ben") == reported(made, student="Ben") == "aisle_uwb_2.pdf"
-    assert reported(made) == "aisle_uwb_3.pdf"
+    # a name is added to a report without one
+    assert reported(made, student="Ana") == reported(made, student="Ana") == "aisle_uwb.pdf"
 
-    # nor does another flight of the same name; a name that is too long is a number
+
+def test_default_report_with_long_name_is_shortened(made) -> None:
+    log = f"{'ü' * 110}.ulg"
+    names = {reported(made, log=log), reported(made, log=log, sigma_z_m=0.05)}
+    assert len(names) == 2
+    assert all(len(os.fsencode(name)) < 200 and name.startswith("ü" * 80) for name in names)
+
+
+def test_default_report_of_other_log_or_student_is_kept(made) -> None:
+    reported(made, student="Ana")
+    before = Path("reports/aisle_uwb.pdf").read_bytes()
     other = replace(made, log=replace(made.log, sha256="0" * 64))
-    assert reported(other) == reported(other) == "aisle_uwb_4.pdf"
-    assert reported(made, log=f"{'ü' * 110}.ulg") == f"{'ü' * 110}.pdf"
-    assert reported(made, log=f"{'ü' * 110}.ulg", sigma_z_m=0.05) == f"{'ü' * 110}_2.pdf"
+    for results_, student in ((other, "Ana"), (made, "Ben"), (made, "")):
+        with pytest.raises(OutputError, match=r"aisle_uwb\.pdf: exists .* Name the report with -o"):
+            reported(results_, student=student)
+    assert Path("reports/aisle_uwb.pdf").read_bytes() == before
 
 
 @pytest.mark.parametrize("name", ["aisle_uwb.pdf", "aisle_uwb.json"])
-def test_what_is_no_report_is_kept(made, name) -> None:
+def test_default_name_of_another_file_is_refused(made, name) -> None:
     mine = Path("reports") / name
     mine.parent.mkdir()
     mine.write_text("mine")
-    assert reported(made) == "aisle_uwb_2.pdf"
+    with pytest.raises(OutputError, match=f"{name}: exists and is not a report"):
+        reported(made)
     assert mine.read_text() == "mine"
+
+
+@pytest.mark.usefixtures("no_drawing")
+def test_same_name_in_two_folders_keeps_first_report(desk, sample_log) -> None:
+    (desk / "b").mkdir()
+    shutil.copy(sample_log, desk / "b" / "l.ulg")
+    done("compare", "l.ulg")
+    before = Path("reports/l.pdf").read_bytes()
+    assert "Name the report with -o" in refused("compare", "b/l.ulg")
+    assert Path("reports/l.pdf").read_bytes() == before
+    done("compare", "l.ulg")
 
 
 def test_names_of_reports_are_names_of_files() -> None:

@@ -12,6 +12,7 @@ from px4fuse.assignment.key import Answer, AnswerKey, key_text, read_key
 from px4fuse.assignment.roster import Person, folded
 from px4fuse.assignment.truth import truth_of
 from px4fuse.errors import OutputError, SettingsError
+from px4fuse.input_files import own_files
 from px4fuse.plain import plain
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
@@ -71,9 +72,9 @@ def assign(
 ) -> tuple[AnswerKey, int]:
     """Write everyone's log and form into a folder, and the answer key.
 
-    Each student's log, form and answer are put in their places together, so that a run that is
-    interrupted can go on. What is there already is never replaced: a log must be the same to the
-    byte, and a key may only gain students.
+    Each student's answer is written before log and form, so that a run that is interrupted can go
+    on. What is there already is never replaced: a log must be the same to the byte, and a key may
+    only gain students.
 
     Parameters
     ----------
@@ -99,7 +100,8 @@ def assign(
     OutputError
         A file is there already with other content, or cannot be written.
     """
-    key = read_key(key_file) if key_file.exists() else AnswerKey(kind, ())
+    with own_files():
+        key = read_key(key_file) if key_file.exists() else AnswerKey(kind, ())
     answers = {folded(answer.student_id): answer for answer in key.answers}
     _check_extends(
         key_file, key.kind == kind and answers.keys() <= {folded(s.student_id) for s in students}
@@ -119,9 +121,10 @@ def assign(
         contents = {folder / student.file: log, folder / form_name(student.file): form}
         new = {path: content for path, content in contents.items() if not _there(path, content)}
         key = AnswerKey(kind, tuple(answers.values()), made_up)
-        write_all({**new, key_file: key_text(key).encode()})
-        # of no use to anyone but the instructor
-        key_file.chmod(0o600)
+        # the key first: it contains the secret, without which a run that was ended cannot go on
+        write_all({key_file: key_text(key).encode()})
+        key_file.chmod(0o600)  # for the instructor only
+        write_all(new)
         written += folder / student.file in new
         step(done, len(students))
     return key, written

@@ -11,8 +11,8 @@ import click
 
 from px4fuse.cli.outputs import Interrupted, written_so_far
 from px4fuse.errors import OutputError, Px4FuseError, on_one_line
+from px4fuse.input_files import inputs_protected
 from px4fuse.threads import ONE_THREAD
-from px4fuse.writing import STOPPING
 
 # Commands, each in a module of its name, and their help: --help must not import what they need
 COMMANDS = {
@@ -36,6 +36,9 @@ COMMANDS = {
     "lesson": "Run the lesson's worked examples through this engine.",
 }
 
+
+#: Signals that end a run: Ctrl-C, termination, and (not on Windows) a closed terminal
+STOPPING = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 
 # pandas loads pyarrow wherever it is installed: 70 MB that only these need
 PARQUET = ("batch", "extract")
@@ -77,7 +80,8 @@ class LazyGroup(click.Group):
     def invoke(self, ctx: click.Context) -> object:
         """Invoke a command; what ends it early is told apart before click sees it."""
         try:
-            return super().invoke(ctx)
+            with inputs_protected():
+                return super().invoke(ctx)
         except Px4FuseError as error:
             error.args = (_in_options(str(error), ctx.invoked_subcommand),)
             raise

@@ -15,7 +15,7 @@ SEVERITIES = get_args(Severity)
 
 
 @click.command()
-@click.argument("log", type=inputs.Named())
+@click.argument("log", type=inputs.InputPath())
 @inputs.analysis_options
 @inputs.person_options
 @inputs.report_options(
@@ -49,7 +49,7 @@ def compare(
         results = judged_results(request, found, person)
         give_back()  # before anything of the report is imported
         if output is None and json_path != STANDARD_OUTPUT:
-            output = outputs.free_report(log.stem, settings_name(request), results)
+            output = outputs.default_report(log.stem, settings_name(request), results)
         contents = outputs.result_files(results, json_path, output, found, step)
     outputs.finish(contents, summary(found, results, output), request)
     bad = bad_verdicts(found) if checks else {}

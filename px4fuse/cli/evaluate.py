@@ -35,8 +35,8 @@ def delta(text: str) -> Delta:
 
 
 @click.command()
-@click.argument("estimate", type=inputs.Named())
-@click.argument("reference", type=inputs.Named())
+@click.argument("estimate", type=inputs.InputPath())
+@click.argument("reference", type=inputs.InputPath())
 @inputs.options("evaluate", rpe={"type": delta, "multiple": True})
 @inputs.request_options(EvaluationRequest, EVALUATION_OPTIONS)
 @inputs.max_size_option
@@ -83,7 +83,7 @@ def evaluate(
         results = evaluation_results(request, found)
         if output is None and json_path is None:
             name = f"{file_name(estimate)}_against_{file_name(reference)}"
-            output = outputs.free_report(name, settings_name(request), results)
+            output = outputs.default_report(name, settings_name(request), results)
         contents = outputs.result_files(results, json_path, output, found, step)
     page = Page()
     write_evaluation(page, found)

@@ -12,7 +12,7 @@ from px4fuse.request import settings_name
 
 
 @click.command()
-@click.argument("logs", nargs=-1, type=inputs.Named())
+@click.argument("logs", nargs=-1, type=inputs.InputPath())
 @inputs.analysis_options
 @inputs.options("explore")
 @inputs.open_option

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from px4fuse.cli.inputs import Named, comparison_request, options, recording_options
+from px4fuse.cli.inputs import InputPath, comparison_request, options, recording_options
 from px4fuse.cli.outputs import write_outputs
 from px4fuse.errors import OutputError, on_one_line
+from px4fuse.input_files import check_output_folder, own_files
 from px4fuse.reading import read_text
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ MAX_DESCRIPTION_BYTES = 50_000_000
 
 
 @click.command()
-@click.argument("log", type=Named())
+@click.argument("log", type=InputPath())
 @options("extract")
 @recording_options
 def extract(
@@ -37,6 +38,7 @@ def extract(
     With data_dictionary.csv, which says the unit, frame, meaning, source topic and clock of every
     column, and flight.json, which says what the log is and what is missing from it.
     """
+    check_output_folder(output)
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output}: is a file. Give a folder with -o.")
     if format == "parquet" and importlib.util.find_spec("pyarrow") is None:
@@ -64,7 +66,8 @@ def extract(
 def _refuse_mixture(folder: Path, sha256: str) -> None:
     """Tables of two flights in one folder would pass for one."""
     try:
-        text = read_text(folder / "flight.json", OutputError, MAX_DESCRIPTION_BYTES)
+        with own_files():
+            text = read_text(folder / "flight.json", OutputError, MAX_DESCRIPTION_BYTES)
         before = json.loads(text)["log"]
         other = before["sha256"] != sha256
         name = str(before["name"])

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from px4fuse.cli.inputs import Named, max_size_option, open_option, options
+from px4fuse.cli.inputs import InputPath, max_size_option, open_option, options
 from px4fuse.cli.outputs import Interrupted, finish, progress, write_new
 from px4fuse.errors import OutputError, SettingsError
+from px4fuse.input_files import add_input, check_output_folder
+from px4fuse.reading import files_below
 
 if TYPE_CHECKING:
     from px4fuse.grading.grade import GradeOutcome
@@ -18,10 +20,15 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("submissions", nargs=-1, type=Named())
-@options("grade-reads")
+@click.argument("submissions", nargs=-1, type=InputPath())
+@options("grade-reads", logs={"type": InputPath(), "multiple": True}, rubric={"type": InputPath()})
 @max_size_option
-@options("grade")
+@options(
+    "grade",
+    key={"type": InputPath()},
+    roster={"type": InputPath()},
+    worksheet={"type": InputPath(), "multiple": True},
+)
 @open_option
 def grade(
     submissions: tuple[Path, ...],
@@ -106,9 +113,14 @@ def grade(
 def _check_place(output: Path, given: tuple[Path, ...]) -> None:
     if output.exists() and not output.is_dir():
         raise OutputError(f"-o {output}: is not a folder. Give another place.")
+    whole = output.resolve()
+    above = [folder for folder in (whole, *whole.parents) if folder.is_dir()]
     for path in given:
-        if path.is_dir() and output.resolve().is_relative_to(path.resolve()):
+        if path.is_dir() and any(map(path.samefile, above)):
             raise OutputError.of("output_within", output=output, path=path)
+        for file in files_below(path):
+            add_input(file)
+    check_output_folder(output)
 
 
 def _page(outcome: GradeOutcome) -> Page:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import Named, comparison_request, json_option, recording_options
-from px4fuse.cli.outputs import finish, progress, result_files
+from px4fuse.cli.inputs import InputPath, comparison_request, json_option, recording_options
+from px4fuse.cli.outputs import check_targets, finish, progress, result_files
 from px4fuse.plain import few_words
 from px4fuse.record import Unavailable
 
@@ -36,7 +36,7 @@ def _versions(context: click.Context, _: click.Parameter, wanted: bool) -> None:
 
 
 @click.command()
-@click.argument("log", type=Named())
+@click.argument("log", type=InputPath())
 @click.option(
     "--versions", is_flag=True, is_eager=True, expose_value=False, callback=_versions,
     help="Print versions, system and libraries, for a bug report, and exit.",
@@ -49,6 +49,7 @@ def info(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.inspect.inventory import take_inventory, to_plain
 
     request = comparison_request(log, given)
+    check_targets([json_path])
     with progress(json_path) as step:
         flight = read_flight(request, step)
         step("looking at what is in it")

@@ -19,6 +19,7 @@ from msgspec.structs import fields
 
 from px4fuse.cli.outputs import OPENED
 from px4fuse.errors import SettingsError
+from px4fuse.input_files import add_input
 from px4fuse.reading import max_log_bytes, read_text
 from px4fuse.record import table
 from px4fuse.request import (
@@ -69,6 +70,20 @@ class Named(click.Path):
         if value == "":
             self.fail("the name is empty.", param, ctx)
         return super().convert(value, param, ctx)
+
+
+class InputPath(Named):
+    """A file or folder to read, which is registered before the command begins.
+
+    A log may have a part of it after a colon, as ``LOG:vio``.
+    """
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Convert what was typed."""
+        path = super().convert(value, param, ctx)
+        file, colon, _ = str(path).rpartition(":")
+        add_input(Path(file) if colon and not Path(path).exists() else Path(path))
+        return path
 
 
 class TypedQuantity(click.ParamType["float | str"]):
@@ -198,7 +213,7 @@ def _declared(field: str, declared: Declared, hint: Any, default: Any) -> Option
     details = {"default": default or None} if default is not NODEFAULT else {}
     details |= _taken(hint) | {"help": declared.meaning, "metavar": declared.metavar}
     if field in ("path", "mavlink", "reference"):
-        details["type"] = Named(str)
+        details["type"] = InputPath(str)
     elif declared.unit:
         auto = len(get_args(hint)) > 2
         details["type"] = TypedQuantity(declared.unit, declared.example, auto=auto)
@@ -256,7 +271,7 @@ open_option = _opened("--open, --show", "opened")
 #: Of the command whose --open is of a loop that did not close
 show_option = _opened("--show", "shown")
 #: Whose report it is
-person_options = options("person", notes={"type": Named()}, answers={"type": Named()})
+person_options = options("person", notes={"type": InputPath()}, answers={"type": InputPath()})
 
 
 def report_options(meaning: str) -> Option:

@@ -52,7 +52,7 @@ def closure(text: str) -> GivenClosure:
 
 
 @click.command()
-@click.argument("source", type=inputs.Named())
+@click.argument("source", type=inputs.InputPath())
 @inputs.options(
     "loop",
     landed_at={"type": landing},
@@ -98,7 +98,9 @@ def loop(
         found = run_loop(request, step)
         made = loop_results(request, found, person)
         if output is None and json_path is None:
-            output = outputs.free_report(f"{file_name(source)}_loop", settings_name(request), made)
+            output = outputs.default_report(
+                f"{file_name(source)}_loop", settings_name(request), made
+            )
         contents = _files(found, tum, g2o)
         contents |= outputs.result_files(made, json_path, output, found, step)
     outputs.finish(contents, summary(found, made.findings), request)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import signal
+import stat
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +14,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import click
 
 from px4fuse.errors import OutputError, ResultsError, on_one_line
-from px4fuse.writing import STANDARD_OUTPUT, write_all
+from px4fuse.input_files import check_outputs
+from px4fuse.writing import STANDARD_OUTPUT, write_all, written_before
 
 if TYPE_CHECKING:
     from msgspec import Struct
@@ -22,15 +25,12 @@ if TYPE_CHECKING:
     from px4fuse.request import Request
     from px4fuse.results.contract import Results
 
-# Of a report with and without the settings in its name: file systems take 255 bytes
-LONGEST_NAME, LONGEST_STEM = 200, 240
+# Limit of the name of a report in bytes, and what is kept of a longer one: file systems take 255
+LONGEST_NAME, LONGEST_STEM = 200, 180
+# Name and id on a report without a student
+NOBODY = ("", "")
 # Columns of a line that no paragraph fills
 UNWRAPPED = 10_000
-# Parameters that name files to read; some name a part of a log after a colon
-INPUTS = (
-    "log", "logs", "report", "mavlink", "position", "notes", "source", "estimate", "reference",
-    "a", "b",
-)  # fmt: skip
 # Under it a run keeps which files it has written, for what is said where it then ends early
 WRITTEN = "px4fuse.written"
 # And under this one whether what was written is to be opened
@@ -96,47 +96,42 @@ def progress(output: Path | None = None) -> Iterator[ShowStep]:
         yield show
 
 
-def free_report(stem: str, settings: str, mine: Results) -> Path:
-    """Where a report goes that was given no name: what is not at its default is in its name.
+def default_report(stem: str, settings: str, results: Results) -> Path:
+    """Path of a report without -o: the name of the log and the settings that are not defaults.
 
-    What an earlier run wrote of the same files, settings and student is written over. Where another
-    file has the name, a number is added.
+    Raises
+    ------
+    OutputError
+        A file of that name exists that is not a report of the same files and student.
     """
-    name = f"{stem}{settings}"
-    if len(os.fsencode(name)) > LONGEST_NAME:
-        name = os.fsencode(stem)[:LONGEST_STEM].decode(errors="ignore")
-    number, path = 1, Path("reports", f"{name}.pdf")
-    while not all(_is_ours(file, mine) for file in (path, path.with_suffix(".json"))):
-        number += 1
-        path = Path("reports", f"{name}_{number}.pdf")
-    return path
-
-
-def _is_ours(file: Path, mine: Results) -> bool:
-    """Whether a report or its results are of the same, or not there yet."""
+    from px4fuse.results.contract import files_named, to_json
     from px4fuse.results.reading import read_results
     from px4fuse.verification.intake import attached_results
 
-    if not file.exists():
-        return True
-    read = read_results if file.suffix == ".json" else attached_results
-    try:
-        found = read(file.read_bytes(), file.name)
-        (asked, names), (ours, our_names) = map(_of_what, (found, mine))
-    except (OSError, ResultsError):
-        return False  # not a report, or not one that this version reads
-    return asked == ours and names in ((), our_names)  # a name is added to what had none
+    name = f"{stem}{settings}"
+    if len(os.fsencode(name)) > LONGEST_NAME:
+        kept = os.fsencode(name)[:LONGEST_STEM].decode(errors="ignore")
+        name = f"{kept}_{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}"
+    path = Path("reports", f"{name}.pdf")
+    for file, read in ((path, attached_results), (path.with_suffix(".json"), read_results)):
+        if not file.exists():
+            continue
+        try:
+            old = read(file.read_bytes(), file.name)
+        except (OSError, ResultsError):
+            is_same = False
+        else:
+            is_same = files_named(to_json(old)) == files_named(to_json(results))
+            is_same &= _person(old) in (NOBODY, _person(results))
+        if not is_same:
+            raise OutputError.of("default_name_taken", file=file)
+    return path
 
 
-def _of_what(results: Results) -> tuple[object, tuple[str, ...]]:
-    """What was asked of which files, and whose report it is."""
-    from px4fuse.results.contract import files_named, to_json
-
+def _person(results: Results) -> tuple[str, str]:
+    """Name and id on a report."""
     student = getattr(results, "student", None)
-    names = (student.name, student.id) if student is not None else ()
-    asked = getattr(results, "request", results.provenance.command)
-    files = files_named(to_json(results))
-    return (type(results), asked, files), names if any(names) else ()
+    return NOBODY if student is None else (student.name, student.id)
 
 
 def web_page(output: Path | None, default: Path) -> Path:
@@ -208,12 +203,12 @@ def result_files(
 
 
 def write_outputs(contents: Mapping[Path, bytes]) -> None:
-    """Write results, all or none, and never over a file that this run has read.
+    """Write results.
 
     Raises
     ------
     OutputError
-        A target is one of the inputs, or cannot be written.
+        As :func:`check_targets`, or a target cannot be written.
     """
     check_targets(contents)
     written: list[Path] = click.get_current_context().meta.setdefault(WRITTEN, [])
@@ -221,9 +216,9 @@ def write_outputs(contents: Mapping[Path, bytes]) -> None:
 
 
 def written_so_far(context: click.Context) -> str:
-    """Which files this run has put in their places, for a run that ends early."""
+    """List the files that this run has written, for a run that ends early."""
     written: list[Path] = context.meta.get(WRITTEN, [])
-    return f"{', '.join(map(str, written))} written before." if written else "nothing was written."
+    return f"{written_before(written)}." if written else "nothing was written."
 
 
 def write_new(path: Path, content: bytes) -> None:
@@ -240,32 +235,26 @@ def write_new(path: Path, content: bytes) -> None:
 
 
 def check_targets(targets: Iterable[Path | None]) -> None:
-    """Refuse outputs that name the same file, or one that this command reads.
+    """Refuse outputs before the analysis.
 
     Raises
     ------
     OutputError
-        Two targets are the same file, or a target is one of the inputs.
+        Two targets are the same file, a target is a folder or one of the inputs so far, or its
+        path is not possible.
     """
     files = [target for target in targets if target not in (None, STANDARD_OUTPUT)]
     if len({file.resolve() for file in files}) < len(files):
         raise OutputError("two outputs name the same file. Give each a name of its own.")
-    params = click.get_current_context().params
-    given = [params[name] for name in INPUTS if params.get(name) is not None]
-    several = [one if isinstance(one, tuple) else (one,) for one in given]
-    paths = [Path(path) for some in several for path in some]  # URLs are texts
-    read = [path if path.exists() else Path(str(path).rpartition(":")[0]) for path in paths]
     for target in files:
-        there = False
         try:
-            there = bool(target.stat())
+            if stat.S_ISDIR(target.stat().st_mode):
+                raise OutputError(f"{target}: is a folder. Give a file name.")
         except FileNotFoundError:
-            pass
+            continue
         except OSError as error:  # a name that is too long, a file in the place of a folder
             raise OutputError.of("cannot_be_written", target=target, error=error) from error
-        for source in read:
-            if there and source.exists() and target.samefile(source):
-                raise OutputError.of("output_is_input", target=target)
+    check_outputs(files)
 
 
 def finish(
@@ -274,7 +263,7 @@ def finish(
     request: Request | None = None,
     written: Iterable[Path] = (),
 ) -> None:
-    """Write all outputs or none; then tell people what was found and written, and open it if asked.
+    """Write all outputs; then print the results and the names of the files; open one on request.
 
     Nothing is told where the results have standard output to themselves. Commands in the words are
     printed so that they run, where the request is given. ``written`` is what is there already.

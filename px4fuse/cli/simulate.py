@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
 import click
 
-from px4fuse.cli.inputs import TypedQuantity, options, typed_parameters
+from px4fuse.cli.inputs import InputPath, TypedQuantity, options, typed_parameters
 from px4fuse.cli.outputs import check_targets, finish, progress
 from px4fuse.errors import OutputError, SettingsError, on_one_line
+from px4fuse.input_files import check_output_folder
 from px4fuse.reading import read_text
 from px4fuse.simulation.mistakes import MISTAKES, as_typed, made, parse
 from px4fuse.simulation.scenario import OF_KIND, Kind, Scenario, Yaw, quantities, scenario_of
@@ -64,7 +65,7 @@ class WithMistakes(click.Command):
 
 
 @click.command(cls=WithMistakes)
-@options("simulate")
+@options("simulate", assignment={"type": InputPath()}, secret_file={"type": InputPath()})
 @_scenario_options
 def simulate(
     output: Path,
@@ -167,8 +168,8 @@ def _assign(
 
     students, page, ends = read_roster(roster), Page(), dict[str, str]()
     key_file = assignment.key_path(folder, answer_path)
-    if key_file.exists() and key_file.samefile(roster):
-        raise OutputError(f"{key_file}: is the roster. Give another name with --answer.")
+    check_targets([key_file])
+    check_output_folder(folder)
     drawn: list[tuple[tuple[str, ...], float | None]]
     if preview:
         found = assignment.preview(students, key_file, secret, kind, count)

@@ -5,12 +5,12 @@ from typing import Any
 
 import click
 
-from px4fuse.cli.inputs import Named, analysis_options, comparison_request, json_option
-from px4fuse.cli.outputs import finish, progress, result_files
+from px4fuse.cli.inputs import InputPath, analysis_options, comparison_request, json_option
+from px4fuse.cli.outputs import check_targets, finish, progress, result_files
 
 
 @click.command()
-@click.argument("log", type=Named())
+@click.argument("log", type=InputPath())
 @analysis_options
 @json_option
 def sync(log: Path, json_path: Path | None, **given: Any) -> None:
@@ -28,6 +28,7 @@ def sync(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.results.build import sync_results
 
     request = comparison_request(log, given)
+    check_targets([json_path])
     with progress(json_path) as step:
         compared = run_preparation(request, step)
         _, found = noises_and_clock(compared, step)

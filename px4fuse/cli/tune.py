@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import Named, analysis_options, comparison_request, json_option
-from px4fuse.cli.outputs import finish, progress, result_files
+from px4fuse.cli.inputs import InputPath, analysis_options, comparison_request, json_option
+from px4fuse.cli.outputs import check_targets, finish, progress, result_files
 from px4fuse.record import Unavailable
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ NOTE = (
 
 
 @click.command()
-@click.argument("log", type=Named())
+@click.argument("log", type=InputPath())
 @analysis_options
 @json_option
 def tune(log: Path, json_path: Path | None, **given: Any) -> None:
@@ -42,6 +42,7 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.results.build import tuning_results
 
     request = comparison_request(log, given)
+    check_targets([json_path])
     with progress(json_path) as step:
         compared = run_preparation(request, step)
         tuned = tuned_noises(compared, progress=step)

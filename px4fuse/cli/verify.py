@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from px4fuse.cli.inputs import Named, max_size_option, open_option, report_options
+from px4fuse.cli.inputs import InputPath, max_size_option, open_option, report_options
 from px4fuse.cli.outputs import check_targets, finish, progress, result_files
 from px4fuse.errors import LogError
 from px4fuse.reading import files_by_sha256, read_whole, shown
@@ -26,8 +26,8 @@ TIMEOUT_S = 1800.0
 
 
 @click.command()
-@click.argument("report", type=Named(), metavar="REPORT.pdf")
-@click.argument("logs", type=Named(), nargs=-1, metavar="[LOG ...]")
+@click.argument("report", type=InputPath(), metavar="REPORT.pdf")
+@click.argument("logs", type=InputPath(), nargs=-1, metavar="[LOG ...]")
 @max_size_option
 @report_options("Write the report, drawn again from the log.")
 @open_option
@@ -52,10 +52,10 @@ def verify(
 
     content = read_whole(report, LogError, MAX_BYTES, smaller="Reports are below 2 MB")
     read = read_report(content, shown(report))
-    check_targets([json_path, output])
     with progress(json_path) as step:
         step("hashing the logs")
         files = files_by_sha256(logs)
+        check_targets([json_path, output])
         if logs and not files:
             raise LogError("there is no file in what was given as LOG.")
         step("running the analysis again")

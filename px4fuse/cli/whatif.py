@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("log", type=inputs.Named())
+@click.argument("log", type=inputs.InputPath())
 @inputs.options("whatif", since={"type": inputs.TypedQuantity("s", 60.0)})
 @inputs.flight_options
 @inputs.report_options("A page, and its results beside it.")

@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from px4fuse.errors import LogError, SettingsError
+from px4fuse.input_files import add_input
 from px4fuse.reading import max_log_bytes
 from px4fuse.results.reading import one_line
 
@@ -91,6 +92,8 @@ def _logs_in(given: str) -> list[FoundLog]:
         is_relative = _is_local(files) and not Path(given).is_absolute()
         log = os.path.relpath(path) if is_relative else address
         found.append(FoundLog(_name(path), log, address, info.get("size")))
+        if _is_local(files):
+            add_input(Path(path))
     return found
 
 

@@ -23,6 +23,7 @@ from px4fuse.fleet.job import Job, Outcome, analyse, file_stem, refused
 from px4fuse.fleet.logs import FoundLog, find_logs
 from px4fuse.fleet.page import html_text
 from px4fuse.fleet.rows import FAILED, NOT_JUDGED, Row, csv_bytes, table_of, writable
+from px4fuse.input_files import check_output_folder
 from px4fuse.reading import max_log_bytes
 from px4fuse.request import ComparisonRequest, command_line
 from px4fuse.workers import MEMORY_BYTES, Failed, run_bounded
@@ -163,6 +164,7 @@ def run(
     if find_spec("fsspec") is None or find_spec("pyarrow") is None:
         raise SettingsError("many logs require more", 'Run pip install "px4fuse[batch]".')
     logs = find_logs(paths)
+    check_output_folder(output)
     try:
         request = ComparisonRequest(log="LOG", **settings)
     except TypeError as error:

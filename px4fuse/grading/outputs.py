@@ -34,6 +34,7 @@ from px4fuse.grading.class_page import html_text
 from px4fuse.grading.entries import NAME, TEMPLATE, Course
 from px4fuse.grading.model import TOTAL, Entry, Graded, columns
 from px4fuse.grading.records import HANDED_IN, PAGE, RECORDS, REDRAWN
+from px4fuse.input_files import own_files
 from px4fuse.plain import few_words
 from px4fuse.results.reading import one_line
 from px4fuse.spreadsheet import neutral, neutral_id
@@ -146,7 +147,8 @@ def _pseudonyms(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]
     """
     kept: dict[str, tuple[str, str]] = {}
     if path.exists():
-        sheet = read_sheet(path)
+        with own_files():
+            sheet = read_sheet(path)
         for row in sheet.rows:
             name, who, student = (sheet.cell(row, (t,)).removeprefix("'") for t in NAMES_HEAD)
             kept[who] = name, student

@@ -36,6 +36,7 @@ from typing import IO
 from px4fuse.assignment.roster import Person, distinct
 from px4fuse.errors import ResultsError, SettingsError
 from px4fuse.grading.model import NOBODY, ExportOrigin, Submission
+from px4fuse.input_files import add_input
 from px4fuse.reading import files_below
 from px4fuse.record import table
 from px4fuse.results.reading import cleaned, one_line
@@ -116,6 +117,7 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
     for path in paths:
         export = path.is_file() and path.name.lower().endswith(".zip")
         for place in (_exported if export else _files)(path, notes):
+            add_input(place.file)
             end = place.name.lower()[-4:]
             if end in (".pdf", ".zip"):
                 found.setdefault((place.file, place.entry), place)
