@@ -188,7 +188,7 @@ def _flown(one: Round, number: int) -> tuple[dict[str, Any], str]:
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
     analysis = run(request, flight=flight)
     findings, packer = find(analysis), Packer()
-    data = flight_data(analysis, packer, replays=False)
+    data = flight_data(analysis, packer)
     key = {
         "right": one.right,
         "made": [

@@ -145,7 +145,7 @@ class LogInfo(Record, frozen=True, omit_defaults=False):
     damage : tuple of str
         What of the file could not be read, and how much that is: sentences.
     bytes_read : int
-        Of ``bytes``, those of whole messages.
+        Part of ``bytes`` that was read as complete messages.
     ends_in_flight : bool
         Whether the land detector still says "flying" at the end of the data.
     restarts : int or None

@@ -444,3 +444,11 @@ def test_a_frame_costs_a_bounded_amount(tmp_path, make, each_bytes, more_bytes):
     assert len(flight.log.senders) <= 32
     assert len(read_frames(path.name, path.read_bytes())) == len(parts)
     assert peak < path.stat().st_size + each_bytes * len(parts) + more_bytes
+
+
+def test_a_recording_that_ends_in_flight_says_so(tmp_path, sample_log):
+    content = sample_log.with_suffix(".tlog").read_bytes()
+    path = tmp_path / "half.tlog"
+    path.write_bytes(content[: len(content) // 2])
+    assert read_log(path).log.ends_in_flight
+    assert not read_log(sample_log.with_suffix(".tlog")).log.ends_in_flight

@@ -14,11 +14,10 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.interventions import CONTENT_NIS, NEES_LARGE, beyond_claim
 from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
 from px4fuse.comparison.preparation import choose_source
-from px4fuse.explore.ekf2_grid import grid_data, judged_numbers
 from px4fuse.explore.packing import COARSE, Packer
 from px4fuse.filter import settings as allowed
 from px4fuse.filter.clock import ClockOffset
-from px4fuse.filter.consistency import CONFIDENCE, nis_band
+from px4fuse.filter.consistency import CONFIDENCE, Consistency, nis_band
 from px4fuse.filter.model import INITIAL_COVARIANCE
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, along, imu_gaps, within
@@ -39,9 +38,7 @@ MAX_PLAN_POINTS = 2000
 OF_KNOBS = frozenset(name for name in NOISES if not name.startswith("ekf2_"))
 
 
-def flight_data(
-    analysis: Analysis, packer: Packer, *, beside: bool = False, replays: bool = True
-) -> dict[str, Any]:
+def flight_data(analysis: Analysis, packer: Packer, *, beside: bool = False) -> dict[str, Any]:
     """Everything about one flight, as JSON can hold it; arrays are places in the packer.
 
     Parameters
@@ -51,8 +48,6 @@ def flight_data(
     packer : Packer
     beside : bool
         Whether it stands beside another flight: then times are from the start of its segment.
-    replays : bool
-        Whether EKF2 with other parameters is among it, most of a page's size.
     """
     signals = signals_of(analysis, packer)
     settings, segment = analysis.settings, analysis.segment
@@ -73,7 +68,6 @@ def flight_data(
             for own, result in zip(signals["axes"], analysis.axes.values(), strict=True)
         ],
         "maps": _maps(analysis),
-        "grid": _grid(analysis, packer, beside=beside, replays=replays),
         "plan": _plan(analysis, packer),
         "events": {
             "silent": list(events.gaps),
@@ -100,14 +94,6 @@ def signals_of(comparison: Comparison, packer: Packer) -> dict[str, Any]:
         "imu": _imu(comparison, packer),
         "axes": [_signals(comparison, line, raw, packer) for line in comparison.lines],
     }
-
-
-def _grid(
-    analysis: Analysis, packer: Packer, *, beside: bool, replays: bool
-) -> dict[str, Any] | str:
-    if beside:
-        return "only for one log"
-    return grid_data(analysis, packer) if replays else "left out of a page of many flights"
 
 
 def ranges() -> dict[str, Any]:
@@ -231,7 +217,7 @@ def _ekf2(analysis: Analysis, result: AxisComparison, packer: Packer) -> dict[st
         "state": _frame(state, ["position_m", "velocity_m_s"], packer),
         "variance": "",
         "innovations": "",
-        "summary": judged_numbers(judged),
+        "summary": _summary(judged),
         "r": None,
     }
     if isinstance(judged.truth, AgainstTruth):
@@ -259,6 +245,20 @@ def _ekf2(analysis: Analysis, result: AxisComparison, packer: Packer) -> dict[st
     else:
         made["why"] = result.ekf2_innovations.reason
     return made
+
+
+def _summary(statement: Consistency | Unavailable) -> dict[str, Any]:
+    """Return EKF2's column of the page's table; the reason where there are too few innovations."""
+    if isinstance(statement, Unavailable):
+        return {"why": statement.reason}
+    return {
+        "why": "",
+        "count": statement.count,
+        "nis": statement.nis_mean,
+        "band": list(statement.nis_band),
+        "outside": statement.outside_two_sigma,
+        "lag1": statement.lag1_autocorrelation,
+    }
 
 
 def _truth(result: AxisComparison, packer: Packer) -> dict[str, Any] | str:

@@ -14,7 +14,7 @@ from px4fuse.webpage.safe import cleaned, inert_json, part, policy_hash, templat
 
 # Longer text from a log is cut
 MAX_CHARACTERS = 2000
-SCRIPTS = ("dom", "story", "grid", "step", "times", "tour")
+SCRIPTS = ("dom", "story", "step", "times", "tour")
 HERE = "px4fuse.explore"
 
 

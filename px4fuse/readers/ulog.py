@@ -16,8 +16,8 @@ from px4fuse.record import lacking
 from px4fuse.recording import Unused
 
 ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
-# A message that is cut off and no more is no loss besides; a silent IMU is one from here on
-LEAST_LOST, LOST_FROM_S = 65_538, 0.2
+# Longer steps between IMU samples count as missing (s)
+IMU_GAP_S = 0.2
 # A receiver's UTC outside these is not valid: PX4's own GPS_EPOCH_SECS (gps_helper.h), and 2100
 UTC_RANGE_S = (1_234_567_890.0, 4_102_444_800.0)
 
@@ -53,7 +53,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
             notes=(*topics.log.notes, *notes),
             dropped=dict(dropped),
             start_unix_s=_start_unix(topics),
-            damage=(*_lost(topics, imu, in_flight), *topics.log.damage),
+            damage=_damage(topics, imu, in_flight),
             ends_in_flight=in_flight,
         ),
         imu=imu,
@@ -75,20 +75,19 @@ def read_ulog(name: str, content: bytes) -> Flight:
     )
 
 
-def _lost(topics: Topics, imu: pd.DataFrame | Unavailable, in_flight: bool) -> tuple[str, ...]:
-    """How much of the file is no whole message, in sentences."""
-    framing, log = topics.framing, topics.log
+def _damage(topics: Topics, imu: pd.DataFrame | Unavailable, in_flight: bool) -> tuple[str, ...]:
+    """Sentences about the missing parts of the file."""
+    end_s = topics.log.duration_s
     said = []
-    if framing.in_message:
-        said.append(parts.cut_off("message", log.duration_s, in_flight))
-    if framing.lost_bytes > LEAST_LOST * framing.in_message:
-        steps = np.array([]) if isinstance(imu, Unavailable) else np.diff(imu.index.to_numpy())
-        silent_s = float(steps[steps > LOST_FROM_S].sum())
-        where = "in one place" if framing.places == 1 else f"in {framing.places} places"
-        missing = f"; {silent_s:.1f} s of the IMU are missing" if silent_s else ""
-        share = f"{framing.lost_bytes / log.bytes:.2%}"
-        lost = f"{framing.lost_bytes:,} of its {log.bytes:,} bytes ({share})"
-        said.append(f"{lost} could not be read, {where}{missing}")
+    if topics.is_cut:
+        said.append(parts.cut_off("message", end_s, in_flight))
+    if topics.is_damaged:
+        missing = "the IMU is missing"
+        if not isinstance(imu, Unavailable):
+            steps_s = np.diff(imu.index.to_numpy())
+            missing_s = float(steps_s[steps_s > IMU_GAP_S].sum())
+            missing = f"{missing_s:.1f} s of the IMU are missing before the end at {end_s:.1f} s"
+        said.append(f"the file is damaged: {missing}; invalid messages were skipped")
     return tuple(said)
 
 

@@ -11,7 +11,7 @@ import struct
 from bisect import bisect_left
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from types import MappingProxyType
 from typing import Any
 
@@ -27,7 +27,6 @@ from px4fuse.errors import LogError
 from px4fuse.plain import few_words
 from px4fuse.readers.layouts import Layout
 from px4fuse.readers.px4_topics import IMU, LAYOUTS, topics
-from px4fuse.readers.ulog_framing import Framing, whole_messages
 from px4fuse.recording import Dropout, LogInfo, Stream
 
 _MICROSECOND = 1e-6
@@ -41,7 +40,10 @@ RELEASE = 255
 NOTE_KEY = "px4fuse_note"
 # A gap longer than this in the IMU's stamps is no dropout: what lies beyond is another boot.
 MAX_DATA_GAP_S = 600.0
-# pyulog walks damaged bytes as though they were messages; these are what that can raise
+# Fields of all subscriptions together, about 300 bytes of memory each; real logs have up to 3,300
+MAX_FIELDS = 200_000
+HEADER_BYTES = 3
+# pyulog reads damaged bytes as messages; these are the exceptions that this can raise
 _PARSE_ERRORS = (
     ULogException, struct.error, IndexError, KeyError, ValueError, TypeError, AttributeError,
     OverflowError, UnicodeError, EOFError, MemoryError, AssertionError, RecursionError,
@@ -52,6 +54,95 @@ _PARSE_ERRORS = (
 Instances = tuple[tuple[float, int], ...]
 # One EKF2 instance alone publishes no selector
 NO_SELECTOR: Instances = ((-np.inf, 0),)
+
+
+class _Content(io.BytesIO):
+    """Content of a ULog; counts the bytes that pyulog skips.
+
+    pyulog reads a header of 3 bytes, then the message. It moves on by one byte, or to the next
+    synchronisation message, where the header is invalid.
+
+    Attributes
+    ----------
+    skipped_bytes : int
+    start, end, position : int
+        Offsets of the last header, of the end of the last read, and of the next one. The last two
+        can be beyond the end of the file.
+    """
+
+    skipped_bytes = start = end = position = 0
+
+    def read(self, size: int, /) -> bytes:  # type: ignore[override]  # pyulog gives a size
+        at = self.position
+        if size == HEADER_BYTES:
+            if at != self.end:
+                self.skipped_bytes += at - self.start
+            self.start = at
+        self.end = self.position = at + size
+        return io.BytesIO.read(self, size)
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
+        # pyulog moves back by the length it asked for: without this it never ends where a damaged
+        # definition is longer than the rest of the file
+        if whence == io.SEEK_CUR:
+            offset += self.position
+        self.position = super().seek(offset)
+        return self.position
+
+
+def _skip_if_short(read: Callable[..., Any]) -> Callable[..., Any]:
+    """Raise ValueError where a message is too short for its kind.
+
+    pyulog skips such a message. At struct.error it takes the end of the file as reached.
+    """
+
+    def checked(*arguments: Any, **named: Any) -> Any:
+        try:
+            return read(*arguments, **named)
+        except struct.error as error:
+            raise ValueError(str(error)) from error
+
+    return checked
+
+
+class _MessageData(ULog._MessageData):  # type: ignore[misc]  # pyulog has no types
+    initialize = _skip_if_short(ULog._MessageData.initialize)
+
+
+class _Reader(ULog):  # type: ignore[misc]
+    """pyulog that loses less of a damaged file, with a limit on the fields of all subscriptions.
+
+    A format of 20 bytes can declare 65,535 fields, and nested formats multiply.
+    """
+
+    fields = 0
+    _MessageData = _MessageData
+    _MessageInfo = staticmethod(_skip_if_short(ULog._MessageInfo))
+    _MessageParameterDefault = staticmethod(_skip_if_short(ULog._MessageParameterDefault))
+    MessageDropout = staticmethod(_skip_if_short(ULog.MessageDropout))
+    MessageLogging = staticmethod(_skip_if_short(ULog.MessageLogging))
+    MessageLoggingTagged = staticmethod(_skip_if_short(ULog.MessageLoggingTagged))
+
+    def _check_packet_corruption(self, header: Any) -> bool:
+        # pyulog skips up to 10,000 bytes as a message of a later PX4; its kind is a capital letter
+        is_corrupt: bool = super()._check_packet_corruption(header)
+        if not ord("A") <= header.msg_type <= ord("Z"):
+            self._file_corrupt = is_corrupt = True
+        return is_corrupt
+
+    @_skip_if_short
+    def _MessageAddLogged(self, data: bytes, header: Any, formats: Any) -> Any:  # noqa: N802
+        @cache
+        def count(name: str) -> int:
+            fields: list[tuple[str, int, str]] = formats[name].fields
+            return 1 + sum(
+                max(size, 1) * (count(kind) if kind in formats else 1) for kind, size, _ in fields
+            )
+
+        self.fields += count(self.parse_string(data[3:]))
+        if self.fields > MAX_FIELDS:
+            raise ULogException(f"its topics have more than {MAX_FIELDS:,} fields")
+        return ULog._MessageAddLogged(data, header, formats)
 
 
 @dataclass(frozen=True)
@@ -70,8 +161,10 @@ class Topics:
         it.
     ekf2_parameters : mapping
         Every EKF2_ parameter, by PX4 name; ``log`` holds only those that enter the results.
-    framing : Framing
-        How much of the file is whole messages.
+    is_cut : bool
+        The file ends inside a message.
+    is_damaged : bool
+        pyulog skipped invalid bytes or messages.
     streams : dict
         Where each part of the flight came from; :meth:`came_from` fills it.
     """
@@ -81,7 +174,8 @@ class Topics:
     zero_us: int
     dropped: dict[tuple[str, int], int]
     ekf2_parameters: Mapping[str, float]
-    framing: Framing
+    is_cut: bool
+    is_damaged: bool
     streams: dict[str, Stream] = field(default_factory=dict)
 
     def instances(self, topic: str) -> list[int]:
@@ -266,14 +360,13 @@ def read_topics(name: str, content: bytes) -> Topics:
     LogError
         It is no ULog, or holds no data with usable time stamps.
     """
-    chatter = io.StringIO()
-    framing = whole_messages(content)
+    source, size = _Content(content), len(content)
     try:
-        with contextlib.redirect_stdout(chatter):  # pyulog prints its warnings
-            ulog = ULog(io.BytesIO(framing.content), message_name_filter_list=topics())
+        with contextlib.redirect_stdout(io.StringIO()):  # pyulog prints its warnings
+            ulog = _Reader(source, message_name_filter_list=topics())
             tables = _tables(ulog)
             # a log of other topics can still be placed in time, by all that it holds
-            placed = tables or _tables(ULog(io.BytesIO(framing.content)))
+            placed = tables or _tables(_Reader(_Content(content)))
     except _PARSE_ERRORS as error:
         raise LogError.of(
             "ulog_unreadable", name=name, why=str(error) or type(error).__name__
@@ -292,7 +385,7 @@ def read_topics(name: str, content: bytes) -> Topics:
     log = LogInfo(
         name=name,
         sha256=hashlib.sha256(content).hexdigest(),
-        bytes=len(content),
+        bytes=size,
         format="ULog",
         firmware=_firmware(ulog.msg_info_dict),
         firmware_hash=_text(ulog.msg_info_dict, "ver_sw", "unknown"),
@@ -305,13 +398,15 @@ def read_topics(name: str, content: bytes) -> Topics:
         ),
         parameters=MappingProxyType({name: given[name] for name in REPORTED if name in given}),
         notes=notes,
-        damage=_corruption(ulog, chatter.getvalue()),
-        bytes_read=len(content) - framing.lost_bytes,
+        bytes_read=source.start - source.skipped_bytes,
         autopilot=_text(ulog.msg_info_dict, "sys_name", "PX4"),
         vehicle=_text(ulog.msg_info_dict, "sys_uuid", ""),
     )
     parameters = {name: value for name, value in given.items() if name.startswith("EKF2_")}
-    return Topics(log, tables, zero_us, {}, MappingProxyType(parameters), framing)
+    is_cut = source.start < size < source.end
+    return Topics(
+        log, tables, zero_us, {}, MappingProxyType(parameters), is_cut, ulog.file_corruption
+    )
 
 
 def _tables(ulog: ULog) -> dict[tuple[str, int], dict[str, NDArray[Any]]]:
@@ -350,15 +445,6 @@ def _text(info: dict[str, Any], key: str, otherwise: str) -> str:
     """A text from the log, without a terminal's control characters."""
     text = str(info.get(key, otherwise))
     return "".join(c for c in text if c.isprintable()) or otherwise
-
-
-def _corruption(ulog: ULog, chatter: str) -> tuple[str, ...]:
-    """What pyulog says of whole messages that make no sense."""
-    if not ulog.file_corruption:
-        return ()
-    said = "; ".join(dict.fromkeys(line.strip() for line in chatter.splitlines() if line.strip()))
-    because = f" ({said})" if said else ""
-    return (f"the file is damaged: messages in it make no sense{because} and were passed over",)
 
 
 def _firmware(info: dict[str, Any]) -> str:
