@@ -1,16 +1,18 @@
 """The command line: parses and prints; it computes nothing."""
 
 import atexit
+import errno
 import gc
 import importlib
 import os
 import signal
 import sys
+from pathlib import Path
 
 import click
 
 from px4fuse.cli.outputs import Interrupted, written_so_far
-from px4fuse.errors import OutputError, Px4FuseError, on_one_line
+from px4fuse.errors import OutputError, Px4FuseError, SettingsError, on_one_line
 from px4fuse.input_files import inputs_protected
 from px4fuse.threads import ONE_THREAD
 
@@ -40,6 +42,13 @@ COMMANDS = {
 #: Signals that end a run: Ctrl-C, termination, and (not on Windows) a closed terminal
 STOPPING = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 
+HELP = ["-h", "--help"]
+# Variables that stop matplotlib and pymavlink while they are imported if their value is wrong; no
+# output depends on them: figures are SVG, and contain no date
+UNUSED = ("MPLBACKEND", "SOURCE_DATE_EPOCH")
+# Address space for the libraries and the sample's report, which takes 0.7 GB
+LEAST_BYTES = 800_000_000
+
 # pandas loads pyarrow wherever it is installed: 70 MB that only these need
 PARQUET = ("batch", "extract")
 
@@ -67,7 +76,6 @@ class LazyGroup(click.Group):
         if name not in COMMANDS and not name.startswith("-"):
             import difflib
             import shlex
-            from pathlib import Path
 
             said = f"No such command {name!r}."
             if near := difflib.get_close_matches(name.lower(), COMMANDS):
@@ -90,10 +98,10 @@ class LazyGroup(click.Group):
             raise BrokenPipeError from error
         except KeyboardInterrupt as stopped:  # click itself would print an empty line
             raise Interrupted(stopped, written_so_far(ctx)) from None
+        except MemoryError as error:
+            raise _system_error(OSError(errno.ENOMEM, ""), written_so_far(ctx)) from error
         except OSError as error:
-            raise OutputError(
-                f"standard output: cannot be written ({error.strerror}), {written_so_far(ctx)}"
-            ) from error
+            raise _system_error(error, written_so_far(ctx)) from error
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the commands from the table above, without importing them."""
@@ -101,9 +109,7 @@ class LazyGroup(click.Group):
             formatter.write_dl(list(COMMANDS.items()))
 
 
-@click.group(
-    cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "show_default": True}
-)
+@click.group(cls=LazyGroup, context_settings={"help_option_names": HELP, "show_default": True})
 @click.version_option(package_name="px4fuse")
 def cli() -> None:
     """Replay a PX4 flight through a two-state Kalman filter and compare it with EKF2.
@@ -112,15 +118,44 @@ def cli() -> None:
     """
 
 
+def _system_error(error: OSError, written: str) -> Px4FuseError:
+    """Error of a system call, with its cause."""
+    if error.errno == errno.ENOMEM:
+        return Px4FuseError(
+            f"not enough memory, {written}", "Close other programs, or raise the limit (ulimit -v)."
+        )
+    try:
+        Path.cwd()
+    except OSError:
+        return SettingsError(
+            f"the current folder no longer exists, {written}", "Change to another folder."
+        )
+    if error.filename is not None:
+        return OutputError(f"{error.filename}: cannot be used ({error.strerror}), {written}")
+    return OutputError(f"standard output: cannot be written ({error.strerror}), {written}")
+
+
+def _check_memory() -> None:
+    """Refuse a limit under which libraries end the process without a message."""
+    try:
+        import resource
+    except ImportError:  # Windows has no such limit
+        return
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit != resource.RLIM_INFINITY and limit < LEAST_BYTES:
+        raise SettingsError(
+            f"the memory limit is {limit / 1e6:.0f} MB, at least {LEAST_BYTES / 1e6:.0f} MB of "
+            "address space are required",
+            "Raise it, for example with ulimit -v unlimited.",
+        )
+
+
 def main() -> None:
     """Run the command line; bad input is one line on standard error and exit code 2."""
     # one short job per process: looking for garbage while importing and drawing costs a tenth
     gc.disable()
     atexit.register(gc.freeze)  # and while everything is thrown away, as much again
-    for name, one in ONE_THREAD.items():  # commands load the libraries later
-        os.environ.setdefault(name, one)
-    if not set(PARQUET) & set(sys.argv[1:2]):
-        sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]  # as if there were none
+    _prepare_libraries()
     _open_streams()
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # σ and ν on a Windows console with a legacy code page
@@ -129,6 +164,8 @@ def main() -> None:
         if signal.getsignal(number) is signal.SIG_DFL:  # not where nohup ignores it
             signal.signal(number, _stop)
     try:
+        if not {*HELP, "--version"} & set(sys.argv):
+            _check_memory()
         code = cli.main(standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
         error.show()
@@ -150,6 +187,16 @@ def main() -> None:
         _say(f"standard output: cannot be written ({error.strerror}), nothing was written.")
         code = 2
     sys.exit(_flushed(code if isinstance(code, int) else 0))
+
+
+def _prepare_libraries() -> None:
+    """Set what libraries read when commands import them later."""
+    for name, one in ONE_THREAD.items():
+        os.environ.setdefault(name, one)
+    for name in UNUSED:
+        os.environ.pop(name, None)
+    if not set(PARQUET) & set(sys.argv[1:2]):
+        sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]  # as if there were none
 
 
 def _flushed(code: int) -> int:

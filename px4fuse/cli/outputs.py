@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 import signal
 import stat
 from collections.abc import Iterable, Iterator, Mapping
@@ -286,8 +287,8 @@ def finish(
 def terminal() -> Console:
     """Standard output for people; a reader that has gone, as with ``| head``, is no error.
 
-    As wide as the terminal. In a pipe lines do not wrap, unless COLUMNS says how wide they are: a
-    paragraph is one line.
+    As wide as the terminal. In a pipe lines do not wrap, unless COLUMNS is their width, a number
+    above 0: a paragraph is one line.
     """
     from rich.console import Console
 
@@ -296,6 +297,9 @@ def terminal() -> Console:
             raise BrokenPipeError
 
     console = PipeConsole(highlight=False)
-    if not console.is_terminal and "COLUMNS" not in os.environ:
+    columns = os.environ.get("COLUMNS", "")
+    if not console.is_terminal and not (columns.isdecimal() and int(columns)):
         console.width = UNWRAPPED
+    elif console.width < 1:  # COLUMNS=0
+        console.width = shutil.get_terminal_size().columns
     return console

@@ -32,9 +32,14 @@ def sync(log: Path, json_path: Path | None, **given: Any) -> None:
     with progress(json_path) as step:
         compared = run_preparation(request, step)
         _, found = noises_and_clock(compared, step)
+    advice = clock_advice(compared, found)
+    if isinstance(found, Unavailable) or not found.determinable:
+        name = compared.flight.log.name
+        remedy = found.remedy if isinstance(found, Unavailable) else advice["Next"].capitalize()
+        raise MissingDataError(
+            f"{name}: no clock offset could be determined: {found.reason}", remedy
+        )
     results = sync_results(request, compared, found)
     page = Page()
-    page.advice(clock_advice(compared, found))
+    page.advice(advice)
     finish(result_files(results, json_path), page, request)
-    if isinstance(found, Unavailable) or not found.determinable:
-        raise MissingDataError(f"{compared.flight.log.name}: no clock offset could be determined.")

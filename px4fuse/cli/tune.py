@@ -46,10 +46,12 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
     with progress(json_path) as step:
         compared = run_preparation(request, step)
         tuned = tuned_noises(compared, progress=step)
+    missing = [found for found in tuned.values() if isinstance(found, Unavailable)]
+    if len(missing) == len(tuned):
+        name, reason = compared.flight.log.name, missing[0].reason
+        raise MissingDataError(f"{name}: no noise could be determined: {reason}", missing[0].remedy)
     results = tuning_results(request, compared, tuned)
     finish(result_files(results, json_path), _page(compared, tuned), request)
-    if all(isinstance(found, Unavailable) for found in tuned.values()):
-        raise MissingDataError(f"{compared.flight.log.name}: no noise could be determined.")
 
 
 def noise_text(noise: Noise) -> str:
