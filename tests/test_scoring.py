@@ -123,8 +123,7 @@ CHECKED = [
     ("loop", changed(LOOP, **{AFTER: NONE}), {}, 0.5, "not corrected"),
     ("loop", EXAMPLE, {}, 0.0, "no external vision with orientation"),
     ("loop", changed(LOOP, loop__absolute=True), {}, 0.0, "does not drift"),
-    ("loop", REJECTED, {}, 0.625, "rejected as false"),
-    ("loop", filled(["open-end"], REJECTED), {}, 1.0, "as your form says"),
+    ("loop", REJECTED, {}, 0.25, "no closure was accepted"),
     ("loop", changed(LOOP, loop__closure_error_m=..., loop__known_end=NONE), {}, 0.0,
      "too few of them"),
     ("number", changed(axes__north__updates__count=50), {"path": "axes.*.updates.count",
@@ -368,6 +367,21 @@ def test_what_stands_out_in_one_report(values, said):
     assert len(found) == len(said)
     assert all(word in flag for word, flag in zip(said, found, strict=True))
     assert list(own_flags(decoded(LOOP))) == []
+
+
+@pytest.mark.parametrize(
+    ("option", "stated", "said"),
+    [
+        ("position_drift_m", 3.9, ""),
+        ("position_drift_m", 50.0, "--drift is 50 m per 100 m; usual is 1 m."),
+        ("position_drift_m", 0.2, "--drift is 0.2 m per 100 m"),
+        ("heading_drift_deg", 90.0, "--heading-drift is 90 ° per 100 m; usual is 3 °."),
+    ],
+)
+def test_own_flags_stated_drift_far_from_usual(option, stated, said):
+    found = list(own_flags(decoded(changed(LOOP, **{f"request__{option}": stated}))))
+    assert len(found) == bool(said)
+    assert all(flag.startswith(said) for flag in found)
 
 
 def text_of(seed, count=120):

@@ -18,6 +18,7 @@ from px4fuse.assignment.roster import folded
 from px4fuse.filter.tuning import Tuned
 from px4fuse.grading.model import Graded
 from px4fuse.plain import few_words
+from px4fuse.request import LoopRequest
 from px4fuse.results.contract import LoopResults, Reported, to_plain
 from px4fuse.results.reading import one_line
 from px4fuse.simulation import flights
@@ -30,6 +31,8 @@ SAME_NUMBERS, NEARLY = 3, 0.02
 HAND_PICKED = 0.5
 # A setting so many times larger or smaller than what the data ask for has another reason
 NO_REASON = 30.0
+# Factor on the usual drift (px4fuse loop's defaults) from which on a stated drift is flagged
+FAR_OFF = 4.0
 SHOWN = 4
 # Words in a row by which two texts are compared: of two written apart a few per cent are the same,
 # of a copy with an error in every fifth word two in five
@@ -74,11 +77,12 @@ def page_flags(verdict: Verdict) -> Iterator[str]:
 
 
 def own_flags(results: Reported, handed_out: bool = False) -> Iterator[str]:
-    """What stands out in one report by itself; nothing in one of a loop alone.
+    """What stands out in one report by itself.
 
     ``handed_out``: there is an answer key, so that logs are simulated for a reason.
     """
     if isinstance(results, LoopResults):
+        yield from _drift_flags(results.request)
         return
     settings, whole_s = results.settings, results.log.duration_s
     share = (settings.end_s - settings.start_s) / whole_s if whole_s else 1.0
@@ -109,6 +113,23 @@ def own_flags(results: Reported, handed_out: bool = False) -> Iterator[str]:
             yield f"{label} {chosen:g} is far from what the data ask for ({wanted[0]:.3g})."
     if results.log.hardware == flights.HARDWARE and not handed_out:
         yield "The log was made by px4fuse simulate: no vehicle flew."
+
+
+def _drift_flags(request: LoopRequest) -> Iterator[str]:
+    """Flag a stated drift that is more than FAR_OFF times the usual one, or less than 1/FAR_OFF.
+
+    The closure is accepted or rejected by the stated drift.
+    """
+    usual = LoopRequest(source="")
+    for option, unit, stated, default in (
+        ("--drift", "m", request.position_drift_m, usual.position_drift_m),
+        ("--heading-drift", "°", request.heading_drift_deg, usual.heading_drift_deg),
+    ):
+        if not default / FAR_OFF <= stated <= default * FAR_OFF:
+            yield (
+                f"{option} is {stated:g} {unit} per 100 m; usual is {default:g} {unit}. Ask for "
+                "the reason: the closure is accepted or rejected by it."
+            )
 
 
 def _form_numbers(one: Graded) -> dict[tuple[str, str], float]:

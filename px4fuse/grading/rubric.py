@@ -20,7 +20,7 @@ from px4fuse.answers import Answers
 from px4fuse.assignment.key import AnswerKey
 from px4fuse.assignment.roster import distinct
 from px4fuse.errors import SettingsError
-from px4fuse.grading.checks import Evidence, RubricItem, Text, bracketed, contradictions, text_of
+from px4fuse.grading.checks import Evidence, RubricItem, Text, bracketed, text_of
 from px4fuse.grading.flags import own_flags, page_flags, text_flags
 from px4fuse.grading.model import TOTAL, Graded, Item
 from px4fuse.reading import read_text
@@ -161,7 +161,6 @@ def assess(
             *page_flags(verdict),
             *own_flags(results, key is not None),
             *text_flags(results, rubric.min_words, rubric.common_words),
-            *contradictions(evidence),
             *([] if evidence.own else [_whose(evidence)]),
         ),
         pending=why if fate == "pending" else "",
