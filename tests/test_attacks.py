@@ -83,7 +83,7 @@ class Flight:
 
 @pytest.fixture
 def _pages_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The process that bounds the drawing of pages takes seconds; test_pages.py has one."""
+    """The process that bounds the comparison of pages takes seconds; test_pages.py has one."""
     monkeypatch.setattr(pages, "bounded", lambda function, job, *_: function(job))
 
 

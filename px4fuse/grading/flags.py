@@ -14,7 +14,7 @@ from typing import Any
 from px4fuse.assignment.roster import folded
 from px4fuse.filter.tuning import Tuned
 from px4fuse.grading.model import Graded
-from px4fuse.plain import few_words
+from px4fuse.plain import capital, few_words
 from px4fuse.request import LoopRequest
 from px4fuse.results.contract import LoopResults, Reported
 from px4fuse.results.reading import one_line
@@ -36,18 +36,13 @@ Pairs = Iterator[tuple[Graded, Graded]]
 
 
 def page_flags(verdict: Verdict) -> Iterator[str]:
-    """Which pages are not as px4fuse draws them, or that nobody could see them."""
+    """Flag a PDF that is not what px4fuse draws from the log, with the first difference."""
     if verdict.pages:
         first, *others = verdict.pages
-        more = f" Also: page {', '.join(str(one.page) for one in others)}." if others else ""
+        more = f" {len(others)} more differences." if others else ""
         yield (
-            f"Page {first.page} of the PDF that was handed in is not what px4fuse draws from the "
-            f"log: {first.what}.{more} Read the redrawn report."
-        )
-    elif verdict.with_log and verdict.page_status == "not compared":
-        yield (
-            "The pages that were handed in could not be drawn: do not open them, read the redrawn "
-            "report."
+            "The PDF that was handed in is not what px4fuse draws from the log. "
+            f"{capital(first.said)}.{more} Read the redrawn report."
         )
 
 
