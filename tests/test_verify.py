@@ -56,6 +56,7 @@ from px4fuse.verification.verification import (
     NO_LOG,
     RELATIVE,
     compare_results,
+    flattened,
     verify,
 )
 
@@ -153,6 +154,29 @@ def test_another_platform_is_still_verified(which: str, request: pytest.FixtureR
     verdict = verify(report_of(one.pdf), one.pdf, one.files, recompute=lambda *_: elsewhere)
     assert (verdict.status, verdict.outcome) == ("verified", "page differs")
     assert verdict.redrawn == aside
+
+
+def test_verify_numbers_1e_12_apart_are_verified(aisle: Base) -> None:
+    """Other kernels of OpenBLAS change results of the sample flights by 3e-8 at most."""
+    nudged_ = read_again(nudged(json.loads(to_json(aisle.again[0])), -1e-12))
+    elsewhere = (nudged_, lambda: forged(aisle.pdf))
+    verdict = verify(report_of(aisle.pdf), aisle.pdf, aisle.files, recompute=lambda *_: elsewhere)
+    assert verdict.outcome == "verified", verdict
+
+
+def test_compare_results_numbers_1e_4_apart_differ(aisle: Base) -> None:
+    """Every number but those with the tolerance of an estimate, and those near zero."""
+    ours = json.loads(to_json(aisle.again[0]))
+    for share, least in ((1e-4, RELATIVE), (1e-2, ESTIMATE_RELATIVE)):
+        theirs = nudged(ours, share)
+        found = {one.path for one in compare_results(theirs, ours)[0]}
+        wide = verification.ESTIMATES if least == RELATIVE else ()
+        expected = {
+            path[:120] for path, value in flattened(ours)
+            if isinstance(value, float) and abs(value) > 0.01 and not path.startswith(wide)
+        }  # fmt: skip
+        assert len(expected) > 100
+        assert expected - found == set()
 
 
 KF = ("axes", "north", "filters", "kf")

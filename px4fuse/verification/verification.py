@@ -40,8 +40,9 @@ MIN_DT_S = 0.01
 ORIGINAL = "Ask for the PDF as px4fuse wrote it."
 LIMIT = "A verified report proves that its numbers belong to the log, not who wrote them."
 NO_LOG = "no log was given, so that no number could be computed again"
-# Sums over a flight differ between machines in the last few of 16 digits; what is left of a
-# difference of two such sums, after a filter has run over it, in the last 8
+# Between processors: sums over a flight differ in the last few of 16 digits, differences of such
+# sums in the last 8. Four kernels of OpenBLAS differ by 3e-8 at most (six flights). This is a
+# tolerance, not a number of digits: two nearly equal numbers may be rounded to other last digits
 RELATIVE, ABSOLUTE = 1e-6, 1e-9
 # Minima are flat: where the likelihood or a cost differs in its 12th digit, the place of its
 # minimum does in its 6th, and the ends of an interval found from it in the 4th. No page prints
