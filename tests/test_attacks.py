@@ -1,6 +1,6 @@
 """Reports as a clever student would forge or pad them: none earns more than the honest one.
 
-Every row of :data:`NOTES`, :data:`FILES` and :data:`LOOPS` is one attack. Words that say nothing
+Every row of :data:`FILES` is one attack. Words that say nothing
 about the flight earn no more than no words; a file whose numbers nobody can compute again earns
 nothing that counts, and is never called verified.
 """
@@ -18,7 +18,7 @@ from cli_tools import done
 from conftest import page_of
 from exchange import replace
 from forgery import Base, Change, base, forged, on_page, put, read_again, report_of
-from results_tools import LOOP, SHA256, changed, decoded
+from results_tools import LOOP, changed, decoded
 
 from px4fuse.answers import form_text
 from px4fuse.assignment.key import Answer, AnswerKey
@@ -83,7 +83,7 @@ class Flight:
 
 @pytest.fixture
 def _pages_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The process that bounds the drawing of pages takes seconds; test_pages.py has one."""
+    """The process that bounds the comparison of pages takes seconds; test_pages.py has one."""
     monkeypatch.setattr(pages, "bounded", lambda function, job, *_: function(job))
 
 
@@ -254,11 +254,8 @@ def test_pages_that_were_painted_over(flight: Flight, honest: Graded, rubric: Ru
 
 OPEN = {"vio_drift": 0.012}, ("open-end=6m",), {"closure_error_m": 6.0}
 CLOSED = {"vio_drift": 0.012}, (), {"closure_error_m": 0.0}
-ELSEWHERE = "The loop is open: the vehicle landed elsewhere, 6 m from where it took off."
 REJECTED = {"closures": [{**LOOP["loop"]["closures"][0], "p": 1e-9, "d2": 60.0, "accepted": False}],
             "closure_error_m": 6.2}  # fmt: skip
-PERFECT = {"closures": [{**LOOP["loop"]["closures"][0], "p": 0.9999, "d2": 1e-4}],
-           "closure_error_m": 0.01}  # fmt: skip
 NO_END: dict[str, Any] = {
     "closures": [],
     "closure_error_m": ...,
@@ -266,12 +263,11 @@ NO_END: dict[str, Any] = {
 }
 
 
-def looped(truth: Any, notes: str, request: dict[str, Any], loop: dict[str, Any]) -> Graded:
-    """What the item on the loop gives."""
+def looped(truth: Any, request: dict[str, Any], loop: dict[str, Any]) -> Graded:
+    """Points of the item on the loop."""
     values = {f"request__{name}": value for name, value in request.items()}
     values |= {f"loop__{name}": value for name, value in loop.items()}
-    form = {"log_sha256": SHA256, "mistakes": [{"kind": "open-end"}] if notes else []}
-    results = decoded(changed(LOOP, student__answers=form, student__id="s01", **values))
+    results = decoded(changed(LOOP, student__id="s01", **values))
     key = truth and AnswerKey("loop", (Answer("s01", "", "", LOOP["track"]["sha256"], *truth),))
     verdict = Verdict("verified", (), True, page_status="same")
     made = assess(results, verdict, read_rubric(None), key)
@@ -280,40 +276,26 @@ def looped(truth: Any, notes: str, request: dict[str, Any], loop: dict[str, Any]
 
 
 LANDED = {"landed_at": {"forward_m": 6.0, "right_m": 0.0}}
-# Truth of the answer key, notes, options, what the loop then has, and the least and most points
-# of 40
-LOOPS: dict[str, tuple[Any, str, dict[str, Any], dict[str, Any], float, float]] = {
-    "honest, closed": (CLOSED, "", {}, {}, 40, 40),
-    "honest, without a key": (None, "", {}, {}, 40, 40),
-    "honest, rejected and said why": (OPEN, ELSEWHERE, {}, REJECTED, 40, 40),
-    "honest, rejected, without a key": (None, ELSEWHERE, {}, REJECTED, 40, 40),
-    "honest, left open and said why": (OPEN, ELSEWHERE, {"came_back": False}, NO_END, 40, 40),
-    "honest, left open, without a key": (None, ELSEWHERE, {"came_back": False}, NO_END, 30, 35),
-    "honest, landed elsewhere": (OPEN, ELSEWHERE, LANDED, {}, 40, 40),
-    "left open and said nothing": (OPEN, "", {"came_back": False}, NO_END, 10, 25),
-    "rejected and said nothing": (OPEN, "", {}, REJECTED, 10, 25),
-    "left open although it came back": (CLOSED, ELSEWHERE, {"came_back": False}, NO_END, 0, 0),
-    "a drift that explains everything": (OPEN, "", {"position_drift_m": 50.0}, {}, 0, 10),
-    "the same, without a key": (None, "", {"position_drift_m": 50.0}, {}, 0, 10),
-    "thrice the usual drift, without a key": (None, "", {"position_drift_m": 3.0}, {}, 30, 30),
-    "a heading that drifts by a right angle": (OPEN, "", {"heading_drift_deg": 90.0}, {}, 0, 10),
-    "honest, drift as it was": (OPEN, ELSEWHERE, {"position_drift_m": 1.2}, REJECTED, 40, 40),
-    "a drift of nothing": (CLOSED, "", {"position_drift_m": 0.01}, REJECTED, 0, 10),
-    "landed where the odometry ends": (
-        None, "", {"landed_at": {"forward_m": 1.42, "right_m": 0.0}}, PERFECT, 0, 10,
-    ),
-    "landed where it did not": (
-        OPEN, "", {"landed_at": {"forward_m": 1.42, "right_m": 0.0}}, {}, 0, 10,
-    ),
-    "landed elsewhere although it came back": (CLOSED, ELSEWHERE, LANDED, {}, 0, 10),
-    "closed although it landed elsewhere": (OPEN, "", {}, {}, 10, 10),
+# Truth of the answer key, options, what the loop then has, the points of 40, and flags
+LOOPS: dict[str, tuple[Any, dict[str, Any], dict[str, Any], float, int]] = {
+    "closed": (CLOSED, {}, {}, 40, 0),
+    "closed, without a key": (None, {}, {}, 40, 0),
+    "open end, rejected": (OPEN, {}, REJECTED, 40, 0),
+    "open end, rejected, without a key": (None, {}, REJECTED, 10, 0),
+    "open end, left open": (OPEN, {"came_back": False}, NO_END, 40, 0),
+    "open end, left open, without a key": (None, {"came_back": False}, NO_END, 0, 0),
+    "open end, landing stated": (OPEN, LANDED, {}, 40, 0),
+    "closed, left open": (CLOSED, {"came_back": False}, NO_END, 0, 0),
+    "closed, rejected by a small drift": (CLOSED, {"position_drift_m": 0.01}, REJECTED, 10, 1),
+    "open end, accepted by a large drift": (OPEN, {"position_drift_m": 50.0}, {}, 40, 1),
+    "open end, accepted by a heading drift": (OPEN, {"heading_drift_deg": 90.0}, {}, 40, 1),
+    "thrice the usual drift": (None, {"position_drift_m": 3.0}, {}, 40, 0),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", LOOPS)
-def test_loops(name: str) -> None:
-    truth, notes, request, loop, least, most = LOOPS[name]
-    graded = looped(truth, notes, request, loop)
-    assert least - 0.01 <= graded.points <= most + 0.01, graded.items
-    contradicts = name.startswith(("a drift", "the same", "a heading", "landed", "left open alth"))
-    assert bool(graded.flags) == contradicts, graded.flags
+def test_loop_item_points_and_flags(name: str) -> None:
+    truth, request, loop, points, flags = LOOPS[name]
+    graded = looped(truth, request, loop)
+    assert graded.points == pytest.approx(points), graded.items
+    assert len(graded.flags) == flags, graded.flags

@@ -156,8 +156,6 @@ REFUSED = {
     "late from when": ("grade in -o out --late 10%/day", "--due"),
     "due in words": ("grade in -o out --due soon", "--due"),
     "late by what": ("grade in -o out --due 2026-11-20 --late 10", "--late"),
-    "no submission": ("grade --gradescope missing", "missing"),
-    "autograder of no logs": ("grade --write-autograder a.zip", "--logs"),
     # assignments
     **{
         name: (f"simulate -o f --assignment roster.csv {typed}", said)

@@ -48,8 +48,6 @@ def grade(
     anonymous: bool,
     jobs: int | None,
     write_rubric: Path | None,
-    write_autograder: Path | None,
-    gradescope: Path | None,
 ) -> None:
     """Verify and score reports: PDFs, folders of them, and zip files of learning platforms.
 
@@ -64,19 +62,12 @@ def grade(
     from px4fuse.assignment.sheet import read_sheet
     from px4fuse.grading.entries import Course, due_time, late_rule
     from px4fuse.grading.grade import grade as grade_all
-    from px4fuse.grading.gradescope import autograder_zip, run_autograder
     from px4fuse.grading.rubric import read_rubric, rubric_text
 
     if write_rubric is not None:
         write_new(write_rubric, rubric_text().encode())
         return
     costs = late_rule(late) if late else None
-    if gradescope is not None:
-        run_autograder(gradescope, costs)
-        return
-    if write_autograder is not None:
-        write_new(write_autograder, autograder_zip(logs, rubric, key, costs))
-        return
     if costs is not None and due is None:
         raise SettingsError("--late: say with --due when it was due.")
     if not submissions:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from px4fuse.report.page import Page
     from px4fuse.verification.model import Verdict
 
-SCHEMA = {"name": "px4fuse-verification", "version": "2.0"}
+SCHEMA = {"name": "px4fuse-verification", "version": "3.0"}
 # A flight of ten minutes takes about one; what takes longer than this was made to
 TIMEOUT_S = 1800.0
 
@@ -37,9 +37,9 @@ def verify(
     """Check that the numbers of REPORT.pdf are what its log gives, and draw the report again.
 
     LOG is the flight log and whatever was read besides it, or folders of such; they are found by
-    their SHA-256. The analysis is run again with the recorded settings. Pages of REPORT.pdf that
-    do not look like the redrawn ones are named: read the redrawn report (-o). Without LOG nothing
-    is verified.
+    their SHA-256. The analysis is run again with the recorded settings. REPORT.pdf is compared
+    with the redrawn report part by part; differences are listed: read the redrawn report (-o).
+    Without LOG nothing is verified.
 
     This proves that the numbers belong to the log, not who wrote them.
 

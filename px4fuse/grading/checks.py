@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 from msgspec import Meta
-from scipy.stats import chi2
 
 from px4fuse.answers import Answers, check
 from px4fuse.assignment.key import Answer, AnswerKey
@@ -25,13 +24,12 @@ from px4fuse.filter.clock import Clock
 from px4fuse.filter.consistency import SIGMA_OFF, HorizontalNis
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.grading.form_points import FormPoints, form_points
-from px4fuse.loop.model import Closure, Correction, LoopPart, Way
-from px4fuse.plain import capital, factor_words, length_words, p_words
+from px4fuse.loop.model import Correction, LoopPart, Way
+from px4fuse.plain import capital, factor_words, length_words
 from px4fuse.record import Maybe, Share
 from px4fuse.results.contract import ASKED, ComparisonResults, LoopResults, Reported, to_plain
 from px4fuse.results.reading import one_line
 from px4fuse.trajectory.evaluation import Score
-from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import flattened, is_number, log_sha256
 
@@ -409,129 +407,39 @@ class ClockItem(RubricItem, frozen=True, kw_only=True, tag="clock"):
 # ------------------------------------------------------------------ a loop
 
 
-OPEN = "open-end"
-# A tape and a pilot's feet are not better, and an open end is not smaller
-TAPE_M = 0.5
-# A drift stated so many times larger or smaller than it is
-FAR_OFF = 4.0
-# What odometry indoors reaches, the defaults of px4fuse loop: after 100 m
-USUAL_DRIFT_M, USUAL_HEADING_DEG = 1.0, 3.0
-# Chance of an end that fits this well or better, and from which on an error is as usual
-TOO_GOOD, USUAL_P = 0.001, 0.05
-# Of an end left open where no key says where it landed, and of a correction without a reference
-OPEN_UNKNOWN, WITHOUT_REFERENCE = 0.8, 0.5
-
-
-def contradictions(evidence: Evidence, closed: bool = False) -> Iterator[str]:
-    """Options of a loop that its log or the answer key contradict: sentences.
-
-    ``closed``: also that it is taken for closed, where it truly landed elsewhere.
-    """
-    results = evidence.results
-    if not isinstance(results, LoopResults):
-        return
-    request, landed = results.request, _landed_m(evidence)
-    at = request.landed_at
-    said = math.hypot(at.forward_m, at.right_m) if at else 0.0
-    if at and landed is not None and abs(said - landed) > TAPE_M:
-        yield (
-            f"--landed-at says {length_words(said)} from the place of take-off; it landed "
-            f"{length_words(landed)} from it."
-        )
-    if landed is not None and landed <= TAPE_M and not request.came_back:
-        yield "--open says that it did not come back, but it landed where it took off."
-    stated = _stated_drift(results)
-    true = 0.0 if evidence.answer is None else evidence.answer.scenario.get("vio_drift") or 0.0
-    off = stated
-    if isinstance(true, float) and true > 0.0:  # stated too small, too, makes a closure false
-        off = request.position_drift_m / (100.0 * true)
-        off = max(off, 1.0 / off, request.heading_drift_deg / USUAL_HEADING_DEG)
-    if off > FAR_OFF:
-        yield "--drift and --heading-drift are far from how the odometry drifts."
-    chosen = at is not None or stated != 1.0
-    if chosen and any(one.accepted and 1.0 - one.p < TOO_GOOD for one in results.loop.closures):
-        yield (
-            "The loop closes far better than the stated drift lets any loop close: "
-            "--landed-at, --drift or --heading-drift may have been chosen for that."
-        )
-    if closed and landed is not None and landed > TAPE_M and request.came_back and at is None:
-        yield (
-            "It did not land at the place of take-off: say where it did (--landed-at) or leave the "
-            "end open (--open)."
-        )
-
-
-def _stated_drift(results: LoopResults) -> float:
-    """How many times the usual drift was stated, at most."""
-    request = results.request
-    position = request.position_drift_m / USUAL_DRIFT_M
-    return max(position, request.heading_drift_deg / USUAL_HEADING_DEG)
-
-
-def _landed_m(evidence: Evidence) -> float | None:
-    """How far from the place of take-off it landed; None where only the vehicle knows."""
-    return None if evidence.answer is None else evidence.answer.truth.get("closure_error_m")
+# Distance of landing and take-off up to which a loop is closed (m): the accuracy of a tape
+CLOSED_M = 0.5
+# Share of the last quarter for a corrected path without a reference, which has no ATE
+WITHOUT_REFERENCE = 0.5
 
 
 class LoopItem(RubricItem, frozen=True, kw_only=True, tag="loop"):
-    """The loop was measured, its end is taken for what it is, and the path corrected if it closes.
+    """Quarters: closure error measured, closure accepted, path corrected, ATE reduced.
 
-    A quarter for measuring, one for a closure error that the odometry's usual drift explains, one
-    for correcting, one for a path that became better by it; where the end is rightly open the last
-    three for saying so.
+    A flight that by the answer key ended elsewhere has all of them for a path without an accepted
+    closure.
     """
 
     def score(self, evidence: Evidence) -> Scored:
-        """Quarters; the first alone where an option contradicts the log or the key."""
-        results, loop = evidence.results, evidence.results.loop
-        opened = isinstance(results, LoopResults) and not results.request.came_back
-        if not isinstance(loop, LoopPart) or (loop.closure_error_m is None and not opened):
+        """Return the quarters, and a sentence with closure error and ATE."""
+        loop = evidence.results.loop
+        accepted = isinstance(loop, LoopPart) and any(one.accepted for one in loop.closures)
+        landed_m = evidence.answer.truth.get("closure_error_m") if evidence.answer else None
+        if landed_m is not None and landed_m > CLOSED_M and not accepted:
+            landed = length_words(landed_m)
+            return 1.0, f"Your vehicle landed {landed} from the take-off: the path stays as it is."
+        if not isinstance(loop, LoopPart) or loop.closure_error_m is None:
             missing = loop.known_end if isinstance(loop, LoopPart) else loop
             why = bracketed(getattr(missing, "reason", ""))
             return 0.0, f"Your report measures no loop{why}."
         if loop.absolute:
             return 0.0, "Your loop is on a track that does not drift; measure it on odometry."
-        off, path = length_words(loop.closure_error_m or 0.0), length_words(loop.path_length_m)
+        off, path = length_words(loop.closure_error_m), length_words(loop.path_length_m)
         said = f"You measured a closure error of {off} in {path}"
-        if opened:
-            said = "You left the end open (--open)"
-        accepted = [one for one in loop.closures if one.accepted]
-        wrong = next(contradictions(evidence, bool(accepted)), "")
-        if wrong and loop.closures:
-            return 0.25, f"{said}. {wrong}"
         if not accepted:
-            share, why = _open_end(evidence, loop)
-            false = "; the closure was rejected as false" if loop.closures else ""
-            worth = (1.0 + 3.0 * share) / 4.0 if share or loop.closures else 0.0
-            return worth, f"{said}{false}, {why}."
-        closed, usual = _closed(evidence, accepted)
+            return 0.25, f"{said}; no closure was accepted."
         corrected, comment = _corrected(loop.corrections)
-        return (1.0 + closed + corrected) / 4.0, f"{said}, {usual}{comment}"
-
-
-def _open_end(evidence: Evidence, loop: LoopPart) -> Scored:
-    """What the words "it did not come back" are worth, and why."""
-    landed = _landed_m(evidence)
-    if landed is not None and landed <= TAPE_M:
-        return 0.0, "but your vehicle landed where it took off"
-    if evidence.claims(OPEN):
-        known = landed is not None or loop.closures
-        return 1.0 if known else OPEN_UNKNOWN, "as your form says"
-    return 0.5, "but your form does not say that it landed elsewhere"
-
-
-def _closed(evidence: Evidence, accepted: Sequence[Closure]) -> Scored:
-    """By the chance of such an error, which a larger drift that was stated does not make usual."""
-    results = evidence.results
-    scale = max(_stated_drift(results), 1.0) ** 2 if isinstance(results, LoopResults) else 1.0
-    p = min(float(chi2.sf(one.d2 * scale, one.degrees_of_freedom)) for one in accepted)
-    if p >= USUAL_P:
-        return 1.0, f"as odometry that drifts as usual may have ({p_words(p)})"
-    share = falling(USUAL_P / p, USUAL_P / GATE_ALPHA) if p > 0.0 else 0.0
-    return share, (
-        f"more than the odometry's usual drift explains ({p_words(p)}; look for what made it "
-        "drift, or whether it landed elsewhere)"
-    )
+        return (2.0 + corrected) / 4.0, f"{said}; the closure was accepted{comment}"
 
 
 def _corrected(corrections: Mapping[Way, Maybe[Correction]]) -> Scored:

@@ -1,7 +1,7 @@
 """A class as one web page: a student per row, and on top what an instructor asks.
 
-Nothing that a student wrote can act: see :mod:`px4fuse.webpage`. Pictures of pages
-and PDFs stand in folders beside the page and are loaded as they are unfolded.
+Nothing that a student wrote can act: see :mod:`px4fuse.webpage`. The redrawn PDFs stand in a
+folder beside the page.
 """
 
 import math
@@ -154,7 +154,9 @@ def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str]) -> Row:
     )
     # who has neither id nor file cannot be named in overrides.csv
     boxes = (_boxes(entry),) if entry.student_id or file else ()
-    beside = _beside(entry, one) if one else ()
+    # the name of the file may name its student
+    report = [("Drawn again from the log (PDF)", local_link(one.redrawn_name))] if one else []
+    beside = (frame.links("The report", report),)
     return Row(cells, tuple(_tags(entry)), (*_details(entry), *boxes), beside)
 
 
@@ -213,23 +215,3 @@ def _boxes(entry: Entry) -> Part:
     ]
     owner = entry.student_id or (one.submission if one else "")
     return frame.boxes("Your points and words", owner, rows, kept)
-
-
-def _beside(entry: Entry, one: Graded) -> tuple[Part, ...]:
-    """The report's pages and links to it, which may name its student."""
-    whose = f"of the report of {entry.called}"
-    drawn = [
-        (f"Page {at} of {len(one.sheets)}", f"Page {at} {whose}, drawn again from the log", link)
-        for at, name in enumerate(one.sheets, start=1)
-        if (link := local_link(name))
-    ]
-    every = frame.pictures("Every page, drawn again from the log", drawn)
-    handed_in = []
-    if source := local_link(one.handed_in):
-        said = f"Page {one.verdict.page}, as handed in: not verified"
-        # the redrawn one stands beside it
-        handed_in = drawn[one.verdict.page - 1 : one.verdict.page]
-        handed_in += [(said, f"Page {one.verdict.page} {whose}, as handed in", source)]
-    report = [("Drawn again from the log (PDF)", local_link(one.redrawn_name))]
-    title = "The page that differs" if drawn else "As handed in"
-    return frame.links("The report", report), frame.pictures(title, handed_in), every

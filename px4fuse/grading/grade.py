@@ -29,7 +29,7 @@ class GradeOutcome:
     Attributes
     ----------
     entries : tuple of Entry
-        Everyone in the roster, then who is not in it; without pictures and redrawn reports.
+        Everyone in the roster, then who is not in it; without redrawn reports.
     notes : tuple of str
         What was passed over.
     reused : int

@@ -115,9 +115,8 @@ class Graded:
         The student's own words.
     mistakes : mapping
         What the answer key says is wrong in the student's flight, and whether the form names it.
-    handed_in, sheets, redrawn_name : str, tuple of str, str
-        Where the picture of a page as it was handed in (the verdict's), pictures of the redrawn
-        pages, and the redrawn PDF stand, relative to the class page.
+    redrawn_name : str
+        Where the redrawn PDF stands, relative to the class page.
     """
 
     submission: str
@@ -134,15 +133,12 @@ class Graded:
     version: str = ""
     notes: str = field(default="", repr=False)
     mistakes: Mapping[str, bool] = field(default_factory=dict)
-    handed_in: str = ""
     redrawn_name: str = ""
-    sheets: tuple[str, ...] = ()
 
     @property
     def status(self) -> str:
-        """That of the verdict, or "page differs" where only the numbers are verified."""
-        differ = self.verdict.page_status == "differ"
-        return self.verdict.outcome if differ else self.verdict.status
+        """That of the verdict, or "page differs" if only the numbers are verified."""
+        return self.verdict.outcome
 
     @property
     def points(self) -> float:

@@ -33,7 +33,7 @@ from px4fuse.grading.checks import text_of
 from px4fuse.grading.class_page import html_text
 from px4fuse.grading.entries import NAME, TEMPLATE, Course
 from px4fuse.grading.model import TOTAL, Entry, Graded, columns
-from px4fuse.grading.records import HANDED_IN, PAGE, RECORDS, REDRAWN
+from px4fuse.grading.records import RECORDS, REDRAWN
 from px4fuse.input_files import own_files
 from px4fuse.plain import few_words
 from px4fuse.results.reading import one_line
@@ -123,21 +123,16 @@ def _identity(entry: Entry, stem: bool = False) -> str:
 
 
 def _with_files(entry: Entry, stem: str, output: Path) -> Entry:
-    """With the redrawn report in its folder, and where the pictures of the pages stand."""
+    """Add the place of the redrawn report, and write it there."""
     one = entry.counting
     if one is None or not one.sha256:
         return entry
-
-    def there(end: str) -> str:
-        name = f"{RECORDS}/{one.sha256}{end}"
-        return name if (output / name).exists() else ""
-
-    name = f"{REPORTS}/{stem}.pdf" if (redrawn := there(REDRAWN)) else ""
-    if name:
-        write_all({output / name: (output / redrawn).read_bytes()})
-    sheets = tuple(itertools.takewhile(bool, map(there, map(PAGE.format, itertools.count(1)))))
-    shown = replace(one, handed_in=there(HANDED_IN), redrawn_name=name, sheets=sheets)
-    return replace(entry, counting=shown)
+    redrawn = output / RECORDS / f"{one.sha256}{REDRAWN}"
+    if not redrawn.exists():
+        return entry
+    name = f"{REPORTS}/{stem}.pdf"
+    write_all({output / name: redrawn.read_bytes()})
+    return replace(entry, counting=replace(one, redrawn_name=name))
 
 
 def _pseudonyms(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]:

@@ -8,8 +8,7 @@ request. Rubric, answer key, roster and overrides are not in it.
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cache, partial
-from importlib.util import find_spec
+from functools import cache
 from pathlib import Path
 
 import msgspec
@@ -20,16 +19,13 @@ from px4fuse.results.model import provenance
 from px4fuse.results.reading import read_results
 from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import Verdict
-from px4fuse.verification.pages import MEMORY_BYTES, TIMEOUT_S, pictures
 from px4fuse.verification.verification import log_sha256, verify
-from px4fuse.workers import bounded
 from px4fuse.writing import write_all
 
 # In the folder of a class
 RECORDS = "records"
-# Behind the SHA-256 of a PDF, whose record is ".json". Pictures stand in files that the class page
-# loads when a row is unfolded: three hundred reports have a hundred megabytes of them
-HANDED_IN, REDRAWN, PAGE = ".handed-in.png", ".pdf", ".page-{:03}.png"
+# The redrawn report: behind the SHA-256 of the handed-in PDF, whose record is ".json"
+REDRAWN = ".pdf"
 
 
 @dataclass(frozen=True)
@@ -82,16 +78,7 @@ def verified(
     rests_on = _rests_on(attached, logs, handed_out)
     gap = rests_on.get(log_sha256(results)) == "handed out"
     verdict = verify(results, pdf, {} if gap else logs)
-    parts: dict[str, bytes] = {}
-    if verdict.pages or not verdict.redrawn:
-        handed_in = bounded(partial(pictures, page=verdict.page - 1), pdf, TIMEOUT_S, MEMORY_BYTES)
-        if isinstance(handed_in, tuple) and handed_in:
-            parts[HANDED_IN] = handed_in[0]
-    if verdict.redrawn:
-        drawn = pictures(verdict.redrawn)
-        shown = drawn if isinstance(drawn, tuple) else ()
-        parts |= {PAGE.format(at): made for at, made in enumerate(shown, start=1)}
-        parts[REDRAWN] = verdict.redrawn
+    parts = {REDRAWN: verdict.redrawn} if verdict.redrawn else {}
     unread = replace(verdict, redrawn=b"")
     _keep(records, sha256, VerificationRecord(rests_on, attached, unread), parts)
     return results, unread, False
@@ -112,8 +99,7 @@ def _rests_on(results: str, logs: Mapping[str, Path], handed_out: frozenset[str]
 @cache
 def _versions() -> dict[str, str]:
     here = provenance("")
-    drawn = f"{find_spec('pypdfium2') is not None}"  # pictures are an extra
-    return {**here.libraries, "px4fuse": here.px4fuse, "pictures": drawn}
+    return {**here.libraries, "px4fuse": here.px4fuse}
 
 
 def _keep(records: Path, sha256: str, kept: VerificationRecord, parts: Mapping[str, bytes]) -> None:

@@ -20,8 +20,8 @@ from px4fuse.answers import Answers
 from px4fuse.assignment.key import AnswerKey
 from px4fuse.assignment.roster import distinct
 from px4fuse.errors import SettingsError
-from px4fuse.grading.checks import Evidence, RubricItem, Text, bracketed, contradictions, text_of
-from px4fuse.grading.flags import own_flags, page_flags, text_flags
+from px4fuse.grading.checks import Evidence, RubricItem, Text, bracketed, text_of
+from px4fuse.grading.flags import own_flags, page_flags
 from px4fuse.grading.model import TOTAL, Graded, Item
 from px4fuse.reading import read_text
 from px4fuse.results.contract import Reported
@@ -63,18 +63,12 @@ class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         What becomes of those of a report on a log that was not given to the student.
     pages : {"count", "pending", "zero"}
         What becomes of those of a verified report whose pages look otherwise.
-    min_words : int
-        Of a student's text, below which the instructor is told.
-    common_words : tuple of str
-        The commonest words of the course's language; empty for any language.
     """
 
     title: Text = ""
     unverified: Literal["pending", "zero"] = "pending"
     others_log: Doubtful = "pending"
     pages: Doubtful = "count"
-    min_words: Annotated[int, Meta(ge=0, le=100_000)] = 100
-    common_words: Annotated[tuple[Text, ...], Meta(max_length=100)] = ()
     items: Annotated[tuple[AnyItem, ...], Meta(min_length=1, max_length=100)] = msgspec.field(
         name="item"
     )
@@ -160,8 +154,6 @@ def assess(
         flags=(
             *page_flags(verdict),
             *own_flags(results, key is not None),
-            *text_flags(results, rubric.min_words, rubric.common_words),
-            *contradictions(evidence),
             *([] if evidence.own else [_whose(evidence)]),
         ),
         pending=why if fate == "pending" else "",

@@ -366,7 +366,7 @@ def origin_of(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> ExportO
 def gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
     r"""People and times of Gradescope's ``submission_metadata.yml``, by number of submission.
 
-    Only what stands where Gradescope writes it: outputs of autograders are in it as well, deeper.
+    Only the keys at Gradescope's own depth are read: texts of students are in it as well, deeper.
     Of a group the first member is named.
 
     >>> text = "submission_7:\n  :submitters:\n  - :name: Ada\n    :sid: '12'\n"

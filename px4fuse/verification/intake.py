@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pypdf
-from pypdf.errors import LimitReachedError, PyPdfError
+from pypdf.errors import DependencyError, LimitReachedError, PyPdfError
 from pypdf.generic import ArrayObject, DictionaryObject, IndirectObject, StreamObject
 
 from px4fuse.errors import ResultsError
@@ -38,7 +38,7 @@ MAX_VALUES = 1_000_000
 MAX_MISSING = 100
 
 _DAMAGED = "damaged: it cannot be read as a PDF. Hand in the file that px4fuse wrote."
-_LOCKED = "encrypted, or damaged. Hand in the file px4fuse wrote."
+_LOCKED = "encrypted. Hand in the file that px4fuse wrote."
 _COSTLY = "it takes more memory or work to open than a report can need."
 
 # 900 files with a few bytes changed gave AttributeError too. What is none of these is a mistake of
@@ -55,7 +55,7 @@ _ACTIONS = re.compile(
 
 # pypdf's defaults are for any PDF. A recovery of broken streams, filters other than Flate, chains
 # of filters and the external JBIG2 decoder are not for ours.
-_PYPDF_LIMITS: dict[str, Any] = {
+PYPDF_LIMITS: dict[str, Any] = {
     "maximum_declared_stream_length": MAX_BYTES,
     "array_based_stream_maximum_output_length": MAX_CONTENT_BYTES,
     "zlib_maximum_output_length": MAX_CONTENT_BYTES,
@@ -123,11 +123,8 @@ def attached_results(pdf: bytes, name: str) -> Results:
     remedy = ""
     try:
         _check_file(pdf)
-        with pypdf.apply_configuration(**_PYPDF_LIMITS):
-            # strict: a file that needs repair is read differently by every program
-            reader = pypdf.PdfReader(
-                io.BytesIO(pdf), strict=True, xref_stream_maximum_entries=10 * MAX_OBJECTS
-            )
+        with pypdf.apply_configuration(**PYPDF_LIMITS):
+            reader = opened(pdf)
             if reader.is_encrypted:
                 raise ResultsError(_LOCKED)
             if not 0 < len(reader.pages) <= MAX_PAGES:
@@ -137,9 +134,18 @@ def attached_results(pdf: bytes, name: str) -> Results:
         reason, remedy = f"{refusal.reason}.", refusal.remedy
     except (LimitReachedError, RecursionError, MemoryError):
         reason = _COSTLY
+    except DependencyError:  # pypdf decrypts AES with a library that px4fuse does not need
+        reason = _LOCKED
     except BROKEN:
         reason = _LOCKED if b"/Encrypt" in pdf else _DAMAGED
     raise ResultsError(f"{one_line(name, 200)}: {reason}", remedy)
+
+
+def opened(pdf: bytes) -> pypdf.PdfReader:
+    """Open a PDF within the limits, strictly: programs repair a damaged file in different ways."""
+    return pypdf.PdfReader(
+        io.BytesIO(pdf), strict=True, xref_stream_maximum_entries=10 * MAX_OBJECTS
+    )
 
 
 def _check_file(pdf: bytes) -> None:

@@ -5,8 +5,8 @@ found by its SHA-256, and what comes out is compared with what was handed in. Th
 numbers belong to the log. It does not prove who wrote them: whoever has the log can make the same
 report with another name on it.
 
-The pages that were handed in prove nothing and are not read: the report is redrawn from what the
-log gives. Pages that look otherwise are named, for somebody to look at.
+The report is drawn again from what the log gives, and the handed-in PDF is compared with it part
+by part (:mod:`px4fuse.verification.pages`). No number rests on the handed-in pages.
 
 The recorded request is a stranger's. It is decoded strictly, and the analysis knows the range of
 every value; files are found by their SHA-256 among those that were given, never by name; and
@@ -16,7 +16,8 @@ nothing in it names an output.
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
 from pathlib import Path
@@ -25,22 +26,23 @@ from typing import Any
 from msgspec.structs import replace
 
 from px4fuse.errors import Px4FuseError, SettingsError
-from px4fuse.flight import Unavailable
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json, to_plain
 from px4fuse.results.model import LIBRARIES, Provenance
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification.model import Mismatch, PageStatus, Status, Verdict
-from px4fuse.verification.pages import NumbersAlike, compare_pages
+from px4fuse.verification.pages import WordsAlike, compare_pages
 
 ADD = "Add {} to --logs."
 ASK = "Ask how the report was made, and for the log and all files that it was made from."
 NOT_OURS = "the recorded request is not one that px4fuse can have made"
 # A flight of ten minutes has 60,000 steps of it, which take half a minute
 MIN_DT_S = 0.01
+ORIGINAL = "Ask for the PDF as px4fuse wrote it."
 LIMIT = "A verified report proves that its numbers belong to the log, not who wrote them."
 NO_LOG = "no log was given, so that no number could be computed again"
-# Sums over a flight differ between machines in the last few of 16 digits; what is left of a
-# difference of two such sums, after a filter has run over it, in the last 8
+# Between processors: sums over a flight differ in the last few of 16 digits, differences of such
+# sums in the last 8. Four kernels of OpenBLAS differ by 3e-8 at most (six flights). This is a
+# tolerance, not a number of digits: two nearly equal numbers may be rounded to other last digits
 RELATIVE, ABSOLUTE = 1e-6, 1e-9
 # Minima are flat: where the likelihood or a cost differs in its 12th digit, the place of its
 # minimum does in its 6th, and the ends of an interval found from it in the 4th. No page prints
@@ -55,6 +57,7 @@ ITERATIONS, MORE_ITERATIONS = "iterations", 2
 # What tells the machine that a report was made on, and no number of it
 MACHINE = ("provenance.python", "provenance.libraries")
 SHOWN = 20
+SHOWN_PAGES = 5
 SHOWN_TEXT = 120
 # Sizes by which a report multiplies numbers to print them: 1, per cent, thousandths
 PRINTED_SCALES = (1.0, 100.0, 1000.0)
@@ -256,43 +259,66 @@ def _with_log(theirs: Reported, pdf: bytes, ours: Reported, draw: Callable[[], b
         else f"the log gives all {compared} values again (within {RELATIVE:g}, estimates "
         f"within {ESTIMATE_RELATIVE:g})"
     ]
-    page_status: PageStatus = "not compared"
-    pages = compare_pages(pdf, redrawn, partial(same_words, alike=alike))
-    if isinstance(pages, Unavailable):
-        reasons.append(f"the pages were not compared: {pages.reason}. {pages.remedy}")
-        pages = ()
-    else:
-        page_status = "differ" if pages else "same"
-    reasons += [f"page {one.page} differs: {one.what}" for one in pages]
+    others = _other_libraries(theirs.provenance, ours.provenance)
+    words_alike = partial(same_words, alike=alike)
+    pages = compare_pages(pdf, redrawn, words_alike, same_libraries=not others)
+    foreign = any(one.structural for one in pages)
+    page_status: PageStatus = "same"
     if pages:
-        reasons += _other_machine(theirs.provenance, ours.provenance)
-    status: Status = "numbers differ" if wrong else "verified"
-    said = (*reasons, *([] if wrong else [LIMIT]))
-    return Verdict(status, said, True, wrong[:SHOWN], page_status, pages, redrawn)
+        page_status = "not compared" if foreign else "differ"
+    status: Status = "numbers differ" if wrong else "cannot verify" if foreign else "verified"
+    said = [one.said for one in pages[:SHOWN_PAGES]]
+    said += [f"{len(pages) - SHOWN_PAGES} more differences"] * (len(pages) > SHOWN_PAGES)
+    # the first reason is the one that a class table shows
+    reasons = [*said, *reasons] if status == "cannot verify" else [*reasons, *said]
+    reasons += [f"made with {others}: of figures only place and texts were compared"] * bool(others)
+    reasons += [LIMIT] * (status == "verified")
+    remedy = ORIGINAL if foreign else ""
+    return Verdict(status, tuple(reasons), True, wrong[:SHOWN], page_status, pages, redrawn, remedy)
 
 
-def _other_machine(theirs: Provenance, ours: Provenance) -> tuple[str, ...]:
-    """With which other versions the report was made; Python's alone changes no number."""
-    others = [
+def _other_libraries(theirs: Provenance, ours: Provenance) -> str:
+    """List the libraries of which the report was made with other versions than those here."""
+    others = (
         f"{name} {theirs.libraries.get(name)} (here {version})"
         for name, version in ours.libraries.items()
         if theirs.libraries.get(name) != version
-    ]
-    made = f"made with {', '.join(others)}, which may draw pages otherwise"
-    return (one_line(made, 400),) if others else ()
+    )
+    return one_line(", ".join(others), 300)
+
+
+@dataclass(frozen=True)
+class Rounding:
+    """Compare two printed numbers: a recorded number and its recomputed twin, each rounded.
+
+    Attributes
+    ----------
+    pairs : tuple of tuple of float
+        Recorded and recomputed numbers that are equal within the tolerances.
+    """
+
+    pairs: tuple[tuple[float, float], ...]
+
+    def __call__(self, one: str, other: str) -> bool:
+        """Return True if one pair gives both numbers."""
+        decimals, printed = _decimals(one), (float(one), float(other))
+        return decimals == _decimals(other) and any(
+            printed == (round(abs(a) * scale, decimals), round(abs(b) * scale, decimals))
+            for scale in PRINTED_SCALES
+            for a, b in self.pairs
+        )
 
 
 def compare_results(
     recorded: Mapping[str, Any], recomputed: Mapping[str, Any]
-) -> tuple[tuple[Mismatch, ...], NumbersAlike, int]:
+) -> tuple[tuple[Mismatch, ...], Rounding, int]:
     """Compare every value of two results, of which the first is a stranger's.
 
     Returns
     -------
     differences : tuple of Mismatch
         What is beyond the tolerances.
-    alike : callable
-        Whether two printed numbers are a recorded number and its recomputed twin, each rounded.
+    alike : Rounding
     compared : int
         How many values.
     """
@@ -310,7 +336,8 @@ def compare_results(
         for path, pair in pairs.items()
         if all(map(is_number, pair))
     }
-    alike = _rounding([pairs[path] for path, is_near in near.items() if is_near])
+    twins = (pairs[path] for path, is_near in near.items() if is_near)
+    alike = Rounding(tuple((float(a), float(b)) for a, b in twins if a != b))
     wrong = [path for path, is_near in near.items() if not is_near]
     wrong += [path for path in pairs if path not in near and not _same(*pairs[path], alike)]
     found = (Mismatch(one_line(path, SHOWN_TEXT), *map(_shown, pairs[path])) for path in wrong)
@@ -348,14 +375,14 @@ def _near(path: str, theirs: float, ours: float, wide: bool) -> bool:
     return abs(theirs - ours) <= relative * abs(ours) + absolute
 
 
-def _same(theirs: Any, ours: Any, rounded: NumbersAlike) -> bool:
+def _same(theirs: Any, ours: Any, rounded: WordsAlike) -> bool:
     """Whether two values that are not both numbers are the same."""
     if isinstance(theirs, str) and isinstance(ours, str):
         return same_words(theirs, cleaned(ours), rounded)
     return type(theirs) is type(ours) and bool(theirs == ours)
 
 
-def same_words(one: str, other: str, alike: NumbersAlike) -> bool:
+def same_words(one: str, other: str, alike: WordsAlike) -> bool:
     """Whether two texts are the same but for the rounding of their numbers.
 
     >>> same_words("0.15 m", "0.16 m", lambda one, other: True)
@@ -369,21 +396,6 @@ def same_words(one: str, other: str, alike: NumbersAlike) -> bool:
     parts, others = _NUMBER.split(one), _NUMBER.split(other)
     numbers = zip(parts[1::2], others[1::2], strict=False)
     return parts[::2] == others[::2] and all(a == b or alike(a, b) for a, b in numbers)
-
-
-def _rounding(near: Sequence[tuple[float, float]]) -> NumbersAlike:
-    """Whether two printed numbers are a recorded number and its recomputed twin, each rounded."""
-    pairs = [(float(one), float(other)) for one, other in near if one != other]
-
-    def alike(one: str, other: str) -> bool:
-        decimals, printed = _decimals(one), (float(one), float(other))
-        return decimals == _decimals(other) and any(
-            printed == (round(abs(a) * scale, decimals), round(abs(b) * scale, decimals))
-            for scale in PRINTED_SCALES
-            for a, b in pairs
-        )
-
-    return alike
 
 
 def _decimals(number: str) -> int:

@@ -128,11 +128,6 @@ def links(title: str, rows: Sequence[tuple[str, str]]) -> Part:
     return ["links", title, [row for row in rows if row[1]]]
 
 
-def pictures(title: str, rows: Sequence[tuple[str, str, str]]) -> Part:
-    """Caption, words for who does not see it, and address (local)."""
-    return ["pictures", title, rows]
-
-
 def boxes(
     title: str,
     owner: str,
