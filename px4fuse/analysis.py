@@ -147,9 +147,14 @@ class Analysis(Comparison):
             near = (time_s >= jump.time_s) & (time_s < jump.time_s + AFTER_STEP_S)
             left_out = np.union1d(left_out, time_s[near])
         together = hanging_together(
-            self.flight, axes, self.settings, tuned.noises, outlier_time_s=left_out,
-            clock_offset_s=offset_s, jumps=jumps,
-        )  # fmt: skip
+            self.flight,
+            axes,
+            self.settings,
+            tuned.noises,
+            outlier_time_s=left_out,
+            clock_offset_s=offset_s,
+            jumps=jumps,
+        )
         if isinstance(together, Unavailable):
             return together, together
         smooth, slow = together
@@ -495,6 +500,11 @@ def explain(comparison: Comparison, progress: Progress = silent) -> Analysis:
 
     loop = loop_in(comparison.flight, progress)
     return Analysis(
-        **vars(comparison), tuning=tuning, clock=clock, ekf2_model=model, why=why, loop=loop,
+        **vars(comparison),
+        tuning=tuning,
+        clock=clock,
+        ekf2_model=model,
+        why=why,
+        loop=loop,
         heading=heading,
-    )  # fmt: skip
+    )

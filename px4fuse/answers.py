@@ -139,8 +139,10 @@ class Answers(Record, frozen=True, kw_only=True):
 AskedKind = Literal["gain", "variance", "innovation", "nis", "silence", "gate"]
 # One of each pair is asked
 _DRAWN: tuple[tuple[AskedKind, AskedKind], ...] = (
-    ("gain", "variance"), ("innovation", "nis"), ("silence", "gate"),
-)  # fmt: skip
+    ("gain", "variance"),
+    ("innovation", "nis"),
+    ("silence", "gate"),
+)
 
 
 class AskedNumber(Record, frozen=True):
@@ -269,8 +271,10 @@ def check(answers: Answers) -> None:
         size = claim.size_in_first_unit()
         if size is not None and not low <= size <= high:
             unit = next(iter(mistake.units))
-            raise ValueError(f"of {claim.kind}: size {size:g} {unit} is none that it can have: "
-                             f"{low:g} to {high:g} {unit}")  # fmt: skip
+            raise ValueError(
+                f"of {claim.kind}: size {size:g} {unit} is none that it can have: "
+                f"{low:g} to {high:g} {unit}"
+            )
 
 
 def _one_of(field: str, value: str, known: Any) -> None:

@@ -56,9 +56,14 @@ class Columns:
     BODY_FIELD: Final = [f"body_field_{axis}_gauss" for axis in ("forward", "right", "down")]
     FIELD_INNOVATION: Final = [f"innovation_{axis}_gauss" for axis in ("forward", "right", "down")]
     DELAYED_STATE: Final = [
-        *QUATERNION, *VELOCITY, *POSITION, *GYRO_BIAS,
-        *ACCELEROMETER_BIAS, *EARTH_FIELD, *BODY_FIELD,
-    ]  # fmt: skip
+        *QUATERNION,
+        *VELOCITY,
+        *POSITION,
+        *GYRO_BIAS,
+        *ACCELEROMETER_BIAS,
+        *EARTH_FIELD,
+        *BODY_FIELD,
+    ]
     DELAYED_VARIANCE: Final = [
         *(f"attitude_{axis}_rad2" for axis in AXIS_NAMES),
         *VELOCITY_VARIANCE,
@@ -66,7 +71,7 @@ class Columns:
         *(f"{name.removesuffix('_rad_s')}_rad2_s2" for name in GYRO_BIAS),
         *(f"{name.removesuffix('_m_s2')}_m2_s4" for name in ACCELEROMETER_BIAS),
         *(f"{name}2" for name in (*EARTH_FIELD, *BODY_FIELD)),
-    ]  # fmt: skip
+    ]
 
 
 @dataclass(frozen=True)
@@ -198,8 +203,18 @@ class PositionTrack:
 
     def about(self) -> dict[str, Any]:
         """What is written of it, and of where it comes from, by the names in results."""
-        names = ("name", "kind", "passage", "description", "frame", "clock", "reconstructed",
-                 "topics", "log", "alignment")  # fmt: skip
+        names = (
+            "name",
+            "kind",
+            "passage",
+            "description",
+            "frame",
+            "clock",
+            "reconstructed",
+            "topics",
+            "log",
+            "alignment",
+        )
         whose = {name: self.origin if hasattr(self.origin, name) else self for name in names}
         return {name: getattr(whose[name], name) for name in names}
 

@@ -108,9 +108,11 @@ def excess_words(factor: float) -> str:
     >>> [excess_words(f) for f in (1.18, 1.96, 2.4, 24.3)]
     ['18 %', '96 %', '2.4 times', '24 times']
     """
-    return f"{factor - 1.0:.0%}".replace("%", " %") if factor < 2.0 else (
-        f"{factor_words(factor)} times"
-    )  # fmt: skip
+    return (
+        f"{factor - 1.0:.0%}".replace("%", " %")
+        if factor < 2.0
+        else (f"{factor_words(factor)} times")
+    )
 
 
 def sentences(beside: str) -> Callable[..., str]:

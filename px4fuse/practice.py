@@ -32,9 +32,14 @@ SIGMA_A_M_S2, SIGMA_Z_M = 0.10, 0.10
 # Short of a minute, with two turns. A quiet IMU, which SIGMA_A fits: else its own errors would look
 # like those of clock and frame
 FLOWN: dict[str, Any] = {
-    "passes": 3, "speed_m_s": 1.5, "sigma_a_m_s2": 0.05, "accel_bias_sigma_m_s2": 0.005,
-    "gyro_bias_sigma_rad_s": 0.0002, "tilt_error_deg": 0.02, "yaw_error_deg": 0.2,
-}  # fmt: skip
+    "passes": 3,
+    "speed_m_s": 1.5,
+    "sigma_a_m_s2": 0.05,
+    "accel_bias_sigma_m_s2": 0.005,
+    "gyro_bias_sigma_rad_s": 0.0002,
+    "tilt_error_deg": 0.02,
+    "yaw_error_deg": 0.2,
+}
 LENGTH_M = (8.0, 12.0)
 # Of a mistake that has its moment, the finding that says when
 MOMENTS = {"nlos": "source_outliers", "jump": "source_jumps", "dropout": "source_gap"}
@@ -132,8 +137,10 @@ def _round(rng: np.random.Generator, choice: str, level: int) -> Round:
     for trick in tricks:
         minus = "-" if trick.either_sign and rng.random() < 0.5 else ""
         typed.append(f"{minus}{trick.sizes[level - 1]}")
-    noisy = next((float(t) for one, t in zip(tricks, typed, strict=True)
-                  if one.mistake == NOISY_UWB), SIGMA_Z_M)  # fmt: skip
+    noisy = next(
+        (float(t) for one, t in zip(tricks, typed, strict=True) if one.mistake == NOISY_UWB),
+        SIGMA_Z_M,
+    )
     scenario = Scenario(
         **FLOWN,
         length_m=round(float(rng.uniform(*LENGTH_M)), 1),
@@ -171,9 +178,14 @@ def practice_text(
         data, script = _flown(one, number)
         scripts.append(script)
     return page_text(
-        "\n".join(scripts), [data], command="practice", heading="What is wrong with this flight?",
-        title=f"seed {seed}, level {level}", rounds=count, choices=CHOICES,
-    )  # fmt: skip
+        "\n".join(scripts),
+        [data],
+        command="practice",
+        heading="What is wrong with this flight?",
+        title=f"seed {seed}, level {level}",
+        rounds=count,
+        choices=CHOICES,
+    )
 
 
 def _flown(one: Round, number: int) -> tuple[dict[str, Any], str]:
@@ -208,6 +220,9 @@ def _made(trick: Trick, size: str, findings: tuple[Finding, ...]) -> dict[str, A
     what = trick.what.format(size=size)
     moments = [one.spans_s[0] for one in findings if one.id == MOMENTS.get(trick.mistake)]
     return {
-        "choice": trick.choice, "what": what, "tell": trick.tell_tale, "view": trick.view,
+        "choice": trick.choice,
+        "what": what,
+        "tell": trick.tell_tale,
+        "view": trick.view,
         "span": list(moments[0]) if moments else None,
-    }  # fmt: skip
+    }

@@ -258,9 +258,14 @@ def _other_frame(
 
 
 def _warnings(
-    flight: Flight, file: PositionRecording, match: Match | None, auto: bool, *,
-    correlation: float | None, clock_offset_s: float | None,
-) -> Iterator[str]:  # fmt: skip
+    flight: Flight,
+    file: PositionRecording,
+    match: Match | None,
+    auto: bool,
+    *,
+    correlation: float | None,
+    clock_offset_s: float | None,
+) -> Iterator[str]:
     """What makes the match doubtful, what it cannot tell, and whether the flight is the same."""
     if match:
         name, fit = match.reference.name, match.clock

@@ -19,8 +19,15 @@ from px4fuse.simulation.mistakes import parse
 from px4fuse.writing import write_all
 
 # Of the numbers that only the instructor knows
-TRUTH = ("duration_s", "sigma_z_m", "sigma_a_m_s2", "reported_sigma_m", "clock_offset_to_add_s",
-         "path_length_m", "closure_error_m")  # fmt: skip
+TRUTH = (
+    "duration_s",
+    "sigma_z_m",
+    "sigma_a_m_s2",
+    "reported_sigma_m",
+    "clock_offset_to_add_s",
+    "path_length_m",
+    "closure_error_m",
+)
 
 
 def fly(

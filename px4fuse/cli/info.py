@@ -38,9 +38,13 @@ def _versions(context: click.Context, _: click.Parameter, wanted: bool) -> None:
 @click.command()
 @click.argument("log", type=InputPath())
 @click.option(
-    "--versions", is_flag=True, is_eager=True, expose_value=False, callback=_versions,
+    "--versions",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_versions,
     help="Print versions, system and libraries, for a bug report, and exit.",
-)  # fmt: skip
+)
 @json_option
 @recording_options
 def info(log: Path, json_path: Path | None, **given: Any) -> None:

@@ -246,9 +246,11 @@ def _allow_size(ctx: click.Context, _: click.Parameter, megabytes: int | None) -
 # It says what this machine can take, not what is analysed, so it is no setting of the analysis
 max_size_option = option(
     "--max-size MB",
-    f"Largest log that is read.  [default: {max_log_bytes.get() // 1_000_000}]", 1,
-    expose_value=False, callback=_allow_size,
-)  # fmt: skip
+    f"Largest log that is read.  [default: {max_log_bytes.get() // 1_000_000}]",
+    1,
+    expose_value=False,
+    callback=_allow_size,
+)
 #: The results, which stand beside a report where there is one
 json_option = option(
     "--json FILE",
@@ -261,9 +263,13 @@ json_option = option(
 def _opened(typed: str, name: str) -> Option:
     """That what was written is to be opened; :func:`~px4fuse.cli.outputs.finish` does."""
     return option(
-        typed, "Open what was written, in the program for it.", name=name, is_flag=True,
-        expose_value=False, callback=lambda ctx, _, value: ctx.meta.update({OPENED: value}),
-    )  # fmt: skip
+        typed,
+        "Open what was written, in the program for it.",
+        name=name,
+        is_flag=True,
+        expose_value=False,
+        callback=lambda ctx, _, value: ctx.meta.update({OPENED: value}),
+    )
 
 
 #: Of every command that writes something to look at

@@ -175,10 +175,15 @@ def _assign(
         found = assignment.preview(students, key_file, secret, kind, count)
         drawn = [(one.typed, one.difficulty) for one in found]
         rows = [
-            (student.student_id, student.name, one.scenario.kind, " ".join(one.typed) or "none",
-             f"{one.difficulty:.2f}")
+            (
+                student.student_id,
+                student.name,
+                one.scenario.kind,
+                " ".join(one.typed) or "none",
+                f"{one.difficulty:.2f}",
+            )
             for student, one in zip(students, found, strict=True)
-        ]  # fmt: skip
+        ]
         page.table(("student", "name", "flight", "mistakes", "difficulty"), rows, right=(4,))
         ends["Preview"] = (
             "Nothing was written. Not for students: this says what is wrong in every flight."
@@ -201,14 +206,16 @@ def _assign(
             )
     counts = Counter(one.partition("=")[0] for typed, _ in drawn for one in typed or ("none",))
     difficulties = [difficulty for _, difficulty in drawn if difficulty is not None]
-    page.advice({
-        "Class": f"{len(drawn)} student{'s' * (len(drawn) != 1)}, {kind}",
-        "Mistakes": ", ".join(f"{name} {number}" for name, number in sorted(counts.items())),
-        "How hard": f"{min(difficulties):.2f} to {max(difficulties):.2f}, drawn between "
-        f"{EASIEST:g} and {HARDEST:g} for everyone: the smallest size that px4fuse finds in 19 of "
-        "20 flights over the size that was drawn, of the hardest mistake",
-        **ends,
-    })  # fmt: skip
+    page.advice(
+        {
+            "Class": f"{len(drawn)} student{'s' * (len(drawn) != 1)}, {kind}",
+            "Mistakes": ", ".join(f"{name} {number}" for name, number in sorted(counts.items())),
+            "How hard": f"{min(difficulties):.2f} to {max(difficulties):.2f}, drawn between "
+            f"{EASIEST:g} and {HARDEST:g} for everyone: the smallest size that px4fuse finds in 19 "
+            "of 20 flights over the size that was drawn, of the hardest mistake",
+            **ends,
+        }
+    )
     finish({}, page)
 
 
@@ -222,14 +229,16 @@ def _page(simulation: Simulation, answer: Path | None) -> Page:
     path = f"{scenario.passes} lap{'s' * many} of a square of {scenario.length_m:g} m"
     if scenario.kind == "aisle":
         path = f"{scenario.passes} pass{'es' * many} of {scenario.length_m:g} m"
-    page.advice({
-        "Flight": f"{scenario.kind}, {path} at {scenario.speed_m_s:g} m/s, "
-        f"{simulation.motion.duration_s:g} s, seed {scenario.seed}",
-        "Position": f"{SOURCES[scenario.kind]}, {scenario.source_sigma_m:g} m at "
-        f"{scenario.source_rate_hz:g} Hz"
-        + (f", drift {scenario.vio_drift:.1%} of the path" if loop else ""),
-        "IMU": f"{scenario.imu_rate_hz:g} Hz, SIGMA_A {scenario.sigma_a_m_s2:g} m/s²",
-    })  # fmt: skip
+    page.advice(
+        {
+            "Flight": f"{scenario.kind}, {path} at {scenario.speed_m_s:g} m/s, "
+            f"{simulation.motion.duration_s:g} s, seed {scenario.seed}",
+            "Position": f"{SOURCES[scenario.kind]}, {scenario.source_sigma_m:g} m at "
+            f"{scenario.source_rate_hz:g} Hz"
+            + (f", drift {scenario.vio_drift:.1%} of the path" if loop else ""),
+            "IMU": f"{scenario.imu_rate_hz:g} Hz, SIGMA_A {scenario.sigma_a_m_s2:g} m/s²",
+        }
+    )
     told = [f"{as_typed(name, simulation.mistakes)}: {MISTAKES[name].help}" for name in names]
     page.labelled("Mistakes", *(told or ["none"]))
     page.labelled("Truth", "in the log" if scenario.truth else "not in the log")

@@ -17,9 +17,13 @@ if TYPE_CHECKING:
     from px4fuse.report.page import Page
 
 HEAD = (
-    "axis", "SIGMA_A (m/s²)\nvalue, 95 %", "SIGMA_Z (m)\nvalue, 95 %", "\ngain", "held\nout",
+    "axis",
+    "SIGMA_A (m/s²)\nvalue, 95 %",
+    "SIGMA_Z (m)\nvalue, 95 %",
+    "\ngain",
+    "held\nout",
     "lag 1\nbefore after",
-)  # fmt: skip
+)
 NOTE = (
     "gain: log-likelihood per measurement above the chosen settings; held out: the same on "
     "the second half, tuned on the first; lag 1: autocorrelation of the innovations."

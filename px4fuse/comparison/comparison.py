@@ -238,8 +238,11 @@ def _nees(at_s: Array, error: Array, variance: pd.Series) -> float | None:
 
 def _horizontal(frames: Mapping[str, Frame]) -> HorizontalNis | None:
     columns = ["innovation_m", "innovation_variance_m2"]
-    pair = [frame[columns] for name in ("north", "east")
-            if isinstance(frame := frames.get(name), pd.DataFrame)]  # fmt: skip
+    pair = [
+        frame[columns]
+        for name in ("north", "east")
+        if isinstance(frame := frames.get(name), pd.DataFrame)
+    ]
     if len(pair) < 2:
         return None
     # only updates that both axes have, at the very same times

@@ -74,10 +74,14 @@ def tuned(
     """
     flight, slow = comparison.flight, imu_too_slow_for_clocks(comparison.flight)
     return tune(
-        comparison.lines, comparison.settings, names, lambda name: progress(f"tuning {name}"),
+        comparison.lines,
+        comparison.settings,
+        names,
+        lambda name: progress(f"tuning {name}"),
         flight if slow is None else replace(flight, imu=slow),
-        comparison.source.origin.may_drift, cache,
-    )  # fmt: skip
+        comparison.source.origin.may_drift,
+        cache,
+    )
 
 
 def noises_and_clock(
@@ -95,10 +99,15 @@ def noises_and_clock(
         return tuning, slow
     settings, known = comparison.settings, known_noises(tuning, HORIZONTAL, *tuning)
     clock = estimate_clock_offset(
-        comparison.flight, comparison.source, comparison.segment, settings,
+        comparison.flight,
+        comparison.source,
+        comparison.segment,
+        settings,
         known.noises if known else Noises(settings.sigma_a_m_s2, settings.sigma_z_m),
-        known.outlier_time_s if known else None, progress, cache,
-    )  # fmt: skip
+        known.outlier_time_s if known else None,
+        progress,
+        cache,
+    )
     drifts = comparison.source.origin.may_drift
     return tuning, with_drift(clock) if drifts and isinstance(clock, ClockOffset) else clock
 
@@ -118,9 +127,13 @@ def turned_frame(
     if isinstance(clock, ClockOffset) and clock.determinable:
         offset_s = clock.remaining_s
     return heading_error(
-        comparison.flight, comparison.source, comparison.segment, comparison.settings, sigma_z_m,
+        comparison.flight,
+        comparison.source,
+        comparison.segment,
+        comparison.settings,
+        sigma_z_m,
         offset_s,
-    )  # fmt: skip
+    )
 
 
 def imu_too_slow_for_clocks(flight: Flight) -> Unavailable | None:

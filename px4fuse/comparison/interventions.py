@@ -88,9 +88,13 @@ ACC_NOISE = "EKF2_ACC_NOISE"
 SHAKEN = 3.0
 # What EKF2 has besides the aid's own; PX4's default is tried where something else was flown
 NOT_OF_AID = (
-    ACC_NOISE, "EKF2_GYR_NOISE", "EKF2_ACC_B_NOISE", "EKF2_GYR_B_NOISE", GNSS_VEL.noise,
+    ACC_NOISE,
+    "EKF2_GYR_NOISE",
+    "EKF2_ACC_B_NOISE",
+    "EKF2_GYR_B_NOISE",
+    GNSS_VEL.noise,
     GNSS_VEL.gate,
-)  # fmt: skip
+)
 INNOVATION_COLUMNS, INNOVATION_VARIANCE_COLUMNS = UPDATE_COLUMNS[:2], UPDATE_COLUMNS[2:4]
 POSITION_VARIANCES = [f"position_variance_{axis}_m2" for axis in LEVEL]
 HEADING_SIGMAS = 3.0
@@ -161,11 +165,13 @@ def cause_of(
     return min(
         (each for each in tried_on(causes, owner, axis, of) if each.is_cause),
         key=lambda each: (
-            not each.is_enough, len(each.change.keys() - ALONG), not each.of_sensors,
+            not each.is_enough,
+            len(each.change.keys() - ALONG),
+            not each.of_sensors,
             abs(each.explains - 1.0),
         ),
         default=None,
-    )  # fmt: skip
+    )
 
 
 class Hidden(NamedTuple):
@@ -249,9 +255,15 @@ def _apart(cause: Intervention, result: AxisComparison, changed: _Changed) -> li
         return []
     share = 1.0 - (after[0] / before[0]) ** 2
     return [
-        structs.replace(cause, of="apart", before=before[0], after=after[0], explains=share,
-                        brings_into_band=False)
-    ]  # fmt: skip
+        structs.replace(
+            cause,
+            of="apart",
+            before=before[0],
+            after=after[0],
+            explains=share,
+            brings_into_band=False,
+        )
+    ]
 
 
 def is_off(statement: FilterSummary | UnjudgedFilter) -> TypeGuard[FilterSummary]:
@@ -286,12 +298,17 @@ def _tried(changed: _Changed, result: AxisComparison, of: Of) -> list[Interventi
         most = NEES_DENIES if nees is not None and nees > 1.0 else NEES_LARGE
         return [
             Intervention(
-                of=of, filter=changed.owner, axis=result.axis.name, change=change, before=before,
-                after=after, explains=1.0 - float(np.log(after) / np.log(before)),
+                of=of,
+                filter=changed.owner,
+                axis=result.axis.name,
+                change=change,
+                before=before,
+                after=after,
+                explains=1.0 - float(np.log(after) / np.log(before)),
                 brings_into_band=low <= after <= high,
                 denied_by_truth=claimed is not None and claimed[0] >= most,
             )
-        ]  # fmt: skip
+        ]
 
     alone = [each for change in candidates for each in tried(change)]
     helping = sorted(

@@ -305,7 +305,11 @@ def choose_segment(
     count = len(within(track.samples, segment))
     if count < MIN_MEASUREMENTS:
         raise SettingsError.of(
-            "segment_short", log=flight.log.name, count=count, track=track, segment=segment,
+            "segment_short",
+            log=flight.log.name,
+            count=count,
+            track=track,
+            segment=segment,
             least=MIN_MEASUREMENTS,
-        )  # fmt: skip
+        )
     return segment

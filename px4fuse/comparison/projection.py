@@ -137,10 +137,12 @@ def project_horizon(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | 
     if aid is not None and f"observation_{aid.axes[0]}" in aid.samples:
         samples = within(aid.samples, segment)
         position, variance = (
-            sum(weights[name] ** power * (samples[f"{a}_{name}"] - samples[f"{b}_{name}"])
-                for name in aid.axes)
+            sum(
+                weights[name] ** power * (samples[f"{a}_{name}"] - samples[f"{b}_{name}"])
+                for name in aid.axes
+            )
             for power, a, b in ((1, "observation", "innovation"), (2, "variance", "noise"))
-        )  # fmt: skip
+        )
         found = pd.DataFrame({"position_m": position, "position_variance_m2": variance})
         return found[found["position_variance_m2"] > 0.0]
     if isinstance(ekf2.record, Unavailable):

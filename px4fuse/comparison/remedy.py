@@ -221,9 +221,12 @@ def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, f
     results = [comparison.axes[name] for name in names]
     later_s = changed.clock_offset_s - comparison.settings.clock_offset_s
     lines = make_axes(
-        comparison.flight, shift_clock(comparison.source, later_s), comparison.segment, names=names,
+        comparison.flight,
+        shift_clock(comparison.source, later_s),
+        comparison.segment,
+        names=names,
         heading_deg=results[0].heading_deg,
-    )  # fmt: skip
+    )
     errors_m: list[tuple[float, float]] = []
     for result, line in zip(results, lines, strict=True):
         run, before = quick_replay(line, changed), result.filters["kf"].truth

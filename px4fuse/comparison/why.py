@@ -159,12 +159,21 @@ def _reasons(
     same = flown["EKF2_ACC_NOISE"] * np.sqrt(inputs.step_s / settings.dt_s)
     surer = same < settings.sigma_a_m_s2
     facts = {
-        "settings": settings, "source": source, "inputs": inputs, "aid": inputs.aid, "data": data,
-        "flown": flown, "delay_ms": flown[delay], "noise_m": noise_used_m(model), "same": same,
-        "age_ms": 1e3 * (source.age_s - settings.clock_offset_s), "step_ms": 1e3 * inputs.step_s,
+        "settings": settings,
+        "source": source,
+        "inputs": inputs,
+        "aid": inputs.aid,
+        "data": data,
+        "flown": flown,
+        "delay_ms": flown[delay],
+        "noise_m": noise_used_m(model),
+        "same": same,
+        "age_ms": 1e3 * (source.age_s - settings.clock_offset_s),
+        "step_ms": 1e3 * inputs.step_s,
         "trusted": "the IMU more, and each position less" if surer else "each position more",
-        "horizon_ms": 1e3 * inputs.horizon_s, "rejected": model.agreement.rejected_share_logged,
-    }  # fmt: skip
+        "horizon_ms": 1e3 * inputs.horizon_s,
+        "rejected": model.agreement.rejected_share_logged,
+    }
     said = {step: text.format_map(facts) for step, text in REASONS.items()}
     return {**said, ways.SAMPLES: said[samples]}
 

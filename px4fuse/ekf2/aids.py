@@ -18,9 +18,14 @@ from px4fuse.flight import AidLog, Ekf2, Flight, Unavailable, at_times
 from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Span, lacking
 
 AidVerdict = Literal[
-    "consistent", "variance overstated", "variance understated", "biased", "starved", "idle",
+    "consistent",
+    "variance overstated",
+    "variance understated",
+    "biased",
+    "starved",
+    "idle",
     "too few samples",
-]  # fmt: skip
+]
 # An aid pulls EKF2 to one side where the mean is half of what the innovations are, root mean
 # square, and a fifth of √S: then averaging does not take it away, and EKF2 follows
 BIASED, FELT = 0.5, 0.2
@@ -209,26 +214,40 @@ def _judge(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidResult:
         found = assess(innovation[tried, number], variance[tried, number], gate)
         if not isinstance(found, Unavailable):
             axes[axis] = AidAxis(
-                samples=found.count, innovation_mean=found.innovation_mean_m,
-                innovation_std=found.innovation_std_m, s_sqrt_median=found.sqrt_s_median_m,
-                nis_mean=found.nis_mean, nis_band=found.nis_band, sigma_factor=found.sigma_factor,
-                rejected_share=found.outside_gate, bias_p=found.bias_p,
-                lag1_autocorrelation=found.lag1_autocorrelation, ljung_box_p=found.ljung_box_p,
+                samples=found.count,
+                innovation_mean=found.innovation_mean_m,
+                innovation_std=found.innovation_std_m,
+                s_sqrt_median=found.sqrt_s_median_m,
+                nis_mean=found.nis_mean,
+                nis_band=found.nis_band,
+                sigma_factor=found.sigma_factor,
+                rejected_share=found.outside_gate,
+                bias_p=found.bias_p,
+                lag1_autocorrelation=found.lag1_autocorrelation,
+                ljung_box_p=found.ljung_box_p,
                 change=_change(
                     times[tried], innovation[tried, number] / np.sqrt(variance[tried, number])
                 ),
-            )  # fmt: skip
+            )
     idle = not tried.any()
     return AidResult(
-        label=aid.label, unit=aid.unit, topic=log.topics[0], intended_share=intended_share,
-        fused_share=_share(fused & meant, meant), fused_logged=fused_logged,
-        rejected_share=_share(rejected & meant, meant), longest_without_s=without_s,
-        resets=int(reset.sum()), gate=gate, noise=noise_median,
-        noise_from=_noise_from(aid, log, noise_median), axes=axes,
-        verdict="idle" if idle else _verdict(
-            axes, without_s[1] - without_s[0], times[fused & (not fused_logged)]
-        ),
-    )  # fmt: skip
+        label=aid.label,
+        unit=aid.unit,
+        topic=log.topics[0],
+        intended_share=intended_share,
+        fused_share=_share(fused & meant, meant),
+        fused_logged=fused_logged,
+        rejected_share=_share(rejected & meant, meant),
+        longest_without_s=without_s,
+        resets=int(reset.sum()),
+        gate=gate,
+        noise=noise_median,
+        noise_from=_noise_from(aid, log, noise_median),
+        axes=axes,
+        verdict="idle"
+        if idle
+        else _verdict(axes, without_s[1] - without_s[0], times[fused & (not fused_logged)]),
+    )
 
 
 def _change(time_s: Array, pull: Array) -> Span | None:

@@ -32,9 +32,15 @@ class Bias:
         self.share = step_s / (FILTER_S + step_s)
 
     def corrected(
-        self, nu: Array, spread: Array, noise_m2: Array, time_s: Array, seen: BoolArray,
-        learning: BoolArray, weight: float = 1.0,
-    ) -> tuple[Array, Array]:  # fmt: skip
+        self,
+        nu: Array,
+        spread: Array,
+        noise_m2: Array,
+        time_s: Array,
+        seen: BoolArray,
+        learning: BoolArray,
+        weight: float = 1.0,
+    ) -> tuple[Array, Array]:
         """Innovation and R with the bias as it was, which learns of them before they are fused.
 
         Parameters

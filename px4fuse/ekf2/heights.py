@@ -121,9 +121,15 @@ class HeightFilter:
     """
 
     def __init__(
-        self, stretch: Stretch, barometer: Array, fix_s: Array, fixed: BoolArray,
-        on: Mapping[str, BoolArray], knob: Mapping[str, Array], gated: BoolArray,
-    ) -> None:  # fmt: skip
+        self,
+        stretch: Stretch,
+        barometer: Array,
+        fix_s: Array,
+        fixed: BoolArray,
+        on: Mapping[str, BoolArray],
+        knob: Mapping[str, Array],
+        gated: BoolArray,
+    ) -> None:
         heights, size = stretch.heights, len(gated)
         assert heights is not None
         self.fused = heights.fused
@@ -175,9 +181,17 @@ class HeightFilter:
         return x, P
 
     def _take(
-        self, e: int, place: int, at: int, x: Array, P: Array, column: Array, spread: Array,
-        nu: Array, R: Array,
-    ) -> tuple[Array, Array]:  # fmt: skip
+        self,
+        e: int,
+        place: int,
+        at: int,
+        x: Array,
+        P: Array,
+        column: Array,
+        spread: Array,
+        nu: Array,
+        R: Array,
+    ) -> tuple[Array, Array]:
         """Fuse an innovation; ``column`` is PH', ``spread`` HPH'."""
         if self.biased[at]:
             seen, time_s = self.seen[place][e], self.time_s[place][e]

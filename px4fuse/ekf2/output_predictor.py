@@ -38,9 +38,13 @@ ATTITUDE_SHARE = 0.5
 
 
 def publish(
-    stretch: Stretch, state: Array, reset_m: Array, turned_rad: Array, lag: int,
+    stretch: Stretch,
+    state: Array,
+    reset_m: Array,
+    turned_rad: Array,
+    lag: int,
     settings: Mapping[str, float],
-) -> tuple[Array, Array]:  # fmt: skip
+) -> tuple[Array, Array]:
     """Published velocity and position at each step's end.
 
     Parameters

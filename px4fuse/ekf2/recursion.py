@@ -193,8 +193,10 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     action = np.where(gated, event["action"], np.where(event["usable"], FUSE, IDLE))
     end, active = event["end"], action > IDLE
     now_s, sampled = stretch.time_s[end], np.any(active, axis=1).tolist()
-    on = {aid.name: now_s < np.array([v.without.get(aid.name, np.inf) for v in variants])
-          for aid in (inputs.aid, GNSS_VEL, MAG, FLOW, EV_POS, *SENSORS)}  # fmt: skip
+    on = {
+        aid.name: now_s < np.array([v.without.get(aid.name, np.inf) for v in variants])
+        for aid in (inputs.aid, GNSS_VEL, MAG, FLOW, EV_POS, *SENSORS)
+    }
     with_velocity = (action == FUSE) & on[GNSS_VEL.name] & fuses_velocity
     sample = np.maximum(intervals[0].events.sample, 0)
     measured, noise = _measurements(inputs, stretch, sample, end, knob, reported)
@@ -291,9 +293,9 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
             moving = with_velocity[e] & ~(outside[:, SPEED].any(axis=1) & gated)
             outside = outside[:, LEVEL].any(axis=1)
             if moved is not None:
-                edge, kept = _by_output(moved[sample[e]], *(
-                    each[:, LEVEL] for each in (nu, S, noise[e], gate2)
-                ))  # fmt: skip
+                edge, kept = _by_output(
+                    moved[sample[e]], *(each[:, LEVEL] for each in (nu, S, noise[e], gate2))
+                )
                 outside = np.where(as_logged & edge, kept, outside)
             rejected[e], fused[e], reset[e], moving = fusion.decide(e, outside, moving)
             if in_turn:
@@ -337,10 +339,23 @@ def run(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
         states[e + 1], spreads[e + 1] = x, _diagonal(P)
     innovations[~active], variances[~active] = np.nan, np.nan
     return Run(
-        stretch, tuple(variants), tuple(each.events for each in intervals), innovations, variances,
-        noise, rejected, fused, reset, moved_m if vision is None else moved_m + vision.moved_m,
-        states, spreads, P, of_field, heights, vision,
-    )  # fmt: skip
+        stretch,
+        tuple(variants),
+        tuple(each.events for each in intervals),
+        innovations,
+        variances,
+        noise,
+        rejected,
+        fused,
+        reset,
+        moved_m if vision is None else moved_m + vision.moved_m,
+        states,
+        spreads,
+        P,
+        of_field,
+        heights,
+        vision,
+    )
 
 
 def _together(x: Array, P: Array, innovation: Array, R: Array) -> tuple[Array, Array]:
@@ -474,8 +489,9 @@ def _drift(
     of_field = ("MAG_E", "MAG_B") if stretch.field is not None else ()
     gained = np.stack([knob[f"EKF2_{of}_NOISE"] for of in ("GYR_B", "ACC_B", *of_field)], axis=-1)
     gained[:, :2] *= np.stack([attitude, biases], axis=-1)
-    limit = np.stack([knob[f"EKF2_{of}_NOISE"] for of in ("GYR", "ACC", *["MAG"] * len(of_field))],
-                     axis=-1)  # fmt: skip
+    limit = np.stack(
+        [knob[f"EKF2_{of}_NOISE"] for of in ("GYR", "ACC", *["MAG"] * len(of_field))], axis=-1
+    )
     return np.repeat((gained * inputs.step_s) ** 2, 3, axis=-1), np.repeat(limit**2, 3, axis=-1)
 
 

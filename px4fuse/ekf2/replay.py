@@ -22,11 +22,21 @@ from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Sh
 Spans = tuple[Span, ...]
 HORIZONTAL: tuple[AxisName, AxisName] = ("north", "east")
 UPDATE_COLUMNS = [
-    "innovation_north_m", "innovation_east_m", "innovation_variance_north_m2",
-    "innovation_variance_east_m2", "rejected", "fused", "reset", "position_variance_north_m2",
-    "position_variance_east_m2", "velocity_variance_north_m2_s2", "velocity_variance_east_m2_s2",
-    "observation_variance_north_m2", "observation_variance_east_m2", "fused_at_s",
-]  # fmt: skip
+    "innovation_north_m",
+    "innovation_east_m",
+    "innovation_variance_north_m2",
+    "innovation_variance_east_m2",
+    "rejected",
+    "fused",
+    "reset",
+    "position_variance_north_m2",
+    "position_variance_east_m2",
+    "velocity_variance_north_m2_s2",
+    "velocity_variance_east_m2_s2",
+    "observation_variance_north_m2",
+    "observation_variance_east_m2",
+    "fused_at_s",
+]
 VELOCITY_UPDATE_COLUMNS = [
     *(f"innovation_{axis}_m_s" for axis in AXIS_NAMES),
     *(f"innovation_variance_{axis}_m2_s2" for axis in AXIS_NAMES),

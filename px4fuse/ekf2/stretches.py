@@ -332,9 +332,13 @@ def find_stretches(
 
 
 def _on_gnss(
-    imu: pd.DataFrame, attitude: pd.DataFrame, ekf2: Ekf2, record: FusionRecord, at: int,
+    imu: pd.DataFrame,
+    attitude: pd.DataFrame,
+    ekf2: Ekf2,
+    record: FusionRecord,
+    at: int,
     end_s: float,
-) -> Stretch:  # fmt: skip
+) -> Stretch:
     """A stretch on an earth that turns, where bad accelerations are relied on less."""
     made = _on_earth(_stretch(imu, attitude, ekf2, record, at, end_s), record)
     return replace(made, shaken=_shaken(imu, record, made.time_s))
@@ -356,8 +360,12 @@ def _breaks_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
     Many clipped samples, which lose motion as a gap does, and resets of EKF2's height and vertical
     velocity, which are published a while after.
     """
-    breaks = [time for reset in ekf2.resets if reset.delta[2]
-              for time in (reset.time_s - RESET_LATE_S, reset.time_s)]  # fmt: skip
+    breaks = [
+        time
+        for reset in ekf2.resets
+        if reset.delta[2]
+        for time in (reset.time_s - RESET_LATE_S, reset.time_s)
+    ]
     if "clipped" in imu:
         times = imu.index.to_numpy()
         clipped_s = times[imu["clipped"].to_numpy() > 0.0]

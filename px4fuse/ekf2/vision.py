@@ -27,9 +27,14 @@ SPEED, HORIZONTAL = slice(3, 5), slice(6, 8)
 # outside the gate the bias, or the position, begins anew (no_aid_timeout_max, common.h)
 STOP_S, FAILING_S = 0.4, 1.0
 COLUMNS = [
-    "innovation_north_m", "innovation_east_m", "innovation_variance_north_m2",
-    "innovation_variance_east_m2", "rejected", "fused", "reset",
-]  # fmt: skip
+    "innovation_north_m",
+    "innovation_east_m",
+    "innovation_variance_north_m2",
+    "innovation_variance_east_m2",
+    "rejected",
+    "fused",
+    "reset",
+]
 
 
 def vision_samples(
@@ -81,9 +86,14 @@ class VisionFilter:
     """
 
     def __init__(
-        self, stretch: Stretch, sent: Sequence[Array], on: Mapping[str, BoolArray],
-        knob: Mapping[str, Array], gated: BoolArray, reported: BoolArray,
-    ) -> None:  # fmt: skip
+        self,
+        stretch: Stretch,
+        sent: Sequence[Array],
+        on: Mapping[str, BoolArray],
+        knob: Mapping[str, Array],
+        gated: BoolArray,
+        reported: BoolArray,
+    ) -> None:
         samples = np.stack(padded(sent), axis=-1)
         self.position_m = np.moveaxis(samples[:2], 0, -1)
         self.age_s, self.taken_s, self.now_s = samples[2:5]

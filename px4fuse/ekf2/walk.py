@@ -279,9 +279,14 @@ def on_the_way(inputs: Inputs, ours: Settings) -> dict[str, Variant]:
     aids = aids_of(inputs)
     others = [name for name in (FLOW.name, EV_POS.name) if name in aids[1:]]
     bare = Variant(
-        own, biases=False, attitude=False, velocity=False, reported=False, gated=False,
+        own,
+        biases=False,
+        attitude=False,
+        velocity=False,
+        reported=False,
+        gated=False,
         without=dict.fromkeys((MAG.name, *others), 0.0),
-    )  # fmt: skip
+    )
     variants = {
         SAMPLES: replace(bare, settings=unmoved, stamp_offset_s=offset_s),
         STAMPS: bare,

@@ -296,9 +296,10 @@ def _steadied(
     """Predictions, with whether each stays where it is when the positions are disturbed."""
     runs = [[one] for one in found]
     tried = [
-        same for same in runs
+        same
+        for same in runs
         if same[0].changed and FEW_REJECTED < same[0].rejected_share <= MOST_REJECTED
-    ]  # fmt: skip
+    ]
     for seed in range(DISTURBED_RUNS if tried else 0):
         other = disturbed(model, DISTURBED_M, seed)
         again = replay_settings(other, [same[0].changed for same in tried], without=without)
@@ -342,11 +343,20 @@ def _of_replay(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
     if (vision := replay.besides.get(EV_POS.name)) is not None:
         resets += vision["reset"][settled(vision["fused_at_s"], judged)].sum()
     return _summary(
-        flight, replay, judged, used, replay.published, variance, replay.besides,
+        flight,
+        replay,
+        judged,
+        used,
+        replay.published,
+        variance,
+        replay.besides,
         replay.delayed["heading_rad"],
-        changed=replay.changed, longest_without_fusion_s=_longest(fused.to_numpy(), judged),
-        resets=int(resets), late=replay.late, lost=replay.lost,
-    )  # fmt: skip
+        changed=replay.changed,
+        longest_without_fusion_s=_longest(fused.to_numpy(), judged),
+        resets=int(resets),
+        late=replay.late,
+        lost=replay.lost,
+    )
 
 
 def _of_log(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
@@ -366,9 +376,18 @@ def _of_log(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
     heading = pd.Series(heading_rad(flight.attitude), flight.attitude.index)
     besides = {name: logged_besides(name, ekf2.aids[name]) for name in replay.besides}
     return _summary(
-        flight, replay, judged, used, ekf2.state, None, besides, heading,
-        changed={}, longest_without_fusion_s=longest, resets=len(resets),
-    )  # fmt: skip
+        flight,
+        replay,
+        judged,
+        used,
+        ekf2.state,
+        None,
+        besides,
+        heading,
+        changed={},
+        longest_without_fusion_s=longest,
+        resets=len(resets),
+    )
 
 
 def _summary(
@@ -416,9 +435,11 @@ def _summary(
     if besides.keys() - {EV_POS.name}:
         more["heights"], more["height_rmse_to_truth_m"] = heights, error_m(np.eye(3)[2])
     return Summary(
-        samples=len(used), rejected_share=float(used["rejected"].mean()),
-        heading_error_mean_deg=_heading_error(flight, replay, heading, judged), **more,
-    )  # fmt: skip
+        samples=len(used),
+        rejected_share=float(used["rejected"].mean()),
+        heading_error_mean_deg=_heading_error(flight, replay, heading, judged),
+        **more,
+    )
 
 
 def _innovations(used: pd.DataFrame, *axes: AxisName) -> tuple[float, tuple[float, float], float]:

@@ -26,19 +26,30 @@ HEIGHT, TALL = 150, 210
 # Ours is dark, solid and round; EKF2 is lighter, dashed and square, as in the report
 OURS_LINE: dict[str, Any] = {"line_color": OURS, "line_width": 1.6, "name": "ours"}
 EKF2_LINE: dict[str, Any] = {
-    "line_color": EKF2, "line_width": 1.6, "line_dash": [6, 3], "name": "ekf2",
-}  # fmt: skip
+    "line_color": EKF2,
+    "line_width": 1.6,
+    "line_dash": [6, 3],
+    "name": "ekf2",
+}
 TRUTH_LINE: dict[str, Any] = {
-    "line_color": TRUTH, "line_width": 1.2, "line_dash": [1, 3], "name": "truth",
-}  # fmt: skip
+    "line_color": TRUTH,
+    "line_width": 1.2,
+    "line_dash": [1, 3],
+    "name": "truth",
+}
 NIS_BAND: dict[str, Any] = {
-    "level": "underlay", "fill_alpha": 0.15, "fill_color": "#4a8f5a", "line_color": "#4a8f5a",
-}  # fmt: skip
+    "level": "underlay",
+    "fill_alpha": 0.15,
+    "fill_color": "#4a8f5a",
+    "line_color": "#4a8f5a",
+}
 LEFT = 96
 STYLES = {
-    "ours": OURS_LINE, "dotted": OURS_LINE | {"line_dash": [2, 2]}, "ekf2": EKF2_LINE,
+    "ours": OURS_LINE,
+    "dotted": OURS_LINE | {"line_dash": [2, 2]},
+    "ekf2": EKF2_LINE,
     "truth": TRUTH_LINE,
-}  # fmt: skip
+}
 # √(2 · drop of log-likelihood): as far as so many standard deviations
 MAP_SIGMAS = 6.0
 
@@ -115,12 +126,19 @@ def _plots(number: int, data: dict[str, Any], time_range: Range1d) -> dict[str, 
             continue
         sources = _Sources(name, number)
         made = plots[name] = figure(
-            name=f"{name}-{number}", height=TALL if plot.tall else HEIGHT,
-            sizing_mode="stretch_width", x_range=time_range, y_range=_range(),
-            toolbar_location=None, y_axis_type=plot.scale, tools="xbox_zoom,xpan,tap",
-            active_drag="xbox_zoom", y_axis_label=plot.label, lod_threshold=None,
+            name=f"{name}-{number}",
+            height=TALL if plot.tall else HEIGHT,
+            sizing_mode="stretch_width",
+            x_range=time_range,
+            y_range=_range(),
+            toolbar_location=None,
+            y_axis_type=plot.scale,
+            tools="xbox_zoom,xpan,tap",
+            active_drag="xbox_zoom",
+            y_axis_label=plot.label,
+            lod_threshold=None,
             min_border_left=LEFT,
-        )  # fmt: skip
+        )
         if name == "position":
             _dots(made, sources["measured"], MEASUREMENT, 3, name="measured")
             _beyond(made, sources["beyond"], MEASUREMENT, "measured")
@@ -158,9 +176,16 @@ class _Sources(dict[str, ColumnDataSource]):
 def _beyond(made: Any, source: ColumnDataSource, colour: str, name: str) -> None:
     """Arrow heads at the edge that hides something, turned upside down at the lower one."""
     made.scatter(
-        "t", "y", angle="turn", source=source, marker="triangle", size=9, fill_color=colour,
-        line_color=None, name=name,
-    )  # fmt: skip
+        "t",
+        "y",
+        angle="turn",
+        source=source,
+        marker="triangle",
+        size=9,
+        fill_color=colour,
+        line_color=None,
+        name=name,
+    )
 
 
 def _innovations(made: Any, sources: dict[str, ColumnDataSource], *, with_ekf2: bool) -> None:
@@ -204,8 +229,11 @@ def _bands(data: dict[str, Any]) -> list[tuple[float, float, dict[str, Any]]]:
     """Shading behind every plot against time: modes in turn, ground, silence, dropouts."""
     grey: dict[str, Any] = {"fill_color": "#888888", "line_color": None}
     hatched: dict[str, Any] = {
-        "hatch_pattern": "/", "hatch_color": "#888888", "hatch_alpha": 0.6, "fill_alpha": 0.05,
-    }  # fmt: skip
+        "hatch_pattern": "/",
+        "hatch_color": "#888888",
+        "hatch_alpha": 0.6,
+        "fill_alpha": 0.05,
+    }
     events = data["events"]
     sand: dict[str, Any] = {"fill_color": "#b08a3a", "fill_alpha": 0.1, "line_color": None}
     return [
@@ -222,19 +250,37 @@ def _strip(number: int, data: dict[str, Any], time_range: Range1d) -> Any:
     has_ekf2 = any(isinstance(axis["ekf2"], dict) for axis in data["axes"])
     rows = FIGURES.strip if has_ekf2 else FIGURES.strip[2:]
     made = figure(
-        name=f"strip-{number}", height=28 * len(rows) + 24, sizing_mode="stretch_width",
-        x_range=time_range, y_range=FactorRange(factors=rows), toolbar_location=None,
-        tools="xbox_zoom,xpan", active_drag="xbox_zoom", min_border_left=LEFT,
+        name=f"strip-{number}",
+        height=28 * len(rows) + 24,
+        sizing_mode="stretch_width",
+        x_range=time_range,
+        y_range=FactorRange(factors=rows),
+        toolbar_location=None,
+        tools="xbox_zoom,xpan",
+        active_drag="xbox_zoom",
+        min_border_left=LEFT,
         x_axis_label="time (s)",
-    )  # fmt: skip
+    )
     made.hbar(
-        y="row", left="left", right="right", height=0.55, source=source, fill_color="#7d8894",
-        line_color="#7d8894", name="event",
-    )  # fmt: skip
+        y="row",
+        left="left",
+        right="right",
+        height=0.55,
+        source=source,
+        fill_color="#7d8894",
+        line_color="#7d8894",
+        name="event",
+    )
     made.text(
-        "left", "row", "text", source=source, text_font_size="11px", text_baseline="middle",
-        x_offset=3, name="ink",
-    )  # fmt: skip
+        "left",
+        "row",
+        "text",
+        source=source,
+        text_font_size="11px",
+        text_baseline="middle",
+        x_offset=3,
+        name="ink",
+    )
     made.add_layout(Span(dimension="height", location=0.0, visible=False, name="cursor"))
     return made
 
@@ -242,10 +288,18 @@ def _strip(number: int, data: dict[str, Any], time_range: Range1d) -> Any:
 def _map(number: int, tuning: Tuning) -> Any:
     """How likely the innovations are over both noises, and where the sliders stand."""
     made = figure(
-        name=f"map-{number}", height=250, sizing_mode="stretch_width", x_axis_type="log",
-        y_axis_type="log", x_range=_range(), y_range=_range(), tools="tap",
-        toolbar_location=None, x_axis_label="SIGMA_A (m/s²)", y_axis_label="SIGMA_Z (m)",
-    )  # fmt: skip
+        name=f"map-{number}",
+        height=250,
+        sizing_mode="stretch_width",
+        x_axis_type="log",
+        y_axis_type="log",
+        x_range=_range(),
+        y_range=_range(),
+        tools="tap",
+        toolbar_location=None,
+        x_axis_label="SIGMA_A (m/s²)",
+        y_axis_label="SIGMA_Z (m)",
+    )
     mapper = LinearColorMapper(palette=FIGURES.map_colours, low=0.0, high=MAP_SIGMAS)
     for name, tuned in tuning.items():
         if isinstance(tuned, AxisTuning):
@@ -282,10 +336,16 @@ def _outer(values: Array) -> tuple[float, float]:
 def _plan(number: int) -> Any:
     """The track seen from above; what is chosen on it is the time that all plots show."""
     made = figure(
-        name=f"plan-{number}", height=250, sizing_mode="stretch_width", match_aspect=True,
-        tools="box_select,tap", active_drag="box_select", toolbar_location=None,
-        x_axis_label="east (m)", y_axis_label="north (m)",
-    )  # fmt: skip
+        name=f"plan-{number}",
+        height=250,
+        sizing_mode="stretch_width",
+        match_aspect=True,
+        tools="box_select,tap",
+        active_drag="box_select",
+        toolbar_location=None,
+        x_axis_label="east (m)",
+        y_axis_label="north (m)",
+    )
     track = _source("plan", number, "t east north")
     shown = _source("shown", number, "east north")
     here = _source("here", number, "east north")
@@ -299,10 +359,16 @@ def _plan(number: int) -> Any:
 def _step(number: int) -> Any:
     """The phase plane: position and velocity with their ellipse of 2σ, and what was measured."""
     made = figure(
-        name=f"step-{number}", height=330, sizing_mode="stretch_width", x_range=_range(),
-        y_range=_range(), tools="", toolbar_location=None,
-        x_axis_label="position (m)", y_axis_label="velocity (m/s)",
-    )  # fmt: skip
+        name=f"step-{number}",
+        height=330,
+        sizing_mode="stretch_width",
+        x_range=_range(),
+        y_range=_range(),
+        tools="",
+        toolbar_location=None,
+        x_axis_label="position (m)",
+        y_axis_label="velocity (m/s)",
+    )
     band: dict[str, Any] = {"left": 0.0, "right": 0.0, "visible": False}
     made.add_layout(
         BoxAnnotation(name="band", fill_color=MEASUREMENT, fill_alpha=0.25, line_color=None, **band)

@@ -70,9 +70,15 @@ def data_scripts(
 
 
 def page_text(
-    scripts: str, data: list[dict[str, Any]], *, command: str, heading: str, title: str,
-    rounds: int = 0, choices: Mapping[str, str] = {},
-) -> str:  # fmt: skip
+    scripts: str,
+    data: list[dict[str, Any]],
+    *,
+    command: str,
+    heading: str,
+    title: str,
+    rounds: int = 0,
+    choices: Mapping[str, str] = {},
+) -> str:
     """The page around data that :func:`data_scripts` made.
 
     Parameters

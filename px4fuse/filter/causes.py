@@ -134,9 +134,15 @@ class Explained:
 
 
 def explained(
-    flight: Flight, axes: tuple[Axis, ...], settings: Settings, *, sigma_a_m_s2: float,
-    sigma_z_m: float, outlier_time_s: Array, clock_offset_s: float,
-) -> Explained | Unavailable:  # fmt: skip
+    flight: Flight,
+    axes: tuple[Axis, ...],
+    settings: Settings,
+    *,
+    sigma_a_m_s2: float,
+    sigma_z_m: float,
+    outlier_time_s: Array,
+    clock_offset_s: float,
+) -> Explained | Unavailable:
     """Estimate biases and scale, and look for jumps of the source.
 
     Parameters
@@ -466,9 +472,12 @@ def _with_signals(legs: Preintegrated, dp: Array, dv: Array, measured_m: Array) 
 
 
 def hypotheses_of(
-    flight: Flight, axes: tuple[Axis, ...], settings: Settings, sigma_z: float,
+    flight: Flight,
+    axes: tuple[Axis, ...],
+    settings: Settings,
+    sigma_z: float,
     clock_offset_s: float,
-) -> Hypotheses | Unavailable:  # fmt: skip
+) -> Hypotheses | Unavailable:
     """Lay out the axes with the columns that every hypothesis is fitted beside.
 
     Parameters

@@ -122,9 +122,15 @@ class Coloured:
 
 
 def hanging_together(
-    flight: Flight, axes: tuple[Axis, ...], settings: Settings, noises: Noises, *,
-    outlier_time_s: Array, clock_offset_s: float, jumps: Sequence[Jump] = (),
-) -> tuple[Smoothing, Coloured | Unavailable] | Unavailable:  # fmt: skip
+    flight: Flight,
+    axes: tuple[Axis, ...],
+    settings: Settings,
+    noises: Noises,
+    *,
+    outlier_time_s: Array,
+    clock_offset_s: float,
+    jumps: Sequence[Jump] = (),
+) -> tuple[Smoothing, Coloured | Unavailable] | Unavailable:
     """Look for a low pass and for a slow error of the source.
 
     Parameters
@@ -163,9 +169,13 @@ def hanging_together(
         # what was undone with an outlier is one too: left out of all models, which are compared
         kept = ~(bad | (known & np.concatenate([[False], bad[:-1]])))
         moved = motion(
-            flight, time[kept], undone[kept], directions=directions, dt_s=settings.dt_s,
+            flight,
+            time[kept],
+            undone[kept],
+            directions=directions,
+            dt_s=settings.dt_s,
             signals=signals,
-        )  # fmt: skip
+        )
         if isinstance(moved, Unavailable):
             return moved, 0.0
         # nothing is known of where a stretch begins: the first one says nothing
@@ -216,9 +226,13 @@ def hanging_together(
 
 
 def against_truth(
-    axes: Sequence[Axis], truths: Sequence[pd.DataFrame], outlier_time_s: Array,
-    clock_offset_s: float, jumps: Sequence[Jump], by_imu: Coloured | Unavailable,
-) -> Coloured | Unavailable:  # fmt: skip
+    axes: Sequence[Axis],
+    truths: Sequence[pd.DataFrame],
+    outlier_time_s: Array,
+    clock_offset_s: float,
+    jumps: Sequence[Jump],
+    by_imu: Coloured | Unavailable,
+) -> Coloured | Unavailable:
     """A slow error in the positions' errors against a truth, where that says more than the IMU.
 
     Parameters

@@ -67,9 +67,12 @@ class Noises:
 
 
 SEARCHES = {
-    "sigma_a_m_s2": SIGMA_A_SEARCH_M_S2, "sigma_z_m": SIGMA_Z_SEARCH_M, "walk_m": WALK_SEARCH_M,
-    "slow_m": SLOW_SEARCH_M, "tau_s": SLOW_SEARCH_S,
-}  # fmt: skip
+    "sigma_a_m_s2": SIGMA_A_SEARCH_M_S2,
+    "sigma_z_m": SIGMA_Z_SEARCH_M,
+    "walk_m": WALK_SEARCH_M,
+    "slow_m": SLOW_SEARCH_M,
+    "tau_s": SLOW_SEARCH_S,
+}
 
 
 class Likelihood:

@@ -26,9 +26,15 @@ from px4fuse.filter.steps import Timeline, timeline
 Row = tuple[float, ...]
 # Columns of ``Replay.updates``
 UPDATES = [
-    "measurement_m", "innovation_m", "innovation_variance_m2", "gain_position", "gain_velocity",
-    "prior_position_m", "prior_position_variance_m2", "prior_velocity_variance_m2_s2",
-]  # fmt: skip
+    "measurement_m",
+    "innovation_m",
+    "innovation_variance_m2",
+    "gain_position",
+    "gain_velocity",
+    "prior_position_m",
+    "prior_position_variance_m2",
+    "prior_velocity_variance_m2_s2",
+]
 
 
 @dataclass(frozen=True)
@@ -93,9 +99,12 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
     kalman.inv = np.reciprocal  # S is 1 by 1
     states, updates = [_row(kalman.x, kalman.P)], []
     for dt, u, extra, measurement in zip(
-        np.diff(line.time_s), line.acceleration_m_s2, line.input_variance_m2_s4,
-        line.measurement[1:], strict=True,
-    ):  # fmt: skip
+        np.diff(line.time_s),
+        line.acceleration_m_s2,
+        line.input_variance_m2_s4,
+        line.measurement[1:],
+        strict=True,
+    ):
         Q = (settings.sigma_a_m_s2**2 + extra) * settings.dt_s * model.matrix(model.noise(dt))
         kalman.predict(u=np.array([[u]]), B=model.input_matrix(dt), F=model.transition(dt), Q=Q)
         if measurement >= 0:

@@ -40,10 +40,15 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
         cause = _sensor(switch, source) or (CHANGE if changed else "")
         yield warning(
             "aid_starved",
-            {"aid": labels, "longest_without_s": longest.longest_without,
-             "rejected_share": longest.rejected_share, CAUSE: cause},
-            (longest.longest_without_s,), most_s=STARVED_S,
-        )  # fmt: skip
+            {
+                "aid": labels,
+                "longest_without_s": longest.longest_without,
+                "rejected_share": longest.rejected_share,
+                CAUSE: cause,
+            },
+            (longest.longest_without_s,),
+            most_s=STARVED_S,
+        )
     for name, aid in judged.items():
         changes = {axis: one.change for axis, one in aid.axes.items() if one.change is not None}
         if changes and not _sensor(AIDS[name].switch, source):
@@ -51,26 +56,42 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
             yield warning(
                 "aid_changed",
                 {"aid": name, "axis": axis, "time_s": time_s, "moved": moved},
-                ((time_s, time_s + WINDOW_S),), label=_named(aid), by=abs(moved),
-            )  # fmt: skip
+                ((time_s, time_s + WINDOW_S),),
+                label=_named(aid),
+                by=abs(moved),
+            )
         elif aid.verdict == "variance understated" and name != source:
             noise = AIDS[name].noise
             yield warning(
                 "aid_understated",
-                {"aid": name, "nis_mean": aid.nis_mean, "rejected_share": aid.rejected_share,
-                 CAUSE: _sensor(AIDS[name].switch, source)},
-                label=_named(aid), times=factor_words(aid.nis_mean**0.5), r=_noise_words(aid),
-                nis=number_words(aid.nis_mean), raised=bool(noise), noise=noise,
-            )  # fmt: skip
+                {
+                    "aid": name,
+                    "nis_mean": aid.nis_mean,
+                    "rejected_share": aid.rejected_share,
+                    CAUSE: _sensor(AIDS[name].switch, source),
+                },
+                label=_named(aid),
+                times=factor_words(aid.nis_mean**0.5),
+                r=_noise_words(aid),
+                nis=number_words(aid.nis_mean),
+                raised=bool(noise),
+                noise=noise,
+            )
         elif aid.verdict == "biased":
             axis, worst = max(aid.axes.items(), key=lambda item: abs(item[1].pull))
             yield info(
                 "aid_biased",
-                {"aid": name, "axis": axis, "innovation_mean": worst.innovation_mean,
-                 "s_sqrt_median": worst.s_sqrt_median},
-                label=_named(aid), unit=aid.unit, mean=number_words(worst.innovation_mean),
+                {
+                    "aid": name,
+                    "axis": axis,
+                    "innovation_mean": worst.innovation_mean,
+                    "s_sqrt_median": worst.s_sqrt_median,
+                },
+                label=_named(aid),
+                unit=aid.unit,
+                mean=number_words(worst.innovation_mean),
                 s=number_words(worst.s_sqrt_median),
-            )  # fmt: skip
+            )
 
 
 def _named(aid: AidResult) -> str:

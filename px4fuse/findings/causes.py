@@ -14,9 +14,15 @@ from px4fuse.record import table
 # In the evidence of a finding about a variance: what the detector holds it to be the effect of
 CAUSE = "cause"
 NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
-    "measurement noise", "process noise", "outliers", "clock", "frame", "gate", "accelerometer",
+    "measurement noise",
+    "process noise",
+    "outliers",
+    "clock",
+    "frame",
+    "gate",
+    "accelerometer",
     "elsewhere",
-)  # fmt: skip
+)
 # In the evidence of a slow error: how many times what a filter assumes of the noise its white part
 # is; where it is beyond that, the noise is wrong by itself
 WHITE_BEYOND = "white_over_assumed"
@@ -29,11 +35,21 @@ VARIANCES = _OURS | {"ekf2_variance_overstated", "ekf2_variance_understated"}
 NOISES = SETTINGS | VARIANCES | {"process_noise_forgotten"}
 CONSEQUENCES = table(__file__, "consequences.toml", dict[str, tuple[str, ...]])
 # What the recording lacks: put right first, since noises are judged by what was recorded
-RECORDING = frozenset({
-    "autopilot_restarted", "imu_gap", "input_unavailable", "log_damaged", "logger_dropouts",
-    "logging_rate_low", "source_decimated", "source_gap", "source_not_logged",
-    "source_samples_lost", "too_few_innovations",
-})  # fmt: skip
+RECORDING = frozenset(
+    {
+        "autopilot_restarted",
+        "imu_gap",
+        "input_unavailable",
+        "log_damaged",
+        "logger_dropouts",
+        "logging_rate_low",
+        "source_decimated",
+        "source_gap",
+        "source_not_logged",
+        "source_samples_lost",
+        "too_few_innovations",
+    }
+)
 
 
 def by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:

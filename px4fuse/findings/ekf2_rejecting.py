@@ -42,9 +42,10 @@ def _narrow_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> Found:
                 rejections[0].severity,
                 "ekf2_gate_small",
                 {"gate": ekf2.gate, "rejected_by_gate": must},
-                name_of_gate=aid.gate, default=aid.default_gate,
+                name_of_gate=aid.gate,
+                default=aid.default_gate,
                 rejected=rejections[0].evidence["rejected_share"],
-            )  # fmt: skip
+            )
 
 
 def _rejections(analysis: Analysis) -> Found:
@@ -61,9 +62,11 @@ def _rejections(analysis: Analysis) -> Found:
                 "error" if share >= REJECTED_SHARE_ERROR else "warning",
                 "ekf2_rejecting",
                 {"rejected_share": share, "count": len(frame), "axis": name},
-                moments(known.index[known > 0.0]), down=name == "down", gate=ekf2.gate,
+                moments(known.index[known > 0.0]),
+                down=name == "down",
+                gate=ekf2.gate,
                 remedy=_remedy(analysis, name),
-            )  # fmt: skip
+            )
 
 
 def _remedy(analysis: Analysis, axis: str) -> str:

@@ -43,9 +43,14 @@ def bias(analysis: Analysis) -> Found:
             "error" if size >= BIAS_ERROR_M_S2 else "warning",
             "accelerometer_bias",
             {"bias_m_s2": size, "sigma_m_s2": found.bias.sigma},
-            case=True, forward=forward.value, right=right.value, within=1.96 * forward.sigma,
-            tilt_deg=size * TILT_DEG_PER_M_S2, ekf2=of_ekf2, and_ekf2=of_ekf2 is not None,
-        )  # fmt: skip
+            case=True,
+            forward=forward.value,
+            right=right.value,
+            within=1.96 * forward.sigma,
+            tilt_deg=size * TILT_DEG_PER_M_S2,
+            ekf2=of_ekf2,
+            and_ekf2=of_ekf2 is not None,
+        )
     elif of_ekf2 is not None:
         # horizontally ours is the better estimate, where there is one
         size = float(np.linalg.norm(of_ekf2[2:] if isinstance(found, Explained) else of_ekf2))

@@ -78,9 +78,12 @@ Found = Iterator[Finding]
 
 
 def finding(
-    severity: Severity, name: str, evidence: Mapping[str, int | float | str] = {},
-    spans_s: tuple[Span, ...] = (), **facts: Any,
-) -> Finding:  # fmt: skip
+    severity: Severity,
+    name: str,
+    evidence: Mapping[str, int | float | str] = {},
+    spans_s: tuple[Span, ...] = (),
+    **facts: Any,
+) -> Finding:
     """A finding in its words of ``words.toml``, filled with the evidence and more facts.
 
     Of several texts a fact of their name chooses one, and ``case`` where there is none of it.
@@ -90,8 +93,9 @@ def finding(
         one = text if isinstance(text, str) else text[said[part if part in said else "case"]]
         said[part] = one.format_map(said)
     message = f"{said['headline']}{said['more']}"
-    return Finding(name, severity, message, said["remedy"], evidence, said["headline"],
-                   spans_s=spans_s)  # fmt: skip
+    return Finding(
+        name, severity, message, said["remedy"], evidence, said["headline"], spans_s=spans_s
+    )
 
 
 error, warning, info = (partial(finding, severity) for severity in SEVERITIES)

@@ -128,9 +128,14 @@ def settings_off(analysis: Analysis) -> Found:
                 "factor": chosen[name] / value,
                 "lag1_autocorrelation": getattr(tuned.before, "lag1_autocorrelation", float("nan")),
             },
-            axes=tuned.name, times=factor_words(size), case=known, low=noise.low or 0.0,
-            high=noise.high, within=known and bool(noise.high), remedy=cure,
-        )  # fmt: skip
+            axes=tuned.name,
+            times=factor_words(size),
+            case=known,
+            low=noise.low or 0.0,
+            high=noise.high,
+            within=known and bool(noise.high),
+            remedy=cure,
+        )
         yield structs.replace(told, caused_by=first)
         first = first or told.id
 
@@ -174,8 +179,9 @@ def forgotten(analysis: Analysis) -> Found:
         yield error(
             "process_noise_forgotten",
             {"relative_growth": growth, "gain": gain, "response_s": response_s, "axis": name},
-            sigma_a=analysis.settings.sigma_a_m_s2, cure=more,
-        )  # fmt: skip
+            sigma_a=analysis.settings.sigma_a_m_s2,
+            cure=more,
+        )
         return
 
 
@@ -232,9 +238,12 @@ def _of_group(analysis: Analysis, owner: FilterName, group: str, members: list[M
         severity,
         f"{owner}_variance_{stated}",
         evidence,
-        times=factor_words(factor), nis=number_words(statement.nis_mean),
-        band=statement.nis_band, group=group, remedy=cure,
-    )  # fmt: skip
+        times=factor_words(factor),
+        nis=number_words(statement.nis_mean),
+        band=statement.nis_band,
+        group=group,
+        remedy=cure,
+    )
 
 
 def _above_stated(analysis: Analysis) -> str:
@@ -247,9 +256,12 @@ def _above_stated(analysis: Analysis) -> str:
         return ""
     held = f"{name} {least_m:g} m holds R above what the receiver states ({stated_m:.2g} m)"
     return remedy.remedy_words(
-        analysis.ekf2_model, {name: float(f"{stated_m:.2g}")}, remedy.noise_helps,
-        why=f"{held}: where you trust the receiver, ", otherwise=f"{held}.",
-    )  # fmt: skip
+        analysis.ekf2_model,
+        {name: float(f"{stated_m:.2g}")},
+        remedy.noise_helps,
+        why=f"{held}: where you trust the receiver, ",
+        otherwise=f"{held}.",
+    )
 
 
 def _is_default(analysis: Analysis, owner: FilterName, result: AxisComparison) -> bool:
@@ -270,9 +282,12 @@ def _asked(noise: Noise) -> float | None:
 
 
 def _remedy(
-    analysis: Analysis, owner: FilterName, result: AxisComparison, tuned: AxisTuning | None,
+    analysis: Analysis,
+    owner: FilterName,
+    result: AxisComparison,
+    tuned: AxisTuning | None,
     cause: Intervention | None,
-) -> str:  # fmt: skip
+) -> str:
     """What to type or to set against the cause; where there is none, what it is not."""
     if cause is None:
         return _without_cause(analysis, owner, result, tuned)

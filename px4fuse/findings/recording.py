@@ -22,32 +22,37 @@ def dropouts(analysis: Comparison) -> Found:
     """The logger stopped for a while."""
     segment = analysis.segment
     lost = [
-        each for each in analysis.flight.log.dropouts
+        each
+        for each in analysis.flight.log.dropouts
         if each.start_s <= segment.end_s and each.start_s + each.duration_s >= segment.start_s
-    ]  # fmt: skip
+    ]
     if lost:
         yield warning(
             "logger_dropouts",
             {"count": len(lost), "total_s": sum(each.duration_s for each in lost)},
             tuple((each.start_s, each.start_s + each.duration_s) for each in lost),
-            often=times(len(lost)), longest_s=max(each.duration_s for each in lost),
-        )  # fmt: skip
+            often=times(len(lost)),
+            longest_s=max(each.duration_s for each in lost),
+        )
 
 
 def loss(flight: Flight) -> Found:
     """Bytes that the reader had to pass over, a flight that goes on, single samples."""
     log = flight.log
     if log.damage or log.ends_in_flight:
-        first, *others = map(_sentence, log.damage or (
-            f"the log ends in flight, after {log.duration_s:.1f} s: the landing is not in it",
-        ))  # fmt: skip
+        first, *others = map(
+            _sentence,
+            log.damage
+            or (f"the log ends in flight, after {log.duration_s:.1f} s: the landing is not in it",),
+        )
         yield finding(
             "warning" if log.damage else "info",
             "log_damaged",
             {"lost_bytes": log.bytes - log.bytes_read, "ends_in_flight": float(log.ends_in_flight)},
-            headline=first, others="".join(f". {other}" for other in others),
+            headline=first,
+            others="".join(f". {other}" for other in others),
             case="ends" if not log.damage else log.format.partition(" ")[0],
-        )  # fmt: skip
+        )
     for topic, count in list(log.dropped.items())[:1]:
         more = len(log.dropped) - 1
         facts = {"topic": topic, "count": count, "others": more, "also": more > 0}

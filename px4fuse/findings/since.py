@@ -31,10 +31,15 @@ def kind_of(analysis: Analysis, cause: Intervention | None) -> str:
         return kinds.ELSEWHERE
     aid = remedy.aid_of(analysis)
     of = {
-        changed.OUTLIERS: kinds.OUTLIERS, changed.CLOCK: kinds.CLOCK, aid.delay: kinds.CLOCK,
-        changed.TURN: kinds.FRAME, changed.FORWARD: kinds.ACCELEROMETER,
-        changed.SIGMA_Z: kinds.NOISE, aid.noise: kinds.NOISE, aid.gate: kinds.GATE,
-    }  # fmt: skip
+        changed.OUTLIERS: kinds.OUTLIERS,
+        changed.CLOCK: kinds.CLOCK,
+        aid.delay: kinds.CLOCK,
+        changed.TURN: kinds.FRAME,
+        changed.FORWARD: kinds.ACCELEROMETER,
+        changed.SIGMA_Z: kinds.NOISE,
+        aid.noise: kinds.NOISE,
+        aid.gate: kinds.GATE,
+    }
     return next((kind for name, kind in of.items() if name in cause.change), kinds.PROCESS)
 
 
@@ -108,9 +113,11 @@ def ekf2_cure_words(analysis: Analysis, cause: Intervention) -> str:
     if not cause.change.keys() <= PARAMETERS.keys():
         return cure_words(analysis, cause)
     return remedy.remedy_words(
-        analysis.ekf2_model, cause.change, HELPS.get(kind_of(analysis, cause), remedy.noise_helps),
+        analysis.ekf2_model,
+        cause.change,
+        HELPS.get(kind_of(analysis, cause), remedy.noise_helps),
         otherwise=f"{capital(reason_words(analysis, cause))}.",
-    )  # fmt: skip
+    )
 
 
 def _one(analysis: Analysis, cause: Intervention, name: str) -> str:

@@ -35,9 +35,12 @@ def offset(analysis: Analysis, clock: ClockOffset) -> Found:
     evidence = {"offset_s": clock.offset_s, "interval_low_s": low, "interval_high_s": high}
     if clock.change_p is not None and clock.change_p < CHANGE_P:
         yield error(
-            "source_clock_changes", {**evidence, "change_p": clock.change_p}, source=source.name,
-            first=clock.parts[0], last=clock.parts[-1],
-        )  # fmt: skip
+            "source_clock_changes",
+            {**evidence, "change_p": clock.change_p},
+            source=source.name,
+            first=clock.parts[0],
+            last=clock.parts[-1],
+        )
         return
     size = abs(clock.remaining_s)
     # one offset cannot hold for stamps that are of arrival in a part of the flight only
@@ -54,9 +57,12 @@ def offset(analysis: Analysis, clock: ClockOffset) -> Found:
         "error" if size > OFFSET_ERROR_S else "warning",
         "source_clock_offset",
         evidence,
-        source=source.name, late=late, size_s=size, ends=(-ends[1], -ends[0]) if late else ends,
+        source=source.name,
+        late=late,
+        size_s=size,
+        ends=(-ends[1], -ends[0]) if late else ends,
         remedy=f"{typed}{_for_ekf2(analysis, clock)}.",
-    )  # fmt: skip
+    )
 
 
 def _for_ekf2(analysis: Analysis, clock: ClockOffset) -> str:
@@ -106,9 +112,12 @@ def delay(analysis: Analysis, clock: ClockOffset) -> Found:
     yield warning(
         "ekf2_ev_delay_wrong",
         {"ekf2_ev_delay_ms": delay_ms, "asked_ms": asked_ms},
-        case=case, size=round(abs(asked_ms)), low=low, high=high,
+        case=case,
+        size=round(abs(asked_ms)),
+        low=low,
+        high=high,
         remedy=delay_remedy(analysis, 0.0 if low_ms <= 0.0 else asked_ms, delay_ms),
-    )  # fmt: skip
+    )
 
 
 def delay_remedy(analysis: Analysis, delay_ms: float, flown_ms: float) -> str:

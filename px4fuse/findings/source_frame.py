@@ -52,8 +52,11 @@ def turned(analysis: Analysis, heading: HeadingError) -> Found:
             "error" if abs(turn) >= HEADING_ERROR_LARGE_DEG else "warning",
             "ekf2_heading_wrong" if of_ekf2 else "source_frame_turned",
             {"turn_deg": turn, "sigma_deg": sigma},
-            within_deg=1.96 * sigma, back_deg=-turn, case="gnss" if gnss else "fused", **facts,
-        )  # fmt: skip
+            within_deg=1.96 * sigma,
+            back_deg=-turn,
+            case="gnss" if gnss else "fused",
+            **facts,
+        )
 
 
 def _is_a_bias(analysis: Analysis) -> bool:
@@ -78,9 +81,13 @@ def _drifting(heading: HeadingError, facts: Mapping[str, Any]) -> Finding:
             "p": max(heading.drift_p, 1e-300),
             "p_limit": DRIFT_P,
         },
-        headline="drifts", more=heading.by, remedy="gnss" if facts["gnss"] else "drifts",
-        first=first, last=last, **facts,
-    )  # fmt: skip
+        headline="drifts",
+        more=heading.by,
+        remedy="gnss" if facts["gnss"] else "drifts",
+        first=first,
+        last=last,
+        **facts,
+    )
 
 
 def placement(analysis: Analysis) -> Found:
@@ -92,6 +99,8 @@ def placement(analysis: Analysis) -> Found:
     for severity, sentences in doubts.items():
         for sentence in sentences:
             yield finding(
-                severity, "position_file_placement", source=analysis.source.name,
+                severity,
+                "position_file_placement",
+                source=analysis.source.name,
                 doubt=capital(sentence.rstrip(".")),
-            )  # fmt: skip
+            )

@@ -43,9 +43,11 @@ def gaps(analysis: Analysis) -> Found:
         yield warning(
             "source_gap",
             {"count": len(silent), "longest_s": until - at, "at_s": at},
-            silent, often=times(len(silent)), usual_s=longest_s(1.0 / rate_hz),
+            silent,
+            often=times(len(silent)),
+            usual_s=longest_s(1.0 / rate_hz),
             gnss=analysis.source.origin.is_gnss,
-        )  # fmt: skip
+        )
 
 
 def losses(analysis: Analysis) -> Found:
@@ -60,8 +62,11 @@ def losses(analysis: Analysis) -> Found:
         yield info(
             "source_samples_lost",
             {"lost": lost, "lost_share": lost / sent},
-            source=source.name, sent=sent, typical_s=typical, in_ulog=analysis.flight.log.has_ulog,
-        )  # fmt: skip
+            source=source.name,
+            sent=sent,
+            typical_s=typical,
+            in_ulog=analysis.flight.log.has_ulog,
+        )
 
 
 def thinning(analysis: Analysis) -> Found:
@@ -88,8 +93,11 @@ def thinning(analysis: Analysis) -> Found:
         "error" if slow else "warning",
         "source_thinned",
         {"rate_hz": 1.0 / interval_s, "source_rate_hz": 1.0 / base, "lost_share": lost},
-        source=source.name, base_s=base, starts=slow, least_s=EV_START_INTERVAL_S,
-    )  # fmt: skip
+        source=source.name,
+        base_s=base,
+        starts=slow,
+        least_s=EV_START_INTERVAL_S,
+    )
 
 
 def _intervals(analysis: Analysis) -> tuple[Array, float]:

@@ -99,8 +99,12 @@ def unequal(analysis: Analysis) -> Found:
     yield warning(
         "source_axes_unequal",
         {f"{less}_sigma_z_m": small, f"{more}_sigma_z_m": large},
-        source=analysis.source.name, large=large, noisier=more, small=small, less=less,
-    )  # fmt: skip
+        source=analysis.source.name,
+        large=large,
+        noisier=more,
+        small=small,
+        less=less,
+    )
 
 
 def levels(analysis: Analysis) -> Found:
@@ -152,5 +156,7 @@ def levels(analysis: Analysis) -> Found:
     yield (error if ratio >= LEVELS_ERROR else warning)(
         "source_noise_changes",
         {"ratio": ratio, "first_s": start, "until_s": end},
-        ((start, end),), source=analysis.source.name, gnss=analysis.source.origin.is_gnss,
-    )  # fmt: skip
+        ((start, end),),
+        source=analysis.source.name,
+        gnss=analysis.source.origin.is_gnss,
+    )

@@ -100,9 +100,12 @@ def jumps(analysis: Analysis) -> Found:
             "error" if size >= JUMP_ERROR_M else "warning",
             "source_jumps",
             {"count": len(large), "size_m": size, "at_s": at_s, "sigma_m": sigma},
-            moments(jump.time_s for jump in large), source=analysis.source.name,
-            often=times(len(large)), within_m=1.96 * sigma, case=analysis.source.origin.is_gnss,
-        )  # fmt: skip
+            moments(jump.time_s for jump in large),
+            source=analysis.source.name,
+            often=times(len(large)),
+            within_m=1.96 * sigma,
+            case=analysis.source.origin.is_gnss,
+        )
 
 
 def scale(analysis: Analysis) -> Found:
@@ -124,8 +127,11 @@ def scale(analysis: Analysis) -> Found:
             "error" if abs(off) >= SCALE_ERROR else "warning",
             "source_scale_wrong",
             {"scale": 1.0 + off, "sigma": sigma},
-            source=analysis.source.name, off=abs(off), long=off > 0, within=1.96 * sigma,
-        )  # fmt: skip
+            source=analysis.source.name,
+            off=abs(off),
+            long=off > 0,
+            within=1.96 * sigma,
+        )
 
 
 def outliers(analysis: Analysis) -> Found:
@@ -148,9 +154,14 @@ def outliers(analysis: Analysis) -> Found:
         "error" if share >= OUTLIERS_ERROR else "warning",
         "source_outliers",
         {"count": count, "share": share, "first_s": times_s[0]},
-        moments(times_s), tuned=tuned, first=first, others=count > 3, case=origin.is_gnss,
-        aid=origin.aid, or_noise=origin.aid is not None,
-    )  # fmt: skip
+        moments(times_s),
+        tuned=tuned,
+        first=first,
+        others=count > 3,
+        case=origin.is_gnss,
+        aid=origin.aid,
+        or_noise=origin.aid is not None,
+    )
 
 
 def stated_variance(analysis: Analysis) -> Found:
@@ -176,9 +187,14 @@ def stated_variance(analysis: Analysis) -> Found:
             "error" if size >= REPORTED_ERROR else "warning",
             "source_variance_wrong",
             {"reported_sigma_m": sigma, "sigma_z_m": noise, "variance_factor": factor},
-            source=source.name, low=low, high=high, times=factor_words(size), small=factor < 1.0,
-            slow=factor > 1.0 and error_m is None, variance_m2=noise**2,
-        )  # fmt: skip
+            source=source.name,
+            low=low,
+            high=high,
+            times=factor_words(size),
+            small=factor < 1.0,
+            slow=factor > 1.0 and error_m is None,
+            variance_m2=noise**2,
+        )
 
 
 def _error_m(analysis: Analysis) -> float | None:

@@ -28,8 +28,10 @@ def detect(analysis: Analysis) -> Found:
         yield warning(
             "companion_not_synchronised",
             {"jitter_s": clock.jitter_s},
-            source=analysis.source.name, method=clock.method, own=clock.method != "arrival time",
-        )  # fmt: skip
+            source=analysis.source.name,
+            method=clock.method,
+            own=clock.method != "arrival time",
+        )
 
 
 def constant(name: str, clock: ClockMap, distinct: int) -> Found:

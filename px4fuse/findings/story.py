@@ -29,10 +29,18 @@ MOST_SENTENCES = 3
 # What the first sentence tells already
 TOLD_FIRST = VARIANCES | {"errors_larger_than_claimed", "ekf2_unavailable"}
 # What a source can have that no setting and no outlier stands for
-SHAPED = frozenset((
-    "source_axes_unequal", "source_clock_changes", "source_coloured", "source_jumps",
-    "source_noise_changes", "source_repeats", "source_scale_wrong", "source_smoothed",
-))  # fmt: skip
+SHAPED = frozenset(
+    (
+        "source_axes_unequal",
+        "source_clock_changes",
+        "source_coloured",
+        "source_jumps",
+        "source_noise_changes",
+        "source_repeats",
+        "source_scale_wrong",
+        "source_smoothed",
+    )
+)
 # What looks like noise of the acceleration, which it turns
 TURNED = frozenset(("ekf2_heading_wrong", "source_frame_turned"))
 # What weighs less than why EKF2 differs
@@ -71,9 +79,10 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
     if since["kf"] is not None and not interventions.OF_SETTINGS.isdisjoint(since["kf"].change):
         known |= SETTINGS
     causes = [
-        one for one in findings
+        one
+        for one in findings
         if one.caused_by is None and one.severity != "info" and one.id not in known
-    ]  # fmt: skip
+    ]
     explained = bool(shapes) or any(
         one.id == "errors_larger_than_claimed" and one.caused_by for one in findings
     )
@@ -142,9 +151,11 @@ def _error(result: AxisComparison, owner: FilterName) -> str:
 
 
 def _judged(
-    analysis: Analysis, owner: FilterName, causes: Mapping[FilterName, Intervention | None],
+    analysis: Analysis,
+    owner: FilterName,
+    causes: Mapping[FilterName, Intervention | None],
     named: bool,
-) -> str:  # fmt: skip
+) -> str:
     """Whether a filter's variance is what its innovations, and the truth, show; and why not."""
     statement, cause = analysis.main.filters[owner], causes[owner]
     since = since_words(analysis, cause)

@@ -17,9 +17,14 @@ from px4fuse.trajectory.model import AxisLengths, Frame, Kind, Trajectory
 
 # How a path is corrected; the part after "pose_graph_" as in `trajectory.graph.analysis.SOLUTIONS`
 Way = Literal[
-    "uncorrected", "by_distance_plain", "by_distance",
-    "pose_graph_all", "pose_graph_gated", "pose_graph_dcs", "pose_graph_gnc",
-]  # fmt: skip
+    "uncorrected",
+    "by_distance_plain",
+    "by_distance",
+    "pose_graph_all",
+    "pose_graph_gated",
+    "pose_graph_dcs",
+    "pose_graph_gnc",
+]
 LANDING = "landing"
 
 

@@ -11,15 +11,27 @@ ULOG_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
 # What is given for a log by mistake: how it begins, or the ends of its name; and what it is for
 _FOREIGN = (
     # libraries/AP_Logger/LogStructure.h
-    (b"\xa3\x95", (), "an ArduPilot DataFlash log, not a PX4 ULog",
-     "Give the .tlog that the ground station wrote."),
+    (
+        b"\xa3\x95",
+        (),
+        "an ArduPilot DataFlash log, not a PX4 ULog",
+        "Give the .tlog that the ground station wrote.",
+    ),
     (b"%PDF-", (), "a PDF, not a flight log", "To check a report: px4fuse verify {name} LOG."),
-    (b"", (".csv", ".tsv"), "a table, not a flight log",
-     "If it holds positions, give it beside the log of the flight: px4fuse compare LOG --position "
-     "{name}."),
-    (b"", (".tum", ".g2o"), "a trajectory or a pose graph, not a flight log",
-     "Score it with px4fuse evaluate, or correct its loop: px4fuse loop {name}."),
-)  # fmt: skip
+    (
+        b"",
+        (".csv", ".tsv"),
+        "a table, not a flight log",
+        "If it holds positions, give it beside the log of the flight: px4fuse compare LOG "
+        "--position {name}.",
+    ),
+    (
+        b"",
+        (".tum", ".g2o"),
+        "a trajectory or a pose graph, not a flight log",
+        "Score it with px4fuse evaluate, or correct its loop: px4fuse loop {name}.",
+    ),
+)
 
 
 def read_log(path: str | Path, *, system: int | None = None) -> Flight:

@@ -25,9 +25,17 @@ ARDUPILOT_REPLAY = lacking("replay_of_ardupilot")
 STAMPED_BY_BOOT_CLOCK = ("HIGHRES_IMU", "ODOMETRY", "ESTIMATOR_STATUS")
 # What an autopilot sends of itself, and nobody else
 OWN_MESSAGES = (
-    "HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "RAW_IMU", "ATTITUDE_QUATERNION",
-    "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "SYS_STATUS", "ESTIMATOR_STATUS",
-)  # fmt: skip
+    "HIGHRES_IMU",
+    "SCALED_IMU",
+    "SCALED_IMU2",
+    "SCALED_IMU3",
+    "RAW_IMU",
+    "ATTITUDE_QUATERNION",
+    "LOCAL_POSITION_NED",
+    "GLOBAL_POSITION_INT",
+    "SYS_STATUS",
+    "ESTIMATOR_STATUS",
+)
 
 
 @dataclass(frozen=True)

@@ -285,9 +285,18 @@ def settle_clocks(frames: Frames, address: Address) -> Recording:
     span = stamps if len(stamps) else np.array([0.0, received.max()])
     zero_s, end_s = float(span[0]), float(span[-1])
     return Recording(
-        frames, address, session, received, line, zero_s, end_s - zero_s, notes, damage,
-        len(restarts) or None, back or None,
-    )  # fmt: skip
+        frames,
+        address,
+        session,
+        received,
+        line,
+        zero_s,
+        end_s - zero_s,
+        notes,
+        damage,
+        len(restarts) or None,
+        back or None,
+    )
 
 
 def _without_strays(stamps: Array, rows: IntArray) -> IntArray:

@@ -71,9 +71,13 @@ def finite_rows(samples: pd.DataFrame, columns: list[str], limit: float = DAMAGE
 def with_nearest(samples: pd.DataFrame, others: pd.DataFrame, within_s: float) -> pd.DataFrame:
     """Rows of a frame, each with the row of another that is nearest in time; NaN beyond."""
     return pd.merge_asof(
-        samples, others, left_index=True, right_index=True, direction="nearest",
+        samples,
+        others,
+        left_index=True,
+        right_index=True,
+        direction="nearest",
         tolerance=within_s,  # type: ignore[arg-type]
-    )  # fmt: skip
+    )
 
 
 def with_attitude(samples: pd.DataFrame) -> pd.DataFrame:

@@ -54,8 +54,9 @@ def intentions(topics: Topics) -> dict[str, pd.Series[float]]:
     named = {flag for aid in every for group in aid.flags for flag in group}
     known = sorted(named.intersection(*tables)) if tables else []
     if known:
-        flags = topics.of_primary(Layout(px4.STATUS_FLAGS, dict(zip(known, known, strict=True))),
-                                  step=True)  # fmt: skip
+        flags = topics.of_primary(
+            Layout(px4.STATUS_FLAGS, dict(zip(known, known, strict=True))), step=True
+        )
         for aid in every:
             group = next((group for group in aid.flags if {*group} <= {*known}), None)
             if group is not None:
@@ -78,10 +79,12 @@ def _own_topic(topics: Topics, aid: Aid, meant: pd.Series[float] | None) -> AidL
         for axis, element in zip(aid.axes, at, strict=True)
         for ours, theirs in (
             *((("observation", "observation"),) if aid.name in px4.WITH_OBSERVATION else ()),
-            ("innovation", "innovation"), ("variance", "innovation_variance"),
-            ("noise", "observation_variance"), ("ratio", "test_ratio"),
+            ("innovation", "innovation"),
+            ("variance", "innovation_variance"),
+            ("noise", "observation_variance"),
+            ("ratio", "test_ratio"),
         )
-    }  # fmt: skip
+    }
     columns |= {"fused": "fused", "rejected": "innovation_rejected"}
     layout = Layout(f"estimator_aid_src_{aid.name}", columns)
     if topics.find(layout) is None:  # most aids of most logs: an empty table takes its time
@@ -97,12 +100,16 @@ def _snapshots(topics: Topics, aid: Aid, meant: pd.Series[float] | None) -> AidL
     gauss = aid.name == "mag_heading" and any(
         "cs_mag" in one for one in topics.of(px4.STATUS_FLAGS)
     )
-    layouts = [] if gauss or not aid.fields else [
-        tuple(
-            Layout(topic, _columns(what, aid, aid.fields))
-            for topic, what in zip(px4.INNOVATIONS, ("innovation", "variance"), strict=True)
-        )
-    ]  # fmt: skip
+    layouts = (
+        []
+        if gauss or not aid.fields
+        else [
+            tuple(
+                Layout(topic, _columns(what, aid, aid.fields))
+                for topic, what in zip(px4.INNOVATIONS, ("innovation", "variance"), strict=True)
+            )
+        ]
+    )
     if aid.before:
         both = _columns("innovation", aid, aid.before)
         squares = (field.replace("innov", "innov_var") for field in aid.before)

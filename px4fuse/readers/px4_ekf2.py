@@ -350,10 +350,16 @@ def _read_flow(topics: Topics, meant: Mapping[str, pd.Series[float]]) -> pd.Data
     range2 = (now["newest_forward_m_s"] ** 2 + now["newest_right_m_s"] ** 2) / (
         now["x_rad_s"] ** 2 + now["y_rad_s"] ** 2
     )
-    found = pd.DataFrame({
-        "forward_m_s": forward, "right_m_s": right, "samples": samples, "interval_s": interval_s,
-        "noise_m2_s2": range2 * np.interp(times[row], noise.index, noise["noise"]),
-    }, index=now.index)  # fmt: skip
+    found = pd.DataFrame(
+        {
+            "forward_m_s": forward,
+            "right_m_s": right,
+            "samples": samples,
+            "interval_s": interval_s,
+            "noise_m2_s2": range2 * np.interp(times[row], noise.index, noise["noise"]),
+        },
+        index=now.index,
+    )
     return found.replace(np.inf, np.nan).dropna()
 
 

@@ -94,11 +94,16 @@ def rebuilt_fixes(
     clear = passed % 1.0 > ekf2.step_s / interval_s
     rows, before, passed = rows[clear], before[clear], np.floor(passed[clear])
     taken_s = times[before] + passed * interval_s
-    made = pd.DataFrame({
-        column: np.interp(taken_s + late_s, ekf2.state.index, ekf2.state[column], np.nan, np.nan)
-        + innovations["innovation_m"].to_numpy()[inside][clear]
-        for column, innovations in zip(Columns.POSITION, (north, east), strict=False)
-    }, index=pd.Index(taken_s, name="time_s"))  # fmt: skip
+    made = pd.DataFrame(
+        {
+            column: np.interp(
+                taken_s + late_s, ekf2.state.index, ekf2.state[column], np.nan, np.nan
+            )
+            + innovations["innovation_m"].to_numpy()[inside][clear]
+            for column, innovations in zip(Columns.POSITION, (north, east), strict=False)
+        },
+        index=pd.Index(taken_s, name="time_s"),
+    )
     known = passed == 0.0
     error = (made - fixes[made.columns].to_numpy()[before])[known].dropna()
     exact_m = float(np.sqrt(np.mean(error.to_numpy() ** 2))) if len(error) >= MIN_KNOWN else np.inf

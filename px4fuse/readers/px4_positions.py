@@ -129,9 +129,15 @@ def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
         frame = "NED"  # rotated by EKF2 itself, whatever the field still says
     orientation = orientation_of(samples)
     return _track(
-        topics, name, samples, (layout.topic,), turns=orientation is not None, frame=frame,
-        clock_map=_arrival(topics, layout.topic), orientation=orientation,
-    )  # fmt: skip
+        topics,
+        name,
+        samples,
+        (layout.topic,),
+        turns=orientation is not None,
+        frame=frame,
+        clock_map=_arrival(topics, layout.topic),
+        orientation=orientation,
+    )
 
 
 def _arrival(topics: Topics, topic: str) -> ClockMap | None:
@@ -146,9 +152,14 @@ def _arrival(topics: Topics, topic: str) -> ClockMap | None:
     if len(age_us) < MIN_TRACK_SAMPLES or np.mean(np.abs(age_us) <= SAME_TIME_US) < ARRIVAL_SHARE:
         return None
     return ClockMap(
-        "the sender's stamps", "arrival time", len(age_us), 0.0, 0.0, 0.0,
+        "the sender's stamps",
+        "arrival time",
+        len(age_us),
+        0.0,
+        0.0,
+        0.0,
         "PX4 replaced them by the time of arrival, since the clocks were not synchronised",
-    )  # fmt: skip
+    )
 
 
 def _read_kept(topics: Topics, turns: bool) -> PositionTrack | Unavailable:
@@ -165,9 +176,14 @@ def _read_kept(topics: Topics, turns: bool) -> PositionTrack | Unavailable:
     # update period (estimator_interface.cpp)
     samples = _later(samples, _delay_s(topics) + 0.5 * target_step_s(topics))
     return _track(
-        topics, px4.KEPT_OBSERVATION, samples, tuple(used),
-        turns=turns, needed=Columns.POSITION[:2], notes=notes,
-    )  # fmt: skip
+        topics,
+        px4.KEPT_OBSERVATION,
+        samples,
+        tuple(used),
+        turns=turns,
+        needed=Columns.POSITION[:2],
+        notes=notes,
+    )
 
 
 def _later(samples: pd.DataFrame, by_s: float) -> pd.DataFrame:
@@ -214,11 +230,15 @@ def _rebuild(topics: Topics, ekf2: Ekf2 | Unavailable, turns: bool) -> PositionT
     if "down_m" in tracks:
         samples, notes = _with_height(samples, tracks["down_m"].to_frame("down_m"))
     return _track(
-        topics, px4.RECONSTRUCTION, _later(samples, _delay_s(topics)),
+        topics,
+        px4.RECONSTRUCTION,
+        _later(samples, _delay_s(topics)),
         ("vehicle_local_position", *ekf2.innovation_topics),
-        turns=turns, needed=Columns.POSITION[:2], notes=notes,
+        turns=turns,
+        needed=Columns.POSITION[:2],
+        notes=notes,
         clock=f"EKF2's time plus {EV_POS.delay}; late by up to one interval of the source",
-    )  # fmt: skip
+    )
 
 
 def project(latitude_deg: Array, longitude_deg: Array, origin: Place) -> tuple[Array, Array]:
@@ -334,10 +354,16 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     if set(px4.ANTENNA_COLUMNS) <= set(gps.columns):  # since v1.17 of each receiver
         more["place_m"] = tuple(gps[px4.ANTENNA_COLUMNS].iloc[-1].tolist())
     found = _track(
-        topics, px4.GPS_POSITION, samples, (layout.topic,), clock=clock, notes=notes,
-        velocity=samples[Columns.VELOCITY + Columns.VELOCITY_VARIANCE], age_s=delay_ms * 1e-3,
+        topics,
+        px4.GPS_POSITION,
+        samples,
+        (layout.topic,),
+        clock=clock,
+        notes=notes,
+        velocity=samples[Columns.VELOCITY + Columns.VELOCITY_VARIANCE],
+        age_s=delay_ms * 1e-3,
         **more,
-    )  # fmt: skip
+    )
     if isinstance(found, Unavailable):
         return found
     return replace(found, origin=structs.replace(found.origin, automatic=fuses(ekf2)))

@@ -52,8 +52,9 @@ DEFAULT_PROFILE = "Record with SDLOG_PROFILE bit 0 (default)."
 ESTIMATOR_STATES = ("estimator_states", "estimator_status")  # since v1.12, v1.8 to v1.11
 # The magnetic field: what was measured, and what EKF2 has kept of it (from v1.14)
 MAGNETOMETER = (
-    ("vehicle_magnetometer", "magnetometer_ga"), ("estimator_aid_src_mag", "observation"),
-)  # fmt: skip
+    ("vehicle_magnetometer", "magnetometer_ga"),
+    ("estimator_aid_src_mag", "observation"),
+)
 # (number of states, number of variances) -> how many variances attitude has; velocity and position
 # follow it. 4: of the quaternion filter, whose biases are increments per prediction; 3: of the
 # error-state filter (EKF/python/ekf_derivation/generated/state.h at v1.15.4 and v1.16)

@@ -122,7 +122,7 @@ class Rows:
             well = (
                 len(part) == words + values and all(is_number(one.strip()) for one in part[words:])
                 for part in parts
-            )  # fmt: skip
+            )
             row = next((row for row, good in enumerate(well) if not good), 0)
             what = f"{quote(texts[row])} is not {words + values} columns of numbers"
             raise self.refuse(row, what, "Correct or remove that line.") from error

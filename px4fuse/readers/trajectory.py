@@ -95,9 +95,14 @@ def read_trajectory(path: str | Path) -> Trajectory:
     is_unix = UNIX_START_S <= time[0] < UNIX_END_S
     clock = "its stamps are UNIX time" if is_unix else "its clock is its own, not UNIX time"
     said = (
-        f"Recognised as {words}; {clock}.", time_words, kind_words, frame_words, dropped,
-        _gaps(time, kind), cut,
-    )  # fmt: skip
+        f"Recognised as {words}; {clock}.",
+        time_words,
+        kind_words,
+        frame_words,
+        dropped,
+        _gaps(time, kind),
+        cut,
+    )
     return Trajectory(
         name=name,
         kind=kind,

@@ -45,9 +45,20 @@ MAX_FIELDS = 200_000
 HEADER_BYTES = 3
 # pyulog reads damaged bytes as messages; these are the exceptions that this can raise
 _PARSE_ERRORS = (
-    ULogException, struct.error, IndexError, KeyError, ValueError, TypeError, AttributeError,
-    OverflowError, UnicodeError, EOFError, MemoryError, AssertionError, RecursionError,
-)  # fmt: skip
+    ULogException,
+    struct.error,
+    IndexError,
+    KeyError,
+    ValueError,
+    TypeError,
+    AttributeError,
+    OverflowError,
+    UnicodeError,
+    EOFError,
+    MemoryError,
+    AssertionError,
+    RecursionError,
+)
 
 
 # Primary EKF2 instance from each time on

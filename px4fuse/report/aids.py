@@ -75,23 +75,46 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
         if aid.is_bad:
             colour = style.SEVERITY_COLOURS["warning"]
         begun: list[Cell] = [
-            aid.label, (aid_verdict_words(aid), colour), meant, f"{aid.rejected_share:.1%}",
-            f"{aid.longest_without:.1f}", noise,
-        ]  # fmt: skip
+            aid.label,
+            (aid_verdict_words(aid), colour),
+            meant,
+            f"{aid.rejected_share:.1%}",
+            f"{aid.longest_without:.1f}",
+            noise,
+        ]
         for name, axis in aid.axes.items():
             low, high = axis.nis_band
-            rows.append([
-                *begun, name, f"{axis.samples}", number_words(axis.nis_mean),
-                f"{low:.2f} – {high:.2f}", f"{axis.pull:+.2f}",
-            ])  # fmt: skip
+            rows.append(
+                [
+                    *begun,
+                    name,
+                    f"{axis.samples}",
+                    number_words(axis.nis_mean),
+                    f"{low:.2f} – {high:.2f}",
+                    f"{axis.pull:+.2f}",
+                ]
+            )
             begun = [""] * len(begun)
         if not aid.axes:
             rows.append([*begun, *[""] * 5])
     page.table(
-        ["aid", "verdict", "meant", "rejec-\nted", "longest\nwithout (s)", "√R", "axis", "n",
-         "mean\nNIS", "95 %\nband", "mean\nν/√S"],
-        rows, right=(2, 3, 4, 5, 7, 8, 10), size=6.8,
-    )  # fmt: skip
+        [
+            "aid",
+            "verdict",
+            "meant",
+            "rejec-\nted",
+            "longest\nwithout (s)",
+            "√R",
+            "axis",
+            "n",
+            "mean\nNIS",
+            "95 %\nband",
+            "mean\nν/√S",
+        ],
+        rows,
+        right=(2, 3, 4, 5, 7, 8, 10),
+        size=6.8,
+    )
     idle = [aid.label for aid in aids.values() if aid.verdict == "idle"]
     if idle:
         page.write(

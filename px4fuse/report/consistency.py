@@ -32,8 +32,10 @@ RUNNING, BELOW, LEGEND = 140.0, 150.0, 14.0
 GREY = "#dcdcdc"
 # What a cause explains: its name, and the power that is shown
 NUMBERS: Mapping[Of, tuple[str, float]] = {
-    "nis": ("mean NIS", 1.0), "nees": ("error (σ)", 0.5), "apart": ("apart (m)", 1.0),
-}  # fmt: skip
+    "nis": ("mean NIS", 1.0),
+    "nees": ("error (σ)", 0.5),
+    "apart": ("apart (m)", 1.0),
+}
 
 
 class Series(NamedTuple):
@@ -51,8 +53,9 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     page = Page("Appendix: consistency", say("consistency", along=along))
     series = _series(result)
     if series:
-        axes = marks.panel(page, analysis, "Mean NIS so far, log scale", _nis_words(series),
-                           RUNNING, above=LEGEND)  # fmt: skip
+        axes = marks.panel(
+            page, analysis, "Mean NIS so far, log scale", _nis_words(series), RUNNING, above=LEGEND
+        )
         _running(axes, series)
         legend_above(axes)
         first, second = halves()
@@ -87,8 +90,7 @@ def _tried(page: Page, analysis: Analysis) -> None:
     if not rows:
         return
     page.heading(f"Causes that were tried along {axis.called}", above=12.0)
-    page.table(["filter", "cause", "number", "flown", "put right", "explains"], rows,
-               right=(3, 4))  # fmt: skip
+    page.table(["filter", "cause", "number", "flown", "put right", "explains"], rows, right=(3, 4))
     page.write(say("causes"), size=7.5, colour=MUTED)
 
 
@@ -204,6 +206,9 @@ def _cells(_: AxisComparison, __: str, one: FilterSummary | UnjudgedFilter) -> l
     if isinstance(one, Unavailable):
         return [""] * 5
     return [
-        f"{one.count}", f"{one.outside_two_sigma:.1%}", f"{one.bias_t:+.1f}",
-        f"{one.lag1_autocorrelation:+.2f}", p_words(one.ljung_box_p),
-    ]  # fmt: skip
+        f"{one.count}",
+        f"{one.outside_two_sigma:.1%}",
+        f"{one.bias_t:+.1f}",
+        f"{one.lag1_autocorrelation:+.2f}",
+        p_words(one.ljung_box_p),
+    ]

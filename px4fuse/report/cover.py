@@ -85,8 +85,7 @@ def _verdict(page: Page, analysis: Analysis) -> None:
             what, claimed = "error is", length_words(hidden.claimed_m)
             large = f"{length_words(hidden.rmse_m)}, claimed {claimed}"
         column.write(f"Along {along} {owner}'s {what}")
-        column.write(large, size=16.0, bold=True, colour=colour if judged else MUTED,
-                     above=1.0)  # fmt: skip
+        column.write(large, size=16.0, bold=True, colour=colour if judged else MUTED, above=1.0)
         if isinstance(one, Unavailable):
             column.write(f"{one.reason}.", above=1.0)
         columns.append(column)
@@ -135,9 +134,12 @@ def write_finding(page: Page, group: list[Finding]) -> None:
     if followers:
         said.append(words(consequences_words(followers), 7.5, MUTED))
     page.labelled(
-        f"{finding.severity}\n{finding.when}".strip(), *said, size=7.0, above=2.0,
+        f"{finding.severity}\n{finding.when}".strip(),
+        *said,
+        size=7.0,
+        above=2.0,
         colour=SEVERITY_COLOURS[finding.severity],
-    )  # fmt: skip
+    )
 
 
 def _aisle(comparison: Comparison) -> Axis | None:

@@ -18,9 +18,12 @@ from px4fuse.trajectory.scores import Interval, PairwiseError, Statistics
 
 # Indices of the axes that are right, up the page and vertical; and whether the last points down
 AXES: Mapping[Frame, tuple[int, int, int, bool]] = {
-    "NED": (1, 0, 2, True), "FRD": (1, 0, 2, True), "ENU": (0, 1, 2, False),
-    "camera": (0, 2, 1, True), "unknown": (0, 1, 2, False),
-}  # fmt: skip
+    "NED": (1, 0, 2, True),
+    "FRD": (1, 0, 2, True),
+    "ENU": (0, 1, 2, False),
+    "camera": (0, 2, 1, True),
+    "unknown": (0, 1, 2, False),
+}
 # A path whose height is less than this share of its length is seen from above alone
 FLAT = 0.1
 # Steps of so many median ones are gaps: no line crosses them
@@ -41,9 +44,7 @@ STATISTICS: tuple[tuple[str, str, dict[str, Any]], ...] = (
 # Rounding: no error to say anything about
 NEGLIGIBLE_M = 1e-6
 SHADES = "The darker the path, the larger its error; × is the largest."
-SCORE_HEAD = (
-    "error", "RMSE", "95 %", "mean", "median", "std", "max", "n", "rotation\nRMSE (°)",
-)  # fmt: skip
+SCORE_HEAD = ("error", "RMSE", "95 %", "mean", "median", "std", "max", "n", "rotation\nRMSE (°)")
 
 
 @cache
@@ -125,9 +126,15 @@ def draw_path(axes: Axes, score: Evaluation, view: View) -> None:
     error, path = score.position_error_m, view.of(score.estimate_m)
     every = max(1, len(error) // PIECES)
     shown = axes.scatter(
-        path[::every, 0], path[::every, 1], c=error[::every], s=9.0, cmap=colours(), linewidths=0,
-        vmin=0.0, vmax=max(float(error.max()), LEAST_SCALE_M),
-    )  # fmt: skip
+        path[::every, 0],
+        path[::every, 1],
+        c=error[::every],
+        s=9.0,
+        cmap=colours(),
+        linewidths=0,
+        vmin=0.0,
+        vmax=max(float(error.max()), LEAST_SCALE_M),
+    )
     way(axes, view.of(score.reference_m), score.time_s, label="reference", **REFERENCE)
     axes.plot(*path[0], "o", color="white", mec="black", ms=5, mew=1.0, label="start", zorder=5)
     worst = path[np.argmax(error)]

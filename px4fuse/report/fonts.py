@@ -67,9 +67,10 @@ def _others() -> tuple[tuple[str, FontPath], ...]:
         except (OSError, RuntimeError, NotImplementedError):
             continue  # what matplotlib cannot read draws nothing
     entries = [
-        entry for entry in manager.ttflist
+        entry
+        for entry in manager.ttflist
         if entry.style == "normal" and not any(word in entry.name.lower() for word in BOXES)
-    ]  # fmt: skip
+    ]
     return tuple(
         (entry.name, FontPath(entry.fname, entry.index)) for entry in sorted(entries, key=_order)
     )

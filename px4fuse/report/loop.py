@@ -35,12 +35,23 @@ STYLES: Mapping[str, dict[str, Any]] = {
     SOLUTIONS["all"]: {"color": "#8d6a9f", "lw": 0.9, "ls": (0, (2, 1))},
 }
 KINDS = {
-    "vio": "odometry (external vision)", "ekf2": "EKF2's track", "kf": "our filter's track",
-    "truth": "ground truth", "slam": "a SLAM system's trajectory", "unknown": "a trajectory",
-}  # fmt: skip
+    "vio": "odometry (external vision)",
+    "ekf2": "EKF2's track",
+    "kf": "our filter's track",
+    "truth": "ground truth",
+    "slam": "a SLAM system's trajectory",
+    "unknown": "a trajectory",
+}
 CLOSURE_HEAD = (
-    "same place at", "missed\nby (m)", "d²", "dof", "p", "gate", "DCS\nweight", "GNC\nweight",
-)  # fmt: skip
+    "same place at",
+    "missed\nby (m)",
+    "d²",
+    "dof",
+    "p",
+    "gate",
+    "DCS\nweight",
+    "GNC\nweight",
+)
 TITLE = "Loop closure"
 MAP_POINTS = 2000
 MAP, LEGEND = 290.0, 38.0  # of the axes, and of the legend below them, in points
@@ -159,10 +170,13 @@ def write_scores(page: Page, loop: Loop) -> None:
     rows: list[list[Cell]] = []
     for closure in loop.closures:
         cells = [
-            closure_name(closure, loop), f"{closure.distance_m:.2f}", f"{closure.d2:.1f}",
-            f"{closure.degrees_of_freedom}", p_words(closure.p).removeprefix("p "),
+            closure_name(closure, loop),
+            f"{closure.distance_m:.2f}",
+            f"{closure.d2:.1f}",
+            f"{closure.degrees_of_freedom}",
+            p_words(closure.p).removeprefix("p "),
             "accepted" if closure.accepted else "REJECTED",
-        ]  # fmt: skip
+        ]
         weights = closure.weight_dcs, closure.weight_gnc
         cells += ["–" if weight is None else f"{weight:.2f}" for weight in weights]
         colour = "black" if closure.accepted else style.SEVERITY_COLOURS["error"]
@@ -180,11 +194,17 @@ def write_scores(page: Page, loop: Loop) -> None:
             continue
         first = next(iter(known.values()))
         head = ["path", *(f"{e.delta_words} (m)" for e in first.rpe), "rotation (°)"]
-        page.table(head, [
-            [name, *(_error(e.translation_m, e.interval_m) for e in score.rpe),
-             _rmse(score.ate.rotation_deg, 2)]
-            for name, score in known.items()
-        ])  # fmt: skip
+        page.table(
+            head,
+            [
+                [
+                    name,
+                    *(_error(e.translation_m, e.interval_m) for e in score.rpe),
+                    _rmse(score.ate.rotation_deg, 2),
+                ]
+                for name, score in known.items()
+            ],
+        )
         for text in (score_words(first), *first.notes, *first.warnings):
             page.numbers(capital(text))
 
@@ -285,12 +305,14 @@ def graph_summary(solved: SolvedGraph) -> Page:
         page.labelled("Robust", "left out for so many closures: --robust takes minutes")
     rows = [
         [
-            SOLUTIONS[key], f"{solution.cost_initial:.6g}", f"{solution.cost:.6g}",
+            SOLUTIONS[key],
+            f"{solution.cost_initial:.6g}",
+            f"{solution.cost:.6g}",
             f"{solution.iterations}" + ("" if solution.converged else " (not converged)"),
             "" if key == "all" else f"{solution.dropped}",
         ]
         for key, solution in solved.solutions.items()
-    ]  # fmt: skip
+    ]
     head = ("path", "cost before", "cost", "iterations", "closures dropped")
     page.table(head, rows, right=(1, 2, 3, 4))
     return page

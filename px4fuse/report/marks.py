@@ -92,9 +92,17 @@ def draw(axes: Axes, analysis: Analysis, *, axis: str | None = None, strip: bool
 
 
 def panel(
-    page: Page, analysis: Analysis, title: str, say: str, height: float, *, above: float = 4.0,
-    axis: str | None = None, strip: bool = False, last: bool = True,
-) -> Axes:  # fmt: skip
+    page: Page,
+    analysis: Analysis,
+    title: str,
+    say: str,
+    height: float,
+    *,
+    above: float = 4.0,
+    axis: str | None = None,
+    strip: bool = False,
+    last: bool = True,
+) -> Axes:
     """A panel over the time of the flight, marked as by :func:`draw`.
 
     Parameters
@@ -149,6 +157,12 @@ def _strip(axes: Axes, analysis: Analysis) -> None:
         start, end = max(mode.start_s, low), min(mode.end_s, high)
         if (end - start) / (high - low) * width >= STRIP_WIDTH * len(mode.name):
             axes.text(
-                (start + end) / 2.0, 1.012, mode.name, transform=axes.get_xaxis_transform(),
-                ha="center", va="bottom", size=STRIP_SIZE, color=MUTED,
-            )  # fmt: skip
+                (start + end) / 2.0,
+                1.012,
+                mode.name,
+                transform=axes.get_xaxis_transform(),
+                ha="center",
+                va="bottom",
+                size=STRIP_SIZE,
+                color=MUTED,
+            )

@@ -34,10 +34,27 @@ FRACTION = re.compile(r"\\frac\s*\{([^{}]*)\}\s*\{([^{}]*)\}")
 TAG = re.compile(r"<!--.*?-->|<[^>]*>", re.DOTALL)
 # Commands of TeX that HTML has no entity of the same name for, or another one
 SYMBOLS = {
-    "cdot": "·", "sqrt": "√", "to": "→", "neq": "≠", "infty": "∞", "circ": "°", "sim": "~",
-    "hat": "", "bar": "", "mathrm": "", "mathbf": "", "text": "", "left": "", "right": "",
-    "quad": " ", "ldots": "…", "degree": "°", ",": " ", ";": " ", "!": "",
-}  # fmt: skip
+    "cdot": "·",
+    "sqrt": "√",
+    "to": "→",
+    "neq": "≠",
+    "infty": "∞",
+    "circ": "°",
+    "sim": "~",
+    "hat": "",
+    "bar": "",
+    "mathrm": "",
+    "mathbf": "",
+    "text": "",
+    "left": "",
+    "right": "",
+    "quad": " ",
+    "ldots": "…",
+    "degree": "°",
+    ",": " ",
+    ";": " ",
+    "!": "",
+}
 
 
 def draw(found: object, results: ComparisonResults | AidsResults | LoopResults) -> Iterator[Page]:

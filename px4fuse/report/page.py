@@ -45,9 +45,16 @@ class Page:
         return self.blocks[-1]
 
     def write(
-        self, text: str, *, size: float = 8.0, bold: bool = False, colour: str = "black",
-        above: float = 0.0, indent: float = 0.0, mark: str = "",
-    ) -> None:  # fmt: skip
+        self,
+        text: str,
+        *,
+        size: float = 8.0,
+        bold: bool = False,
+        colour: str = "black",
+        above: float = 0.0,
+        indent: float = 0.0,
+        mark: str = "",
+    ) -> None:
         """Write a paragraph, so many points below and to the right, with the mark of a list."""
         if text or mark:
             looks = words(text, size, colour, bold)
@@ -62,9 +69,15 @@ class Page:
         self.write(text, size=7.0, colour=MUTED, above=-1.0)
 
     def labelled(
-        self, label: str, *texts: str | Block, size: float = 8.0, width: float = LABEL,
-        above: float = 0.0, colour: str = "black", bold: bool = True,
-    ) -> None:  # fmt: skip
+        self,
+        label: str,
+        *texts: str | Block,
+        size: float = 8.0,
+        width: float = LABEL,
+        above: float = 0.0,
+        colour: str = "black",
+        bold: bool = True,
+    ) -> None:
         """Write a label, and beside it sentences, of which :func:`words` have their own looks."""
         beside = [words(text, size) if isinstance(text, str) else text for text in texts]
         looks = words(label, size, colour, bold)
@@ -76,9 +89,14 @@ class Page:
             self.labelled(label, text, size=size)
 
     def table(
-        self, head: Sequence[str], rows: Sequence[Sequence[Cell]], *,
-        shares: Sequence[float] | None = None, right: Sequence[int] = (), size: float = 7.4,
-    ) -> None:  # fmt: skip
+        self,
+        head: Sequence[str],
+        rows: Sequence[Sequence[Cell]],
+        *,
+        shares: Sequence[float] | None = None,
+        right: Sequence[int] = (),
+        size: float = 7.4,
+    ) -> None:
         """Write a table.
 
         Parameters
@@ -93,9 +111,16 @@ class Page:
         self.add("table", head=head, rows=rows, shares=shares, right=right, size=size)
 
     def panel(
-        self, title: str, say: str, height: float, *, above: float = 4.0, left: float = AXIS_LEFT,
-        right: float = 8.0, below: float = 0.0,
-    ) -> Axes:  # fmt: skip
+        self,
+        title: str,
+        say: str,
+        height: float,
+        *,
+        above: float = 4.0,
+        left: float = AXIS_LEFT,
+        right: float = 8.0,
+        below: float = 0.0,
+    ) -> Axes:
         """Axes of the column's width below a title and the sentence that says what to see.
 
         Parameters
@@ -113,8 +138,17 @@ class Page:
         axes.locator_params(axis="y", nbins=4)
         around = left, right, below, above
         alt = ": ".join(filter(None, (title, say)))
-        block = self.add("panel", title=title, say=say, alt=alt, axes=axes, around=around,
-                         height=height, width=self.width, figure=axes.figure)  # fmt: skip
+        block = self.add(
+            "panel",
+            title=title,
+            say=say,
+            alt=alt,
+            axes=axes,
+            around=around,
+            height=height,
+            width=self.width,
+            figure=axes.figure,
+        )
         _place(block)
         return axes
 
@@ -126,10 +160,15 @@ class Page:
         figure = Figure(figsize=(self.width / 72.0, 13.0 * len(kept) / 72.0))
         for place, entries in enumerate(kept):
             figure.legend(
-                handles=entries, loc="upper left", ncols=len(entries), borderaxespad=0.0,
-                borderpad=0.0, bbox_to_anchor=(0.0, 1.0 - place / len(kept)), handlelength=2.0,
+                handles=entries,
+                loc="upper left",
+                ncols=len(entries),
+                borderaxespad=0.0,
+                borderpad=0.0,
+                bbox_to_anchor=(0.0, 1.0 - place / len(kept)),
+                handlelength=2.0,
                 columnspacing=1.2,
-            )  # fmt: skip
+            )
         named = ", ".join(str(artist.get_label()) for row in kept for artist in row)
         alt = f"Legend: {named}"
         self.add("panel", title="", say="", alt=alt, width=self.width, figure=figure)
@@ -167,9 +206,14 @@ def appendix(title: str) -> str:
 def legend_above(axes: Axes, columns: int = 9, **options: Any) -> None:
     """Legend of a panel in the line above its axes, at the right, where nothing lies beneath."""
     axes.legend(
-        loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.0,
-        borderpad=0.1, columnspacing=1.2, **options,
-    )  # fmt: skip
+        loc="lower right",
+        bbox_to_anchor=(1.0, 1.0),
+        ncols=columns,
+        borderaxespad=0.0,
+        borderpad=0.1,
+        columnspacing=1.2,
+        **options,
+    )
 
 
 def printable(text: str) -> str:

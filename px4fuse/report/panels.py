@@ -37,7 +37,7 @@ class Quantity(NamedTuple):
 
 POSITIONS = Quantity(
     "m", "position_m", "position_variance_m2", "position_rmse_m", "sigma_p_median_m"
-)  # fmt: skip
+)
 VELOCITIES = Quantity(
     "m/s", "velocity_m_s", "velocity_variance_m2_s2", "velocity_rmse_m_s", "sigma_v_median_m_s"
 )
@@ -57,9 +57,15 @@ class Panel(NamedTuple):
         return self.title.format("truth" if isinstance(result.truth, pd.DataFrame) else "EKF2")
 
     def put(
-        self, page: Page, analysis: Analysis, result: AxisComparison, *, last: bool,
-        strip: bool = False, narrow: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        page: Page,
+        analysis: Analysis,
+        result: AxisComparison,
+        *,
+        last: bool,
+        strip: bool = False,
+        narrow: bool = False,
+    ) -> None:
         """Draw it on a page, above others on the same time axis unless it is the last.
 
         Parameters
@@ -72,8 +78,9 @@ class Panel(NamedTuple):
         say, height = ("", NARROW) if narrow else (self.say(analysis, result), self.height)
         # rejected innovations are there themselves
         rejected = "" if self is INNOVATIONS else result.axis.name
-        axes = marks.panel(page, analysis, self.named(result), say, height, axis=rejected,
-                           strip=strip, last=last)  # fmt: skip
+        axes = marks.panel(
+            page, analysis, self.named(result), say, height, axis=rejected, strip=strip, last=last
+        )
         if narrow:
             axes.locator_params(axis="x", nbins=4)
         self.draw(axes, result)
@@ -303,18 +310,30 @@ VELOCITY = Panel(
     "Velocity (m/s)", 150.0, partial(draw_tracks, of=VELOCITIES), _velocity_words, _velocity_numbers
 )
 ERROR = Panel(
-    "Position - {} (m)", 150.0, draw_error, _error_words,
+    "Position - {} (m)",
+    150.0,
+    draw_error,
+    _error_words,
     lambda result: _error_numbers(result) or _position_numbers(result),
-)  # fmt: skip
+)
 INNOVATIONS = Panel(
-    "Innovation: measurement - prediction (m)", 140.0, draw_innovations, innovation_words,
+    "Innovation: measurement - prediction (m)",
+    140.0,
+    draw_innovations,
+    innovation_words,
     _innovation_numbers,
-)  # fmt: skip
+)
 SIGMA_P = Panel(
-    "σ of position (m), log scale", 80.0, partial(_draw_sigma, of=POSITIONS), sigma_words,
+    "σ of position (m), log scale",
+    80.0,
+    partial(_draw_sigma, of=POSITIONS),
+    sigma_words,
     partial(_medians, of=POSITIONS),
-)  # fmt: skip
+)
 SIGMA_V = Panel(
-    "σ of velocity (m/s), log scale", 60.0, partial(_draw_sigma, of=VELOCITIES), lambda *_: "",
+    "σ of velocity (m/s), log scale",
+    60.0,
+    partial(_draw_sigma, of=VELOCITIES),
+    lambda *_: "",
     partial(_medians, of=VELOCITIES),
-)  # fmt: skip
+)

@@ -40,15 +40,24 @@ STANDARDS: list[Any] = ["a-3a", "ua-1"]
 # Of each kind of results
 PAGES: Mapping[type, tuple[Callable[[Any, Any], Iterator[Page]], ...]] = {
     contract.ComparisonResults: (
-        cover.draw, flight.draw, flight.draw_innovations, why.draw, flight.draw_other_axes,
-        consistency.draw, sensitivity.draw, clock.draw, aids.draw, loop.draw, notes.draw,
+        cover.draw,
+        flight.draw,
+        flight.draw_innovations,
+        why.draw,
+        flight.draw_other_axes,
+        consistency.draw,
+        sensitivity.draw,
+        clock.draw,
+        aids.draw,
+        loop.draw,
+        notes.draw,
         provenance.draw,
     ),
     contract.AidsResults: (aids.draw_alone, notes.draw, provenance.draw_aids),
     contract.LoopResults: (loop.draw_report, notes.draw, provenance.draw_loop),
     contract.WhatIfResults: (whatif.draw,),
     contract.EvaluationResults: (evaluation.draw,),
-}  # fmt: skip
+}
 
 
 def _named(results: Any) -> tuple[str, str, str]:

@@ -81,10 +81,13 @@ def draw_loop(loop: Loop, results: LoopResults) -> Iterator[Page]:
     page = _begin("Provenance", results)
     tracks = [("track", loop.odometry.trajectory), *(("reference", r) for r in loop.references)]
     read = [
-        (label, f"{track.name}, {track.size_bytes} bytes, SHA-256 {track.sha256}. "
-         f"{' '.join(track.notes)}")
+        (
+            label,
+            f"{track.name}, {track.size_bytes} bytes, SHA-256 {track.sha256}. "
+            f"{' '.join(track.notes)}",
+        )
         for label, track in tracks
-    ]  # fmt: skip
+    ]
     _section(page, "The files", read)
     _section(page, "Choices made on the way", plain=loop.notes or ["none"])
     _methods(page, "methods_loop.md")

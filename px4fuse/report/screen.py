@@ -31,9 +31,12 @@ INDENT = 9
 COLUMN = 6.0  # points
 # Colours of paper that a screen has too; others stand for lines of panels, and are left out
 STYLES = {
-    MUTED: "dim", SEVERITY_COLOURS["error"]: "bold red", SEVERITY_COLOURS["warning"]: "yellow",
-    SEVERITY_COLOURS["info"]: "cyan", GOOD: "green",
-}  # fmt: skip
+    MUTED: "dim",
+    SEVERITY_COLOURS["error"]: "bold red",
+    SEVERITY_COLOURS["warning"]: "yellow",
+    SEVERITY_COLOURS["info"]: "cyan",
+    GOOD: "green",
+}
 # A value ends before the full stop of its sentence
 _WRITTEN = re.compile(r"px4fuse (\w+) LOG(?![\w.])((?: --[a-z-]+ [-\w]+(?:\.\d+)?)*)")
 _FIELDS = {option.name: field for field, option in OPTIONS.items()}

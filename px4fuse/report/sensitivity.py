@@ -80,8 +80,14 @@ def _map(page: Page, analysis: Analysis) -> None:
     best = [_point(noise) for noise in noises]
     axes.plot(best[1], best[0], "o", color="white", mec="black", ms=6.0, label="asked for")
     axes.plot(chosen[1], chosen[0], "X", color="black", mec="white", ms=8.0, label="chosen")
-    axes.set(xscale="log", yscale="log", xlim=z_limits, ylim=a_limits,
-             xlabel="SIGMA_Z (m)", ylabel="SIGMA_A (m/s²)")  # fmt: skip
+    axes.set(
+        xscale="log",
+        yscale="log",
+        xlim=z_limits,
+        ylim=a_limits,
+        xlabel="SIGMA_Z (m)",
+        ylabel="SIGMA_A (m/s²)",
+    )
     plain_ticks(axes.xaxis)
     plain_ticks(axes.yaxis)
     axes.grid(False)
@@ -133,9 +139,10 @@ def _point(noise: Noise) -> float:
 def _drop(comparison: Comparison, name: str, found: AxisTuning, a: Array, z: Array) -> Array:
     """Ln of how much less likely each pair is than the best of them, shape (n, m)."""
     axes = [
-        one.axis for one in comparison.axes.values()
+        one.axis
+        for one in comparison.axes.values()
         if one.axis.name == name or (name == HORIZONTAL and one.axis.name in ("north", "east"))
-    ]  # fmt: skip
+    ]
     legs = [preintegrate(axis, comparison.settings) for axis in axes]
     time = axes[0].measurement_time_s[-len(legs[0].measurement_m) :]
     weight = np.where(np.isin(time, found.outlier_time_s), FIRST_WIDTH**-2.0, 1.0)

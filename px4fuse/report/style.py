@@ -46,11 +46,14 @@ OURS_DOTS: dict[str, Any] = {"color": OURS, "marker": "o", "ms": 2.0, "mew": 0, 
 EKF2_DOTS: dict[str, Any] = {"color": EKF2, "marker": "s", "ms": 2.2, "mew": 0, "ls": "none"}
 # What EKF2 did not fuse is hollow everywhere
 EKF2_REJECTED: dict[str, Any] = {
-    "color": EKF2, "marker": "s", "ms": 2.8, "mew": 0.6, "mfc": "white", "ls": "none",
-}  # fmt: skip
-MEASURED: dict[str, Any] = {
-    "color": MEASUREMENT, "marker": ".", "ms": 1.8, "mew": 0, "ls": "none",
-}  # fmt: skip
+    "color": EKF2,
+    "marker": "s",
+    "ms": 2.8,
+    "mew": 0.6,
+    "mfc": "white",
+    "ls": "none",
+}
+MEASURED: dict[str, Any] = {"color": MEASUREMENT, "marker": ".", "ms": 1.8, "mew": 0, "ls": "none"}
 # By the names that a reader sees
 LINES = {"ours": OURS_LINE, "EKF2": EKF2_LINE, "truth": TRUTH_LINE}
 DOTS = {"ours": OURS_DOTS, "EKF2": EKF2_DOTS}

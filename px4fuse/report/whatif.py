@@ -67,11 +67,13 @@ def rows(made_of: Counterfactual) -> list[list[str]]:
     tables = dict.fromkeys(HORIZONTAL, AXIS_ROWS) | {"": tuple(over_all)}
     every = [found.logged, found.replayed, *found.whatif[: made_of.first]]
     return [
-        [label.format(AIDS[name].label if name in besides else name),
-         *(_cell(summary, name, cell) for summary in every)]
+        [
+            label.format(AIDS[name].label if name in besides else name),
+            *(_cell(summary, name, cell) for summary in every),
+        ]
         for name, table in (tables | dict.fromkeys(besides, HEIGHT_ROWS)).items()
         for label, cell in table
-    ]  # fmt: skip
+    ]
 
 
 def _cell(summary: Summary, name: str, cell: Callable[[Any], str]) -> str:
@@ -94,9 +96,14 @@ def sweep_table(made_of: Counterfactual) -> tuple[list[str], list[list[str]]]:
             cells = [both[0], *(cell(one) for _, cell in ROWS[1:]), *both[1:]]
         rows.append([number_words(one.changed[name]), *cells])
     head = [
-        f"{name} ({unit})" if unit else name, "mean NIS N/E", "rejected", "longest gap (s)",
-        "resets", "σ_p N/E (m)", "RMSE to truth N/E (m)",
-    ]  # fmt: skip
+        f"{name} ({unit})" if unit else name,
+        "mean NIS N/E",
+        "rejected",
+        "longest gap (s)",
+        "resets",
+        "σ_p N/E (m)",
+        "RMSE to truth N/E (m)",
+    ]
     return head, rows
 
 

@@ -30,9 +30,18 @@ from px4fuse.trajectory.graph.analysis import SolvedGraph
 
 # Parts of an analysis that are written as they are
 _AS_FOUND = (
-    "axes", "horizontal", "tuning", "clock", "heading", "ekf2_replay", "why", "causes", "loop",
-    "notes", "missing",
-)  # fmt: skip
+    "axes",
+    "horizontal",
+    "tuning",
+    "clock",
+    "heading",
+    "ekf2_replay",
+    "why",
+    "causes",
+    "loop",
+    "notes",
+    "missing",
+)
 
 
 def results(
@@ -137,9 +146,11 @@ def log_part(flight: Flight) -> Log:
 
 
 def _begun(
-    name: str, request: ComparisonRequest | WhatIfRequest, flight: Flight,
+    name: str,
+    request: ComparisonRequest | WhatIfRequest,
+    flight: Flight,
     command: str | None = None,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """What all results of a flight have: which they are, what was asked of which log, versions."""
     return {
         "schema": schema_of(name),

@@ -182,10 +182,14 @@ def _barometer(inputs: Inputs, done: Run, track: TopicTrack) -> list[Topic]:
     noise = np.full(len(step), inputs.settings[BAROMETER.noise] ** 2)
     return [
         _aid_source(
-            BAROMETER, inputs.settings, track.stamps(step, taken_s),
-            measured, (innovation, variance, noise), (rejected > 0, fused > 0),
+            BAROMETER,
+            inputs.settings,
+            track.stamps(step, taken_s),
+            measured,
+            (innovation, variance, noise),
+            (rejected > 0, fused > 0),
         )
-    ]  # fmt: skip
+    ]
 
 
 def _of_field(inputs: Inputs, done: Run, track: TopicTrack, attitude_hz: float) -> list[Topic]:
@@ -204,17 +208,21 @@ def _of_field(inputs: Inputs, done: Run, track: TopicTrack, attitude_hz: float) 
     told = np.flatnonzero(sensors.thinned(sensors.seconds(track.time_us[: -track.lag]), FLAGS_HZ))
     return [
         sensors.attitude_topic(
-            "vehicle_attitude", track.time_us[published], PUBLISHED_LATER_US,
+            "vehicle_attitude",
+            track.time_us[published],
+            PUBLISHED_LATER_US,
             track.attitude[published],
         ),
         _aid_source(
-            MAG, settings, track.stamps(rows), last,
-            (innovation, variance, noise), (~taken, taken),
+            MAG,
+            settings,
+            track.stamps(rows),
+            last,
+            (innovation, variance, noise),
+            (~taken, taken),
         ),
-        topic(
-            "estimator_status", track.stamps(told) | {"control_mode_flags": 1 << MAG_3D_BIT}
-        ),
-    ]  # fmt: skip
+        topic("estimator_status", track.stamps(told) | {"control_mode_flags": 1 << MAG_3D_BIT}),
+    ]
 
 
 def _aid_source(

@@ -65,9 +65,10 @@ class Ramps:
         """Position, velocity, acceleration and jerk, each of shape (n, k), from zero at rest."""
         velocity_before = np.cumsum(self.change, axis=0) - self.change
         # a whole ramp moves by half its length times its change, and by the speed before
-        gained = velocity_before[:-1] * np.diff(self.start_s)[:, None] + self.change[:-1] * (
-            np.diff(self.start_s) - self.length_s[:-1] / 2.0
-        )[:, None]  # fmt: skip
+        gained = (
+            velocity_before[:-1] * np.diff(self.start_s)[:, None]
+            + self.change[:-1] * (np.diff(self.start_s) - self.length_s[:-1] / 2.0)[:, None]
+        )
         position_before = np.vstack([np.zeros((1, self.change.shape[1])), np.cumsum(gained, 0)])
         at = np.maximum(np.searchsorted(self.start_s, time_s, side="right") - 1, 0)
         length = self.length_s[at]

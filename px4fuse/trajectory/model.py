@@ -34,9 +34,13 @@ AxisLengths = Annotated[dict[str, float], Meta(min_length=3, max_length=3)]
 
 # Where what is negative along an axis lies
 OPPOSITE = {
-    "north": "south", "east": "west", "up": "down", "down": "up", "forward": "back",
+    "north": "south",
+    "east": "west",
+    "up": "down",
+    "down": "up",
+    "forward": "back",
     "right": "left",
-}  # fmt: skip
+}
 
 
 def in_words(vector_m: Mapping[str, float]) -> str:
@@ -46,10 +50,11 @@ def in_words(vector_m: Mapping[str, float]) -> str:
     ('1.00 m forward, 0.50 m left', '-1.00 m along x')
     """
     return ", ".join(
-        f"{value:.2f} m along {name}" if name not in OPPOSITE
+        f"{value:.2f} m along {name}"
+        if name not in OPPOSITE
         else f"{abs(value):.2f} m {OPPOSITE[name] if value < 0.0 else name}"
         for name, value in vector_m.items()
-    )  # fmt: skip
+    )
 
 
 def by_axis(frame: Frame, vector_m: Array) -> dict[str, float]:
@@ -131,8 +136,13 @@ class Trajectory:
         ----------
         chosen : slice, boolean array of shape (n,), or integer array
         """
-        every = ("time_s", "position_m", "rotation", "position_variance_m2",
-                 "rotation_variance_rad2")  # fmt: skip
+        every = (
+            "time_s",
+            "position_m",
+            "rotation",
+            "position_variance_m2",
+            "rotation_variance_rad2",
+        )
         known: dict[str, Any] = {name: getattr(self, name) for name in every}
         some = {name: values[chosen] for name, values in known.items() if values is not None}
         return replace(self, **some)

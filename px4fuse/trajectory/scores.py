@@ -261,9 +261,16 @@ def relative_error(
         interval = rmse_interval(translation, what, min_block=overlap)
         scores = statistics(translation), interval, statistics(rotation)
     return PairwiseError(
-        delta.value, delta.unit, all_pairs, "reference", *scores,
-        start=start, end=end, translation_error_m=translation, rotation_error_deg=rotation,
-    )  # fmt: skip
+        delta.value,
+        delta.unit,
+        all_pairs,
+        "reference",
+        *scores,
+        start=start,
+        end=end,
+        translation_error_m=translation,
+        rotation_error_deg=rotation,
+    )
 
 
 def rotations_of(

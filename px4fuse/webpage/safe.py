@@ -66,10 +66,12 @@ def local_link(path: str) -> str:
 def template(name: str) -> Template:
     """A template of the package: text from data is clean and escaped in it, whatever it is."""
     environment = Environment(
-        loader=PackageLoader("px4fuse", ""), autoescape=True, trim_blocks=True,
+        loader=PackageLoader("px4fuse", ""),
+        autoescape=True,
+        trim_blocks=True,
         finalize=lambda value: clean(value) if type(value) is str else value,
         undefined=StrictUndefined,
-    )  # fmt: skip
+    )
     return environment.get_template(name)
 
 

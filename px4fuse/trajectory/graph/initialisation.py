@@ -61,9 +61,13 @@ def _chordal(graph: PoseGraph) -> PoseGraph:
     eye = np.broadcast_to(np.eye(d), measured.shape)
     # of the transposed rotations Y: sum of spin |Z' Y_i - Y_j|^2
     relaxed = _solved(
-        graph, measured.transpose(0, 2, 1), -eye, spin[:, None, None] * eye, 0.0 * measured,
+        graph,
+        measured.transpose(0, 2, 1),
+        -eye,
+        spin[:, None, None] * eye,
+        0.0 * measured,
         lie.rotation_matrix(graph.poses[0]).T,
-    )  # fmt: skip
+    )
     rotation = _nearest_rotations(relaxed.transpose(0, 2, 1))
     # Residual of an edge in the axes of the measured pose: (R_i Z)' (t_j - t_i - R_i z)
     from_i = rotation[graph.first]
@@ -81,9 +85,13 @@ def _chordal(graph: PoseGraph) -> PoseGraph:
 
 
 def _solved(
-    graph: PoseGraph, of_first: Array, of_second: Array, information: Array, value: Array,
+    graph: PoseGraph,
+    of_first: Array,
+    of_second: Array,
+    information: Array,
+    value: Array,
     held: Array,
-) -> Array:  # fmt: skip
+) -> Array:
     """Least squares as :func:`normal_equations` has them, shape (n, d, k)."""
     found = solve_with(*normal_equations(graph, of_first, of_second, information, value, held))
     if found is None:

@@ -175,9 +175,12 @@ def _minimise(
         jacobian = lie.right_jacobian_inverse(state.residual)
         back = jacobian @ lie.adjoint(lie.inverse(state.relative))
         matrix, downhill = normal_equations(
-            graph, -back, jacobian, weights[:, None, None] * graph.information,
+            graph,
+            -back,
+            jacobian,
+            weights[:, None, None] * graph.information,
             -state.residual[..., None],
-        )  # fmt: skip
+        )
         while True:
             drop, promised, flat = 0.0, 0.0, False
             step = solve_with(matrix, downhill, damping)
