@@ -83,10 +83,13 @@ def progress(output: Path | None = None) -> Iterator[ShowStep]:
     from rich import progress as bars
 
     columns = (
-        bars.SpinnerColumn(), bars.TextColumn("{task.description}", markup=False), bars.BarColumn(),
-        bars.TextColumn("{task.fields[count]}"), bars.TimeElapsedColumn(),
+        bars.SpinnerColumn(),
+        bars.TextColumn("{task.description}", markup=False),
+        bars.BarColumn(),
+        bars.TextColumn("{task.fields[count]}"),
+        bars.TimeElapsedColumn(),
         bars.TimeRemainingColumn(),
-    )  # fmt: skip
+    )
     with bars.Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("starting", total=None, count="")
 

@@ -116,9 +116,13 @@ def number_changes(
     """
     for path in {**first, **second}:
         a, b = first.get(path), second.get(path)
-        if a and b and math.isclose(
-            a.value, b.value, rel_tol=RELATIVE_TOLERANCE, abs_tol=ABSOLUTE_TOLERANCE
-        ):  # fmt: skip
+        if (
+            a
+            and b
+            and math.isclose(
+                a.value, b.value, rel_tol=RELATIVE_TOLERANCE, abs_tol=ABSOLUTE_TOLERANCE
+            )
+        ):
             continue
         known = a or b
         assert known is not None

@@ -71,9 +71,10 @@ def _logs_in(given: str) -> list[FoundLog]:
         if files.isdir(root):
             every = files.find(root, detail=True)
             infos = {
-                path: info for path, info in every.items()
+                path: info
+                for path, info in every.items()
                 if PurePosixPath(path).suffix.lower() in SUFFIXES
-            }  # fmt: skip
+            }
         elif files.exists(root):  # of a device or pipe its worker says that it is none
             infos = {root: files.info(root) if files.isfile(root) else {}}
         else:

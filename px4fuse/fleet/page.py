@@ -19,10 +19,21 @@ FILES = (("The report (PDF)", "report"), ("The results (JSON)", "results"))
 # Unfolded, the table's columns stand under their own names: those of each axis, and the others
 BY_AXIS = [name for name, place in PLACES.items() if "{" in place]
 OF_LOG = [
-    name for name, place in PLACES.items()
-    if name not in (*BY_AXIS, "axis", "status", "reason", "remedy", "story", "findings", "results",
-                    "report")
-]  # fmt: skip
+    name
+    for name, place in PLACES.items()
+    if name
+    not in (
+        *BY_AXIS,
+        "axis",
+        "status",
+        "reason",
+        "remedy",
+        "story",
+        "findings",
+        "results",
+        "report",
+    )
+]
 FILTERS = (
     ("Status", "status", "Every status"),
     ("Vehicle", "vehicle", "Every vehicle"),
@@ -70,11 +81,14 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
             frame.words(log.get("firmware", "")),
             Cell(log["status"], log["status"], look=LOOKS[log["status"]]),
             *(_figure(log["factors"].get(whose), overstated_words) for whose in ("kf", "ekf2")),
-            *(_figure(log.get(name), number_words)
-              for name in ("sigma_z_m", "clock_offset_s", "position_rmse_m")),
-            Cell() if log["status"] == FAILED else
-            frame.figure(float(len(said)), below=few_words(said, 2)),
-        )  # fmt: skip
+            *(
+                _figure(log.get(name), number_words)
+                for name in ("sigma_z_m", "clock_offset_s", "position_rmse_m")
+            ),
+            Cell()
+            if log["status"] == FAILED
+            else frame.figure(float(len(said)), below=few_words(said, 2)),
+        )
         rows.append(Row(cells, tuple(log["tags"]), _details(log), _beside(log)))
     return frame.page(
         title=title,
@@ -155,8 +169,11 @@ def logs_of(table: pd.DataFrame) -> list[Log]:
     rows: dict[str, list[dict[str, Any]]] = defaultdict(list)
     present = (table.notna() & (table != "")).to_numpy()
     for row, there in zip(table.to_dict("records"), present, strict=True):
-        kept = {str(n): value for (n, value), is_there in zip(row.items(), there, strict=True)
-                if is_there}  # fmt: skip
+        kept = {
+            str(n): value
+            for (n, value), is_there in zip(row.items(), there, strict=True)
+            if is_there
+        }
         rows[str(row["log"])].append(kept)
     return [_log(axes) for axes in rows.values()]
 
@@ -171,14 +188,15 @@ def _log(rows: Sequence[Mapping[str, Any]]) -> Log:
     log |= {
         "name": log.get("name") or PurePosixPath(log["log"]).name or "nameless",
         "factors": {
-            whose: factor for whose in ("kf", "ekf2")
+            whose: factor
+            for whose in ("kf", "ekf2")
             if (factor := _overstated(main, f"{whose}_nis_mean")) is not None
         },
         "status": DONE if any(row["status"] == DONE for row in rows) else rows[0]["status"],
         "lacking": tuple(dict.fromkeys(one for one in lacking if any(one))),
         "axes": axes,
         "findings": [part for part in log.get("findings", "").split(BETWEEN_FINDINGS) if part],
-    }  # fmt: skip
+    }
     return log | {"tags": _tags(log)}
 
 

@@ -87,8 +87,10 @@ class _Run:
 def batch(
     paths: str | Path | Iterable[str | Path],
     output: str | Path | None = None,
-    *, reports: bool = False, **how: Any,
-) -> pd.DataFrame:  # fmt: skip
+    *,
+    reports: bool = False,
+    **how: Any,
+) -> pd.DataFrame:
     """Compare many logs, on this computer or a Dask cluster.
 
     In a session with a Dask client of its own (``distributed.Client``), that one's cluster does

@@ -451,7 +451,7 @@ def _corrected(corrections: Mapping[Way, Maybe[Correction]]) -> Scored:
     before = _ates(corrections.get("uncorrected"))
     pairs = [
         (before[name], now) for one in done for name, now in _ates(one).items() if before.get(name)
-    ]  # fmt: skip
+    ]
     if not pairs:
         return 1.0 + WITHOUT_REFERENCE, (
             ", and corrected the path, but not against a reference: with --reference its error "

@@ -163,10 +163,11 @@ def class_entries(
         attempts[place].append(_attempt(one, submission, course, place, everyone))
     most = max((one.of for one in graded), default=0.0)
     made = [
-        _chosen(attempts[at], course) if attempts[at]
+        _chosen(attempts[at], course)
+        if attempts[at]
         else Entry(person.name, person.student_id, None, of=most)
         for at, person in enumerate(everyone.people)
-    ]  # fmt: skip
+    ]
     nobody = "Neither the report nor the platform names anyone."
     note = "Not in the roster." if course.register.people else nobody
     made += [replace(entry, flags=(note, *entry.flags)) for *_, entry in attempts[None]]

@@ -135,10 +135,16 @@ COMMON: tuple[tuple[str, Callable[[Graded], object], Callable[[Graded], str]], .
     ("The same file as {}.", attrgetter("sha256"), attrgetter("submission")),
     ("The same student id as in {}.", lambda one: folded(one.student_id), attrgetter("submission")),
     ("The same log as {}.", attrgetter("log_sha256"), _who),
-    ("The same numbers to the last digit, from a log of another hash, as {}: a copy of the log.",
-     lambda one: one.verdict.status == "verified" and len(one.numbers) >= SAME_NUMBERS
-     and tuple(one.numbers.values()), attrgetter("log_sha256")),
-)  # fmt: skip
+    (
+        "The same numbers to the last digit, from a log of another hash, as {}: a copy of the log.",
+        lambda one: (
+            one.verdict.status == "verified"
+            and len(one.numbers) >= SAME_NUMBERS
+            and tuple(one.numbers.values())
+        ),
+        attrgetter("log_sha256"),
+    ),
+)
 
 
 def class_flags(graded: Sequence[Graded]) -> Mapping[str, Sequence[str]]:

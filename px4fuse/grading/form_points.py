@@ -192,11 +192,12 @@ def cure_share(wrong: Wrong, claim: Claim, truth: FormTruth) -> float:
     """What the parameter and its value are worth, by what they do to this flight."""
     value = claim.value_in_first_unit()
     worth = [
-        share if (low, high) == ANY
+        share
+        if (low, high) == ANY
         else share * (0.5 if value is None else _value_share(value, low, high, 0.5))
         for parameter, (low, high), share in cures(wrong, truth)
         if parameter == claim.parameter
-    ]  # fmt: skip
+    ]
     return max(worth, default=0.0)
 
 

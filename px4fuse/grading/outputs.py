@@ -50,9 +50,15 @@ NAMES_HEAD = ("pseudonym", "id", "name")
 # Columns of the class table, before and behind those of items and numbers
 FIRST = ("file", "student", "id", "status", "points", "pending points", "of", "deducted", "total")
 LAST = (
-    "handed in", "hours late", "pending", "comment", "flags", "other files", "reasons",
+    "handed in",
+    "hours late",
+    "pending",
+    "comment",
+    "flags",
+    "other files",
+    "reasons",
     "log SHA-256",
-)  # fmt: skip
+)
 BETWEEN = " | "
 # A list of reasons is cut where it would become longer than a sentence
 NAMED = 4
@@ -165,15 +171,28 @@ def nameless(entry: Entry, pseudonym: str) -> Entry:
     one = entry.counting
     if one is not None:
         one = Graded(
-            "", "", "", replace(one.verdict, reasons=(), differences=()),
+            "",
+            "",
+            "",
+            replace(one.verdict, reasons=(), differences=()),
             tuple(replace(item, comment="") for item in one.items),
             pending=one.pending and "Its points are pending.",
-            form=one.form, numbers=one.numbers, mistakes=one.mistakes,
-        )  # fmt: skip
+            form=one.form,
+            numbers=one.numbers,
+            mistakes=one.mistakes,
+        )
     return Entry(
-        pseudonym, "", one, (), entry.handed_in, entry.late_s, entry.deduction,
-        total=entry.total, of=entry.of, flags=("Flagged.",) * bool(entry.flags),
-    )  # fmt: skip
+        pseudonym,
+        "",
+        one,
+        (),
+        entry.handed_in,
+        entry.late_s,
+        entry.deduction,
+        total=entry.total,
+        of=entry.of,
+        flags=("Flagged.",) * bool(entry.flags),
+    )
 
 
 # ------------------------------------------------------------------ the class table
@@ -197,16 +216,26 @@ def csv_text(entries: Sequence[Entry]) -> str:
         one = entry.counting
         points = {item.title: item.points for item in one.items} if one else {}
         row: list[str | float | None] = [
-            one.submission if one else "", entry.student, None, one.status if one else "missing",
-            one.counted if one else None, one.points if one and one.counted is None else None,
-            entry.of, entry.deduction or None, entry.total,
+            one.submission if one else "",
+            entry.student,
+            None,
+            one.status if one else "missing",
+            one.counted if one else None,
+            one.points if one and one.counted is None else None,
+            entry.of,
+            entry.deduction or None,
+            entry.total,
             *map(points.get, items),
             *(one.numbers.get(title) if one else None for title in numbers),
-            entry.handed_in, None if entry.late_s is None else entry.late_s / 3600.0,
-            one.pending if one else "", entry.comment, BETWEEN.join(entry.flags),
+            entry.handed_in,
+            None if entry.late_s is None else entry.late_s / 3600.0,
+            one.pending if one else "",
+            entry.comment,
+            BETWEEN.join(entry.flags),
             BETWEEN.join(other.submission for other in entry.others),
-            BETWEEN.join(one.verdict.reasons) if one else "", one.log_sha256 if one else "",
-        ]  # fmt: skip
+            BETWEEN.join(one.verdict.reasons) if one else "",
+            one.log_sha256 if one else "",
+        ]
         cells = [neutral(part) if isinstance(part, str) else number(part) for part in row]
         cells[FIRST.index("id")] = neutral_id(entry.student_id)
         rows.append(tuple(cells))
@@ -238,9 +267,13 @@ def returned_text(entry: Entry, class_name: str = "") -> str:
 
 def _wrapped(text: str, indent: str = "") -> str:
     return textwrap.fill(
-        text, 88, initial_indent=indent, subsequent_indent=indent, break_long_words=False,
+        text,
+        88,
+        initial_indent=indent,
+        subsequent_indent=indent,
+        break_long_words=False,
         break_on_hyphens=False,
-    )  # fmt: skip
+    )
 
 
 # ------------------------------------------------------------------ platforms' tables
@@ -266,8 +299,11 @@ def grade_column(sheet: Sheet, wanted: str) -> int:
     }
     usual = sheet.column(GRADE)
     assignments = [at for at in titles if ASSIGNMENT.search(titles[at])]
-    named = [at for at, title in titles.items()
-             if folded(wanted) in (folded(title), folded(ASSIGNMENT.sub("", title)))]  # fmt: skip
+    named = [
+        at
+        for at, title in titles.items()
+        if folded(wanted) in (folded(title), folded(ASSIGNMENT.sub("", title)))
+    ]
     found = assignments if usual is None else [usual]
     # the title may be meant for another table than Moodle's
     if wanted and (named or sheet.column(("identifier",)) is None):
@@ -323,8 +359,11 @@ def filled(
         row[place] = number(total).replace(".", "," if comma else ".")
         if comments is not None and comments != place:
             row[comments] = as_read(feedback[at])
-    left = [names[at] for at in range(len(register.people))
-            if at not in seen and entries[at].total is not None]  # fmt: skip
+    left = [
+        names[at]
+        for at in range(len(register.people))
+        if at not in seen and entries[at].total is not None
+    ]
     if left:
         notes.append(f"{sheet.path.name}: it has no row for {few_words(left, 4)}.")
     return replace(sheet, rows=tuple(map(tuple, cells))), tuple(notes)

@@ -307,12 +307,14 @@ def _unpacked(archive: zipfile.ZipFile, name: str) -> bytes:
     known = entry.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
     for wrong, why in (
         (entry.flag_bits & _ENCRYPTED, "encrypted in its zip file."),
-        (stat.S_ISLNK(entry.external_attr >> 16),
-         "a symbolic link in its zip file, which is not followed."),
+        (
+            stat.S_ISLNK(entry.external_attr >> 16),
+            "a symbolic link in its zip file, which is not followed.",
+        ),
         (not known, "packed in its zip file by a method that is not read."),
         (entry.file_size > MAX_BYTES, _TOO_LARGE),
         (not small, f"it shrinks more than {MAX_RATIO} times in its zip file: no report."),
-    ):  # fmt: skip
+    ):
         if wrong:
             raise _EntryError(why)
     # zipfile gives no more than the declared size

@@ -271,8 +271,11 @@ def _attachment(reader: pypdf.PdfReader) -> bytes:
     if len(files) != 1 or len(streams) != 1:
         raise ResultsError.of("attachments_many")
     (file,), (stream,) = files, streams.values()
-    names = {str(_resolved(file.get(key))) for key in ("/UF", "/F", "/DOS", "/Mac", "/Unix")
-             if key in file}  # fmt: skip
+    names = {
+        str(_resolved(file.get(key)))
+        for key in ("/UF", "/F", "/DOS", "/Mac", "/Unix")
+        if key in file
+    }
     if names != {RESULTS_NAME}:
         shown = one_line(" / ".join(sorted(names)), 80)
         raise ResultsError(f"the attached file is called {shown!r}, not {RESULTS_NAME!r}.")

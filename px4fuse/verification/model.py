@@ -5,8 +5,14 @@ from typing import Literal
 
 # What Python raises where a value in a broken file is of another type, out of range or not there
 BAD_VALUES = (
-    ArithmeticError, AssertionError, LookupError, OSError, RuntimeError, TypeError, ValueError,
-)  # fmt: skip
+    ArithmeticError,
+    AssertionError,
+    LookupError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
 # Of the numbers; the comparison of pages is a result of its own
 Status = Literal["verified", "numbers differ", "other log", "cannot verify"]
 PageStatus = Literal["same", "differ", "not compared"]

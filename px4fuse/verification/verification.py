@@ -49,9 +49,16 @@ RELATIVE, ABSOLUTE = 1e-6, 1e-9
 # more than three digits of these.
 ESTIMATE_RELATIVE, ESTIMATE_ABSOLUTE = 1e-3, 1e-5
 ESTIMATES = (
-    "tuning", "clock", "ekf2_replay", "why", "findings", "loop.closures", "loop.corrections",
-    "source.alignment", "settings.clock_offset_s",
-)  # fmt: skip
+    "tuning",
+    "clock",
+    "ekf2_replay",
+    "why",
+    "findings",
+    "loop.closures",
+    "loop.corrections",
+    "source.alignment",
+    "settings.clock_offset_s",
+)
 # How often a solver went round
 ITERATIONS, MORE_ITERATIONS = "iterations", 2
 # What tells the machine that a report was made on, and no number of it
