@@ -277,6 +277,13 @@ def bookmark(writer: PdfWriter) -> None:
     )
 
 
+def spread_text(content: bytes, writer: PdfWriter) -> bytes:
+    """A 2 for the first 1 on page 1, far from the letters before it."""
+    letters = glyphs(font("/f0")(writer))
+    one, two = (text(letters[digit]) for digit in "12")
+    return content.replace(one, b")-9000(" + two, 1)
+
+
 def other_digit(writer: PdfWriter) -> None:
     """A 2 for the first 1 on page 1."""
     letters = glyphs(font("/f0")(writer))
@@ -350,6 +357,9 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     "the colour of the verdict": (
         content(once(rb"/c0 cs [\d. ]+ scn", b"/c0 cs 0 0.6 0 scn")), "drawing operation", False,
     ),
+    "a colour a little": (
+        content(once(rb"/c0 cs 0\.3\d+ 0\.3", b"/c0 cs 0.5 0.3")), "drawing operation", False,
+    ),
     "another digit": (other_digit, "its text has", False),
     "a white rectangle": (drawn(WHITE), "drawing operation", False),
     "points of a plot erased": (
@@ -368,7 +378,7 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     ),
     "a text enlarged": (content(once(rb"/f0 8 Tf", b"/f0 9 Tf")), "drawing operation", False),
     "a text squeezed": (
-        content(once(rb"1 0 0 -1 0 0 Tm", b"0.1 0 0 -1 0 0 Tm")), "drawing operation", False,
+        content(once(rb"1 0 0 -1 0 0 Tm", b"0.8 0 0 -1 0 0 Tm")), "drawing operation", False,
     ),
     "a text invisible": (content(once(rb"BT 0 Tr", b"BT 3 Tr")), "drawing operation", False),
     "a letter far aside": (
@@ -709,6 +719,11 @@ def test_compare_pages_rounded_number_is_equal(pdf: bytes) -> None:
     ((theirs, ours),) = [pair for pair in asked if pair[0] != pair[1]]
     assert same_words(theirs, ours, lambda *_: True)
     assert not same_words(theirs, ours, Rounding(()))
+    # its letters stand where they stood
+    digit = once(rb"(?<=\))(-?[\d.]+)(?=\()", b"-9000")
+    assert compared(forged(made, on_page(1, digit)), made, alike=alike) != ()
+    spread = forged(pdf, lambda w: on_page(1, lambda c: spread_text(c, w))(w))
+    assert compared(spread, pdf, alike=alike) != ()
 
 
 # -- other libraries ----------------------------------------------------------------------------
