@@ -277,6 +277,13 @@ def bookmark(writer: PdfWriter) -> None:
     )
 
 
+def spread_text(content: bytes, writer: PdfWriter) -> bytes:
+    """A 2 for the first 1 on page 1, far from the letters before it."""
+    letters = glyphs(font("/f0")(writer))
+    one, two = (text(letters[digit]) for digit in "12")
+    return content.replace(one, b")-9000(" + two, 1)
+
+
 def other_digit(writer: PdfWriter) -> None:
     """A 2 for the first 1 on page 1."""
     letters = glyphs(font("/f0")(writer))
@@ -350,6 +357,9 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     "the colour of the verdict": (
         content(once(rb"/c0 cs [\d. ]+ scn", b"/c0 cs 0 0.6 0 scn")), "drawing operation", False,
     ),
+    "a colour a little": (
+        content(once(rb"/c0 cs 0\.3\d+ 0\.3", b"/c0 cs 0.5 0.3")), "drawing operation", False,
+    ),
     "another digit": (other_digit, "its text has", False),
     "a white rectangle": (drawn(WHITE), "drawing operation", False),
     "points of a plot erased": (
@@ -368,7 +378,7 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     ),
     "a text enlarged": (content(once(rb"/f0 8 Tf", b"/f0 9 Tf")), "drawing operation", False),
     "a text squeezed": (
-        content(once(rb"1 0 0 -1 0 0 Tm", b"0.1 0 0 -1 0 0 Tm")), "drawing operation", False,
+        content(once(rb"1 0 0 -1 0 0 Tm", b"0.8 0 0 -1 0 0 Tm")), "drawing operation", False,
     ),
     "a text invisible": (content(once(rb"BT 0 Tr", b"BT 3 Tr")), "drawing operation", False),
     "a letter far aside": (
@@ -395,6 +405,7 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     "an inline image": (
         drawn(b"BI /W 1 /H 1 /BPC 8 /CS /G ID \xff EI"), "drawing operation", False,
     ),
+    "a long content": (content(lambda c: c * 5), "/Contents: its content", False),
     "a comment": (content(lambda c: c + b"\n% x\n"), "drawing operation", False),
     "a second content stream": (second_content, "/Contents is of another type", True),
     "an array of contents": (contents_in_an_array, "/Contents is of another type", True),
@@ -708,6 +719,11 @@ def test_compare_pages_rounded_number_is_equal(pdf: bytes) -> None:
     ((theirs, ours),) = [pair for pair in asked if pair[0] != pair[1]]
     assert same_words(theirs, ours, lambda *_: True)
     assert not same_words(theirs, ours, Rounding(()))
+    # its letters stand where they stood
+    digit = once(rb"(?<=\))(-?[\d.]+)(?=\()", b"-9000")
+    assert compared(forged(made, on_page(1, digit)), made, alike=alike) != ()
+    spread = forged(pdf, lambda w: on_page(1, lambda c: spread_text(c, w))(w))
+    assert compared(spread, pdf, alike=alike) != ()
 
 
 # -- other libraries ----------------------------------------------------------------------------
@@ -750,11 +766,11 @@ def test_compare_pages_beyond_limits_is_a_difference(
     pdf: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In a process of its own."""
-    slow = forged(pdf, on_page(1, lambda _: b"(a\\" * 2_000_000))
-    monkeypatch.setattr(pages, "TIMEOUT_S", 3.0)
-    (found,) = compared(slow, pdf)
+    monkeypatch.setattr(pages, "TIMEOUT_S", 0.001)
+    (found,) = compared(pdf, pdf)
     assert found.structural
     assert "within the limits" in found.what
+    monkeypatch.undo()
     assert compared(pdf, pdf) == ()
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from px4fuse.assignment.key import AnswerKey
 from px4fuse.errors import ResultsError
 from px4fuse.grading import submissions
-from px4fuse.grading.entries import NAME, Course, Overrides, class_entries, read_overrides
+from px4fuse.grading.entries import NAME, Course, class_entries, read_overrides
 from px4fuse.grading.model import Entry, Graded, Submission
 from px4fuse.grading.outputs import grade_column, write_class
 from px4fuse.grading.records import RECORDS, verified
@@ -83,37 +83,13 @@ def grade(
     unread = sorted(one.name for one in output.glob("overrides*") if one.name != NAME)
     renamed = [f"{one_line(name, 80)}: not read; only {NAME} is." for name in unread]
     found, notes = submissions.collect(paths)
-    entries, unknown, reused = grade_all(
-        found, course, output / RECORDS, overrides, processes, progress
-    )
-    written, more = write_class(entries, course, output)
-    return GradeOutcome(entries, (*notes, *renamed, *unknown, *more), reused, written)
-
-
-def grade_all(
-    found: Sequence[Submission],
-    course: Course,
-    records: Path,
-    overrides: Overrides,
-    processes: int | None = None,
-    progress: Callable[[int, int], None] = lambda done, of: None,
-) -> tuple[tuple[Entry, ...], tuple[str, ...], int]:
-    """Verify, or recall, and score every file, each within bounds, and lay out the class.
-
-    Returns
-    -------
-    entries, notes
-        As :func:`~px4fuse.grading.entries.class_entries` gives them.
-    reused : int
-        How many reports were recalled.
-    """
     jobs = []
     for submission in found:
         place = course.register.place(submission.origin.person)
         owner = "" if place is None else course.register.people[place].student_id
         jobs.append((submission, owner))
     rules, logs = (course.rubric, course.key), files_by_sha256(course.logs)
-    scored = partial(grade_one, *rules, logs, records, max_log_bytes.get())
+    scored = partial(grade_one, *rules, logs, output / RECORDS, max_log_bytes.get())
     made: dict[int, Graded] = {}
     reused = 0
     progress(0, len(found))
@@ -131,7 +107,9 @@ def grade_all(
             reused += recalled
             progress(len(made), len(found))
     graded = [made[index] for index in range(len(found))]
-    return (*class_entries(graded, found, course, overrides), reused)
+    entries, unknown = class_entries(graded, found, course, overrides)
+    written, more = write_class(entries, course, output)
+    return GradeOutcome(entries, (*notes, *renamed, *unknown, *more), reused, written)
 
 
 def grade_one(
