@@ -329,6 +329,39 @@ def test_parameters_that_are_no_numbers(tmp_path, parameter, value):
         assert np.isfinite(track.samples.index).all()
 
 
+@pytest.mark.parametrize(
+    ("parameter", "value", "note"),
+    [
+        ("EKF2_GYR_NOISE", 1e30, "1e+30 rad/s is outside PX4's range 0.0001 to 0.1; "
+         "the default 0.015 is used."),
+        ("EKF2_PREDICT_US", -1.0, "-1 µs is outside PX4's range 1000 to 20000; "
+         "the default 10000 is used."),
+        ("EKF2_EVV_GATE", 0.0, "0 SD is outside PX4's range 1 to 1000; the default 3 is used."),
+        ("EKF2_EV_POS_X", 1e30, "1e+30 m is outside PX4's range -100 to 100; "
+         "the default 0 is used."),
+        ("EKF2_ACC_NOISE", np.nan, "is not a finite number; the default 0.35 is used."),
+        ("SDLOG_PROFILE", np.inf, "is not a finite number and is not used."),
+    ],
+)  # fmt: skip
+def test_parameter_out_of_range_becomes_default_with_note(tmp_path, parameter, value, note):
+    log = rich_log()
+    log.parameters[parameter] = value
+    flight = read_of(log, tmp_path)
+    assert [said for said in flight.log.notes if parameter in said] == [f"{parameter} {note}"]
+    assert flight.log.parameters.get(parameter) != value
+    assert flight.ekf2.step_s == 0.01
+    assert all(aid.parameters.get(parameter) != value for aid in flight.ekf2.aids.values())
+
+
+def test_parameter_at_float32_end_of_range_is_kept(tmp_path):
+    log = make_log("v1.16", 2.0)
+    lowest = float(np.float32(0.01))  # 0.0099999998
+    log.parameters |= {"EKF2_EVP_NOISE": lowest, "EKF2_GYR_NOISE": float(np.float32(0.1))}
+    flight = read_of(log, tmp_path)
+    assert flight.log.parameters["EKF2_EVP_NOISE"] == lowest
+    assert flight.log.notes == ()
+
+
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_too_few_samples_of_everything(tmp_path, count):
     log = make_log("v1.16", 2.0)

@@ -22,7 +22,7 @@ from pyulog import ULog
 from pyulog.exceptions import ULogException
 
 from px4fuse.arrays import IntArray
-from px4fuse.ekf2_parameters import REPORTED
+from px4fuse.ekf2_parameters import REPORTED, valid_parameters
 from px4fuse.errors import LogError
 from px4fuse.plain import few_words
 from px4fuse.readers.layouts import Layout
@@ -288,7 +288,8 @@ def read_topics(name: str, content: bytes) -> Topics:
         notes += (_text(ulog.msg_info_dict, NOTE_KEY, ""),)
     zero_us, end_us = _data_span(placed, name)
     every = ulog.initial_parameters.items()
-    given = {of: float(v) for of, v in every if isinstance(v, int | float) and np.isfinite(v)}
+    numbers = {name: float(v) for name, v in every if isinstance(v, int | float)}
+    given, faults = valid_parameters(numbers)
     log = LogInfo(
         name=name,
         sha256=hashlib.sha256(content).hexdigest(),
@@ -304,7 +305,7 @@ def read_topics(name: str, content: bytes) -> Topics:
             for d in ulog.dropouts
         ),
         parameters=MappingProxyType({name: given[name] for name in REPORTED if name in given}),
-        notes=notes,
+        notes=(*notes, *faults),
         damage=_corruption(ulog, chatter.getvalue()),
         bytes_read=len(content) - framing.lost_bytes,
         autopilot=_text(ulog.msg_info_dict, "sys_name", "PX4"),
