@@ -25,7 +25,7 @@ from px4fuse.arrays import IntArray
 from px4fuse.ekf2_parameters import REPORTED, valid_parameters
 from px4fuse.errors import LogError
 from px4fuse.plain import few_words
-from px4fuse.readers.layouts import Layout
+from px4fuse.readers.layouts import IMPOSSIBLE, Layout
 from px4fuse.readers.px4_topics import IMU, LAYOUTS, topics
 from px4fuse.readers.ulog_framing import Framing, whole_messages
 from px4fuse.recording import Dropout, LogInfo, Stream
@@ -143,7 +143,7 @@ class Topics:
                 },
                 index=pd.Index((time_us[keep] - self.zero_us) * _MICROSECOND, name="time_s"),
             )
-        frame = frame.where(np.isfinite(frame))  # an infinite value is as unusable as NaN
+        frame = frame.where(np.abs(frame) < IMPOSSIBLE)  # such a value is as unusable as NaN
         # what lies outside the span of the data by more than the margin is dropped
         end = self.log.duration_s + WINDOW_MARGIN_S
         return frame if step else frame[(frame.index >= -WINDOW_MARGIN_S) & (frame.index <= end)]
