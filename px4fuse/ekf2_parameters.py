@@ -81,6 +81,8 @@ class Aid:
 AID_MASK = "EKF2_AID_MASK"
 # Since main of 2026 EKF2 takes a fix's own time of measurement, where the driver knows it
 GNSS_MODE = "EKF2_GPS_MODE"
+# Relative; half of the last digit of a float32 is 6e-8
+FLOAT32_ERROR = 1e-6
 # Age of a fix since v1.17, of the first receiver: EKF2 then takes the stamp with it taken off
 RECEIVER_DELAYS = ("SENS_GNSS0_DELAY", "SENS_GPS0_DELAY")
 
@@ -103,6 +105,18 @@ class Parameter:
     minimum: float
     maximum: float
 
+    def outside(self, value: float) -> str:
+        """Return the fault of a finite value outside the range; empty if it is inside.
+
+        Logs hold float32, in which the end 0.01 is 0.0099999998.
+        """
+        low = self.minimum - FLOAT32_ERROR * abs(self.minimum)
+        high = self.maximum + FLOAT32_ERROR * abs(self.maximum)
+        if low <= value <= high:
+            return ""
+        unit = f" {self.unit}" if self.unit else ""
+        return f" {value:g}{unit} is outside PX4's range {self.minimum:g} to {self.maximum:g}"
+
 
 TABLE = table(__file__, "ekf2_parameters.toml", dict)
 AIDS, DISTURBANCES = (
@@ -114,6 +128,8 @@ EV_POS, GNSS_POS, GNSS_VEL, GNSS_HGT, BAROMETER, FLOW, MAG = map(
     ("ev_pos", "gnss_pos", "gnss_vel", "gnss_hgt", "baro_hgt", "optical_flow", "mag"),
 )
 PARAMETERS = msgspec.convert(TABLE["parameters"], dict[str, Parameter])
+# Those of the model and all others of a log with which px4fuse computes
+RANGES = PARAMETERS | msgspec.convert(TABLE["logged"], dict[str, Parameter])
 FIELD_NOISES = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
 # Up to v1.13, ekf2_params.c
 OLD_DEFAULTS: Mapping[str, float] = {EV_POS.delay: 175.0}
@@ -151,6 +167,40 @@ def settings_in_force(
 def fuses_by_mask(logged: Mapping[str, float]) -> bool:
     """Whether the release is one that chooses aiding by EKF2_AID_MASK (up to v1.13)."""
     return AID_MASK in logged and EV_POS.switch not in logged
+
+
+def valid_parameters(logged: Mapping[str, float]) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Replace each parameter of a log that is not finite or outside PX4's range by its default.
+
+    Returns
+    -------
+    valid : dict
+        The same parameters; without those that are not finite and have no default here.
+    notes : tuple of str
+        One per parameter that was replaced or left out.
+
+    Examples
+    --------
+    >>> valid_parameters({"EKF2_EVP_GATE": 0.0, "SYS_AUTOSTART": 4001.0})[0]
+    {'EKF2_EVP_GATE': 5.0, 'SYS_AUTOSTART': 4001.0}
+    """
+    valid, notes = {}, []
+    defaults = {name: known.default for name, known in RANGES.items()}
+    if fuses_by_mask(logged):
+        defaults |= OLD_DEFAULTS
+    for name, value in logged.items():
+        known = RANGES.get(name)
+        finite = math.isfinite(value)
+        fault = "" if known is None else known.outside(value)
+        if finite and not fault:
+            valid[name] = value
+        elif known is None:
+            notes.append(f"{name} is not a finite number and is not used.")
+        else:
+            valid[name] = defaults[name]
+            said = fault if finite else " is not a finite number"
+            notes.append(f"{name}{said}; the default {valid[name]:g} is used.")
+    return valid, tuple(notes)
 
 
 def check(chosen: Mapping[str, float]) -> dict[str, float]:

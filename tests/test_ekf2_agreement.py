@@ -13,10 +13,13 @@ from exchange import replace
 from findings_tools import NONE, made
 
 from px4fuse.ekf2.replay import (
+    VELOCITY_UPDATE_COLUMNS,
     Agreement,
     AxisAgreement,
     Ekf2Replay,
     _axis,
+    _heading_off_deg,
+    _velocity,
     _verdict,
     agreement_with_log,
     logged_innovations,
@@ -24,7 +27,7 @@ from px4fuse.ekf2.replay import (
     settled,
     with_obedient,
 )
-from px4fuse.flight import Columns, Ekf2, Unavailable
+from px4fuse.flight import AidLog, Columns, Ekf2, FusionRecord, Unavailable
 
 AID = ("estimator_aid_src_ev_pos",)
 
@@ -133,6 +136,24 @@ def test_what_an_axis_is_compared_by():
     assert found.nis_mean_replayed == pytest.approx(np.mean((nu_log + 0.5) ** 2 / s))
     assert found.position_rms_difference_m == pytest.approx(math.sqrt(12.5))
     assert found.velocity_rms_difference_m_s == pytest.approx(0.25)
+
+
+def test_constant_velocity_innovations_have_no_correlation():
+    """np.corrcoef of a constant is NaN, with a warning."""
+    index = pd.Index(10.0 + np.arange(30.0))
+    updates = pd.DataFrame(0.1, index=index, columns=VELOCITY_UPDATE_COLUMNS)
+    columns = [f"{of}_{axis}" for of in ("innovation", "variance") for axis in ["north", "east"]]
+    samples = pd.DataFrame(0.1, index=index, columns=[*columns, "innovation_down", "variance_down"])
+    ekf2 = made(Ekf2, aids={"gnss_vel": made(AidLog, samples=samples)})
+    replay = SimpleNamespace(updates=updates, judged_s=((0.0, 99.0),), besides={})
+    assert _velocity(ekf2, replay, own=True) == ({}, True)
+
+
+def test_heading_without_a_logged_state_in_judged_time_is_absent():
+    delayed = pd.DataFrame(index=pd.Index([1.0]))
+    ekf2 = made(Ekf2, record=made(FusionRecord, delayed=delayed))
+    replay = SimpleNamespace(settings={"EKF2_MAG_NOISE": 0.05}, judged_s=((5.0, 9.0),))
+    assert _heading_off_deg(ekf2, replay) is None
 
 
 def compared(count: int, *, varying: bool = True) -> Agreement | Unavailable:

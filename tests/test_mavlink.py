@@ -397,6 +397,24 @@ def test_integer_parameters_are_bytes_in_px4_and_casts_in_ardupilot(read, autopi
     assert flight.ekf2.gate == 3.5
 
 
+def test_parameter_out_of_range_becomes_default_with_note(read):
+    recorder = Aisle().record()
+    for name, value in (
+        (b"EKF2_EVP_GATE", 0.0),
+        (b"EKF2_EVP_NOISE", 1e30),
+        (b"EKF2_EV_DELAY", 300.0),
+    ):
+        recorder.hear(unix(60.0), AUTOPILOT, parameter(name, value, by_bytes=True))
+    flight = read(recorder)
+    notes = [note for note in flight.log.notes if "EKF2_" in note]
+    assert notes == [
+        "EKF2_EVP_GATE 0 SD is outside PX4's range 1 to 1000; the default 5 is used.",
+        "EKF2_EVP_NOISE 1e+30 m is outside PX4's range 0.01 to 1000; the default 0.1 is used.",
+    ]
+    assert flight.ekf2.gate == 5.0
+    assert flight.log.parameters["EKF2_EV_DELAY"] == 300.0
+
+
 @pytest.mark.parametrize(
     "lacking", [(), ("VISION_POSITION_ESTIMATE",), ("HIGHRES_IMU", "ODOMETRY")]
 )

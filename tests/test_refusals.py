@@ -36,6 +36,7 @@ def desk(tmp_path_factory):
     binary = np.random.default_rng(0).bytes(5000)
     for name, content in {
         "a.ulg": (SAMPLES / "aisle_uwb.ulg").read_bytes(),
+        "deep.md": b"*" * 500 + b"a" + b"*" * 500,
         "a.tlog": (SAMPLES / "aisle_uwb.tlog").read_bytes(),
         "c.csv": (SAMPLES / "aisle_uwb_external.csv").read_bytes(),
         "l.ulg": (SAMPLES / "loop_vio.ulg").read_bytes(), "straight.ulg": make_log().encode(),
@@ -70,6 +71,10 @@ REFUSED = {
     "beyond the flight": ("compare a.ulg --start 500", "empty"),
     "end before start": ("compare a.ulg --start 50 --end 40", "empty"),
     "no such source": ("compare a.ulg --position-source nonsense", "no such source"),
+    "notes that nest": (
+        "compare a.ulg --notes deep.md",
+        "--notes deep.md: nested 251 deep, at most 100 are",
+    ),
     "no notes": ("compare a.ulg --notes absent.md", "absent.md"),
     "no report": ("compare a.ulg -o report.txt", "report.txt"),
     "a file as a folder": ("compare a.ulg -o n.md/r.pdf", "n.md"),

@@ -11,6 +11,7 @@ from scipy.interpolate import CubicSpline
 
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.comparison import compare
+from px4fuse.filter import coloured
 from px4fuse.filter.coloured import hanging_together
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.settings import Settings
@@ -229,6 +230,24 @@ def test_too_few_and_no_imu_are_said() -> None:
     assert "99" in found.reason
     blind = replace(analysis.flight, imu=Unavailable("IMU", "no IMU", ""))
     assert hanging_together(blind, (axis,), RIGHT, Noises(0.3, 0.1), **given) == blind.imu
+
+
+def test_slow_error_is_searched_at_zero_and_at_the_clock_offset(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    analysis, tried = judged(MIXED), []
+
+    def none_better(moved: Any, offsets: list[float], noises: Any) -> tuple[float, Any]:
+        tried.append(offsets)
+        return 0.0, noises[0]
+
+    monkeypatch.setattr(coloured, "_best_of", none_better)
+    for offset_s in (0.0, 0.3, -0.2):
+        hanging_together(
+            analysis.flight, (analysis.axes["north"].axis,), RIGHT, Noises(0.3, 0.1),
+            outlier_time_s=NONE, clock_offset_s=offset_s,
+        )  # fmt: skip
+    assert tried[::2] == tried[1::2] == [[0.0], [0.0, 0.3], [-0.2, 0.0]]
 
 
 def test_a_slow_error_shows_beside_a_jump_and_outliers() -> None:

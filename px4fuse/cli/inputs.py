@@ -339,7 +339,7 @@ def read_person(given: dict[str, Any]) -> Student:
     Raises
     ------
     SettingsError
-        The notes or the answers cannot be read.
+        The notes or the answers cannot be read, or the notes cannot be drawn.
     """
     from msgspec import UNSET
 
@@ -349,7 +349,10 @@ def read_person(given: dict[str, Any]) -> Student:
     name, number = given.pop("student") or "", given.pop("student_id") or ""
     path, form, notes = given.pop("notes"), given.pop("answers"), ""
     if path is not None:
+        from px4fuse.report.notes import parse  # the report takes long to import
+
         notes = read_text(path, SettingsError, MAX_NOTES_BYTES, name=f"--notes {path}")
+        parse(notes, f"--notes {path}")  # before the analysis
     answers = UNSET if form is None else read_answers(form)
     person = Student(encodable(name), encodable(number), notes, answers)
     _tell_fonts(person.name + person.id + person.notes)

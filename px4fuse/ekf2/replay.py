@@ -1,6 +1,6 @@
 """What a replay of EKF2 gives, and whether it agrees with the log, so that it may be believed."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
 from px4fuse.ekf2.inputs import aid_source, replayed_aid, same_sample
 from px4fuse.ekf2.stretches import SETTLING_S
-from px4fuse.ekf2_parameters import AIDS, EV_POS, FLOW, GNSS_HGT, GNSS_POS, MAG
+from px4fuse.ekf2_parameters import AIDS, EV_POS, FLOW, GNSS_HGT, GNSS_POS, GNSS_VEL, MAG
 from px4fuse.filter import signals
 from px4fuse.filter.heading import heading_rad
 from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Columns, Ekf2, Flight, Truth, Unavailable
@@ -42,6 +42,7 @@ VELOCITY_UPDATE_COLUMNS = [
     *(f"innovation_variance_{axis}_m2_s2" for axis in AXIS_NAMES),
 ]
 MIN_SAMPLES = 20
+CONSTANT = "its logged or replayed innovations are constant"
 # The older topics repeat a sample until the next fusion, with the time of a later step
 MAX_REPEAT_S = 0.5
 # Measured on simulated flights of v1.13 to main: where the log is complete the correlation is
@@ -246,8 +247,7 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     log, model = _matched(replay, replay.updates, logged_innovations(ekf2), own=own)
     if len(log) < MIN_SAMPLES:
         return lacking("compared_few", count=len(log), least=MIN_SAMPLES)
-    columns = [f"innovation_{axis}_m" for axis in HORIZONTAL]
-    if not (np.ptp(log[columns], axis=0).all() and np.ptp(model[columns], axis=0).all()):
+    if _constant(log, model, HORIZONTAL):
         return lacking("innovations_constant")
     axes: dict[str, AxisAgreement]
     axes = {axis: _axis(axis, log, model, ekf2, replay) for axis in HORIZONTAL}
@@ -257,6 +257,9 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     good, reason = _verdict(axes, *shares)
     on_gnss = replayed_aid(ekf2) == GNSS_POS
     besides, doubtful = _besides(ekf2, replay)
+    velocity, constant = _velocity(ekf2, replay, own=own)
+    if constant:
+        doubtful[GNSS_VEL.name] = CONSTANT
     position = {GNSS_POS.name if on_gnss else EV_POS.name: axes}
     apart_m = np.hypot(north.position_rms_difference_m, east.position_rms_difference_m)
     carried_m = _carried_off_m(ekf2, replay)
@@ -269,7 +272,7 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     return Agreement(
         north=north,
         east=east,
-        gnss_vel=_velocity(ekf2, replay, own=own),
+        gnss_vel=velocity,
         **(position | besides),
         doubtful=doubtful,
         samples=len(log),
@@ -304,19 +307,32 @@ def _heading_off_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
         return None
     logged = ekf2.record.delayed
     logged = logged[settled(logged.index, replay.judged_s)]
+    if logged.empty:
+        return None
     ours = replay.delayed["heading_rad"]
     off = np.interp(logged.index, ours.index, np.unwrap(ours)) - heading_rad(logged)
     return float(np.degrees(rms(np.angle(np.exp(1j * off)))))
 
 
-def _velocity(ekf2: Ekf2, replay: Ekf2Replay, *, own: bool) -> dict[str, AxisAgreement]:
-    """Agreement of the velocity of GNSS; empty where it is not fused or not logged."""
+def _constant(logged: pd.DataFrame, model: pd.DataFrame, axes: Iterable[AxisName]) -> bool:
+    """Return True if the innovations of an axis are all equal: they have no correlation."""
+    columns = [f"innovation_{axis}_m" for axis in axes]
+    return not all(np.ptp(one[columns], axis=0).all() for one in (logged, model))
+
+
+def _velocity(
+    ekf2: Ekf2, replay: Ekf2Replay, *, own: bool
+) -> tuple[dict[str, AxisAgreement], bool]:
+    """Agreement of the velocity of GNSS, and whether there is none for constant innovations.
+
+    Empty where it is not fused or not logged.
+    """
     log = ekf2.aids.get("gnss_vel")
     if log is None or VELOCITY_UPDATE_COLUMNS[0] not in replay.updates:
-        return {}
+        return {}, False
     logged, model = _matched(replay, replay.updates, log.samples, own=own)
     if len(logged) < MIN_SAMPLES:
-        return {}
+        return {}, False
     names: dict[str, str] = {}  # those of a position
     for axis in AXIS_NAMES:
         nu, S = f"innovation_{axis}_m", f"innovation_variance_{axis}_m2"
@@ -325,7 +341,9 @@ def _velocity(ekf2: Ekf2, replay: Ekf2Replay, *, own: bool) -> dict[str, AxisAgr
     model = model[VELOCITY_UPDATE_COLUMNS].rename(columns=names)
     # down where the height is no longer EKF2's own
     axes = AXIS_NAMES if GNSS_HGT.name in replay.besides else HORIZONTAL
-    return {axis: _axis(axis, logged, model, ekf2, replay) for axis in axes}
+    if _constant(logged, model, axes):
+        return {}, True
+    return {axis: _axis(axis, logged, model, ekf2, replay) for axis in axes}, False
 
 
 def _besides(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, str]]:
@@ -339,6 +357,9 @@ def _besides(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, 
         logged, model = _matched(replay, updates, rows, own=own)
         if len(logged) < MIN_SAMPLES:
             doubtful[name] = f"{len(logged)} logged innovations are too few to compare with"
+            continue
+        if _constant(logged, model, axes_of(updates)):
+            doubtful[name] = CONSTANT
             continue
         found[name] = {axis: _axis(axis, logged, model, ekf2, replay) for axis in axes_of(updates)}
         shares = (float(np.mean(frame["rejected"] > 0.0)) for frame in (logged, model))

@@ -9,6 +9,7 @@ import numpy as np
 from px4fuse.arrays import Array
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.text_table import Rows, at_line, quote, text_of
+from px4fuse.readers.trajectory import MAX_VALUE
 from px4fuse.reading import read_whole, shown
 from px4fuse.trajectory.graph.initialisation import initialise
 from px4fuse.trajectory.graph.model import FROM_FILE, PoseGraph
@@ -163,6 +164,9 @@ def _parse(rows: Rows, tag: str) -> tuple[np.ndarray[Any, np.dtype[np.int64]], A
     rows.refuse_where(wrong.reshape(-1, named), what, "Give an integer.")
     remedy = "Correct it, or take the line out."
     rows.refuse_where(~np.isfinite(numbers), "a number that is not finite", remedy)
+    # of positions in m; of SE2 also the angle
+    far = np.abs(numbers[:, :3]) >= MAX_VALUE
+    rows.refuse_where(far, f"a value beyond {MAX_VALUE:.0e}", remedy)
     return words[:, 1:].astype(np.int64), numbers
 
 

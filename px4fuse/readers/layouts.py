@@ -11,6 +11,8 @@ import msgspec
 
 from px4fuse.flight import Columns
 
+# No field reaches it, flags and UNIX times in µs (1.8e15) included
+IMPOSSIBLE = 1e17
 GLOBAL_COLUMNS = ["latitude_deg", "longitude_deg", "altitude_m"]
 
 

@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 import pandas as pd
 
-from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, REPORTED, settings_in_force
+from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, REPORTED, settings_in_force, valid_parameters
 from px4fuse.flight import AXIS_NAMES, Columns, Ekf2, Flight, FlightMode, Unavailable
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import mavlink_senders as senders
@@ -59,7 +59,7 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     address, autopilot = senders.choose_autopilot(frames, system)
     recording = settle_clocks(frames, address)
     mapped = senders.map_senders(recording)
-    parameters = _read_parameters(recording, autopilot)
+    parameters, faults = valid_parameters(_read_parameters(recording, autopilot))
     remedies, _ = messages.remedies_of(autopilot)
     imu = _read_imu(recording, remedies["imu"])
     attitude = _read_attitude(recording, remedies["attitude"])
@@ -75,7 +75,7 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     modes = _read_modes(recording) if autopilot == "PX4" else messages.NO_MODES
     return Flight(
         # after all that is read, since it tells what was dropped
-        log=_describe(recording, parameters, autopilot, in_flight),
+        log=_describe(recording, parameters, faults, autopilot, in_flight),
         imu=imu,
         attitude=attitude,
         positions=positions,
@@ -221,7 +221,7 @@ def _read_modes(recording: Recording) -> tuple[FlightMode, ...] | Unavailable:
     return parts.stretches_of_modes(pd.Series(names, index=time_s), recording.duration_s)
 
 
-def _read_parameters(recording: Recording, autopilot: str) -> MappingProxyType[str, float]:
+def _read_parameters(recording: Recording, autopilot: str) -> dict[str, float]:
     """Parameters as first sent; PX4 puts the bytes of an integer into the float."""
     table = recording.frames.table("PARAM_VALUE", recording.rows("PARAM_VALUE"))
     by_bytes = (autopilot == "PX4") & (table["param_type"] < PARAMETER_REAL)
@@ -230,13 +230,17 @@ def _read_parameters(recording: Recording, autopilot: str) -> MappingProxyType[s
     found: dict[str, float] = {}
     for name, value in zip(table["param_id"].tolist(), values.tolist(), strict=True):
         text = name.decode(errors="replace")
-        if text in REPORTED and np.isfinite(value):
+        if text in REPORTED:
             found.setdefault(text, float(value))
-    return MappingProxyType(found)
+    return found
 
 
 def _describe(
-    recording: Recording, parameters: Mapping[str, float], autopilot: str, in_flight: bool
+    recording: Recording,
+    parameters: Mapping[str, float],
+    faults: tuple[str, ...],
+    autopilot: str,
+    in_flight: bool,
 ) -> LogInfo:
     frames = recording.frames
     end = (parts.cut_off("frame", recording.duration_s, in_flight),) if frames.in_frame else ()
@@ -267,8 +271,8 @@ def _describe(
         hardware=f"{kind} (MAVLink system {recording.address[0]})",
         boot_time_s=recording.zero_s,
         duration_s=recording.duration_s,
-        parameters=parameters,
-        notes=(*recording.notes, *dropped),
+        parameters=MappingProxyType(parameters),
+        notes=(*recording.notes, *faults, *dropped),
         restarts=recording.restarts,
         receipt_went_back=recording.receipt_went_back,
         dropped=dict(sorted(recording.dropped.items())),

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.flight import Columns
-from px4fuse.readers.layouts import Layout
+from px4fuse.readers.layouts import IMPOSSIBLE, Layout
 from px4fuse.readers.mavlink_clocks import UNIX_FROM_S, Line, least_delay, tells_time
 from px4fuse.readers.mavlink_frames import LONGEST_FRAME, Address, Frames, message_name, wire_layout
 from px4fuse.readers.mavlink_messages import FRAMES_OF_REFERENCE, STAMPED_BY_BOOT_CLOCK
@@ -120,7 +120,7 @@ class Recording:
             field_values = table[base][:, int(index)] if index else table[base]
             values[:, at] = field_values.astype(np.float64) * layout.scale.get(column, 1.0)
         del table
-        values[~np.isfinite(values)] = np.nan
+        values[~(np.abs(values) < IMPOSSIBLE)] = np.nan
         times = pd.Index(boot_s[keep] - self.zero_s, name="time_s")
         samples = pd.DataFrame(values, times, list(layout.columns), copy=False)
         if "roll" in samples:

@@ -57,13 +57,13 @@ def intentions(topics: Topics) -> dict[str, pd.Series[float]]:
         flags = topics.of_primary(
             Layout(px4.STATUS_FLAGS, dict(zip(known, known, strict=True))), step=True
         )
-        for aid in every:
+        for aid in every if len(flags) else ():
             group = next((group for group in aid.flags if {*group} <= {*known}), None)
             if group is not None:
                 meant[aid.name] = flags[list(group)].max(axis=1)
     if not known and topics.find(px4.LAYOUTS["control_bits"]) is not None:
         bits = topics.of_primary(px4.LAYOUTS["control_bits"], step=True)["bits"].dropna()
-        for aid in every:
+        for aid in every if len(bits) else ():
             if aid.bit is not None:
                 on = bits.to_numpy().astype(np.int64) >> aid.bit & 1
                 meant[aid.name] = pd.Series(on.astype(float), index=bits.index)

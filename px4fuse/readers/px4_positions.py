@@ -394,7 +394,8 @@ def read_truth(
     is not: the truth is moved there.
     """
     attitude = attitude_of(topics.read(px4.LAYOUTS["truth_attitude"]))
-    local = topics.read(px4.LAYOUTS["truth_local"]).dropna()
+    logged = topics.read(px4.LAYOUTS["truth_local"])
+    local = finite_rows(logged, logged.columns.tolist())
     geo = finite_rows(topics.read(px4.LAYOUTS["truth_global"]), GLOBAL_COLUMNS[:2])
     if len(local):
         if len(geo) and fuses(ekf2):
@@ -404,7 +405,10 @@ def read_truth(
         velocity = geo.reindex(columns=Columns.VELOCITY)
         samples = projected(geo, _local_origin(topics)).join(velocity)
         return Truth(px4.LAYOUTS["truth_global"].topic, samples, attitude)
-    return motion_capture(positions, "vehicle_mocap_odometry") or lacking("truth_not_logged")
+    captured = motion_capture(positions, "vehicle_mocap_odometry")
+    if captured is None and len(logged):
+        return lacking("truth_unusable", topic=px4.LAYOUTS["truth_local"].topic)
+    return captured or lacking("truth_not_logged")
 
 
 def _about_origin(local: pd.DataFrame, there: pd.DataFrame) -> pd.DataFrame:

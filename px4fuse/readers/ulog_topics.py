@@ -22,10 +22,10 @@ from pyulog import ULog
 from pyulog.exceptions import ULogException
 
 from px4fuse.arrays import IntArray
-from px4fuse.ekf2_parameters import REPORTED
+from px4fuse.ekf2_parameters import REPORTED, valid_parameters
 from px4fuse.errors import LogError
 from px4fuse.plain import few_words
-from px4fuse.readers.layouts import Layout
+from px4fuse.readers.layouts import IMPOSSIBLE, Layout
 from px4fuse.readers.px4_topics import IMU, LAYOUTS, topics
 from px4fuse.recording import Dropout, LogInfo, Stream
 
@@ -248,7 +248,7 @@ class Topics:
                 },
                 index=pd.Index((time_us[keep] - self.zero_us) * _MICROSECOND, name="time_s"),
             )
-        frame = frame.where(np.isfinite(frame))  # an infinite value is as unusable as NaN
+        frame = frame.where(np.abs(frame) < IMPOSSIBLE)  # such a value is as unusable as NaN
         # what lies outside the span of the data by more than the margin is dropped
         end = self.log.duration_s + WINDOW_MARGIN_S
         return frame if step else frame[(frame.index >= -WINDOW_MARGIN_S) & (frame.index <= end)]
@@ -392,7 +392,8 @@ def read_topics(name: str, content: bytes) -> Topics:
         notes += (_text(ulog.msg_info_dict, NOTE_KEY, ""),)
     zero_us, end_us = _data_span(placed, name)
     every = ulog.initial_parameters.items()
-    given = {of: float(v) for of, v in every if isinstance(v, int | float) and np.isfinite(v)}
+    numbers = {name: float(v) for name, v in every if isinstance(v, int | float)}
+    given, faults = valid_parameters(numbers)
     log = LogInfo(
         name=name,
         sha256=hashlib.sha256(content).hexdigest(),
@@ -408,7 +409,7 @@ def read_topics(name: str, content: bytes) -> Topics:
             for d in ulog.dropouts
         ),
         parameters=MappingProxyType({name: given[name] for name in REPORTED if name in given}),
-        notes=notes,
+        notes=(*notes, *faults),
         bytes_read=source.start - source.skipped_bytes,
         autopilot=_text(ulog.msg_info_dict, "sys_name", "PX4"),
         vehicle=_text(ulog.msg_info_dict, "sys_uuid", ""),

@@ -303,6 +303,11 @@ def graph_summary(solved: SolvedGraph) -> Page:
         page.labelled("Gate", f"rejects {len(rejected)} of {len(gates)} closures", *said)
     if len(solved.solutions) == 1 and (~solved.graph.successive).sum() > MANY_CLOSURES:
         page.labelled("Robust", "left out for so many closures: --robust takes minutes")
+    unsolved = [SOLUTIONS[key] for key, one in solved.solutions.items() if not one.converged]
+    if unsolved:
+        page.labelled(
+            "Solver", f"not converged: {', '.join(unsolved)}. Its cost is not the minimum"
+        )
     rows = [
         [
             SOLUTIONS[key],

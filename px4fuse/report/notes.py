@@ -10,22 +10,27 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from html.entities import html5
+from itertools import accumulate
 from typing import TYPE_CHECKING
 
 from px4fuse.analysis import Analysis
 from px4fuse.answers import Answers, form_rows
+from px4fuse.errors import SettingsError
 from px4fuse.report.page import Page, appendix
 from px4fuse.report.style import MUTED
 from px4fuse.results.contract import AidsResults, ComparisonResults, LoopResults
 
 if TYPE_CHECKING:
     from markdown_it.rules_inline import StateInline
+    from markdown_it.token import Token
     from markdown_it.tree import SyntaxTreeNode
 
 BODY_SIZE = 8.5
 HEADING_SIZES = {"h1": 12.0, "h2": 10.8, "h3": 9.6}
 INDENT = 12.0  # points
 MOST_INDENTS = 8
+# Levels of Markdown; each takes three levels of Python's stack, which has 1000
+MOST_NESTED = 100
 TABLE_SIZE = 8.0
 # $ opens before what is no space and closes after it, not before a digit: prices stay prices
 MATHS = re.compile(r"\$\$(.+?)\$\$|\$(?!\s)((?:\\.|[^$\\])+?)(?<!\s)\$(?!\d)", re.DOTALL)
@@ -78,13 +83,39 @@ def write(page: Page, notes: str) -> None:
     >>> [block["text"] for block in page.blocks]
     ['A b', 'σ_z^2 is R', '[picture: a map]']
     """
+    from markdown_it.tree import SyntaxTreeNode  # noqa: PLC0415
+
+    _blocks(page, SyntaxTreeNode(parse(notes)), 0)
+
+
+def parse(notes: str, name: str = "the notes") -> list[Token]:
+    """Parse Markdown into tokens that can be drawn.
+
+    Parameters
+    ----------
+    notes : str
+    name : str
+        For the message.
+
+    Raises
+    ------
+    SettingsError
+        Emphasis, lists and quotes are nested more than :data:`MOST_NESTED` deep.
+    """
     # the parser costs a fiftieth of a second: not where there are no notes
     from markdown_it import MarkdownIt  # noqa: PLC0415
-    from markdown_it.tree import SyntaxTreeNode  # noqa: PLC0415
 
     markdown = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
     markdown.inline.ruler.before("escape", "maths", _maths)
-    _blocks(page, SyntaxTreeNode(markdown.parse(notes)), 0)
+    tokens = markdown.parse(notes)
+    every = (part for token in tokens for part in (token, *(token.children or ())))
+    depth = max(accumulate(token.nesting for token in every), default=0)
+    if depth > MOST_NESTED:
+        raise SettingsError(
+            f"{name}: nested {depth} deep, at most {MOST_NESTED} are drawn",
+            "Take repeated * and _ out.",
+        )
+    return tokens
 
 
 def _blocks(page: Page, node: SyntaxTreeNode, indents: int, mark: str = "") -> None:

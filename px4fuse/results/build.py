@@ -23,6 +23,7 @@ from px4fuse.request import (
     command_line,
 )
 from px4fuse.results import contract
+from px4fuse.results.bounds import within_bounds
 from px4fuse.results.contract import AvailableTrack, ChosenSettings, Log, PositionSource
 from px4fuse.results.model import NOBODY, Student, provenance, schema_of
 from px4fuse.trajectory.evaluation import Evaluation
@@ -49,13 +50,15 @@ def results(
 ) -> contract.ComparisonResults:
     """Everything that the report says."""
     findings = find(analysis)
-    return contract.ComparisonResults(
-        **_of_flight(contract.COMPARISON, request, analysis),
-        **{name: written(getattr(analysis, name)) for name in _AS_FOUND},
-        aids={} if isinstance(analysis.aids, Unavailable) else dict(analysis.aids),
-        story=story(analysis, findings),
-        findings=findings,
-        student=student,
+    return within_bounds(
+        contract.ComparisonResults(
+            **_of_flight(contract.COMPARISON, request, analysis),
+            **{name: written(getattr(analysis, name)) for name in _AS_FOUND},
+            aids={} if isinstance(analysis.aids, Unavailable) else dict(analysis.aids),
+            story=story(analysis, findings),
+            findings=findings,
+            student=student,
+        )
     )
 
 
@@ -65,12 +68,14 @@ def judged_results(
     """What ``px4fuse compare`` found; of a flight without a position source EKF2's aids alone."""
     if isinstance(found, Analysis):
         return results(request, found, student)
-    return contract.AidsResults(
-        **_begun(contract.AIDS, request, found.flight),
-        aids=dict(found.aids),
-        findings=find_aids(found.aids),
-        missing=(found.lacking, *found.flight.missing),
-        student=student,
+    return within_bounds(
+        contract.AidsResults(
+            **_begun(contract.AIDS, request, found.flight),
+            aids=dict(found.aids),
+            findings=find_aids(found.aids),
+            missing=(found.lacking, *found.flight.missing),
+            student=student,
+        )
     )
 
 
@@ -81,7 +86,7 @@ def tuning_results(
 ) -> contract.TuningResults:
     """What ``px4fuse tune`` found."""
     begun = _of_flight("px4fuse-tuning", request, comparison, "tune")
-    return contract.TuningResults(**begun, tuning=written(tuned))
+    return within_bounds(contract.TuningResults(**begun, tuning=written(tuned)))
 
 
 def sync_results(
@@ -89,22 +94,24 @@ def sync_results(
 ) -> contract.SyncResults:
     """What ``px4fuse sync`` found."""
     begun = _of_flight("px4fuse-sync", request, comparison, "sync")
-    return contract.SyncResults(**begun, clock=written(clock))
+    return within_bounds(contract.SyncResults(**begun, clock=written(clock)))
 
 
 def whatif_results(request: WhatIfRequest, made_of: Counterfactual) -> contract.WhatIfResults:
     """What ``px4fuse whatif`` found."""
     found, first = made_of.whatif, made_of.first
-    return contract.WhatIfResults(
-        **_begun(contract.WHATIF, request, made_of.flight),
-        agreement=found.agreement,
-        judged_s=found.judged,
-        asked=made_of.asked,
-        logged=found.logged,
-        replayed=found.replayed,
-        whatif=found.whatif[0] if first else None,
-        sweep=found.whatif[first:],
-        notes=found.notes,
+    return within_bounds(
+        contract.WhatIfResults(
+            **_begun(contract.WHATIF, request, made_of.flight),
+            agreement=found.agreement,
+            judged_s=found.judged,
+            asked=made_of.asked,
+            logged=found.logged,
+            replayed=found.replayed,
+            whatif=found.whatif[0] if first else None,
+            sweep=found.whatif[first:],
+            notes=found.notes,
+        )
     )
 
 
@@ -112,32 +119,38 @@ def loop_results(
     request: LoopRequest, loop: Loop, student: Student = NOBODY
 ) -> contract.LoopResults:
     """What ``px4fuse loop`` found."""
-    return contract.LoopResults(
-        schema=schema_of(contract.LOOP),
-        request=request.recorded(),
-        track=loop.odometry.trajectory.track(),
-        references=tuple(reference.track() for reference in loop.references),
-        loop=written(loop),
-        findings=find_loop(loop),
-        student=student,
-        provenance=provenance(command_line(request)),
+    return within_bounds(
+        contract.LoopResults(
+            schema=schema_of(contract.LOOP),
+            request=request.recorded(),
+            track=loop.odometry.trajectory.track(),
+            references=tuple(reference.track() for reference in loop.references),
+            loop=written(loop),
+            findings=find_loop(loop),
+            student=student,
+            provenance=provenance(command_line(request)),
+        )
     )
 
 
 def evaluation_results(request: EvaluationRequest, score: Evaluation) -> contract.EvaluationResults:
     """What ``px4fuse evaluate`` found."""
-    return contract.EvaluationResults(
-        schema=schema_of("px4fuse-evaluation"),
-        estimate=score.estimate.track(),
-        reference=score.reference.track(),
-        provenance=provenance(command_line(request)),
-        **msgspec.structs.asdict(written(score)),
+    return within_bounds(
+        contract.EvaluationResults(
+            schema=schema_of("px4fuse-evaluation"),
+            estimate=score.estimate.track(),
+            reference=score.reference.track(),
+            provenance=provenance(command_line(request)),
+            **msgspec.structs.asdict(written(score)),
+        )
     )
 
 
 def graph_results(solved: SolvedGraph, command: str) -> contract.GraphResults:
     """What ``px4fuse loop`` found about a pose graph; edges by the vertex numbers of the file."""
-    return contract.GraphResults(schema_of("px4fuse-graph"), written(solved), provenance(command))
+    return within_bounds(
+        contract.GraphResults(schema_of("px4fuse-graph"), written(solved), provenance(command))
+    )
 
 
 def log_part(flight: Flight) -> Log:
