@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import msgspec
 
-from px4fuse.errors import SettingsError, did_you_mean
+from px4fuse.errors import SettingsError, suggest_name
 from px4fuse.record import table
 
 
@@ -68,11 +68,11 @@ class Aid:
     bit: int | None = None
 
     @property
-    def own(self) -> frozenset[str]:
+    def own_parameters(self) -> frozenset[str]:
         """Names of parameters that concern its measurements alone."""
         return frozenset((self.noise, self.gate, self.delay, self.noise_mode))
 
-    def in_log(self, logged: Mapping[str, float]) -> dict[str, float]:
+    def logged_parameters(self, logged: Mapping[str, float]) -> dict[str, float]:
         """Its parameters among those of a log, and what switches it."""
         names = (self.noise, self.delay, self.gate, self.noise_mode, self.switch, AID_MASK)
         return {name: float(logged[name]) for name in names if name in logged}
@@ -149,12 +149,12 @@ def settings_in_force(
     aid, *others : Aid
         What EKF2 fused: those of other aids are left out.
     """
-    used = {one.switch for one in (aid, *others)}
+    used = {fused_aid.switch for fused_aid in (aid, *others)}
     of_others = {
         name
         for other in (EV_POS, GNSS_POS, GNSS_VEL, MAG, BAROMETER)
         if other.switch not in used
-        for name in (*other.own, *other.place, *(FIELD_NOISES if other == MAG else ()))
+        for name in (*other.own_parameters, *other.place, *(FIELD_NOISES if other == MAG else ()))
     }
     defaults = {
         name: parameter.default for name, parameter in PARAMETERS.items() if name not in of_others
@@ -203,7 +203,7 @@ def valid_parameters(logged: Mapping[str, float]) -> tuple[dict[str, float], tup
     return valid, tuple(notes)
 
 
-def check(chosen: Mapping[str, float]) -> dict[str, float]:
+def check_parameters(chosen: Mapping[str, float]) -> dict[str, float]:
     """The same parameters, each known to the model and within PX4's range.
 
     Raises
@@ -213,7 +213,7 @@ def check(chosen: Mapping[str, float]) -> dict[str, float]:
 
     Examples
     --------
-    >>> check({"EKF2_EVP_NOISE": 0.2})
+    >>> check_parameters({"EKF2_EVP_NOISE": 0.2})
     {'EKF2_EVP_NOISE': 0.2}
     """
     for name, value in chosen.items():
@@ -221,7 +221,7 @@ def check(chosen: Mapping[str, float]) -> dict[str, float]:
         if known is None:
             raise SettingsError(
                 f"{name}: the model of EKF2 does not have this parameter",
-                f"{did_you_mean(name, PARAMETERS)}It knows {', '.join(PARAMETERS)}.",
+                f"{suggest_name(name, PARAMETERS)}It knows {', '.join(PARAMETERS)}.",
             )
         if not known.minimum <= value <= known.maximum or not math.isfinite(value):
             unit = f" {known.unit}" if known.unit else ""

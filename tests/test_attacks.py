@@ -22,10 +22,10 @@ from results_tools import LOOP, changed, decoded
 
 from px4fuse.answers import form_text
 from px4fuse.assignment.key import Answer, AnswerKey
-from px4fuse.assignment.truth import truth_of
+from px4fuse.assignment.truth import form_truth
 from px4fuse.errors import ResultsError
-from px4fuse.grading.model import Graded
-from px4fuse.grading.rubric import Rubric, assess, read_rubric, refused
+from px4fuse.grading.model import GradedReport
+from px4fuse.grading.rubric import Rubric, assess, read_rubric, refused_report
 from px4fuse.report import pdf as pdf_module
 from px4fuse.results.contract import Reported
 from px4fuse.simulation import flights
@@ -34,7 +34,7 @@ from px4fuse.simulation.scenario import Scenario
 from px4fuse.verification import pages
 from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import Verdict
-from px4fuse.verification.verification import unknown
+from px4fuse.verification.verification import cannot_verify
 
 pytestmark = pytest.mark.usefixtures("analysed_once", "_pages_here")
 
@@ -65,14 +65,16 @@ class Flight:
     honest: Base
     key: AnswerKey
 
-    def graded(self, report: Reported | ResultsError, verdict: Verdict, rubric: Rubric) -> Graded:
+    def graded(
+        self, report: Reported | ResultsError, verdict: Verdict, rubric: Rubric
+    ) -> GradedReport:
         if isinstance(report, ResultsError):
-            made = refused(rubric, self.key, f"{report.reason}.", report.remedy)
-            return Graded("a.pdf", "", "", verdict, made.items, pending=made.pending)
+            made = refused_report(rubric, self.key, f"{report.reason}.", report.remedy)
+            return GradedReport("a.pdf", "", "", verdict, made.items, pending=made.pending)
         made = assess(report, verdict, rubric, self.key)
-        return Graded("a.pdf", "", "", verdict, made.items, made.flags, made.pending)
+        return GradedReport("a.pdf", "", "", verdict, made.items, made.flags, made.pending)
 
-    def with_notes(self, text: str, rubric: Rubric) -> Graded:
+    def with_notes(self, text: str, rubric: Rubric) -> GradedReport:
         """As if the report had been made with these notes, which verifies."""
         results = copy.deepcopy(self.honest.results)
         results["student"]["notes"] = text
@@ -84,7 +86,7 @@ class Flight:
 @pytest.fixture
 def _pages_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """The process that bounds the comparison of pages takes seconds; test_pages.py has one."""
-    monkeypatch.setattr(pages, "bounded", lambda function, job, *_: function(job))
+    monkeypatch.setattr(pages, "run_one_bounded", lambda function, job, *_: function(job))
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +111,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
         done("compare", log, "-o", pdf, *own)
     honest = base(pdf.read_bytes(), log)
     (sha256,) = honest.files
-    truth = truth_of(simulation, sha256)
+    truth = form_truth(simulation, sha256)
     answers = (
         Answer("s01", "Ada", "s01.ulg", sha256, {}, MISTAKES, {"duration_s": 70.0}, None, truth),
         Answer("s02", "Bob", "s02.ulg", "b" * 64),
@@ -118,12 +120,12 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
 
 
 @pytest.fixture(scope="module")
-def honest(flight: Flight, rubric: Rubric) -> Graded:
+def honest(flight: Flight, rubric: Rubric) -> GradedReport:
     verdict = flight.honest.verified(flight.honest.pdf)
     return flight.graded(report_of(flight.honest.pdf), verdict, rubric)
 
 
-def test_the_honest_report_is_verified_and_names_both(honest: Graded) -> None:
+def test_the_honest_report_is_verified_and_names_both(honest: GradedReport) -> None:
     assert honest.status == "verified"
     assert honest.pending == ""
     assert honest.flags == ()
@@ -146,12 +148,12 @@ def test_the_honest_report_is_verified_and_names_both(honest: Graded) -> None:
     ],
 )
 def test_no_sentence_earns_anything(
-    flight: Flight, honest: Graded, rubric: Rubric, text: str
+    flight: Flight, honest: GradedReport, rubric: Rubric, text: str
 ) -> None:
     graded = flight.with_notes(text, rubric)
     points = [(item.title, item.points) for item in graded.items]
     assert points == [(item.title, item.points) for item in honest.items]
-    assert graded.waits
+    assert graded.awaits_points
 
 
 # ------------------------------------------------------------------ files
@@ -212,7 +214,7 @@ FILES: dict[str, tuple[Change, str, str]] = {
 
 @pytest.mark.parametrize("name", FILES)
 def test_files(
-    flight: Flight, honest: Graded, rubric: Rubric, name: str, monkeypatch: pytest.MonkeyPatch
+    flight: Flight, honest: GradedReport, rubric: Rubric, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     change, status, pending = FILES[name]
     if status == "numbers differ":  # whatever the pages look like
@@ -226,7 +228,7 @@ def test_files(
         report: Reported | ResultsError = read_report(pdf, "a.pdf")
         verdict = flight.honest.verified(pdf)
     except ResultsError as error:
-        report, verdict = error, unknown(str(error))
+        report, verdict = error, cannot_verify(str(error))
     graded = flight.graded(report, verdict, rubric)
     assert graded.status != "verified"
     assert not graded.counted
@@ -237,7 +239,7 @@ def test_files(
     assert graded.points <= honest.points + 1e-9
 
 
-def test_pages_that_were_painted_over(flight: Flight, honest: Graded, rubric: Rubric) -> None:
+def test_pages_that_were_painted_over(flight: Flight, honest: GradedReport, rubric: Rubric) -> None:
     """The numbers are verified, the page is not, and what is scored is the redrawn report."""
     painted = on_page(1, lambda stream: stream + b"\n0 0 0 rg 100 300 200 200 re f\n")
     pdf = forged(flight.honest.pdf, painted)
@@ -252,7 +254,7 @@ def test_pages_that_were_painted_over(flight: Flight, honest: Graded, rubric: Ru
 
 # ------------------------------------------------------------------ loops
 
-OPEN = {"vio_drift": 0.012}, ("open-end=6m",), {"closure_error_m": 6.0}
+OPEN_END = {"vio_drift": 0.012}, ("open-end=6m",), {"closure_error_m": 6.0}
 CLOSED = {"vio_drift": 0.012}, (), {"closure_error_m": 0.0}
 REJECTED = {"closures": [{**LOOP["loop"]["closures"][0], "p": 1e-9, "d2": 60.0, "accepted": False}],
             "closure_error_m": 6.2}  # fmt: skip
@@ -263,7 +265,7 @@ NO_END: dict[str, Any] = {
 }
 
 
-def looped(truth: Any, request: dict[str, Any], loop: dict[str, Any]) -> Graded:
+def looped(truth: Any, request: dict[str, Any], loop: dict[str, Any]) -> GradedReport:
     """Points of the item on the loop."""
     values = {f"request__{name}": value for name, value in request.items()}
     values |= {f"loop__{name}": value for name, value in loop.items()}
@@ -272,7 +274,7 @@ def looped(truth: Any, request: dict[str, Any], loop: dict[str, Any]) -> Graded:
     verdict = Verdict("verified", (), True, page_status="same")
     made = assess(results, verdict, read_rubric(None), key)
     items = tuple(item for item in made.items if "Loop" in item.title)
-    return Graded("a.pdf", "", "", verdict, items, made.flags, made.pending)
+    return GradedReport("a.pdf", "", "", verdict, items, made.flags, made.pending)
 
 
 LANDED = {"landed_at": {"forward_m": 6.0, "right_m": 0.0}}
@@ -280,15 +282,15 @@ LANDED = {"landed_at": {"forward_m": 6.0, "right_m": 0.0}}
 LOOPS: dict[str, tuple[Any, dict[str, Any], dict[str, Any], float, int]] = {
     "closed": (CLOSED, {}, {}, 40, 0),
     "closed, without a key": (None, {}, {}, 40, 0),
-    "open end, rejected": (OPEN, {}, REJECTED, 40, 0),
+    "open end, rejected": (OPEN_END, {}, REJECTED, 40, 0),
     "open end, rejected, without a key": (None, {}, REJECTED, 10, 0),
-    "open end, left open": (OPEN, {"came_back": False}, NO_END, 40, 0),
+    "open end, left open": (OPEN_END, {"came_back": False}, NO_END, 40, 0),
     "open end, left open, without a key": (None, {"came_back": False}, NO_END, 0, 0),
-    "open end, landing stated": (OPEN, LANDED, {}, 40, 0),
+    "open end, landing stated": (OPEN_END, LANDED, {}, 40, 0),
     "closed, left open": (CLOSED, {"came_back": False}, NO_END, 0, 0),
     "closed, rejected by a small drift": (CLOSED, {"position_drift_m": 0.01}, REJECTED, 10, 1),
-    "open end, accepted by a large drift": (OPEN, {"position_drift_m": 50.0}, {}, 40, 1),
-    "open end, accepted by a heading drift": (OPEN, {"heading_drift_deg": 90.0}, {}, 40, 1),
+    "open end, accepted by a large drift": (OPEN_END, {"position_drift_m": 50.0}, {}, 40, 1),
+    "open end, accepted by a heading drift": (OPEN_END, {"heading_drift_deg": 90.0}, {}, 40, 1),
     "thrice the usual drift": (None, {"position_drift_m": 3.0}, {}, 40, 0),
 }  # fmt: skip
 

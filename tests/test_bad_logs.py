@@ -25,7 +25,7 @@ from px4fuse.flight import Flight, Unavailable
 from px4fuse.inspect.inventory import take_inventory
 from px4fuse.readers import ULOG_MAGIC, read_log
 from px4fuse.request import ComparisonRequest
-from px4fuse.results.build import judged_results
+from px4fuse.results.build import outcome_results
 from px4fuse.results.contract import to_json
 
 
@@ -412,7 +412,7 @@ def test_compare_of_damaged_part_writes_finite_results(tmp_path, damage):
     log = make_log("v1.16", 20.0)
     damage(log)
     request = ComparisonRequest(log=str(log.write(tmp_path / "made.ulg")))
-    results = judged_results(request, run_or_judge_aids(request))
+    results = outcome_results(request, run_or_judge_aids(request))
     assert not re.search(r"\b(nan|inf)\b|e\+[23]\d", to_json(results))
     if damage is truth_impossible:
         reason = "vehicle_local_position_groundtruth has no sample"

@@ -18,10 +18,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pypdf import PdfReader
 
-from px4fuse.answers import Answers, Claim
+from px4fuse.answers import Answers, ClaimedMistake
 from px4fuse.grading.class_page import html_text, tenths
-from px4fuse.grading.model import Entry, Graded, Item, Override
-from px4fuse.grading.outputs import nameless
+from px4fuse.grading.model import Entry, GradedReport, Item, Override
+from px4fuse.grading.outputs import anonymise_entry
 from px4fuse.verification.model import Mismatch, PageDifference, Verdict
 from px4fuse.webpage.safe import MAX_CHARACTERS
 
@@ -33,13 +33,13 @@ TURNED = "\N{REPLACEMENT CHARACTER}gnp.exe\N{REPLACEMENT CHARACTER}"
 LONG = "W" * 5000
 
 
-def graded(name: str, points: float | None, **more: Any) -> Graded:
+def graded(name: str, points: float | None, **more: Any) -> GradedReport:
     verdict = Verdict(more.pop("status", "verified"), more.pop("reasons", ("All agrees.",)), True,
                       pages=more.pop("pages", ()))  # fmt: skip
     items = () if points is None else (
         Item("Pages", min(points, 4.0), 4.0, "There."), Item("Notes", points - 4, 16.0, "–")
     )  # fmt: skip
-    return Graded(
+    return GradedReport(
         more.pop("file", f"{name.lower()}.pdf"), name, more.pop("id", ""), verdict,
         more.pop("items", items), **more,
     )  # fmt: skip
@@ -59,25 +59,53 @@ def row(name: str, points: float | None, **more: Any) -> Entry:
 
 
 FORM = Answers(
-    log_sha256="a" * 64, mistakes=(Claim(MARKUP, 1.0, BREAKOUT, panel=MARKUP, parameter=BREAKOUT),)
+    log_sha256="a" * 64,
+    mistakes=(ClaimedMistake(MARKUP, 1.0, BREAKOUT, panel=MARKUP, parameter=BREAKOUT),),
 )
 CLASS = (
-    row("Zoë", 18.5, id="1007", numbers={"mean NIS": 1.02}, redrawn_name="reports/1007.pdf",
-        mistakes={"positions that jump": True}),
-    row("ada", 9.0, id="1001", status="numbers differ", flags=("The same log as Zoë.",),
-        mistakes={"positions that jump": False, "outliers": False}, late_s=7200.0, deduction=1.0),
+    row(
+        "Zoë",
+        18.5,
+        id="1007",
+        numbers={"mean NIS": 1.02},
+        redrawn_name="reports/1007.pdf",
+        mistakes={"positions that jump": True},
+    ),
+    row(
+        "ada",
+        9.0,
+        id="1001",
+        status="numbers differ",
+        flags=("The same log as Zoë.",),
+        mistakes={"positions that jump": False, "outliers": False},
+        late_s=7200.0,
+        deduction=1.0,
+    ),
     row("Émile", 9.0, id="1010", numbers={"mean NIS": 0.5}),
     row("Bo", 20.0, id="99", numbers={"mean NIS": -3.0}),
     row("", None, file="broken.pdf", status="cannot verify", reasons=("Not a PDF.",)),
-    row(MARKUP, 5.0, id=FORMULA, file=BREAKOUT, flags=(MARKUP, MARKUP), notes=BREAKOUT,
-        reasons=(BREAKOUT,), numbers={MARKUP: 1.0}, pending=MARKUP,
-        form=FORM, mistakes={MARKUP: False}, redrawn_name="javascript:alert(1)", comment=BREAKOUT,
-        items=(Item(BREAKOUT, 5.0, 20.0, MARKUP, by_hand=True, waits=True),), handed_in_at=MARKUP,
-        overrides={BREAKOUT: Override(None, MARKUP)}),
+    row(
+        MARKUP,
+        5.0,
+        id=FORMULA,
+        file=BREAKOUT,
+        flags=(MARKUP, MARKUP),
+        notes=BREAKOUT,
+        reasons=(BREAKOUT,),
+        numbers={MARKUP: 1.0},
+        pending=MARKUP,
+        form=FORM,
+        mistakes={MARKUP: False},
+        redrawn_name="javascript:alert(1)",
+        comment=BREAKOUT,
+        items=(Item(BREAKOUT, 5.0, 20.0, MARKUP, by_hand=True, awaits_points=True),),
+        handed_in_at=MARKUP,
+        overrides={BREAKOUT: Override(None, MARKUP)},
+    ),
     row(REVERSED, 8.0, id="5"),
     row(LONG, 7.0, id="6"),
     Entry("Mia", "1011", None),
-)  # fmt: skip
+)
 
 
 # ------------------------------------------------------------------ without a browser
@@ -133,7 +161,7 @@ def test_what_is_not_finite_too_long_or_too_much() -> None:
     assert "nan" not in text.lower().split("<script>")[0]
     assert len(text) < 16 * MAX_CHARACTERS
     apart = (Mismatch("axes.49", "1.0", "2.0"),)
-    one = Graded("a.pdf", "Ada", "1", Verdict("numbers differ", ("60.",), True, apart))
+    one = GradedReport("a.pdf", "Ada", "1", Verdict("numbers differ", ("60.",), True, apart))
     text = html_text([Entry("Ada", "1", one)], "Class", "px4fuse 1")
     assert '["axes.49","1.0","2.0"]' in text
 
@@ -163,7 +191,7 @@ def anonymous_class() -> list[Entry]:
             redrawn_name=f"reports/{student_id}.pdf", sha256="ab" * 32,
         )  # fmt: skip
         entry = entry if file else Entry(name, student_id, None)
-        entries.append(nameless(entry, f"Student {(7 * number) % 4 + 1:03}"))
+        entries.append(anonymise_entry(entry, f"Student {(7 * number) % 4 + 1:03}"))
     return entries
 
 
@@ -272,7 +300,7 @@ def test_tenths_count_values_by_lower_edge() -> None:
 
 def test_what_students_wrote_stays_text(page: Browser) -> None:
     page.ask("[...document.querySelectorAll('.unfold')].forEach((button) => button.click())")
-    named = [TURNED if one.student == REVERSED else one.called for one in CLASS]
+    named = [TURNED if one.student == REVERSED else one.display_name for one in CLASS]
     assert page.names() == named
     row = page.ask(
         "[...document.querySelectorAll('[data-row=\"5\"] :is(td:nth-child(2), .file, li)')]"

@@ -13,13 +13,13 @@ from browser import Browser
 from explore_tools import ask, axe, open_view, serious, settle, show
 
 from px4fuse.analysis import Analysis, run, run_comparison
-from px4fuse.comparison.interventions import beyond_claim
+from px4fuse.comparison.interventions import error_beyond_reported_sigma
 from px4fuse.explore.page import html_text
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
 from px4fuse.findings.story import story
-from px4fuse.plain import length_words, number_words
+from px4fuse.plain import format_length, format_number
 from px4fuse.request import ComparisonRequest
 
 pytestmark = pytest.mark.usefixtures("analysed_once")
@@ -115,7 +115,7 @@ def test_the_words_follow_the_knobs_and_their_cure_was_replayed(
     told = text(page, "live")
     ours = analysis.main.filters["kf"]
     assert told.startswith(
-        f"Along the aisle our filter is {length_words(ours.truth.position_rmse_m)} from the truth "
+        f"Along the aisle our filter is {format_length(ours.truth.position_rmse_m)} from the truth "
         "(RMS) and 9 % too modest; EKF2 is 6 cm from the truth and is honest about it."
     )
     assert told.split("; EKF2")[0].split("our filter is ")[1] == (
@@ -125,12 +125,12 @@ def test_the_words_follow_the_knobs_and_their_cure_was_replayed(
     told = text(page, "live")
     now = Settings(sigma_a_m_s2=0.002, sigma_z_m=0.05)
     nis = nis_with(analysis, now)
-    assert f"{number_words(nis**0.5, 2)} times too sure of itself" in told
+    assert f"{format_number(nis**0.5, 2)} times too sure of itself" in told
     cure = re.search(r"nearest comes SIGMA_A ([\d.]+) \(mean NIS ([\d,]+) → ([\d.]+)\)", told)
-    assert cure[2] == number_words(nis, 2)
+    assert cure[2] == format_number(nis, 2)
     cured = nis_with(analysis, Settings(sigma_a_m_s2=float(cure[1]), sigma_z_m=0.05))
-    assert cure[3] == number_words(cured, 2)
-    assert f"ours {number_words(nis, 2)} (understated" in text(page, "read-0")
+    assert cure[3] == format_number(cured, 2)
+    assert f"ours {format_number(nis, 2)} (understated" in text(page, "read-0")
     hand = page.ask("document.querySelector('#needle-0 .hand.ours').style.left")
     assert hand == "100%"
 
@@ -140,9 +140,9 @@ def test_an_error_that_innovations_hide_is_told_by_what_the_filter_claims(
 ) -> None:
     put(page, offset=0.3)
     shifted = _shifted(explored[1], 0.3)
-    hidden = beyond_claim(shifted.axes["aisle"].filters["kf"])
+    hidden = error_beyond_reported_sigma(shifted.axes["aisle"].filters["kf"])
     assert hidden is not None
-    error, claimed = length_words(hidden.rmse_m), length_words(hidden.claimed_m)
+    error, claimed = format_length(hidden.rmse_m), format_length(hidden.reported_sigma_m)
     assert f"our filter is {error} from the truth (RMS) and claims {claimed};" in text(page, "live")
 
 
@@ -286,7 +286,7 @@ def test_the_tour_from_end_to_end(page: Browser, explored: tuple[Path, Analysis]
     assert a == 0.002
     told = re.search(r"mean NIS goes from ([\d.]+) to ([\d.,]+)\.", forgotten)
     with_clock = _shifted(analysis, seen[0][4])
-    assert told[2] == number_words(nis_with(with_clock, Settings(a, z)), 2)
+    assert told[2] == format_number(nis_with(with_clock, Settings(a, z)), 2)
     _, _, a, z, _ = seen[3]
     size = re.search(r"NIS from ([\d.]+) to ([\d.]+), a ninth", seen[3][1])
     assert float(size[2]) == pytest.approx(float(size[1]) / 9.0, rel=0.1)

@@ -22,12 +22,12 @@ from px4fuse.assignment.roster import file_names
 from px4fuse.cli.outputs import Interrupted
 from px4fuse.grading.entries import Course
 from px4fuse.grading.grade import GradeOutcome, grade
-from px4fuse.grading.model import Entry, Graded
+from px4fuse.grading.model import Entry, GradedReport
 from px4fuse.grading.rubric import read_rubric
 from px4fuse.reading import files_by_sha256
 from px4fuse.verification import pages
 from px4fuse.verification.model import Verdict
-from px4fuse.workers import Failed
+from px4fuse.workers import JobFailure
 
 pytestmark = pytest.mark.usefixtures("analysed_once")
 
@@ -91,7 +91,9 @@ def test_grade_pages_beyond_limits_cannot_be_verified(tmp_path, monkeypatch) -> 
     (folder / "a.pdf").write_bytes(
         forged(REPORT.read_bytes(), lambda writer: writer.remove_page(7))
     )
-    monkeypatch.setattr(pages, "bounded", lambda *_: Failed("it took longer than 10 s."))
+    monkeypatch.setattr(
+        pages, "run_one_bounded", lambda *_: JobFailure("it took longer than 10 s.")
+    )
     (only,) = grade(
         [folder], Course(read_rubric(None), logs=[LOG.parent]), tmp_path / "class"
     ).graded
@@ -206,7 +208,7 @@ def test_what_the_command_says(tmp_path, monkeypatch) -> None:
     """Names on one line each, and of an interrupted run that it can go on."""
     import px4fuse.grading.grade as module
 
-    one = Graded("a.pdf", "Ada\nPoints 120\n" + "A" * 100_000, "1", UNKNOWN)
+    one = GradedReport("a.pdf", "Ada\nPoints 120\n" + "A" * 100_000, "1", UNKNOWN)
     entry = Entry(one.student, one.student_id, one)
     monkeypatch.chdir(tmp_path)
     shutil.copy(REPORT, "a.pdf")

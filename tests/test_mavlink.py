@@ -496,7 +496,11 @@ def test_gnss_is_a_position_about_the_autopilots_origin(read, origin, clock):
     """Also where the receiver stamps by its own clock."""
     flight = read(outdoors(origin=origin, clock=clock))
     (track,) = flight.positions
-    assert (track.name, track.origin.by_gnss, track.origin.automatic) == ("GPS_RAW_INT", True, True)
+    assert (track.name, track.origin.fused_as_gnss, track.origin.is_automatic) == (
+        "GPS_RAW_INT",
+        True,
+        True,
+    )
     assert track.age_s == pytest.approx(0.11)
     true = np.array([Aisle().path(BOOT_S + t)[0] for t in track.samples.index])
     exact_m = 0.02 if clock is same else 0.03
@@ -525,7 +529,7 @@ def test_the_height_of_a_recording_may_be_the_barometers(read):
 
 def test_gnss_is_not_taken_by_itself_where_the_autopilot_does_not_know_where_it_is(read):
     flight = read(outdoors(knows=False))
-    assert not flight.positions[0].origin.automatic
+    assert not flight.positions[0].origin.is_automatic
     with pytest.raises(MissingDataError, match="`position_source` GPS_RAW_INT"):
         compare(flight)
 

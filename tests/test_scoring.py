@@ -10,14 +10,14 @@ import pytest
 from exchange import replace
 from results_tools import EXAMPLE, LOOP, SHA256, changed, correction, decoded, finding
 
-from px4fuse.answers import Answers, Claim
+from px4fuse.answers import Answers, ClaimedMistake
 from px4fuse.assignment.key import Answer, AnswerKey
-from px4fuse.assignment.truth import FormTruth, VerdictTruth, Wrong
+from px4fuse.assignment.truth import FormTruth, TrueMistake, VerdictTruth
 from px4fuse.errors import ResultsError
 from px4fuse.findings import NAMES
 from px4fuse.grading.flags import class_flags, own_flags
-from px4fuse.grading.model import Entry, Graded
-from px4fuse.grading.outputs import returned_text
+from px4fuse.grading.model import Entry, GradedReport
+from px4fuse.grading.outputs import feedback_text
 from px4fuse.grading.rubric import assess, parse_rubric, read_rubric
 from px4fuse.results.contract import to_plain
 from px4fuse.simulation.flights import HARDWARE
@@ -145,7 +145,7 @@ def test_the_clock_of_a_flight_that_was_handed_out_is_not_the_student_s_choice()
 
 
 TRUTH = FormTruth(
-    (Wrong("dropout", 3.0, 2.55, 3.45, 50.0, 53.0),), 0.1, VerdictTruth("consistent"),
+    (TrueMistake("dropout", 3.0, 2.55, 3.45, 50.0, 53.0),), 0.1, VerdictTruth("consistent"),
     VerdictTruth("consistent"), ("coasted, then reset",), (), (0.5, 0.1, 0.2),
 )  # fmt: skip
 
@@ -195,9 +195,13 @@ class TestForm:
         assert [item.points for item in items if "your flight" in item.title] == [points]
 
     def test_a_text_waits_for_the_instructor(self):
-        for notes, waits in (("", False), ("I saw a gap.", True)):
+        for notes, awaits_points in (("", False), ("I saw a gap.", True)):
             made = assessed(noted(notes, student__id="s01"), key=key())
-            assert (made.waits, made.counted is None, made.items[-1].points) == (waits, waits, 0.0)
+            assert (made.awaits_points, made.counted is None, made.items[-1].points) == (
+                awaits_points,
+                awaits_points,
+                0.0,
+            )
 
 
 # ------------------------------------------------------------------ the whole
@@ -272,14 +276,14 @@ class TestScore:
 
 def fed_back(one, title=""):
     """What the student reads, its line ends left out."""
-    text = returned_text(Entry(one.student, one.student_id, one), title)
+    text = feedback_text(Entry(one.student, one.student_id, one), title)
     assert all(len(line) <= 100 for line in text.splitlines())
     return " ".join(text.split())
 
 
 def graded(items=(), **values):
     given = {"submission": "a.pdf", "student": "Ann Lee", "student_id": "1001"}
-    return Graded(**{**given, "verdict": VERIFIED, "items": tuple(items), **values})
+    return GradedReport(**{**given, "verdict": VERIFIED, "items": tuple(items), **values})
 
 
 class TestWhatStudentsRead:
@@ -392,9 +396,9 @@ class TestClassFlags:
         }
 
     def test_a_classmates_numbers_each_changed_a_little(self):
-        claims = Claim("yaw", -20.5), Claim("nlos", 1.23)
+        claims = ClaimedMistake("yaw", -20.5), ClaimedMistake("nlos", 1.23)
         mine = Answers(log_sha256=SHA, mistakes=claims, quantities=(0.123, None, 0.45))
-        other = (Claim("nlos", 1.24), Claim("yaw", -20.3))
+        other = (ClaimedMistake("nlos", 1.24), ClaimedMistake("yaw", -20.3))
         theirs = Answers(log_sha256=SHA, mistakes=other, quantities=(0.124, 0.7, None))
         made = class_flags([of(1, form=mine), of(2, form=theirs)])
         assert set(made) == {"1.pdf", "2.pdf"}

@@ -22,7 +22,7 @@ from px4fuse.analysis import run as analyse
 from px4fuse.cli.outputs import default_report, progress, terminal
 from px4fuse.errors import OutputError
 from px4fuse.report import screen
-from px4fuse.report.screen import paragraph, runnable
+from px4fuse.report.screen import expand_commands, print_paragraph
 from px4fuse.report.terminal import summary
 from px4fuse.request import ComparisonRequest, PositionFile, command_line, settings_name
 from px4fuse.results.build import results
@@ -97,7 +97,7 @@ def test_nothing_is_cut_and_words_are_whole(document, monkeypatch) -> None:
 
 def test_a_paragraph_hangs_beside_its_label(capsys) -> None:
     console = Console(width=30, highlight=False)
-    paragraph(console, "one two three four five six seven", "Label", 9)
+    print_paragraph(console, "one two three four five six seven", "Label", 9)
     lines = ["Label    one two three four", "         five six seven"]
     assert capsys.readouterr().out.splitlines() == lines
 
@@ -117,7 +117,7 @@ def test_commands_are_written_with_what_was_typed() -> None:
         log="my flights/a'b.ulg", mavlink="-t.tlog", position=PositionFile(path="u w/b.csv"),
         start_s=12.5, sigma_z_m=0.3,
     )  # fmt: skip
-    text, (command, loops) = runnable(
+    text, (command, loops) = expand_commands(
         "Try px4fuse compare LOG --sigma-z 0.2 --clock-offset -0.125: better. Or (px4fuse loop "
         "LOG). Not px4fuse sync LOG.ulg.",
         request,
@@ -192,7 +192,7 @@ def reported(made: ComparisonResults, **changes: object) -> str:
     """Write a report without pages where it goes by default."""
     student = Student(name=str(changes.pop("student", "")))
     request = replace(made.request, **changes)
-    changed = replace(made, request=request.recorded(), student=student)
+    changed = replace(made, request=request.without_paths(), student=student)
     path = default_report(Path(request.log).stem, settings_name(request), changed)
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(page_of(None, to_json(changed)))
@@ -282,4 +282,4 @@ def test_the_bar_shows_what_is_done_on_a_terminal_only(monkeypatch, capsys) -> N
 def test_what_is_bold_on_a_page_is_bold_on_a_terminal() -> None:
     for weight, bold in (("bold", True), ("regular", False)):
         block = {"text": "so", "colour": "black", "weight": weight}
-        assert ("bold" in str(screen._styled(block).style)) is bold  # type: ignore[arg-type]
+        assert ("bold" in str(screen._styled_text(block).style)) is bold  # type: ignore[arg-type]

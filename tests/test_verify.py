@@ -51,10 +51,10 @@ from px4fuse.results.contract import to_json, to_plain
 from px4fuse.verification import pages, verification
 from px4fuse.verification.intake import read_report
 from px4fuse.verification.verification import (
-    ESTIMATE_RELATIVE,
+    ESTIMATE_RELATIVE_TOLERANCE,
     LIMIT,
     NO_LOG,
-    RELATIVE,
+    RELATIVE_TOLERANCE,
     compare_results,
     flattened,
     verify,
@@ -69,7 +69,7 @@ LOOP_LOG = SAMPLES / "loop_vio.ulg"
 def _pages_in_this_process() -> Iterator[None]:
     """The process that bounds the comparison of pages takes seconds; test_pages.py has one."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pages, "bounded", lambda function, job, *_: function(job))
+        patch.setattr(pages, "run_one_bounded", lambda function, job, *_: function(job))
         yield
 
 
@@ -148,7 +148,7 @@ def test_another_platform_is_still_verified(which: str, request: pytest.FixtureR
     elsewhere = (nudged_, lambda: drawn)
     verdict = verify(report_of(one.pdf), one.pdf, one.files, recompute=lambda *_: elsewhere)
     assert verdict.outcome == "verified", verdict
-    assert f"within {RELATIVE:g}" in verdict.reasons[0]
+    assert f"within {RELATIVE_TOLERANCE:g}" in verdict.reasons[0]
     aside = shifted(one.pdf, 0.6)
     elsewhere = (one.again[0], lambda: aside)
     verdict = verify(report_of(one.pdf), one.pdf, one.files, recompute=lambda *_: elsewhere)
@@ -167,10 +167,10 @@ def test_verify_numbers_1e_12_apart_are_verified(aisle: Base) -> None:
 def test_compare_results_numbers_1e_4_apart_differ(aisle: Base) -> None:
     """Every number but those with the tolerance of an estimate, and those near zero."""
     ours = json.loads(to_json(aisle.again[0]))
-    for share, least in ((1e-4, RELATIVE), (1e-2, ESTIMATE_RELATIVE)):
+    for share, least in ((1e-4, RELATIVE_TOLERANCE), (1e-2, ESTIMATE_RELATIVE_TOLERANCE)):
         theirs = nudged(ours, share)
         found = {one.path for one in compare_results(theirs, ours)[0]}
-        wide = verification.ESTIMATES if least == RELATIVE else ()
+        wide = verification.ESTIMATES if least == RELATIVE_TOLERANCE else ()
         expected = {
             path[:120] for path, value in flattened(ours)
             if isinstance(value, float) and abs(value) > 0.01 and not path.startswith(wide)
@@ -185,10 +185,10 @@ KF = ("axes", "north", "filters", "kf")
 def test_tolerances(aisle: Base) -> None:
     ours = json.loads(to_json(aisle.again[0]))
     for share, path, alike in (
-        (0.5 * RELATIVE, (*KF, "nis_mean"), True),
-        (2.0 * RELATIVE, (*KF, "nis_mean"), False),
-        (0.5 * ESTIMATE_RELATIVE, ("tuning", "horizontal", "sigma_a_m_s2"), True),
-        (2.0 * ESTIMATE_RELATIVE, ("tuning", "horizontal", "sigma_a_m_s2"), False),
+        (0.5 * RELATIVE_TOLERANCE, (*KF, "nis_mean"), True),
+        (2.0 * RELATIVE_TOLERANCE, (*KF, "nis_mean"), False),
+        (0.5 * ESTIMATE_RELATIVE_TOLERANCE, ("tuning", "horizontal", "sigma_a_m_s2"), True),
+        (2.0 * ESTIMATE_RELATIVE_TOLERANCE, ("tuning", "horizontal", "sigma_a_m_s2"), False),
     ):
         theirs = copy.deepcopy(ours)
         part = theirs
@@ -372,7 +372,7 @@ DRAWING: dict[str, Edit] = {
 PAGES = 8
 
 # Every page in one way, and each of the others on one page
-DRAWN = [
+DRAW_LABEL = [
     (page, name)
     for place, name in enumerate(DRAWING)
     for page in range(1, PAGES + 1)
@@ -380,7 +380,7 @@ DRAWN = [
 ]
 
 
-@pytest.mark.parametrize(("page", "name"), DRAWN)
+@pytest.mark.parametrize(("page", "name"), DRAW_LABEL)
 def test_a_changed_page(aisle: Base, page: int, name: str) -> None:
     verdict = aisle.verified(forged(aisle.pdf, on_page(page, DRAWING[name])))
     assert verdict.redrawn == aisle.pdf  # what is redrawn is never touched by a forgery

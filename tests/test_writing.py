@@ -283,7 +283,7 @@ def test_a_name_that_no_font_has_is_said_before_the_report(
         return b"%PDF-"
 
     monkeypatch.setattr(pdf, "render", render)
-    monkeypatch.setattr(fonts, "_others", lambda: ())
+    monkeypatch.setattr(fonts, "_other_fonts", lambda: ())
     fonts.font_of.cache_clear()
     run_main(monkeypatch, capsys, *f"compare l.ulg -o r.pdf --student {name}".split())
     fonts.font_of.cache_clear()

@@ -7,13 +7,13 @@ from dataclasses import asdict
 from pathlib import Path
 
 from px4fuse.answers import form_name, form_text
-from px4fuse.assignment.drawing import Drawn, Kinds, draw
+from px4fuse.assignment.drawing import AssignedFlight, Kinds, draw
 from px4fuse.assignment.key import Answer, AnswerKey, key_text, read_key
-from px4fuse.assignment.roster import Person, folded
-from px4fuse.assignment.truth import truth_of
+from px4fuse.assignment.roster import Person, normalise_text
+from px4fuse.assignment.truth import form_truth
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.input_files import own_files
-from px4fuse.plain import plain
+from px4fuse.plain import to_json_types
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.writing import write_all
@@ -34,8 +34,8 @@ def fly(
     secret: bytes, student: Person, kind: Kinds, count: int | None = None, truth: bool = True
 ) -> tuple[bytes, Answer]:
     """One student's log, and the answer to it."""
-    drawn = draw(secret, student.student_id, kind, count, truth)
-    simulation = flights.simulate(drawn.scenario, parse(drawn.typed))
+    assigned_flight = draw(secret, student.student_id, kind, count, truth)
+    simulation = flights.simulate(assigned_flight.scenario, parse(assigned_flight.typed))
     log = flights.to_ulog(simulation)
     sha256 = hashlib.sha256(log).hexdigest()
     known = flights.answer(simulation)["truth"]
@@ -44,15 +44,15 @@ def fly(
         name=student.name,
         file=student.file,
         sha256=sha256,
-        scenario=plain(asdict(drawn.scenario)),
-        mistakes=drawn.typed,
+        scenario=to_json_types(asdict(assigned_flight.scenario)),
+        mistakes=assigned_flight.typed,
         truth={name: float(known[name]) for name in TRUTH},
-        difficulty=drawn.difficulty,
-        form=truth_of(simulation, sha256),
+        difficulty=assigned_flight.difficulty,
+        form=form_truth(simulation, sha256),
     )
 
 
-def key_path(folder: Path, given: Path | None) -> Path:
+def key_path(folder: Path, key_option: Path | None) -> Path:
     """Where the answer key goes: beside the students' folder, never into it.
 
     Raises
@@ -60,9 +60,9 @@ def key_path(folder: Path, given: Path | None) -> Path:
     OutputError
         It would be among the students' files.
     """
-    whole = folder.resolve()
-    path = given or whole.parent / f"{whole.name}_answers.json"
-    if whole in (path.resolve(), *path.resolve().parents):
+    resolved_folder = folder.resolve()
+    path = key_option or resolved_folder.parent / f"{resolved_folder.name}_answers.json"
+    if resolved_folder in (path.resolve(), *path.resolve().parents):
         raise OutputError.of("key_among_students", path=path)
     return path
 
@@ -109,25 +109,28 @@ def assign(
     """
     with own_files():
         key = read_key(key_file) if key_file.exists() else AnswerKey(kind, ())
-    answers = {folded(answer.student_id): answer for answer in key.answers}
+    answers = {normalise_text(answer.student_id): answer for answer in key.answers}
     _check_extends(
-        key_file, key.kind == kind and answers.keys() <= {folded(s.student_id) for s in students}
+        key_file,
+        key.kind == kind and answers.keys() <= {normalise_text(s.student_id) for s in students},
     )
-    made_up = key.secret
+    new_secret = key.secret
     if secret is None:
-        made_up = made_up or secrets.token_urlsafe(24)
-        secret = made_up.encode()
-    elif made_up.encode() != secret:
-        made_up = ""
+        new_secret = new_secret or secrets.token_urlsafe(24)
+        secret = new_secret.encode()
+    elif new_secret.encode() != secret:
+        new_secret = ""
     written = 0
     for done, student in enumerate(students, start=1):
         log, answer = fly(secret, student, kind, count, truth)
-        known = answers.setdefault(folded(student.student_id), answer)
+        known = answers.setdefault(normalise_text(student.student_id), answer)
         _check_extends(key_file, known.sha256 == answer.sha256)
         form = form_text(student.file, answer.sha256).encode()
         contents = {folder / student.file: log, folder / form_name(student.file): form}
-        new = {path: content for path, content in contents.items() if not _there(path, content)}
-        key = AnswerKey(kind, tuple(answers.values()), made_up)
+        new = {
+            path: content for path, content in contents.items() if not _is_written(path, content)
+        }
+        key = AnswerKey(kind, tuple(answers.values()), new_secret)
         # the key first: it contains the secret, without which a run that was ended cannot go on
         write_all({key_file: key_text(key).encode()})
         key_file.chmod(0o600)  # for the instructor only
@@ -143,7 +146,7 @@ def preview(
     secret: bytes | None,
     kind: Kinds,
     count: int | None = None,
-) -> list[Drawn]:
+) -> list[AssignedFlight]:
     """What :func:`assign` would draw for each, without a flight and without a file.
 
     Raises
@@ -161,7 +164,7 @@ def preview(
     return [draw(secret, student.student_id, kind, count) for student in students]
 
 
-def _there(target: Path, log: bytes) -> bool:
+def _is_written(target: Path, log: bytes) -> bool:
     """Whether a log is there already; another one in its place is not replaced."""
     if not target.exists() and not target.is_symlink():
         return False

@@ -12,7 +12,7 @@ from pathlib import Path
 import click
 
 from px4fuse.cli.outputs import Interrupted, written_so_far
-from px4fuse.errors import OutputError, Px4FuseError, SettingsError, on_one_line
+from px4fuse.errors import OutputError, Px4FuseError, SettingsError, to_one_line
 from px4fuse.input_files import inputs_protected
 from px4fuse.threads import ONE_THREAD
 
@@ -50,7 +50,7 @@ UNUSED = ("MPLBACKEND", "SOURCE_DATE_EPOCH")
 LEAST_BYTES = 800_000_000
 
 # pandas loads pyarrow wherever it is installed: 70 MB that only these need
-PARQUET = ("batch", "extract")
+PARQUET_COMMANDS = ("batch", "extract")
 
 
 class LazyGroup(click.Group):
@@ -77,12 +77,12 @@ class LazyGroup(click.Group):
             import difflib
             import shlex
 
-            said = f"No such command {name!r}."
-            if near := difflib.get_close_matches(name.lower(), COMMANDS):
-                said += f" Did you mean {near[0]!r}?"
+            message = f"No such command {name!r}."
+            if close_matches := difflib.get_close_matches(name.lower(), COMMANDS):
+                message += f" Did you mean {close_matches[0]!r}?"
             elif Path(name).is_file():
-                said = f"Say what to do with it: {shlex.join(['px4fuse', 'compare', *args])}."
-            ctx.fail(said)
+                message = f"Say what to do with it: {shlex.join(['px4fuse', 'compare', *args])}."
+            ctx.fail(message)
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> object:
@@ -91,7 +91,7 @@ class LazyGroup(click.Group):
             with inputs_protected():
                 return super().invoke(ctx)
         except Px4FuseError as error:
-            error.args = (_in_options(str(error), ctx.invoked_subcommand),)
+            error.args = (_with_option_names(str(error), ctx.invoked_subcommand),)
             raise
         except BrokenPipeError as error:
             # click itself ends with exit code 1 where it sees errno EPIPE
@@ -162,7 +162,7 @@ def main() -> None:
             stream.reconfigure(errors="replace")
     for number in STOPPING:
         if signal.getsignal(number) is signal.SIG_DFL:  # not where nohup ignores it
-            signal.signal(number, _stop)
+            signal.signal(number, _interrupt)
     try:
         if not {*HELP, "--version"} & set(sys.argv):
             _check_memory()
@@ -171,22 +171,22 @@ def main() -> None:
         error.show()
         code = 2
     except click.UsageError as error:
-        where = error.ctx.command_path if error.ctx else "px4fuse"
-        _say(f"{error.format_message()} See {where} --help.")
+        command_name = error.ctx.command_path if error.ctx else "px4fuse"
+        _print_error(f"{error.format_message()} See {command_name} --help.")
         code = 2
     except Px4FuseError as error:
-        _say(str(error))
+        _print_error(str(error))
         code = 2
     except Interrupted as stopped:
-        _say(str(stopped))
+        _print_error(str(stopped))
         code = stopped.exit_code
     except BrokenPipeError:  # the reader of a pipe has gone, as with | head; the files are written
         _abandon_output()
         code = 0
     except OSError as error:  # of --help and --version, which click writes itself
-        _say(f"standard output: cannot be written ({error.strerror}), nothing was written.")
+        _print_error(f"standard output: cannot be written ({error.strerror}), nothing was written.")
         code = 2
-    sys.exit(_flushed(code if isinstance(code, int) else 0))
+    sys.exit(_flush_output(code if isinstance(code, int) else 0))
 
 
 def _prepare_libraries() -> None:
@@ -195,18 +195,18 @@ def _prepare_libraries() -> None:
         os.environ.setdefault(name, one)
     for name in UNUSED:
         os.environ.pop(name, None)
-    if not set(PARQUET) & set(sys.argv[1:2]):
+    if not set(PARQUET_COMMANDS) & set(sys.argv[1:2]):
         sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]  # as if there were none
 
 
-def _flushed(code: int) -> int:
+def _flush_output(code: int) -> int:
     """The exit code once all that was said is out."""
     try:
         sys.stdout.flush()
     except OSError as error:
         _abandon_output()
         if code == 0:  # else said before
-            _say(f"standard output: cannot be written ({error.strerror}).")
+            _print_error(f"standard output: cannot be written ({error.strerror}).")
             return 2
     return code
 
@@ -215,14 +215,14 @@ def _open_streams() -> None:
     """Give a stream that was closed (``>&-``) a place where what is written is lost."""
     for number, name in ((1, "stdout"), (2, "stderr")):
         if getattr(sys, name) is None:
-            lost = os.open(os.devnull, os.O_WRONLY)
-            if lost != number:
-                os.dup2(lost, number)
-                os.close(lost)
+            null_device = os.open(os.devnull, os.O_WRONLY)
+            if null_device != number:
+                os.dup2(null_device, number)
+                os.close(null_device)
             setattr(sys, name, open(number, "w", encoding="utf-8"))  # noqa: SIM115, PTH123 - for good
 
 
-def _in_options(text: str, command: str | None) -> str:
+def _with_option_names(text: str, command: str | None) -> str:
     """The text of an error as somebody who typed a command reads it."""
     from px4fuse.request import EVALUATION_OPTIONS, LOOP_OPTIONS, OPTIONS, with_options
 
@@ -230,11 +230,11 @@ def _in_options(text: str, command: str | None) -> str:
     return with_options(text, tables.get(command or "", OPTIONS))
 
 
-def _say(text: str) -> None:
-    click.echo(f"px4fuse: {on_one_line(text)}", err=True)
+def _print_error(text: str) -> None:
+    click.echo(f"px4fuse: {to_one_line(text)}", err=True)
 
 
-def _stop(number: int, _: object) -> None:
+def _interrupt(number: int, _: object) -> None:
     """End the run by termination as by Ctrl-C, so that it clears up."""
     raise KeyboardInterrupt(number)
 

@@ -30,6 +30,6 @@ def diff(a: Path, b: Path, json_path: Path | None) -> None:
     outputs.check_targets([json_path])  # fail early if the output cannot be written
     with outputs.progress(json_path) as step:
         results = compared(a, b, progress=step)
-    outputs.finish(outputs.result_files(results, json_path), differences(results))
+    outputs.write_and_print(outputs.result_files(results, json_path), differences(results))
     if results.worse:
         sys.exit(1)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import click
 
-from px4fuse.errors import OutputError, ResultsError, on_one_line
+from px4fuse.errors import OutputError, ResultsError, to_one_line
 from px4fuse.input_files import check_outputs
 from px4fuse.writing import STANDARD_OUTPUT, write_all, written_before
 
@@ -31,13 +31,13 @@ LONGEST_NAME, LONGEST_STEM = 200, 180
 # Name and id on a report without a student
 NOBODY = ("", "")
 # Columns of a line that no paragraph fills
-UNWRAPPED = 10_000
+UNWRAPPED_WIDTH = 10_000
 # Under it a run keeps which files it has written, for what is said where it then ends early
-WRITTEN = "px4fuse.written"
+WRITTEN_KEY = "px4fuse.written"
 # And under this one whether what was written is to be opened
-OPENED = "px4fuse.opened"
+OPEN_KEY = "px4fuse.opened"
 # What is looked at first, of all that a command writes
-TO_LOOK_AT = (".html", ".htm", ".pdf", ".png")
+OPENABLE_SUFFIXES = (".html", ".htm", ".pdf", ".png")
 
 
 class Interrupted(Exception):  # noqa: N818 - no error of anybody
@@ -59,11 +59,11 @@ class Interrupted(Exception):  # noqa: N818 - no error of anybody
 class ShowStep(Protocol):
     """Says what is being done, and how much of it is done where that can be counted."""
 
-    def __call__(self, what: str, done: int = 0, of: int | None = None) -> None:
+    def __call__(self, activity: str, done_count: int = 0, total_count: int | None = None) -> None:
         """Show it."""
 
 
-def silent(what: str, done: int = 0, of: int | None = None) -> None:
+def show_nothing(activity: str, done_count: int = 0, total_count: int | None = None) -> None:
     """Show nothing."""
 
 
@@ -78,7 +78,7 @@ def progress(output: Path | None = None) -> Iterator[ShowStep]:
     console = Console(stderr=True)
     # an older rich ends a disabled bar with an empty line
     if not console.is_terminal or output == STANDARD_OUTPUT:
-        yield silent
+        yield show_nothing
         return
     from rich import progress as bars
 
@@ -93,9 +93,11 @@ def progress(output: Path | None = None) -> Iterator[ShowStep]:
     with bars.Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("starting", total=None, count="")
 
-        def show(what: str, done: int = 0, of: int | None = None) -> None:
-            count = "" if of is None else f"{done} of {of}"
-            bar.update(task, description=what, completed=done, total=of, count=count)
+        def show(activity: str, done_count: int = 0, total_count: int | None = None) -> None:
+            count = "" if total_count is None else f"{done_count} of {total_count}"
+            bar.update(
+                task, description=activity, completed=done_count, total=total_count, count=count
+            )
 
         yield show
 
@@ -108,7 +110,7 @@ def default_report(stem: str, settings: str, results: Results) -> Path:
     OutputError
         A file of that name exists that is not a report of the same files and student.
     """
-    from px4fuse.results.contract import files_named, to_json
+    from px4fuse.results.contract import file_hashes_in, to_json
     from px4fuse.results.reading import read_results
     from px4fuse.verification.intake import attached_results
 
@@ -125,7 +127,7 @@ def default_report(stem: str, settings: str, results: Results) -> Path:
         except (OSError, ResultsError):
             is_same = False
         else:
-            is_same = files_named(to_json(old)) == files_named(to_json(results))
+            is_same = file_hashes_in(to_json(old)) == file_hashes_in(to_json(results))
             is_same &= _person(old) in (NOBODY, _person(results))
         if not is_same:
             raise OutputError.of("default_name_taken", file=file)
@@ -165,20 +167,20 @@ def report_paths(output: Path | None, json_path: Path | None) -> list[Path]:
     """
     if output is not None and output.suffix.lower() != ".pdf":
         raise OutputError(f"{output}: the report is a PDF. Give a name that ends in .pdf with -o.")
-    beside = json_path
+    results_path = json_path
     if output is not None and json_path in (None, STANDARD_OUTPUT):
-        beside = output.with_suffix(".json")
-    known = [path for path in (output, beside) if path is not None]
-    check_targets(known)
-    return known
+        results_path = output.with_suffix(".json")
+    paths = [path for path in (output, results_path) if path is not None]
+    check_targets(paths)
+    return paths
 
 
 def result_files(
     results: Struct | dict[str, Any],
     json_path: Path | None,
     output: Path | None = None,
-    found: object = None,
-    step: ShowStep = silent,
+    subject: object = None,
+    step: ShowStep = show_nothing,
 ) -> dict[Path, bytes]:
     """Results where --json says, and a document as a PDF that holds them and has them beside it.
 
@@ -187,7 +189,7 @@ def result_files(
     results : Struct or dict
     json_path, output : Path or None
         As given with --json and -o.
-    found : object, optional
+    subject : object, optional
         What the results are of, which is drawn.
     step : callable
         Told what is being done.
@@ -195,12 +197,12 @@ def result_files(
     from px4fuse.results.contract import to_json
 
     text, contents = to_json(results), dict[Path, bytes]()
-    if output is not None and found is not None:
+    if output is not None and subject is not None:
         from px4fuse.report.pdf import render
 
         step("drawing the report")
-        output, beside = report_paths(output, json_path)
-        contents |= {output: render(found, results, text), beside: text.encode()}
+        output, results_path = report_paths(output, json_path)
+        contents |= {output: render(subject, results, text), results_path: text.encode()}
     if json_path is not None:
         contents[json_path] = text.encode()
     return contents
@@ -215,13 +217,13 @@ def write_outputs(contents: Mapping[Path, bytes]) -> None:
         As :func:`check_targets`, or a target cannot be written.
     """
     check_targets(contents)
-    written: list[Path] = click.get_current_context().meta.setdefault(WRITTEN, [])
+    written: list[Path] = click.get_current_context().meta.setdefault(WRITTEN_KEY, [])
     write_all(contents, written.append)
 
 
 def written_so_far(context: click.Context) -> str:
     """List the files that this run has written, for a run that ends early."""
-    written: list[Path] = context.meta.get(WRITTEN, [])
+    written: list[Path] = context.meta.get(WRITTEN_KEY, [])
     return f"{written_before(written)}." if written else "nothing was written."
 
 
@@ -235,7 +237,7 @@ def write_new(path: Path, content: bytes) -> None:
     """
     if path.exists():
         raise OutputError(f"{path}: exists already; it was not overwritten. Give another name.")
-    finish({path: content})
+    write_and_print({path: content})
 
 
 def check_targets(targets: Iterable[Path | None]) -> None:
@@ -261,7 +263,7 @@ def check_targets(targets: Iterable[Path | None]) -> None:
     check_outputs(files)
 
 
-def finish(
+def write_and_print(
     contents: Mapping[Path, bytes],
     page: Page | None = None,
     request: Request | None = None,
@@ -281,10 +283,12 @@ def finish(
         if page is not None:
             show(console, page.blocks, request)
         for path in files:
-            print_line(console, "Wrote", on_one_line(str(path)), "bold")
-    seen = [path for ending in TO_LOOK_AT for path in files if path.suffix.lower() == ending]
-    if click.get_current_context().meta.get(OPENED) and seen:
-        click.launch(str(seen[0].resolve()))
+            print_line(console, "Wrote", to_one_line(str(path)), "bold")
+    openable = [
+        path for ending in OPENABLE_SUFFIXES for path in files if path.suffix.lower() == ending
+    ]
+    if click.get_current_context().meta.get(OPEN_KEY) and openable:
+        click.launch(str(openable[0].resolve()))
 
 
 def terminal() -> Console:
@@ -302,7 +306,7 @@ def terminal() -> Console:
     console = PipeConsole(highlight=False)
     columns = os.environ.get("COLUMNS", "")
     if not console.is_terminal and not (columns.isdecimal() and int(columns)):
-        console.width = UNWRAPPED
+        console.width = UNWRAPPED_WIDTH
     elif console.width < 1:  # COLUMNS=0
         console.width = shutil.get_terminal_size().columns
     return console

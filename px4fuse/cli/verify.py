@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import click
 
 from px4fuse.cli.inputs import InputPath, max_size_option, open_option, report_options
-from px4fuse.cli.outputs import check_targets, finish, progress, result_files
+from px4fuse.cli.outputs import check_targets, progress, result_files, write_and_print
 from px4fuse.errors import LogError
-from px4fuse.reading import files_by_sha256, read_whole, shown
+from px4fuse.reading import display_name, files_by_sha256, read_bytes_limited
 
 if TYPE_CHECKING:
     from px4fuse.report.page import Page
@@ -48,10 +48,10 @@ def verify(
     """
     from px4fuse.verification.intake import MAX_BYTES, read_report
     from px4fuse.verification.verification import verify as verify_report
-    from px4fuse.workers import Failed, bounded
+    from px4fuse.workers import JobFailure, run_one_bounded
 
-    content = read_whole(report, LogError, MAX_BYTES, smaller="Reports are below 2 MB")
-    read = read_report(content, shown(report))
+    content = read_bytes_limited(report, LogError, MAX_BYTES, size_remedy="Reports are below 2 MB")
+    read = read_report(content, display_name(report))
     with progress(json_path) as step:
         step("hashing the logs")
         files = files_by_sha256(logs)
@@ -59,16 +59,16 @@ def verify(
         if logs and not files:
             raise LogError("there is no file in what was given as LOG.")
         step("running the analysis again")
-        verdict = bounded(partial(verify_report, pdf=content, logs=files), read, TIMEOUT_S)
-    if isinstance(verdict, Failed):
-        raise LogError(f"{shown(report)}: cannot be verified: {verdict.reason}")
+        verdict = run_one_bounded(partial(verify_report, pdf=content, logs=files), read, TIMEOUT_S)
+    if isinstance(verdict, JobFailure):
+        raise LogError(f"{display_name(report)}: cannot be verified: {verdict.reason}")
     redrawn = {} if output is None or not verdict.redrawn else {output: verdict.redrawn}
-    contents = redrawn | result_files(_plain(content, verdict), json_path)
-    finish(contents, _page(shown(report), verdict, output))
+    contents = redrawn | result_files(_verdict_data(content, verdict), json_path)
+    write_and_print(contents, _page(display_name(report), verdict, output))
     sys.exit(0 if verdict.outcome == "verified" else 1)
 
 
-def _plain(pdf: bytes, verdict: Verdict) -> dict[str, object]:
+def _verdict_data(pdf: bytes, verdict: Verdict) -> dict[str, object]:
     from px4fuse.verification.verification import LIMIT
 
     values = asdict(verdict)
@@ -85,21 +85,21 @@ def _plain(pdf: bytes, verdict: Verdict) -> dict[str, object]:
 
 def _page(name: str, verdict: Verdict, output: Path | None) -> Page:
     from px4fuse.report.page import Page
-    from px4fuse.report.style import GOOD, MUTED, SEVERITY_COLOURS
+    from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
     from px4fuse.results.reading import one_line
     from px4fuse.verification.verification import LIMIT
 
     page = Page()
-    colours = {"verified": GOOD, "cannot verify": SEVERITY_COLOURS["warning"]}
+    colours = {"verified": GOOD_COLOUR, "cannot verify": SEVERITY_COLOURS["warning"]}
     colour = colours.get(verdict.outcome, SEVERITY_COLOURS["error"])
     page.write(f"{one_line(name, 200)}: {verdict.outcome}", bold=True, colour=colour)
-    said = [one_line(reason, 400) for reason in verdict.reasons if reason != LIMIT]
-    said += [f"{d.path}: {d.recorded}, recomputed {d.recomputed}" for d in verdict.differences]
-    for text in said:
+    sentences = [one_line(reason, 400) for reason in verdict.reasons if reason != LIMIT]
+    sentences += [f"{d.path}: {d.recorded}, recomputed {d.recomputed}" for d in verdict.differences]
+    for text in sentences:
         page.write(text, indent=12.0)
     if output is not None and not verdict.redrawn:
         page.write("Nothing was redrawn, since the analysis was not run again.")
     elif output is None and verdict.pages:
         page.write("Read the redrawn report instead: -o writes it.")
-    page.write(LIMIT, colour=MUTED)
+    page.write(LIMIT, colour=MUTED_COLOUR)
     return page

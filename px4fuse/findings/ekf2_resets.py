@@ -4,7 +4,7 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.projection import continuous_state
-from px4fuse.findings.model import Found, finding, moments, times, warning
+from px4fuse.findings.model import Found, finding, format_count, moments, warning
 from px4fuse.flight import Ekf2
 
 
@@ -28,7 +28,7 @@ def detect(analysis: Analysis) -> Found:
             "ekf2_resets",
             {"count": len(inside), "largest_m": max(sizes), "at_s": at_s},
             moments(r.time_s for r in inside),
-            often=times(len(inside)),
+            often=format_count(len(inside)),
             treated=treated,
             horizontal=horizontal,
             part=0 < horizontal < len(inside),
@@ -37,5 +37,5 @@ def detect(analysis: Analysis) -> Found:
     switches = [time for time, _ in ekf2.instances if segment.start_s < time <= segment.end_s]
     if switches:
         evidence = {"count": len(switches), "at_s": switches[0]}
-        often = times(len(switches))
+        often = format_count(len(switches))
         yield warning("ekf2_instance_switch", evidence, moments(switches), often=often)

@@ -5,9 +5,9 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.inputs import MODEL_NOTE
-from px4fuse.findings.model import Found, finding, info, times, warning
+from px4fuse.findings.model import Found, finding, format_count, info, warning
 from px4fuse.flight import Ekf2, Flight
-from px4fuse.plain import capital
+from px4fuse.plain import capitalise_first
 
 
 def detect(analysis: Analysis) -> Found:
@@ -31,7 +31,7 @@ def dropouts(analysis: Comparison) -> Found:
             "logger_dropouts",
             {"count": len(lost), "total_s": sum(each.duration_s for each in lost)},
             tuple((each.start_s, each.start_s + each.duration_s) for each in lost),
-            often=times(len(lost)),
+            often=format_count(len(lost)),
             longest_s=max(each.duration_s for each in lost),
         )
 
@@ -63,9 +63,11 @@ def clocks_set_back(flight: Flight) -> Found:
     """The boot clock began again, or the recording computer's clock was set back."""
     log = flight.log
     if log.restarts:
-        yield warning("autopilot_restarted", {"count": log.restarts}, often=times(log.restarts))
+        yield warning(
+            "autopilot_restarted", {"count": log.restarts}, often=format_count(log.restarts)
+        )
     if back := log.receipt_went_back:
-        yield info("receipt_out_of_order", {"count": back}, often=times(back))
+        yield info("receipt_out_of_order", {"count": back}, often=format_count(back))
 
 
 def estimators(analysis: Analysis) -> Found:
@@ -84,4 +86,4 @@ def estimators(analysis: Analysis) -> Found:
 
 def _sentence(note: str) -> str:
     """A note with a capital letter, unless it begins with a file's name."""
-    return note if "." in note.split(" ", 1)[0] else capital(note)
+    return note if "." in note.split(" ", 1)[0] else capitalise_first(note)

@@ -24,7 +24,7 @@ from pyulog.exceptions import ULogException
 from px4fuse.arrays import IntArray
 from px4fuse.ekf2_parameters import REPORTED, valid_parameters
 from px4fuse.errors import LogError
-from px4fuse.plain import few_words
+from px4fuse.plain import join_first
 from px4fuse.readers.layouts import IMPOSSIBLE, Layout
 from px4fuse.readers.px4_topics import IMU, LAYOUTS, topics
 from px4fuse.recording import Dropout, LogInfo, Stream
@@ -177,7 +177,7 @@ class Topics:
     is_damaged : bool
         pyulog skipped invalid bytes or messages.
     streams : dict
-        Where each part of the flight came from; :meth:`came_from` fills it.
+        Where each part of the flight came from; :meth:`record_stream` fills it.
     """
 
     log: LogInfo
@@ -234,17 +234,22 @@ class Topics:
         """
         available = self.instances(layout.topic)
         table = self.tables[layout.topic, instance if instance in available else available[0]]
-        optional = {ours: px4 for ours, px4 in layout.optional.items() if px4 in table}
+        optional = {
+            column: field_name
+            for column, field_name in layout.optional.items()
+            if field_name in table
+        }
         columns = {**layout.columns, **optional}
         time_us = measurement_time_us(table)
-        keep = increasing(time_us)
+        keep = longest_increasing_run(time_us)
         if len(keep) < len(time_us):
             self.dropped[layout.topic, instance] = len(time_us) - len(keep)
         with np.errstate(invalid="ignore"):  # damaged bytes can be signalling NaNs
             frame = pd.DataFrame(
                 {
-                    ours: table[px4][keep].astype(np.float64) * layout.scale.get(ours, 1.0)
-                    for ours, px4 in columns.items()
+                    column: table[field_name][keep].astype(np.float64)
+                    * layout.scale.get(column, 1.0)
+                    for column, field_name in columns.items()
                 },
                 index=pd.Index((time_us[keep] - self.zero_us) * _MICROSECOND, name="time_s"),
             )
@@ -256,9 +261,9 @@ class Topics:
     def read(self, *layouts: Layout, step: bool = False) -> pd.DataFrame:
         """:meth:`frame` of the first layout that this log holds; empty where it holds none."""
         layout = self.find(*layouts)
-        return _nothing(layouts[0]) if layout is None else self.frame(layout, step=step)
+        return _empty_frame(layouts[0]) if layout is None else self.frame(layout, step=step)
 
-    def of_primary(
+    def primary_samples(
         self,
         layout: Layout,
         *,
@@ -277,20 +282,20 @@ class Topics:
             Which rows of an instance count; all by default.
         """
         if self.find(layout) is None:
-            return _nothing(layout)
+            return _empty_frame(layout)
         available = self.instances(layout.topic)
-        alone = self.primary == NO_SELECTOR
+        is_single = self.primary == NO_SELECTOR
         starts, numbers = (np.array(part) for part in zip(*self.primary, strict=True))
-        parts: list[pd.DataFrame] = []
-        for number in available[:1] if alone else available:
+        primary_frames: list[pd.DataFrame] = []
+        for number in available[:1] if is_single else available:
             frame = self.frame(layout, number, step=step)
             frame = frame if select is None else select(frame)
             at = np.searchsorted(starts, frame.index.to_numpy(), side="right") - 1
-            parts.append(frame if alone else frame[numbers[at] == number])
-        joined = pd.concat(parts).sort_index()
-        return joined[~joined.index.duplicated()]
+            primary_frames.append(frame if is_single else frame[numbers[at] == number])
+        joined_frames = pd.concat(primary_frames).sort_index()
+        return joined_frames[~joined_frames.index.duplicated()]
 
-    def came_from(self, part: str, *topics: str) -> None:
+    def record_stream(self, part: str, *topics: str) -> None:
         """Note where a part of the flight came from, and which moment its times are."""
         # of sensor_combined the stamp is the gyro's, to which the accelerometer's offset is added
         measured = part == "imu" or any(
@@ -301,7 +306,7 @@ class Topics:
         self.streams[part] = Stream(topics, clock, self.log.name)
 
 
-def _nothing(layout: Layout) -> pd.DataFrame:
+def _empty_frame(layout: Layout) -> pd.DataFrame:
     """What a log without a topic has of it."""
     times = pd.Index([], dtype=np.float64, name="time_s")
     return pd.DataFrame(columns=list(layout.columns), index=times, dtype=np.float64)
@@ -325,7 +330,7 @@ def measurement_time_us(table: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
     return np.where(plausible, sampled, published)
 
 
-def increasing(time_us: NDArray[np.int64]) -> IntArray:
+def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
     """Indices of the longest strictly increasing run of positive time stamps.
 
     A stamp hours ahead must cost one sample, not all that follow it, so the longest increasing
@@ -377,23 +382,23 @@ def read_topics(name: str, content: bytes) -> Topics:
             ulog = _Reader(source, message_name_filter_list=topics())
             tables = _tables(ulog)
             # a log of other topics can still be placed in time, by all that it holds
-            placed = tables or _tables(_Reader(_Content(content)))
+            time_tables = tables or _tables(_Reader(_Content(content)))
     except _PARSE_ERRORS as error:
         raise LogError.of(
             "ulog_unreadable", name=name, why=str(error) or type(error).__name__
         ) from error
     notes: tuple[str, ...] = ()
-    if not placed:
+    if not time_tables:
         raise LogError.of("ulog_empty", name=name)
     if not tables:
-        names = sorted({topic for topic, _ in placed})
-        notes += (f"none of its topics is one that px4fuse uses (it holds {few_words(names, 5)})",)
+        names = sorted({topic for topic, _ in time_tables})
+        notes += (f"none of its topics is one that px4fuse uses (it holds {join_first(names, 5)})",)
     if NOTE_KEY in ulog.msg_info_dict:
         notes += (_text(ulog.msg_info_dict, NOTE_KEY, ""),)
-    zero_us, end_us = _data_span(placed, name)
-    every = ulog.initial_parameters.items()
-    numbers = {name: float(v) for name, v in every if isinstance(v, int | float)}
-    given, faults = valid_parameters(numbers)
+    zero_us, end_us = _data_span(time_tables, name)
+    parameter_items = ulog.initial_parameters.items()
+    numbers = {name: float(v) for name, v in parameter_items if isinstance(v, int | float)}
+    parameter_values, faults = valid_parameters(numbers)
     log = LogInfo(
         name=name,
         sha256=hashlib.sha256(content).hexdigest(),
@@ -408,13 +413,17 @@ def read_topics(name: str, content: bytes) -> Topics:
             Dropout((d.timestamp - zero_us) * _MICROSECOND, d.duration * 1e-3)
             for d in ulog.dropouts
         ),
-        parameters=MappingProxyType({name: given[name] for name in REPORTED if name in given}),
+        parameters=MappingProxyType(
+            {name: parameter_values[name] for name in REPORTED if name in parameter_values}
+        ),
         notes=(*notes, *faults),
         bytes_read=source.start - source.skipped_bytes,
         autopilot=_text(ulog.msg_info_dict, "sys_name", "PX4"),
         vehicle=_text(ulog.msg_info_dict, "sys_uuid", ""),
     )
-    parameters = {name: value for name, value in given.items() if name.startswith("EKF2_")}
+    parameters = {
+        name: value for name, value in parameter_values.items() if name.startswith("EKF2_")
+    }
     is_cut = source.start < size < source.end
     return Topics(
         log, tables, zero_us, {}, MappingProxyType(parameters), is_cut, ulog.file_corruption
@@ -444,11 +453,11 @@ def _data_span(
     """First and last time (µs) of the IMU, or else of the topic with most samples."""
     for key in sorted(tables, key=lambda of: (of[0] != IMU.topic, -len(tables[of]["timestamp"]))):
         time_us = tables[key]["timestamp"].astype(np.int64)
-        kept = time_us[increasing(time_us)]
-        if len(kept):
+        increasing_us = time_us[longest_increasing_run(time_us)]
+        if len(increasing_us):
             # a stamp hours away from the others is a leftover: the longest stretch counts
-            breaks = np.flatnonzero(np.diff(kept) > MAX_DATA_GAP_S / _MICROSECOND) + 1
-            stretch = max(np.split(kept, breaks), key=len)
+            breaks = np.flatnonzero(np.diff(increasing_us) > MAX_DATA_GAP_S / _MICROSECOND) + 1
+            stretch = max(np.split(increasing_us, breaks), key=len)
             return int(stretch[0]), int(stretch[-1])
     raise LogError.of("stamps_zero", name=name)
 

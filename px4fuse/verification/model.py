@@ -55,7 +55,7 @@ class PageDifference:
     structural: bool = False
 
     @property
-    def said(self) -> str:
+    def sentence(self) -> str:
         """The difference with its place."""
         return f"{f'page {self.page}' if self.page else 'document'}: {self.what}"
 

@@ -36,9 +36,9 @@ from pypdf.generic import (
 )
 
 from px4fuse.results.reading import one_line
-from px4fuse.verification.intake import BROKEN, MAX_VALUES, PYPDF_LIMITS, opened
+from px4fuse.verification.intake import BROKEN_PDF_ERRORS, MAX_VALUES, PYPDF_LIMITS, opened
 from px4fuse.verification.model import PageDifference
-from px4fuse.workers import Failed, bounded
+from px4fuse.workers import JobFailure, run_one_bounded
 
 # Of coordinates (pt). Other kernels of OpenBLAS move points by at most 0.07; 0.25 is not visible
 COORDINATE_PT = 0.25
@@ -118,8 +118,8 @@ def compare_pages(
         are exceeded, that is the difference.
     """
     job = (submitted, redrawn, words_alike, same_libraries)
-    found = bounded(_found, job, TIMEOUT_S, MEMORY_BYTES)
-    if isinstance(found, Failed):
+    found = run_one_bounded(_found, job, TIMEOUT_S, MEMORY_BYTES)
+    if isinstance(found, JobFailure):
         what = f"it cannot be compared within the limits ({found.reason.rstrip('.')})"
         return (PageDifference(0, what, True),)
     return found
@@ -138,7 +138,7 @@ def _found(job: tuple[bytes, bytes, WordsAlike, bool]) -> tuple[PageDifference, 
                 what = f"another program wrote this file ({one_line(str(producer), 60)})"
                 found.insert(0, PageDifference(0, what, True))
             return tuple(found)
-    except (LimitReachedError, RecursionError, SyntaxError, *BROKEN) as error:
+    except (LimitReachedError, RecursionError, SyntaxError, *BROKEN_PDF_ERRORS) as error:
         what = f"it cannot be read ({type(error).__name__})"
         return (PageDifference(0, what, True),)
 
