@@ -302,7 +302,7 @@ def _abilities(flight: Flight, compared: Comparison | None, reason: str) -> Iter
         yield _ability(name, logged if isinstance(logged, Unavailable) else used, said)
     aids, ekf2 = judge_aids(flight), flight.ekf2
     if isinstance(aids, dict) and isinstance(ekf2, Ekf2):
-        rates = (f"{a.label} {sample_rate(ekf2.aids[n].samples):.2g} Hz" for n, a in aids.items())
+        rates = (f"{a.label} {_rate(ekf2.aids[n].samples)}" for n, a in aids.items())
         said = f"each judged by its own innovations: {', '.join(rates)}"
     yield _ability("aids", aids, said)
     inputs = prepare(flight)
@@ -310,6 +310,11 @@ def _abilities(flight: Flight, compared: Comparison | None, reason: str) -> Iter
         replayed_s = sum(float(np.ptp(stretch.time_s)) for stretch in inputs.stretches)
         said = f"EKF2 replayed on {inputs.aid.label} for {replayed_s:.0f} s, also otherwise set"
     yield _ability("what if", inputs, said)
+
+
+def _rate(samples: pd.DataFrame) -> str:
+    """Rate of samples; one alone has none."""
+    return f"{sample_rate(samples):.2g} Hz" if len(samples) > 1 else "1 sample"
 
 
 def _ability(name: str, part: object, said: str) -> Ability:
