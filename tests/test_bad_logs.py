@@ -419,6 +419,16 @@ def test_compare_of_damaged_part_writes_finite_results(tmp_path, damage):
         assert any(reason in missing.reason for missing in results.missing)
 
 
+def test_info_of_an_aid_with_one_sample_gives_no_rate(tmp_path):
+    log = make_log("v1.16", 20.0)
+    name = "estimator_aid_src_ev_hgt"
+    log.topics = [take(one, [50]) if one.name == name else one for one in log.topics]
+    flight = read_of(log, tmp_path)
+    aids = next(one for one in take_inventory(flight).abilities if one.name == "aids")
+    assert "external vision, height 1 sample" in aids.reason
+    assert "nan" not in aids.reason
+
+
 @pytest.mark.parametrize("command", ["sync", "tune", "loop"])
 @pytest.mark.parametrize(("value", "whole"), [(3e38, True), (-1e20, False)])
 @pytest.mark.parametrize(

@@ -384,6 +384,9 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     "a letter far aside": (
         content(once(rb"\)(-?[\d.]+)\(", rb")-9000(")), "its text has", False,
     ),
+    "a letter a little aside": (
+        content(once(rb"\)(-?[\d.]+)\(", rb")150(")), "its text has", False,
+    ),
     "a text less": (content(once(rb"\[\([^]]*\]TJ", b"[]TJ")), "its text has", False),
     "the page clipped": (
         content(lambda c: b"0 0 300 300 re W n\n" + c), "drawing operation 1 ", False,

@@ -194,9 +194,18 @@ def _velocity_sentence(why: Why) -> str:
     mostly = f", in velocity mostly by the {first.name} ({share:.0%})" if share <= 1.0 else ""
     return (
         f"Where EKF2 was replayed they are {np.sqrt(position):.3f} m and {np.sqrt(total):.3f} m/s "
-        f"rms apart{mostly}; the model leaves {why.position_left_share:.1%} of that in position "
-        f"and {why.velocity_left_mean_square_m2_s2 / total:.1%} in velocity unexplained."
+        f"rms apart{mostly}; the model leaves {_left(why.position_left_share)} of that in position "
+        f"and {_left(why.velocity_left_mean_square_m2_s2 / total)} in velocity unexplained."
     )
+
+
+def _unexplained_text(share: float) -> str:
+    """Format the unexplained share of a mean square; above 1 the model explains nothing.
+
+    >>> _unexplained_text(0.0071), _unexplained_text(4.2)
+    ('0.7%', 'all')
+    """
+    return f"{share:.1%}" if share <= 1.0 else "all"
 
 
 def _truth_sentences(why: Why) -> list[str]:

@@ -315,7 +315,7 @@ def _abilities(
         yield _ability(name, logged if isinstance(logged, Unavailable) else used_part, description)
     aids, ekf2 = evaluate_aids(flight), flight.ekf2
     if isinstance(aids, dict) and isinstance(ekf2, Ekf2):
-        rates = (f"{a.label} {sample_rate(ekf2.aids[n].samples):.2g} Hz" for n, a in aids.items())
+        rates = (f"{a.label} {_rate_text(ekf2.aids[n].samples)}" for n, a in aids.items())
         description = f"each judged by its own innovations: {', '.join(rates)}"
     yield _ability("aids", aids, description)
     inputs = prepare_inputs(flight)
@@ -325,6 +325,11 @@ def _abilities(
             f"EKF2 replayed on {inputs.aid.label} for {replayed_s:.0f} s, also otherwise set"
         )
     yield _ability("what if", inputs, description)
+
+
+def _rate_text(samples: pd.DataFrame) -> str:
+    """Format the rate of samples (Hz); a single sample has none."""
+    return f"{sample_rate(samples):.2g} Hz" if len(samples) > 1 else "1 sample"
 
 
 def _ability(name: str, part: object, description: str) -> AnalysisOption:
