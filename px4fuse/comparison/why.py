@@ -194,8 +194,8 @@ def _velocity_sentence(why: Why) -> str:
     mostly = f", in velocity mostly by the {first.name} ({share:.0%})" if share <= 1.0 else ""
     return (
         f"Where EKF2 was replayed they are {np.sqrt(position):.3f} m and {np.sqrt(total):.3f} m/s "
-        f"rms apart{mostly}; the model leaves {_left(why.position_left_share)} of that in position "
-        f"and {_left(why.velocity_left_mean_square_m2_s2 / total)} in velocity unexplained."
+        f"rms apart{mostly}; the model leaves {_unexplained_text(why.position_left_share)} of that in position "
+        f"and {_unexplained_text(why.velocity_left_mean_square_m2_s2 / total)} in velocity unexplained."
     )
 
 
