@@ -54,7 +54,6 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.reading import display_name
-from px4fuse.record import missing_data
 from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest
 
 if TYPE_CHECKING:
@@ -201,7 +200,11 @@ class Analysis(Comparison):
             tuned = self.tuning.get(name)
             if isinstance(tuned, AxisTuning) and self.axes.keys() >= set(group):
                 return tuple(self.axes[each].axis for each in group), tuned, offset_s
-        return missing_data("noises_unknown")
+        return Unavailable(
+            "causes other than noise",
+            "the noises of the horizontal axes could not be estimated",
+            "Analyse north and east, or the aisle (--axis).",
+        )
 
 
 @dataclass(frozen=True)
@@ -255,7 +258,10 @@ def run_or_evaluate_aids(
     no_position, aids = explain_missing_source(flight), evaluate_aids(flight)
     if isinstance(aids, Unavailable):
         if flight.airborne == ():
-            raise MissingDataError.of("not_flown", log=flight.log.name, reason=aids.reason)
+            raise MissingDataError(
+                f"{flight.log.name}: the vehicle did not fly, so there is nothing to analyse "
+                f"({aids.reason}). px4fuse info {flight.log.name} lists what is logged."
+            )
         neither = f"{no_position.reason}, and the aids of EKF2 cannot be judged: {aids.reason}"
         raise MissingDataError(f"{flight.log.name}: {neither}", no_position.remedy)
     return AidsOnlyAnalysis(flight, aids, no_position)
@@ -299,7 +305,10 @@ def read_flight(request: ComparisonRequest, progress: Progress = silent) -> Flig
 
         other = read_log(Path(request.mavlink), system=request.system)
         if not other.log.format.startswith("MAVLink"):
-            raise LogError.of("not_mavlink", other=other)
+            raise LogError(
+                (f"--mavlink {other.log.name} is a {other.log.format}, not a MAVLink recording."),
+                "Give the ULog as LOG and the recording (.tlog) with --mavlink.",
+            )
         flight = join(flight, other)
     position, offset = request.position, request.clock_offset_s
     if position is None:
@@ -358,7 +367,13 @@ def prepare_comparison(
         return prepared
     _, clock = noises_and_clock(prepared, progress)
     if isinstance(clock, Unavailable) or not clock.determinable:
-        raise MissingDataError.of("offset_unknown", flight=flight, clock=clock)
+        raise MissingDataError(
+            (
+                f"{flight.log.name}: the clock offset cannot be determined from this flight "
+                f"({clock.reason})."
+            ),
+            "Give --clock-offset SECONDS, or omit it.",
+        )
     low, high = clock.interval_s
     if low <= 0.0 <= high:
         note = (

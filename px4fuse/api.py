@@ -111,7 +111,13 @@ def compare(
     if unknown := set(named).difference(known):
         raise SettingsError(f"`axes` {unknown.pop()!r}: choose from {', '.join(known)}.")
     if isinstance(log, Flight) and (position, mavlink, system) != (None, None, None):
-        raise SettingsError.of("flight_was_read")
+        raise SettingsError(
+            (
+                "position, mavlink and system are only used when a log is read, and this "
+                "flight is already read."
+            ),
+            "Give the path of its log instead.",
+        )
     if isinstance(clock_offset_s, str) and clock_offset_s != request.AUTO:
         raise SettingsError(f"`clock_offset_s` {clock_offset_s!r}: give seconds, or 'auto'.")
     asked = {name: given[name] for name in request.ComparisonRequest.__struct_fields__}
@@ -307,7 +313,10 @@ def _ending(path: Pathlike, ending: str) -> Path:
 
 def _request(analysis: Analysis) -> request.ComparisonRequest:
     if analysis.request is None:
-        raise SettingsError.of("without_request")
+        raise SettingsError(
+            "This analysis contains no request, so its command is unknown.",
+            "Create it with px4fuse.compare.",
+        )
     return analysis.request
 
 

@@ -225,8 +225,9 @@ def check_parameters(chosen: Mapping[str, float]) -> dict[str, float]:
             )
         if not known.minimum <= value <= known.maximum or not math.isfinite(value):
             unit = f" {known.unit}" if known.unit else ""
-            raise SettingsError.of(
-                "parameter_outside", name=name, value=value, known=known, unit=unit
+            raise SettingsError(
+                f"{name}={value:g} is outside PX4's range of {known.minimum:g} to "
+                f"{known.maximum:g}{unit} (default {known.default:g})."
             )
         if name == EV_POS.noise_mode and value not in (0.0, 1.0):
             raise SettingsError(f"{name}={value:g}: only 0 and 1 have a meaning.")

@@ -15,10 +15,7 @@ as Python does, in backticks (`sigma_z_m`); the command line puts its options in
 (:func:`px4fuse.request.with_options`), prints it on standard error and ends with exit code 2.
 """
 
-from collections.abc import Iterable, Mapping
-from functools import cache
-from pathlib import Path
-from typing import Self
+from collections.abc import Iterable
 
 
 def suggest_name(name: str, known: Iterable[str]) -> str:
@@ -44,14 +41,6 @@ def to_one_line(text: str) -> str:
     return "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in text)
 
 
-@cache
-def _error_texts() -> Mapping[str, list[str]]:
-    """Reason, and remedy where there is one, of every case."""
-    import tomllib  # noqa: PLC0415 - where something is wrong only
-
-    return tomllib.loads(Path(__file__).with_name("refusals.toml").read_text("utf-8"))
-
-
 class Px4FuseError(Exception):
     """Base of all errors that px4fuse raises on purpose; all is put on one line.
 
@@ -67,15 +56,6 @@ class Px4FuseError(Exception):
         text, self.remedy = to_one_line(reason), to_one_line(remedy)
         self.reason = text.removesuffix(".")
         super().__init__(f"{self.reason}. {self.remedy}" if remedy else text)
-
-    @classmethod
-    def of(cls, case: str, /, **facts: object) -> Self:
-        """The error of a case, in the words of ``refusals.toml``.
-
-        >>> str(SettingsError.of("no_column", path="class.csv")).partition(". ")[0]
-        'class.csv: no column tells who a student is'
-        """
-        return cls(*(text.format_map(facts) for text in _error_texts()[case]))
 
 
 class LogError(Px4FuseError):

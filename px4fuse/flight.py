@@ -23,7 +23,7 @@ from px4fuse.arrays import Array, BoolArray
 from px4fuse.display import one_line_repr
 from px4fuse.ekf2_parameters import BAROMETER, Aid
 from px4fuse.origin import Origin
-from px4fuse.record import NotNegative, Record, Vector, missing_data
+from px4fuse.record import NotNegative, Record, Vector
 from px4fuse.record import Unavailable as Unavailable  # noqa: PLC0414 - for everybody
 from px4fuse.recording import ClockMap, InputFile, LogInfo, Stream, Unused
 
@@ -245,11 +245,23 @@ class Reset:
 
 # EKF2_PREDICT_US, ekf2_params.c
 EKF2_STEP_S = 0.010
-BIAS_NOT_LOGGED = missing_data("bias_not_logged")
-HORIZON_NOT_LOGGED = missing_data("horizon_not_logged")
+BIAS_NOT_LOGGED = Unavailable(
+    "EKF2 accelerometer bias",
+    "estimator_sensor_bias and estimator_states are not logged",
+    "Record a ULog with SDLOG_PROFILE bit 0 (default).",
+)
+HORIZON_NOT_LOGGED = Unavailable(
+    "EKF2 fusion horizon",
+    "the log has no separate times of fusion and publication",
+    "Record a ULog with PX4 v1.13 or newer.",
+)
 
 
-RECORD_NOT_LOGGED = missing_data("record_not_logged")
+RECORD_NOT_LOGGED = Unavailable(
+    "EKF2 state at the fusion horizon",
+    "estimator_states is not logged",
+    ("Record a ULog with PX4 v1.12 or newer and SDLOG_PROFILE bit 0 (default), and add it."),
+)
 
 
 GROUND_EFFECT, BAD_ACCELERATION = "gnd_effect", "bad_acc_vertical"
@@ -442,7 +454,11 @@ class Truth:
     __repr__ = one_line_repr
 
 
-MODES_NOT_LOGGED = missing_data("modes_not_logged")
+MODES_NOT_LOGGED = Unavailable(
+    "flight modes",
+    "vehicle_status is not logged or not usable",
+    "Record with SDLOG_PROFILE bit 0 (default).",
+)
 
 
 # equal to itself only: what is made of it is kept by it

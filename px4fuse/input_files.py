@@ -75,7 +75,10 @@ def check_outputs(targets: Iterable[Path]) -> None:
     register = _register.get() or _Register()
     for target in targets:
         if _identity(target) in register.read:
-            raise OutputError.of("output_is_input", target=target)
+            raise OutputError(
+                f"{target} is an input of this command and was not overwritten. Choose "
+                "another output name."
+            )
 
 
 def check_output_folder(folder: Path) -> None:
@@ -95,7 +98,9 @@ def check_output_folder(folder: Path) -> None:
             continue
         found = place if identity in register.read else register.containing.get(identity)
         if found is not None:
-            raise OutputError.of("folder_of_inputs", folder=folder, found=found)
+            raise OutputError(
+                f"-o {folder}: contains an input of this command, {found}", "Give another folder."
+            )
 
 
 def _entries(folder: Path) -> list[Path]:

@@ -61,7 +61,9 @@ def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int
     if stat.S_ISDIR(status.st_mode):
         raise error_type(f"{name}: is a folder", "Give a file.")
     if not stat.S_ISREG(status.st_mode):
-        raise error_type.of("not_regular", name=name)
+        raise error_type(
+            f"{name} is not a regular file (device, pipe or socket).", "Save it to a file first."
+        )
     add_input(path)
     return status.st_size
 
@@ -157,7 +159,9 @@ def read_text(
     try:
         return content.decode("utf-16" if is_utf16 else "utf-8-sig")
     except UnicodeDecodeError as error:
-        raise error_type.of("not_utf8", name=name, error=error) from error
+        raise error_type(
+            f"{name} is not a UTF-8 text file (byte {error.start}).", "Save it as UTF-8."
+        ) from error
 
 
 def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:

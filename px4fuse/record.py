@@ -132,18 +132,3 @@ def table(beside: str, name: str, kind: type[T]) -> T:
         What it holds.
     """
     return msgspec.toml.decode(Path(beside).with_name(name).read_bytes(), type=kind)
-
-
-_MISSING_DATA = table(__file__, "lacking.toml", dict[str, Unavailable])
-
-
-def missing_data(name: str, /, **facts: object) -> Unavailable:
-    """What was looked for and not found, in the words of ``missing_data.toml``.
-
-    Examples
-    --------
-    >>> str(missing_data("measurements_few", what="tuning", count=3, least=30)).partition(". ")[0]
-    'tuning: 3 measurements are too few (at least 30)'
-    """
-    row = _MISSING_DATA[name]
-    return Unavailable(*(text.format(**facts) for text in (row.what, row.reason, row.remedy)))

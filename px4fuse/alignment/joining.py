@@ -38,12 +38,19 @@ def join(flight: Flight, other: Flight) -> Flight:
         The two do not overlap in time, or are not of the same flight.
     """
     if other.log.sha256 == flight.log.sha256:
-        raise MissingDataError.of("recording_twice", other=other)
+        raise MissingDataError(
+            f"{other.log.name} is the same recording as LOG.",
+            "Give the other recording of the flight.",
+        )
     shift_s = other.log.boot_time_s - flight.log.boot_time_s
     low, high = max(0.0, shift_s), min(flight.log.duration_s, shift_s + other.log.duration_s)
     if high - low < MIN_OVERLAP_S:
-        raise MissingDataError.of(
-            "no_common_time", flight=flight, other=other, one=_span(flight), two=_span(other)
+        raise MissingDataError(
+            (
+                f"{flight.log.name} and {other.log.name} do not overlap in time: "
+                f"{_span(flight)} and {_span(other)} on the autopilot's boot clock."
+            ),
+            "Give recordings of the same flight.",
         )
     shifted = shift_times(other, shift_s)
     agreement = _agreement(flight, shifted)
@@ -151,6 +158,12 @@ def _agreement(flight: Flight, other: Flight) -> str:
             )
             median = float(np.median(distance_m))
             if median > MAX_POSITION_DIFFERENCE_M:
-                raise MissingDataError.of("other_flight", flight=flight, other=other, median=median)
+                raise MissingDataError(
+                    (
+                        f"{flight.log.name} and {other.log.name} are different flights: their EKF2 "
+                        f"positions differ by {median:.2f} m (median)."
+                    ),
+                    "Give recordings of the same flight.",
+                )
             return f"their EKF2 positions differ by {median:.3f} m (median)"
     return "that they are of the same flight could not be checked: no EKF2 in both"

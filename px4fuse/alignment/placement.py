@@ -76,8 +76,10 @@ def align_position_file(
     _check_options(frame, yaw_deg, clock_offset_s)
     samples = finite_rows(file.samples, ["x_m", "y_m"])
     if len(samples) < tracks.MIN_SAMPLES:
-        raise MissingDataError.of(
-            "positions_few", file=file, count=len(samples), least=tracks.MIN_SAMPLES
+        raise MissingDataError(
+            f"{file.name} contains {len(samples)} positions; at least "
+            f"{tracks.MIN_SAMPLES} are needed. Check the file and the segment (--start, "
+            "--end)."
         )
     start_s, end_s = float(samples.index[0]), float(samples.index[-1])
     boot_s = flight.log.boot_time_s
@@ -87,8 +89,12 @@ def align_position_file(
     )
     lag_s = None if clock_offset_s is None else start_s + clock_offset_s - boot_s
     if lag_s is not None and not start_s - end_s <= lag_s <= flight.log.duration_s:
-        raise MissingDataError.of(
-            "offset_apart", file=file, clock_offset_s=clock_offset_s, spans=spans
+        raise MissingDataError(
+            (
+                f"{file.name}: with --clock-offset {clock_offset_s:.3f} the file does not "
+                f"overlap the log ({spans})."
+            ),
+            "Correct the offset, or omit it: px4fuse then estimates it.",
         )
     yaw_rad = None if yaw_deg == "auto" else float(np.radians(yaw_deg or 0.0))
     try:
@@ -125,7 +131,9 @@ def _check_options(
     frame: str | None, yaw_deg: float | str | None, clock_offset_s: float | None
 ) -> None:
     if frame is not None and frame not in tracks.FRAMES:
-        raise SettingsError.of("no_such_frame", frame=frame, known=", ".join(tracks.FRAMES))
+        raise SettingsError(
+            f"Frame {frame} is not known.", f"Use one of {', '.join(tracks.FRAMES)}."
+        )
     if isinstance(yaw_deg, str) and yaw_deg != "auto":
         raise SettingsError(f"`yaw_deg` {yaw_deg}: give degrees, or auto.")
     for name, value in (("yaw_deg", yaw_deg), ("clock_offset_s", clock_offset_s)):

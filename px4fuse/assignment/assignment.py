@@ -63,7 +63,10 @@ def key_path(folder: Path, key_option: Path | None) -> Path:
     resolved_folder = folder.resolve()
     path = key_option or resolved_folder.parent / f"{resolved_folder.name}_answers.json"
     if resolved_folder in (path.resolve(), *path.resolve().parents):
-        raise OutputError.of("key_among_students", path=path)
+        raise OutputError(
+            f"{path} is in the students' folder, where students would find it. Choose "
+            "another place with --answer."
+        )
     return path
 
 
@@ -159,7 +162,10 @@ def preview(
     if secret is None:
         before = read_key(key_file) if key_file.exists() else None
         if before is None or not before.secret:
-            raise SettingsError.of("preview_without_secret")
+            raise SettingsError(
+                "--preview requires --secret-file or --secret. A generated secret is not "
+                "stored, so the next run would draw other flights."
+            )
         secret = before.secret.encode()
     return [draw(secret, student.student_id, kind, count) for student in students]
 
@@ -170,10 +176,18 @@ def _is_written(target: Path, log: bytes) -> bool:
         return False
     if target.is_file() and target.stat().st_size == len(log) and target.read_bytes() == log:
         return True
-    raise OutputError.of("flight_there", target=target)
+    raise OutputError(
+        f"{target} already exists and contains another flight. It was not "
+        "overwritten. Use the same secret and options as before, or another folder "
+        "(-o)."
+    )
 
 
 def _check_extends(key_file: Path, same: bool) -> None:
     """A key that is there already must be part of the new one."""
     if not same:
-        raise OutputError.of("key_of_others", key_file=key_file)
+        raise OutputError(
+            f"{key_file} is the answer key of other flights. It was not overwritten. Use "
+            "the same secret, options and students as before (more students may be "
+            "added), or another file (--answer)."
+        )

@@ -152,7 +152,10 @@ def draw(
         - 1
     )
     if count is not None and not 0 <= count <= most:
-        raise SettingsError.of("mistakes_many", count=count, kind=kind, most=most)
+        raise SettingsError(
+            f"--mistakes {count} is out of range: a flight of kind {kind} can have 0 to "
+            f"{most} mistakes that are all detectable."
+        )
     if kind == "mixed":
         kind = "loop" if uniform(secret, student_id, kind, "kind") < LOOP_SHARE else "aisle"
     draw_number = partial(uniform, secret, student_id, kind)
@@ -194,5 +197,11 @@ def encode_secret(text: str, where: str) -> bytes:
     """
     stripped = text.strip()
     if len(stripped) < MIN_SECRET:
-        raise SettingsError.of("secret_short", where=where, length=len(stripped), least=MIN_SECRET)
+        raise SettingsError(
+            (f"{where}: the secret has only {len(stripped)} characters and can be guessed."),
+            (
+                f"Use {MIN_SECRET} or more, or omit it: px4fuse then generates one and "
+                "stores it in the answer key."
+            ),
+        )
     return stripped.encode(errors="replace")

@@ -115,5 +115,8 @@ def read_key(path: Path) -> AnswerKey:
         if len({normalise_text(answer.student_id) for answer in key.answers}) < len(key.answers):
             raise ValueError("two students have the same id")
     except (msgspec.MsgspecError, RecursionError, ValueError) as error:
-        raise SettingsError.of("no_key", path=path, error=error) from error
+        raise SettingsError(
+            f"{path} is not an answer key of this px4fuse version ({error}).",
+            "Give the file that px4fuse simulate --assignment wrote.",
+        ) from error
     return key

@@ -68,7 +68,9 @@ def read_people(sheet: Sheet) -> tuple[Person, ...]:
         No column tells who somebody is, or two rows have the same id.
     """
     if all(sheet.column(titles) is None for titles in COLUMNS.values()):
-        raise SettingsError.of("no_column", path=sheet.path)
+        raise SettingsError(
+            f"{sheet.path}: no column identifies the student.", "Name one column id, email or name."
+        )
     rows: dict[str, int] = {}
     people = []
     for number, row in enumerate(sheet.rows, start=2):
@@ -77,12 +79,12 @@ def read_people(sheet: Sheet) -> tuple[Person, ...]:
             continue
         wanted = normalise_text(person.student_id)
         if wanted and rows.setdefault(wanted, number) != number:
-            raise SettingsError.of(
-                "id_twice",
-                sheet=sheet,
-                before=rows[wanted],
-                number=number,
-                student_id=one_line(person.student_id, 40),
+            raise SettingsError(
+                (
+                    f"{sheet.path}: rows {rows[wanted]} and {number} have the same id "
+                    f"{one_line(person.student_id, 40)!r}."
+                ),
+                "Give each student a unique id.",
             )
         people.append(person)
     return tuple(people)
@@ -105,7 +107,10 @@ def read_roster(path: Path) -> tuple[Person, ...]:
         stem = file_stem(person.student_id)
         if stem is None or stems.setdefault(stem.casefold(), person) is not person:
             who = one_line(person.student_id or person.name, 40)
-            raise SettingsError.of("id_without_file", path=path, who=who)
+            raise SettingsError(
+                f"{path}: the id of {who!r} cannot be used as a file name.",
+                "Give each student an id with letters or digits.",
+            )
     return people
 
 

@@ -42,7 +42,10 @@ def extract(
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output}: is a file. Give a folder with -o.")
     if format == "parquet" and importlib.util.find_spec("pyarrow") is None:
-        raise OutputError.of("no_pyarrow")
+        raise OutputError(
+            '--format parquet requires pyarrow. Run pip install "px4fuse[parquet]", or '
+            "use --format csv."
+        )
     from px4fuse.analysis import read_flight
     from px4fuse.inspect import tables as extraction
     from px4fuse.results.contract import to_json
@@ -74,7 +77,9 @@ def _require_same_flight(folder: Path, sha256: str) -> None:
     except (OutputError, ValueError, KeyError, TypeError):  # not one of ours
         return
     if other:
-        raise OutputError.of("tables_of_another", folder=folder, name=name)
+        raise OutputError(
+            f"{folder} contains the tables of another log, {name}. Choose another folder (-o)."
+        )
 
 
 def _csv_bytes(table: pd.DataFrame) -> bytes:

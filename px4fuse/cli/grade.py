@@ -108,7 +108,10 @@ def _require_output_outside(output: Path, input_paths: tuple[Path, ...]) -> None
     above = [folder for folder in (whole, *whole.parents) if folder.is_dir()]
     for path in input_paths:
         if path.is_dir() and any(map(path.samefile, above)):
-            raise OutputError.of("output_within", output=output, path=path)
+            raise OutputError(
+                f"-o {output} is inside {path}, which is an input. Its own output would be "
+                "graded. Choose another folder."
+            )
         for file in files_below(path):
             add_input(file)
     check_output_folder(output)

@@ -127,7 +127,10 @@ def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict
     if tum is not None:
         best = loop_result.best
         if best is loop_result.odometry:
-            raise MissingDataError.of("no_corrected_path", tum=display_name(tum))
+            raise MissingDataError(
+                f"--tum {display_name(tum)}: no corrected path exists: no loop closure was "
+                "accepted. Give a closure (--closure) or the landing place (--landed-at)."
+            )
         contents[tum] = tum_text(from_z_down(best.trajectory, loop_result.original_frame)).encode()
     if g2o is not None:
         contents[g2o] = g2o_text(loop_result.solved_graph()).encode()
@@ -151,8 +154,12 @@ def _solve_graph(
         )
     for parameter in inputs.typed_parameters():
         if parameter.name not in GRAPH_PARAMETERS:
-            raise SettingsError.of(
-                "not_for_graphs", source=display_name(source), option=parameter.opts[-1]
+            raise SettingsError(
+                (
+                    f"{display_name(source)}: {parameter.opts[-1]} is not available for a pose "
+                    "graph."
+                ),
+                "Only --g2o FILE and --json FILE are.",
             )
     outputs.check_targets([json_path, g2o])
     with outputs.progress(json_path) as step:

@@ -130,7 +130,13 @@ def default_report(stem: str, settings: str, results: Results) -> Path:
             is_same = file_hashes_in(to_json(old)) == file_hashes_in(to_json(results))
             is_same &= _person(old) in (NOBODY, _person(results))
         if not is_same:
-            raise OutputError.of("default_name_taken", file=file)
+            raise OutputError(
+                (
+                    f"{file}: exists and is not a report of the same files and student by this "
+                    "version; it was not replaced"
+                ),
+                "Name the report with -o.",
+            )
     return path
 
 
@@ -259,7 +265,9 @@ def check_targets(targets: Iterable[Path | None]) -> None:
         except FileNotFoundError:
             continue
         except OSError as error:  # a name that is too long, a file in the place of a folder
-            raise OutputError.of("cannot_be_written", target=target, error=error) from error
+            raise OutputError(
+                f"{target} cannot be written ({error.strerror}). Choose another place."
+            ) from error
     check_outputs(files)
 
 

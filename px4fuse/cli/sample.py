@@ -32,7 +32,10 @@ def sample_log() -> Path:
             with as_file(files("px4fuse_samples") / SAMPLE) as installed:
                 sample_path = installed
         except ModuleNotFoundError:
-            raise MissingDataError.of("no_sample", install=INSTALL) from None
+            raise MissingDataError(
+                "No log was given, and the sample flights are not installed.",
+                f"Give a LOG, or run {INSTALL}.",
+            ) from None
     click.echo(f"No log was given: this is the sample flight, {SAMPLE}.", err=True)
     return sample_path
 
@@ -54,7 +57,10 @@ def sample(output: Path = FOLDER) -> None:
     contents = {output / one.name: one.read_bytes() for one in sorted(flights, key=str)}
     for path, content in contents.items():
         if path.is_file() and path.read_bytes() != content:
-            raise OutputError.of("sample_there", path=path)
+            raise OutputError(
+                f"{path} already exists and is another file. Nothing was written. Move it, "
+                "or choose another folder (-o)."
+            )
     first = next(path for path in contents if path.suffix == ".ulg")
     command = command_line(ComparisonRequest(log=str(first)), "compare", typed=True)
     page = Page()

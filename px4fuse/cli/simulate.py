@@ -145,10 +145,19 @@ def simulate(
 def _check_options(assignment: Path | None) -> None:
     """Refuse options that do not go together."""
     if assignment is not None and click.get_current_context().params["kind"] == OUTDOOR:
-        raise SettingsError.of("kind_is_single", outdoor=OUTDOOR, mixed=MIXED)
+        raise SettingsError(
+            f"--kind {OUTDOOR} is not available with --assignment.",
+            f"Use --kind aisle, loop or {MIXED}.",
+        )
     for parameter in typed_parameters():
         if assignment is not None and parameter.name not in ASSIGNMENT_OPTIONS:
-            raise SettingsError.of("option_is_single", parameter=parameter)
+            raise SettingsError(
+                (
+                    f"{parameter.opts[0]} is not available with --assignment, which draws it for "
+                    "each student."
+                ),
+                "Omit it.",
+            )
         if assignment is None and parameter.name in ASSIGNMENT_ONLY_OPTIONS:
             raise SettingsError(f"{parameter.opts[0]} requires --assignment ROSTER.csv.")
 

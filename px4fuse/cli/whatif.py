@@ -78,7 +78,10 @@ def _parse_sweep(text: str) -> Sweep:
     name, _, ends = text.partition("=")
     limits = ends.split(":")
     if len(limits) not in (2, 3) or (len(limits) == 3 and not limits[2].isdecimal()):
-        raise SettingsError.of("sweep_wrong", text=text)
+        raise SettingsError(
+            f"--sweep {text} is not valid. Use NAME=LOW:HIGH or NAME=LOW:HIGH:COUNT, for "
+            "example EKF2_EVP_NOISE=0.02:0.5."
+        )
     low, high = (_parse_number(f"--sweep {text}", name, limit) for limit in limits[:2])
     return Sweep(name, low, high, *map(int, limits[2:]))
 

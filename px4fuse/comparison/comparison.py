@@ -25,7 +25,6 @@ from px4fuse.filter.consistency import GATE_SIGMA, HorizontalNis, assess, assess
 from px4fuse.filter.kalman import Replay, replay, state_at, variance_at
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import RECORD_NOT_LOGGED, Ekf2, Flight, Unavailable, sample_rate
-from px4fuse.record import missing_data
 
 STATE = ("position_m", "velocity_m_s")
 VARIANCES = ("position_variance_m2", "velocity_variance_m2_s2")
@@ -167,7 +166,11 @@ def difference(run: Replay, ekf2_state: pd.DataFrame) -> Difference | Unavailabl
     )
     position, velocity = kf_minus_ekf2[:, np.isfinite(kf_minus_ekf2).all(axis=0)]
     if len(position) < projection.MIN_COMMON_SAMPLES:
-        return missing_data("difference_few", count=len(position))
+        return Unavailable(
+            "difference KF - EKF2",
+            f"only {len(position)} common samples in the segment",
+            "Choose a segment in which EKF2 runs.",
+        )
     return Difference(
         count=len(position),
         position_rmse_m=_rmse(position),
@@ -212,7 +215,9 @@ def error_statistics(
     ]
     position, velocity = (error[np.isfinite(error)] for error in errors)
     if len(position) < projection.MIN_COMMON_SAMPLES:
-        return missing_data("truth_not_common")
+        return Unavailable(
+            "error against ground truth", "no common samples", "Choose a segment with ground truth."
+        )
     # EKF2's variances are logged at a tenth of the state's rate: NEES at their own times
     nees = {
         variance_column: _mean_nees(time_s, error, variance[variance_column])

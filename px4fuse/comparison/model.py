@@ -195,11 +195,9 @@ class Comparison:
             It was not analysed.
         """
         if axis not in self.axes:
-            raise MissingDataError.of(
-                "no_such_axis",
-                axis=axis,
-                near=suggest_name(axis, self.axes),
-                known=", ".join(self.axes),
+            raise MissingDataError(
+                f"Axis {axis!r} was not analysed.",
+                f"{suggest_name(axis, self.axes)}Available axes: {', '.join(self.axes)}.",
             )
         return self.axes[axis]
 

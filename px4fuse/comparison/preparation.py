@@ -24,13 +24,16 @@ from px4fuse.readers.px4_innovations import (
     with_gnss_innovations,
 )
 from px4fuse.readers.px4_topics import TOPIC_ORIGINS
-from px4fuse.record import missing_data
 from px4fuse.request import HeightName
 from px4fuse.trajectory.rotation import interpolate, matrix
 
 # Of the names under which logs have external positions, PX4's topics and MAVLink's messages
 LOGGED_ORIGINS = TOPIC_ORIGINS | {source.name: source.origin for source in POSITION_INPUTS}
-NOT_ITS_OWN_TRUTH = missing_data("own_truth")
+NOT_ITS_OWN_TRUTH = Unavailable(
+    "ground truth",
+    ("the position source is the only reference in the log, and KF uses it as its input"),
+    "Choose another --position-source; this one then serves as ground truth.",
+)
 
 
 # A receiver's height is much noisier than its position, and SIGMA_Z is one number
@@ -315,18 +318,17 @@ def choose_segment(
             low, high = clipped
             reason += ", cut at the ends of the data"
     if not low < high:
-        raise SettingsError.of(
-            "segment_empty", log=flight.log.name, low=low, high=high, runs_s=runs_s
+        raise SettingsError(
+            f"{flight.log.name}: no positions between {low:.6g} s and {high:.6g} s; the "
+            f"position source runs from {runs_s[0]:.2f} s to {runs_s[1]:.2f} s. Change "
+            "--start or --end."
         )
     segment = Segment(low, high, reason)
     count = len(within(track.samples, segment))
     if count < MIN_MEASUREMENTS:
-        raise SettingsError.of(
-            "segment_short",
-            log=flight.log.name,
-            count=count,
-            track=track,
-            segment=segment,
-            least=MIN_MEASUREMENTS,
+        raise SettingsError(
+            f"{flight.log.name}: {track.name} has only {count} measurements between "
+            f"{segment.start_s:.2f} s and {segment.end_s:.2f} s; at least "
+            f"{MIN_MEASUREMENTS} are needed. Choose a longer segment (--start, --end)."
         )
     return segment

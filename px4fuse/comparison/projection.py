@@ -20,7 +20,6 @@ from px4fuse.flight import (
     Truth,
     Unavailable,
 )
-from px4fuse.record import missing_data
 
 # EKF2 never trusts external vision better than this (ev_pos_control.cpp, EKF2.cpp)
 EKF2_MIN_NOISE_M = 0.01
@@ -129,7 +128,9 @@ def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame |
         return ekf2.variance
     projected = project(ekf2.variance, axis, segment)
     if projected.empty:
-        return missing_data("variances_outside_segment")
+        return Unavailable(
+            "EKF2 variances", "no samples in the segment", "Analyse a longer segment."
+        )
     return projected
 
 
@@ -170,7 +171,11 @@ def project_innovations(
     ``posterior_variance_m2`` (P⁺ = P⁻R/S, or P⁻ where rejected), NaN where R is unknown.
     """
     if track.aid(axis.name) is None:
-        return missing_data("innovations_of_another", name=track.name)
+        return Unavailable(
+            "EKF2 innovations",
+            (f"EKF2 never fuses {track.name}; the logged innovations belong to another source"),
+            "Choose the source that EKF2 fused (--position-source).",
+        )
     frames = []
     for name in ("north", "east") if axis.name == AISLE else (axis.name,):
         frame = next(frame for key, frame in ekf2.innovations.items() if key == name)
@@ -181,7 +186,9 @@ def project_innovations(
     if axis.name == AISLE:
         rows = _innovations_along(rows, frames[1], axis.direction)
     if rows.empty:
-        return missing_data("innovations_outside_segment")
+        return Unavailable(
+            "EKF2 innovations", "no samples in the segment", "Analyse a longer segment."
+        )
     r = rows["observation_variance_m2"].fillna(observation_variance(flight, track, axis, segment))
     s_total = rows["innovation_variance_m2"]
     prior = (s_total - r).where(s_total > r)
@@ -246,5 +253,9 @@ def project_truth(
         return truth
     projected = project(truth.samples, axis, segment)
     if len(projected) < MIN_COMMON_SAMPLES:
-        return missing_data("truth_outside_segment", name=truth.name)
+        return Unavailable(
+            "ground truth",
+            f"{truth.name} has no samples in the segment",
+            "Analyse a longer segment.",
+        )
     return projected

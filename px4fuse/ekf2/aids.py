@@ -15,16 +15,7 @@ from px4fuse.arrays import Array, BoolArray
 from px4fuse.ekf2_parameters import AIDS, Aid
 from px4fuse.filter.consistency import SIGMA_FACTOR_FINDING, assess, classify_mean_nis, nis_band
 from px4fuse.flight import AidLog, Ekf2, Flight, Unavailable, step_values_at
-from px4fuse.record import (
-    Correlation,
-    Count,
-    NotNegative,
-    Positive,
-    Record,
-    Share,
-    Span,
-    missing_data,
-)
+from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
 
 AidVerdict = Literal[
     "consistent",
@@ -188,7 +179,11 @@ def evaluate_aids(flight: Flight) -> dict[str, AidResult] | Unavailable:
     if isinstance(flight.ekf2, Unavailable):
         return flight.ekf2
     if not flight.ekf2.aids:
-        return missing_data("aids_not_logged")
+        return Unavailable(
+            "EKF2 aids",
+            ("no estimator_aid_src topic, estimator_innovations or ekf2_innovations in flight"),
+            "Record a ULog with SDLOG_PROFILE bit 0 (default).",
+        )
     span = flight_span(flight)
     if isinstance(span, Unavailable):
         return span

@@ -45,7 +45,6 @@ from px4fuse.origin import POSITION_FILE
 from px4fuse.readers.px4_innovations import fused_aid, with_gnss_innovations
 from px4fuse.readers.px4_positions import MAX_THINNED_HZ
 from px4fuse.readers.px4_topics import DEFAULT_PROFILE
-from px4fuse.record import missing_data
 from px4fuse.trajectory.rotation import conjugate, interpolate, matrix, multiply
 
 ANALYSIS_NAME = "EKF2 replay"
@@ -229,8 +228,13 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (a reason each)
     modelled_aids = (*GNSS_LABELS, *([FLOW.label] if len(record.flow) else [])) if gnss else ()
     if more := [aid_name for aid_name in record.other_aiding if aid_name not in modelled_aids]:
         fused, off = ("GNSS", "") if gnss else ("vision position", f", {GNSS_POS.switch} 0")
-        return missing_data(
-            "aids_not_modelled", fused=fused, more=", ".join(more), off=off, vision=EV_POS.switch
+        return Unavailable(
+            "EKF2 replay",
+            (
+                f"EKF2 fused horizontal aids besides {fused} that the model does not contain "
+                f"({', '.join(more)})"
+            ),
+            f"Fly with EKF2_OF_CTRL 0{off} and without bit 2 of {EV_POS.switch}.",
         )
     if missing := _missing_imu(imu.index.to_numpy()):
         return missing
@@ -258,7 +262,17 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (a reason each)
     stretches = find_stretches(flight, imu, attitude, ekf2, record, carrying_s, gnss=gnss)
     if not stretches:
         fused = aid.label.removesuffix(", position")
-        return missing_data("stretch_short", least_s=MIN_STRETCH_S, fused=fused)
+        return Unavailable(
+            "EKF2 replay",
+            (
+                f"{fused} was never fused for {MIN_STRETCH_S:g} s in flight without a gap in "
+                "it or in the IMU"
+            ),
+            (
+                "Record without dropouts (faster SD card, fewer topics) and with a steady "
+                "position source."
+            ),
+        )
     fusing = ekf2.fusing
     if len(flow):
         gate = record.parameters.get(FLOW.gate, FLOW.default_gate)
@@ -300,11 +314,21 @@ def _missing_imu(time_s: Array) -> Unavailable | None:
     intervals = np.diff(time_s)
     interval = float(np.median(intervals))
     if interval > MAX_IMU_INTERVAL_S:
-        return missing_data("imu_slow", rate_hz=1.0 / interval)
+        return Unavailable(
+            "EKF2 replay",
+            f"the IMU is logged at {1.0 / interval:.0f} Hz, below EKF2's prediction rate",
+            ("Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate."),
+        )
     regular_intervals = intervals[intervals <= IMU_GAP_S]
     lost_share = float((np.rint(regular_intervals / interval) - 1.0).clip(0.0).sum() / len(time_s))
     return (
-        None if lost_share <= MAX_LOST_SHARE else missing_data("imu_incomplete", share=lost_share)
+        None
+        if lost_share <= MAX_LOST_SHARE
+        else Unavailable(
+            "EKF2 replay",
+            f"{lost_share:.0%} of the IMU samples are missing from the log",
+            "Use a faster SD card, or log fewer topics (SDLOG_PROFILE).",
+        )
     )
 
 
@@ -350,7 +374,11 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
     if track is None or track.velocity is None:
         return Unavailable(ANALYSIS_NAME, "no vehicle_gps_position in the log", DEFAULT_PROFILE)
     if track.rate_hz < MAX_THINNED_HZ:
-        return missing_data("gnss_thinned", rate_hz=track.rate_hz)
+        return Unavailable(
+            "EKF2 replay",
+            f"GNSS is logged at {track.rate_hz:.1f} Hz, below the rate that EKF2 fused",
+            "Set bit 1 of SDLOG_PROFILE to log all fixes.",
+        )
     parameters = record.parameters
     switch = int(parameters.get(GNSS_POS.switch, 7.0))
     samples, velocities = track.samples, track.velocity
@@ -432,7 +460,14 @@ def read_vision(
         rotated = bool(int(record.parameters[AID_MASK]) & ROTATE_VISION_BIT)
     if track.frame == "FRD" and rotated:
         if track.orientation is None:
-            return missing_data("frame_not_turned", name=track.name)
+            return Unavailable(
+                "EKF2 replay",
+                (
+                    f"{track.name} is in its own frame (FRD) and has no orientation to rotate it "
+                    "into NED"
+                ),
+                "Send the position in NED, or with an orientation.",
+            )
         published, sent = (
             interpolate(stamp, frame.index.to_numpy(), frame[Columns.QUATERNION].to_numpy())
             for frame in (attitude, track.orientation)
@@ -455,7 +490,14 @@ def _read_vision_besides_gnss(
     if (enabled := _enabled_log(ekf2, EV_POS)) is None:
         return None
     if fuses_by_mask(record.parameters):
-        return missing_data("vision_moves", firmware=flight.log.firmware)
+        return Unavailable(
+            "EKF2 replay",
+            (
+                f"{flight.log.firmware} fuses relative vision positions besides GNSS, which "
+                "the model does not contain"
+            ),
+            "Use PX4 v1.14 or newer, or fly with only one of the two.",
+        )
     received = read_vision(flight, ekf2, record, attitude)
     if isinstance(received, Unavailable):
         return received
@@ -521,4 +563,11 @@ def _vision_track(flight: Flight) -> PositionTrack | Unavailable:
             why.append(
                 f"{track.name} holds one sample in {interval:.2g} s, fewer than EKF2 may have fused"
             )
-    return missing_data("vision_incomplete", why="; ".join(why))
+    return Unavailable(
+        "EKF2 replay",
+        f"{'; '.join(why)}",
+        (
+            "Set SDLOG_PROFILE to 129 (default and vision), or add the MAVLink "
+            "recording (--mavlink)."
+        ),
+    )

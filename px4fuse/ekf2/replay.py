@@ -17,16 +17,7 @@ from px4fuse.filter import signals
 from px4fuse.filter.heading import heading_rad
 from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Columns, Ekf2, Flight, Truth, Unavailable
 from px4fuse.readers.px4_innovations import along as innovations_along
-from px4fuse.record import (
-    Correlation,
-    Count,
-    NotNegative,
-    Positive,
-    Record,
-    Share,
-    Span,
-    missing_data,
-)
+from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
 
 Spans = tuple[Span, ...]
 HORIZONTAL: tuple[AxisName, AxisName] = ("north", "east")
@@ -161,7 +152,11 @@ class Agreement(Record, frozen=True, kw_only=True):
     def as_unavailable(self, what: str) -> Unavailable:
         """What stands in for a conclusion where the replay is not good."""
         profile = "3 (default and full rates)" if self.gnss_pos else "129 (default and vision)"
-        return missing_data("replay_doubted", what=what, reason=self.reason, profile=profile)
+        return Unavailable(
+            f"{what}",
+            f"the EKF2 replay does not agree with the log: {self.reason}",
+            f"Record without dropouts and with SDLOG_PROFILE {profile}.",
+        )
 
 
 class Replayed(Record, frozen=True, kw_only=True, omit_defaults=False):
@@ -255,9 +250,20 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     own = aid_source(replayed_aid(ekf2)) in ekf2.innovation_topics
     log, model = _matched_samples(replay, replay.updates, logged_innovations(ekf2), own=own)
     if len(log) < MIN_SAMPLES:
-        return missing_data("compared_few", count=len(log), least=MIN_SAMPLES)
+        return Unavailable(
+            "EKF2 replay",
+            (
+                f"only {len(log)} logged innovations to compare with (at least {MIN_SAMPLES} "
+                "are needed)"
+            ),
+            ("Fly longer on external vision, and record with SDLOG_PROFILE bit 0 (default)."),
+        )
     if _constant(log, model, HORIZONTAL):
-        return missing_data("innovations_constant")
+        return Unavailable(
+            "EKF2 replay",
+            "the logged innovations are constant, so agreement cannot be tested",
+            "Record a flight with motion and real measurements.",
+        )
     axes: dict[str, AxisAgreement]
     axes = {axis: _axis_agreement(axis, log, model, ekf2, replay) for axis in HORIZONTAL}
     north, east = axes["north"], axes["east"]

@@ -30,7 +30,7 @@ from px4fuse.filter.kalman import Replay, state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Columns, Ekf2, Truth, Unavailable
-from px4fuse.record import Count, NotNegative, Record, missing_data
+from px4fuse.record import Count, NotNegative, Record
 
 ANALYSIS_NAME = "why EKF2 differs"
 OTHER_TIME = Unavailable("RMSE to truth", "the truth is of another time", "Record both together.")
@@ -210,7 +210,11 @@ def explain_by_steps(
         is_inside &= (times >= index[0]) & (times <= index[-1])
     times = times[is_inside]
     if not len(times):
-        return missing_data("walk_elsewhere", what=ANALYSIS_NAME)
+        return Unavailable(
+            f"{ANALYSIS_NAME}",
+            "KF and the EKF2 replay have no time in common",
+            "Analyse a segment in which EKF2 fused the source (--start, --end).",
+        )
     span = float(times[0]), float(times[-1])
     directions = {name: run.axis.direction for name, run in (runs or {}).items()}
     directions = directions or {"north": np.eye(3)[0], "east": np.eye(3)[1]}

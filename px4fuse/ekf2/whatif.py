@@ -32,12 +32,16 @@ from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.heading import heading_rad
 from px4fuse.flight import AxisName, Columns, Ekf2, Flight, Unavailable
-from px4fuse.record import Count, NotNegative, Record, Share, missing_data
+from px4fuse.record import Count, NotNegative, Record, Share
 
 ANALYSIS_NAME = "EKF2 what-if"
 # Below this share of EKF2's samples in the log, gaps between fusions cannot be told from it
 MIN_COMPLETE_SHARE = 0.9
-NO_TRUTH = missing_data("rmse_without_truth")
+NO_TRUTH = Unavailable(
+    "RMSE against ground truth",
+    "the log has no ground truth",
+    ("Record motion capture (ATT_POS_MOCAP) besides the position source, or fly in simulation."),
+)
 # Of a flight on GNSS
 HEADING_FOLLOWS = (
     "The heading follows, with the magnetometer as EKF2 fused it (as flown it is {:.1f}° off the "
@@ -48,7 +52,16 @@ HEADING_STAYS = (
     "fused of a magnetometer, all axes throughout"
 )
 HEIGHT_FOLLOWS, HEIGHT_STAYS = "The height follows too", "The height is EKF2's own as flown"
-OWN_HEADING, OWN_HEIGHT = missing_data("heading_own"), missing_data("height_own")
+OWN_HEADING, OWN_HEIGHT = (
+    Unavailable(
+        "heading error",
+        "with external vision the replay uses the logged EKF2 heading",
+        "Read the heading in the log.",
+    ),
+    Unavailable(
+        "height error", "the replay uses the logged EKF2 height", "Read the height in the log."
+    ),
+)
 # What must be left to judge once an aid is taken away
 MIN_EVALUATED_S = 5.0
 SWEEP_VALUES = 9
@@ -242,11 +255,10 @@ def what_if(
         ]
         judged = tuple(remaining_spans[:1])
         if not judged:
-            raise SettingsError.of(
-                "since_late",
-                since=since,
-                least_s=MIN_EVALUATED_S,
-                end_s=model.flown.judged_s[-1][1],
+            raise SettingsError(
+                f"--from {since:g} s leaves less than {MIN_EVALUATED_S:g} s of the replayed "
+                f"flight, which ends at {model.flown.judged_s[-1][1]:.0f} s. Choose an "
+                "earlier time."
             )
     gnss = model.inputs.aid == GNSS_POS
     return WhatIf(
@@ -391,8 +403,10 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary
     resets = horizontal_resets_s(ekf2) - horizon_s
     resets = resets[inside_spans(resets, judged)]
     replayed = int(inside_spans(replay.updates.index, judged).sum())
-    longest: float | Unavailable = missing_data(
-        "fusions_few", count=len(evaluated_updates), of=replayed
+    longest: float | Unavailable = Unavailable(
+        "longest time without fusion",
+        (f"the log contains only {len(evaluated_updates)} of about {replayed} innovations"),
+        "Log estimator_aid_src_ev_pos at full rate.",
     )
     if len(evaluated_updates) > MIN_COMPLETE_SHARE * replayed:
         fused = evaluated_updates.index[evaluated_updates["rejected"] == 0].to_numpy()

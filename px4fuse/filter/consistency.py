@@ -10,16 +10,7 @@ import numpy as np
 from scipy.special import chdtrc, gammaincinv, stdtr
 
 from px4fuse.arrays import Array
-from px4fuse.record import (
-    Correlation,
-    Count,
-    NotNegative,
-    Positive,
-    Record,
-    Share,
-    Unavailable,
-    missing_data,
-)
+from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Unavailable
 
 Verdict = Literal["consistent", "variance overstated", "variance understated"]
 
@@ -167,9 +158,17 @@ def assess(
     nu, s = innovation_m[is_usable], innovation_variance_m2[is_usable]
     count = len(nu)
     if count < MIN_INNOVATIONS:
-        return missing_data("innovations_few", count=count, least=MIN_INNOVATIONS)
+        return Unavailable(
+            "consistency test",
+            f"only {count} innovations (at least {MIN_INNOVATIONS} are needed)",
+            "Analyse a longer segment, or log the source at a higher rate.",
+        )
     if np.ptp(nu) == 0.0:
-        return missing_data("innovations_alike")
+        return Unavailable(
+            "consistency test",
+            "all innovations have the same value",
+            "Check the position source; then analyse a longer segment.",
+        )
     normalised = nu / np.sqrt(s)
     std = float(np.std(nu, ddof=1))
     bias_t = float(np.sqrt(count) * np.mean(nu) / std)

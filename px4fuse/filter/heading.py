@@ -25,7 +25,7 @@ from px4fuse.filter.motion import MAX_IMU_INTERVAL_S
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import IMU_GAP_S, Segment, ned_acceleration, within
 from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
-from px4fuse.record import NotNegative, Record, Share, missing_data
+from px4fuse.record import NotNegative, Record, Share
 
 PART_LENGTH_S = 2.0
 MIN_PARTS = 3
@@ -166,9 +166,15 @@ def estimate_heading_error(
     count = len(samples)
     if is_slow or count < MIN_MEASUREMENTS:
         return (
-            missing_data("heading_slow_imu")
+            Unavailable(
+                "heading error", "the IMU rate is too low", "Log sensor_combined at full rate."
+            )
             if is_slow
-            else missing_data("heading_few", count=count)
+            else Unavailable(
+                "heading error",
+                f"only {count} measurements",
+                "Log sensor_combined at full rate, and analyse a longer segment.",
+            )
         )
     samples = samples.iloc[:: int(np.ceil(len(samples) / MAX_MEASUREMENTS))]
     result = _estimate_from_positions(acceleration, samples, settings.dt_s, sigma_z_m)

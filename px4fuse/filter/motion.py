@@ -26,7 +26,6 @@ from px4fuse.filter.marginal import Positions, centre_on_path
 from px4fuse.filter.model import continuous_noise_unit
 from px4fuse.filter.signals import imu_gaps
 from px4fuse.flight import Columns, Flight, Unavailable
-from px4fuse.record import missing_data
 from px4fuse.trajectory.rotation import from_vector, matrix, multiply, running_product
 
 # Standard deviations of the constants, wide for consumer sensors: tilt and heading (rad), gyro
@@ -266,7 +265,14 @@ def prepare_motion(
                 stretch_signals.append(signals[span])
     used_rows = np.concatenate([np.zeros(0, dtype=np.intp), *rows_by_stretch])
     if len(used_rows) < MIN_MEASUREMENTS:
-        return missing_data("motion_few", count=len(used_rows), least=MIN_MEASUREMENTS)
+        return Unavailable(
+            "clock offset",
+            (
+                f"only {len(used_rows)} measurements have IMU and attitude data (at least "
+                f"{MIN_MEASUREMENTS} are needed)"
+            ),
+            "Analyse a longer segment.",
+        )
     edges = np.cumsum([0, *map(len, rows_by_stretch)])
     # from the first of each stretch, whose place nothing says: numbers stay small
     measured = pd.DataFrame(measurement_m[used_rows])

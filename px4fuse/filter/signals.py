@@ -17,7 +17,6 @@ from px4fuse.arrays import Array, BoolArray, cumulative_integral
 from px4fuse.display import one_line_repr
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import AXIS_NAMES, Columns, Flight, PositionTrack, Unavailable
-from px4fuse.record import missing_data
 
 AISLE = "aisle"
 # A track that is so many times longer than wide was flown along an aisle
@@ -145,7 +144,11 @@ def _ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     known = flight.attitude.index.to_numpy()
     imu = flight.imu[(flight.imu.index >= known[0]) & (flight.imu.index <= known[-1])]
     if len(imu) < 2:
-        return missing_data("no_overlap")
+        return Unavailable(
+            "acceleration in NED",
+            "IMU and attitude data do not overlap in time",
+            "Log both from boot (SDLOG_MODE 1).",
+        )
     quaternions = flight.attitude[Columns.QUATERNION].to_numpy(copy=True)
     rotations = Rotation.from_quat(quaternions, scalar_first=True)
     body_to_ned = Slerp(known, rotations)(imu.index.to_numpy())
@@ -205,7 +208,7 @@ def make_axes(
     if heading_deg is not None and not 0.0 <= heading_deg <= 360.0:
         raise SettingsError(f"`heading_deg` {heading_deg:g} is not between 0 and 360 degrees.")
     if unknown := [name for name in axis_names if name not in known]:
-        raise SettingsError.of("axis_unknown", axis=unknown[0], known=", ".join(known))
+        raise SettingsError(f"Axis {unknown[0]} is not known.", f"Use one of {', '.join(known)}.")
     source_label = f"{flight.log.name}: {track.name}"
     axes = []
     for name in axis_names:
@@ -232,7 +235,11 @@ def make_axes(
 
 def too_few_measurements(what: str, count: int, least: int) -> Unavailable:
     """What stands in for an estimate from so few measurements."""
-    return missing_data("measurements_few", what=what, count=count, least=least)
+    return Unavailable(
+        f"{what}",
+        f"only {count} measurements (at least {least} are needed)",
+        "Analyse a longer segment, or log the source at a higher rate.",
+    )
 
 
 def along(frame: pd.DataFrame, columns: list[str], weights: Array) -> Array:
@@ -279,7 +286,11 @@ def project_acceleration(
     value = ned @ direction
     inside = (time >= segment.start_s) & (time <= segment.end_s)
     if np.count_nonzero(inside) < 2:
-        return missing_data("imu_outside_segment")
+        return Unavailable(
+            "IMU",
+            "no IMU samples in the analysed segment",
+            "Choose --start and --end within the IMU data.",
+        )
     is_gap = imu_gaps(time)
     gap, passed_s = np.flatnonzero(is_gap), np.cumsum(np.where(is_gap, np.diff(time), 0.0))
     ends = np.unique([0, *gap, *(gap + 1), len(time) - 1])

@@ -38,7 +38,7 @@ from px4fuse.filter.motion import SignalCache, prepare_motion
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, too_few_measurements
 from px4fuse.flight import Flight, Unavailable
-from px4fuse.record import Count, NotNegative, OrUnavailable, Record, missing_data
+from px4fuse.record import Count, NotNegative, OrUnavailable, Record
 
 HORIZONTAL = "horizontal"
 NoiseInterval = tuple[NotNegative, NotNegative | None]
@@ -303,7 +303,14 @@ def tune_axes(
     best_fit = two_state_fit if motion_fit is None else motion_fit
     skip = two_state_fit.outlier_probability > 0.5
     if np.mean(skip) > MAX_OUTLIER_SHARE:
-        return missing_data("tuning_outliers", name=name, share=np.mean(skip))
+        return Unavailable(
+            f"tuning, {name}",
+            (
+                f"{np.mean(skip):.0%} of the measurements are outliers. Remove the outliers "
+                "at the source first"
+            ),
+            "The noise cannot be estimated with this many.",
+        )
     sigma_a, sigma_z = (_estimate_noise(best_fit, noise_index) for noise_index in (0, 1))
     final_sigma_z_m = sigma_z.value or sigma_z.high or best_fit.noises.sigma_z_m
     two_state_sigma_a = (
@@ -416,7 +423,14 @@ def _hold_out(
     """Tune on the first half, score on the second."""
     half = len(fit.weight) // 2
     if half < MIN_MEASUREMENTS:
-        return missing_data("held_out_few", name=name, half=half, least=MIN_MEASUREMENTS)
+        return Unavailable(
+            f"held-out check, {name}",
+            (
+                f"half of the segment contains {half} measurements (at least "
+                f"{MIN_MEASUREMENTS} are needed)"
+            ),
+            "Analyse a longer segment.",
+        )
     first_half = [filter_positions(interval_input.first(half)) for interval_input in intervals]
     first = maximise_likelihood(first_half, fit.noises, fit.weight[:half], outliers=False)
     tuned_noises = first.noises

@@ -53,13 +53,16 @@ def connect_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
         from distributed import Client  # noqa: PLC0415 - of the extra `batch`
         from distributed.utils import silence_logging_cmgr  # noqa: PLC0415
     except ImportError as error:
-        raise SettingsError.of("no_dask") from error
+        raise SettingsError(
+            "--scheduler requires Dask.", 'Run pip install "px4fuse[batch]".'
+        ) from error
     try:
         # one that fails must not become the session's own
         client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise SettingsError.of(
-            "no_scheduler", scheduler=scheduler, why=one_line(str(error), 120)
+        raise SettingsError(
+            f"--scheduler {scheduler}: no Dask scheduler answers ({one_line(str(error), 120)}).",
+            "Start one with: dask scheduler",
         ) from error
     # a scheduler that goes is said here, in one line: Dask would print its tracebacks
     with silence_logging_cmgr(logging.CRITICAL), client, client.as_current():
@@ -85,12 +88,18 @@ def _check(client: Client) -> None:
     try:
         client.wait_for_workers(1, timeout=CONNECT_S)
     except TimeoutError as error:
-        raise SettingsError.of("no_workers", address=address) from error
+        raise SettingsError(
+            f"Scheduler {address} has no workers.",
+            f"Start them with: dask worker {address} --nthreads 1",
+        ) from error
     here = metadata.version("px4fuse")
     for name, worker_version in client.run(metadata.version, "px4fuse", on_error="return").items():
         if worker_version != here:
             other = f"px4fuse {worker_version}" if isinstance(worker_version, str) else "no px4fuse"
-            raise SettingsError.of("worker_of_another", name=name, other=other, here=here)
+            raise SettingsError(
+                f"Worker {name} runs {other}, but this computer runs {here}.",
+                "Install the same version on both.",
+            )
 
 
 def run_jobs(

@@ -68,7 +68,10 @@ def _read_attached(path: Path) -> DiffInput | None:
     content = read_bytes_limited(path, ResultsError, limit, size_remedy=advice)
     found = (attached_results if is_report else read_results)(content, name)
     if not isinstance(found, Results):
-        raise ResultsError.of("not_to_compare", name=name, found=found)
+        raise ResultsError(
+            f"{name} contains {found.schema.name}, which px4fuse diff cannot compare. "
+            "Give a log, or a report or results of px4fuse compare."
+        )
     return DiffInput(name, "report" if is_report else "results", found)
 
 

@@ -88,7 +88,10 @@ def _logs_in(pattern: str) -> list[FoundLog]:
             f"{pattern}: cannot be read ({one_line(str(error), 200) or type(error).__name__})."
         ) from error
     if not infos:
-        raise SettingsError.of("no_logs", given=pattern, suffixes=", ".join(SUFFIXES))
+        raise SettingsError(
+            f"{pattern} contains no logs ({', '.join(SUFFIXES)}).",
+            "Give a log, or a folder with logs.",
+        )
     found_logs = []
     for path, info in infos.items():
         address = path if _is_local(files) else files.unstrip_protocol(path)
@@ -122,7 +125,10 @@ def local_file(address: str) -> Iterator[Path]:
         return
     size, limit = files.info(path).get("size"), max_log_bytes.get()
     if size is not None and size > limit:
-        raise LogError.of("log_large", size_mb=size / 1000000.0, limit_mb=limit / 1000000.0)
+        raise LogError(
+            (f"The file has {size / 1000000.0:,.0f} MB; the limit is {limit / 1000000.0:,.0f} MB."),
+            "Raise it with --max-size MB.",
+        )
     with TemporaryDirectory(prefix="px4fuse-") as folder:
         local = Path(folder, _name(path))
         files.get_file(path, str(local))
@@ -136,7 +142,9 @@ def _file_system(address: str) -> tuple[AbstractFileSystem, str]:
         files, path = url_to_fs(address)
     except ImportError as error:  # its cause names the module, which is the package's name
         package = getattr(error.__cause__, "name", None) or "the package that it names"
-        raise SettingsError.of("no_package_of_url", address=address, package=package) from error
+        raise SettingsError(
+            f"{address}: this type of URL requires a package.", f'Run pip install "{package}".'
+        ) from error
     except ValueError as error:  # of a protocol that nobody knows
         raise SettingsError(f"{address}: {error}", "Give a path or another URL.") from error
     return files, path

@@ -452,7 +452,10 @@ def due_time(text: str) -> datetime:
         zone = ZoneInfo(words.pop()) if words and words[-1][0].isalpha() else None
         time = datetime.fromisoformat("T".join(words[:2]) + "".join(words[2:]))
     except (ZoneInfoNotFoundError, ValueError, OSError) as error:
-        raise SettingsError.of("due_wrong", text=text) from error
+        raise SettingsError(
+            f"--due {text!r} is not a valid time. Use '2026-11-20 23:59', optionally "
+            "followed by a time zone ('+01:00' or 'Europe/Berlin')."
+        ) from error
     clock = re.search(r"\d\d:\d\d(:\d\d)?", text)
     if clock is None:
         time = time.replace(hour=23, minute=59)

@@ -16,7 +16,6 @@ from px4fuse.errors import MissingDataError
 from px4fuse.filter.signals import ned_acceleration
 from px4fuse.flight import Ekf2, Flight, PositionTrack, Truth, Unavailable
 from px4fuse.plain import to_json_types
-from px4fuse.record import missing_data
 
 SCHEMA_NAME = "px4fuse-flight"
 SCHEMA_VERSION = "1.0"
@@ -24,7 +23,11 @@ DICTIONARY_COLUMNS = ["table", "column", "unit", "frame", "meaning", "source_top
 # What a file name may not hold on some system, or what is awkward in a shell
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
 MAX_NAME = 80
-NO_POSITION = missing_data("no_track")
+NO_POSITION = Unavailable(
+    "external position",
+    "the log contains no position track. px4fuse info LOG lists how to log one",
+    "",
+)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ from px4fuse.loop.corrections import correct_paths_by_distance, gate_closures, s
 from px4fuse.loop.model import LANDING, KnownEnd, Loop, OdometryNoise
 from px4fuse.loop.odometry import ClosureClaim, pose_graph
 from px4fuse.loop.tracks import LoopSource, odometry_of, trajectory_of
-from px4fuse.record import missing_data
 from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Trajectory, by_axis, cumulative_distance
@@ -150,7 +149,7 @@ def _find_known_end(
             raise SettingsError("`landed_at` and `came_back` exclude each other", "Leave one out.")
         return part.measured_end(path, request.landed_at)
     if not request.came_back:
-        return missing_data("open_end")
+        return Unavailable("closure error", "the loop is declared open (--open)", "Remove --open.")
     return by_truth if isinstance(by_truth, KnownEnd) else part.assumed_end(path)
 
 
@@ -167,7 +166,13 @@ def _key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
     frames = key_frames(path.position_m, spacing_m)
     along = cumulative_distance(path.position_m[frames])
     if not along[-1] >= max(MIN_PATH_M * min(1.0, spacing_m / 0.5), 1e-6):
-        raise TrajectoryError.of("path_short", path=path, length_m=along[-1], spacing_m=spacing_m)
+        raise TrajectoryError(
+            (
+                f"{path.name}: the path is only {along[-1]:.2f} m long (key frame spacing "
+                f"{spacing_m:g} m), too short for a loop."
+            ),
+            "Choose a longer part (--from, --to) or a smaller --key-frames.",
+        )
     return frames, np.interp(path.time_s, path.time_s[frames], along)
 
 
@@ -181,7 +186,10 @@ def _require_valid_closure(closure: GivenClosure, path: Trajectory) -> None:
     (low, high), times = path.time_s[[0, -1]], (closure.time_1_s, closure.time_2_s)
     label = f"{path.name}: closure {times[0]:.12g},{times[1]:.12g}"
     if not low <= times[0] < times[1] <= high:
-        raise TrajectoryError.of("closure_outside", label=label, low=low, high=high)
+        raise TrajectoryError(
+            f"{label}: both times must be in ascending order and on the path, which runs "
+            f"from {low:.2f} s to {high:.2f} s."
+        )
     if not 1e-4 <= closure.sigma_m <= MAX_VALUE:
         raise TrajectoryError(f"{label}: SIGMA {closure.sigma_m:g} is outside 0.0001 to 100 m.")
 
@@ -194,7 +202,14 @@ def _heading_error(end: KnownEnd | Unavailable, heading_deg: float | None) -> fl
     if heading_deg is None:
         return Unavailable(what, "the trajectory has no orientations", "None needed.")
     if end.heading_change_deg is None:
-        return missing_data("turn_unknown", what=what, heading_deg=heading_deg)
+        return Unavailable(
+            f"{what}",
+            (
+                f"the final heading differs by {heading_deg:+.0f}° from the initial one, and "
+                "the true rotation is not known"
+            ),
+            "Give it as the third number of --landed-at FORWARD,RIGHT,DEG.",
+        )
     return float(np.degrees(lie.wrap(np.radians(heading_deg - end.heading_change_deg))))
 
 
@@ -218,7 +233,9 @@ def analyse_flight_loop(
         trajectory = trajectory_of(flight, "vio")
     except MissingDataError as error:  # too few poses, or none
         reason = odometry.reason if isinstance(odometry, Unavailable) else str(error).rstrip(".")
-        return missing_data("no_odometry_for_loop", reason=reason)
+        return Unavailable(
+            "loop closure", f"{reason}", "A loop needs visual-inertial odometry, sent as ODOMETRY."
+        )
     segment, _ = part.choose_loop_segment(flight, trajectory, None, None)
     time = trajectory.time_s
     inside = trajectory.position_m[(time >= segment.start_s) & (time <= segment.end_s)]
@@ -227,5 +244,12 @@ def analyse_flight_loop(
         extent = float(np.linalg.norm(np.ptp(inside, axis=0)))
         gap = float(np.linalg.norm(inside[-1] - inside[0]))
     if 2.0 * extent < LOOP_MIN_PATH_M or gap > LOOP_MAX_GAP_SHARE * 2.0 * extent:
-        return missing_data("no_loop", gap=gap, extent=extent)
+        return Unavailable(
+            "loop closure",
+            (
+                f"the odometry ends {gap:.1f} m from its start and spans {extent:.1f} m, so "
+                "it is not a loop"
+            ),
+            "Fly back to the take-off place, or use px4fuse loop with --closure.",
+        )
     return analyse(LoopSource(trajectory, flight), progress=progress)

@@ -13,7 +13,7 @@ from px4fuse.flight import Unavailable
 from px4fuse.loop.closure import correct_by_distance, distribute_by_distance
 from px4fuse.loop.model import LANDING, Closure, CorrectedPath, Way
 from px4fuse.loop.odometry import ClosureClaim
-from px4fuse.record import missing_data, to_serializable
+from px4fuse.record import to_serializable
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
 from px4fuse.trajectory.graph.analysis import ROBUST, SOLUTIONS
 from px4fuse.trajectory.graph.covariance import gate
@@ -61,7 +61,17 @@ def correct_paths_by_distance(
 
 
 def _rejected_closure(what: str, closure: Closure) -> Unavailable:
-    return missing_data("closure_rejected", what=what, closure=closure, d2=closure.d2, p=closure.p)
+    return Unavailable(
+        f"{what}",
+        (
+            f"the gate rejects {closure} (d² {closure.d2:.1f}, p {closure.p:.1g}); "
+            "enforcing it would deform the whole path"
+        ),
+        (
+            "Measure the landing place (--landed-at), leave the landing out (--open), "
+            "or increase --drift if this odometry drifts more."
+        ),
+    )
 
 
 def gate_closures(

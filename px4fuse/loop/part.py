@@ -87,7 +87,13 @@ def choose_loop_segment(
         low, high = low if start_s is None else start_s, high if end_s is None else end_s
         reason = "chosen with --from or --to"
     if not low < high:
-        raise SettingsError.of("part_empty", low=low, high=high, span=span)
+        raise SettingsError(
+            (
+                f"No poses between {low:.12g} s and {high:.12g} s; the track runs from "
+                f"{span[0]:.2f} s to {span[1]:.2f} s."
+            ),
+            "Change --from or --to.",
+        )
     inside = max(low, span[0]), min(high, span[1])
     if inside != (low, high) and inside[0] < inside[1]:
         reason, (low, high) = f"{reason}, cut at the ends of the data", inside

@@ -19,7 +19,6 @@ from px4fuse.readers.parts import finite_rows
 from px4fuse.readers.text_table import decode_text
 from px4fuse.readers.trajectory import read_trajectory
 from px4fuse.reading import display_name, read_head
-from px4fuse.record import missing_data
 from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
 
 FlightPart = Literal["vio", "ekf2", "kf", "truth"]
@@ -37,7 +36,11 @@ def odometry_of(flight: Flight) -> PositionTrack | Unavailable:
         if track.origin.is_vision and track.orientation is not None:
             return track
     have = ", ".join(track.name for track in flight.positions) or "none"
-    return missing_data("no_odometry", have=have)
+    return Unavailable(
+        "visual-inertial odometry",
+        f"the log has no external vision with orientation (position sources: {have})",
+        ("Send the odometry to PX4 as ODOMETRY, and set SDLOG_PROFILE to 129 to log it."),
+    )
 
 
 def trajectory_of(flight: Flight, part: FlightPart) -> Trajectory:
@@ -164,8 +167,9 @@ def split_part(argument: str) -> tuple[Path, FlightPart | None]:
     if part in FLIGHT_PARTS:
         return Path(path), part
     if Path(path).is_file():
-        raise TrajectoryError.of(
-            "no_such_part", path=display_name(Path(path)), part=part, known=", ".join(FLIGHT_PARTS)
+        raise TrajectoryError(
+            f"{display_name(Path(path))}:{part}: {part!r} is not a track of a flight.",
+            f"Use one of {', '.join(FLIGHT_PARTS)}.",
         )
     return full_path, None
 
@@ -219,14 +223,25 @@ def read_source(
             f"{display_name(path)}: the file is empty", "Copy or export it again."
         )
     if is_g2o(path):
-        raise TrajectoryError.of("graph_not_trajectory", path=display_name(path))
+        raise TrajectoryError(
+            f"{display_name(path)} is a pose graph, not a trajectory.",
+            f"Optimise it with px4fuse loop {display_name(path)}.",
+        )
     if decode_text(head) is not None:  # and so no flight log
         if part is not None:
-            raise TrajectoryError.of("part_of_trajectory", path=display_name(path), part=part)
+            raise TrajectoryError(
+                f"{display_name(path)} is a trajectory file and has no track {part!r}.", "Omit it."
+            )
         trajectory = read_trajectory(path)
         return LoopSource(trajectory if frame is None else replace(trajectory, frame=frame), None)
     if frame is not None:
-        raise SettingsError.of("frame_of_log", frame=frame.lower(), path=display_name(path))
+        raise SettingsError(
+            (
+                f"--frame {frame.lower()} is only for trajectory files; {display_name(path)} "
+                "is a flight log, which defines its frame."
+            ),
+            "Omit --frame.",
+        )
     flight = read_log(path, system=system)
     chosen = part or default
     if chosen is None:

@@ -21,7 +21,6 @@ from px4fuse.readers.mavlink_positions import pressure_altitude, read_positions,
 from px4fuse.readers.mavlink_recording import RECEIPT_CLOCK, Recording, read_recording, unix_of_boot
 from px4fuse.readers.px4_positions import barometer
 from px4fuse.readers.ulog_topics import NO_SELECTOR, dropped_note
-from px4fuse.record import missing_data
 from px4fuse.recording import LogInfo, Unused
 
 VARIANCE_COLUMNS = Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE
@@ -110,7 +109,11 @@ def _read_imu(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
     imu = recording.read(layout, rows)
     imu = parts.finite_rows(imu, imu.columns.tolist(), parts.BEYOND_IMU)
     if len(imu) < 2:
-        return missing_data("imu_few", topic=layout.topic, count=len(imu))
+        return Unavailable(
+            "IMU",
+            f"{layout.topic} contains only {len(imu)} usable samples",
+            "Check that the sensors were running while the link was recorded.",
+        )
     recording.record_stream("imu", layout.topic)
     return imu
 
@@ -140,7 +143,9 @@ def _read_ekf2(
     layout = next(dense)
     message = layout.topic
     if counts[message] < 2:
-        return missing_data("ekf2_not_sent", remedy=remedies["state"])
+        return Unavailable(
+            "EKF2", "the autopilot sent no ODOMETRY or LOCAL_POSITION_NED", f"{remedies['state']}"
+        )
     samples = recording.read(layout)
     state = samples[Columns.STATE].dropna()
     if len(state) < 2:
@@ -163,18 +168,30 @@ def _read_ekf2(
             notes.append(f"EKF2's position variances are {by}; velocity variances are not sent")
     variance: pd.DataFrame | Unavailable = found
     if found.empty:
-        variance = missing_data("variances_not_sent", remedy=remedies["variance"])
+        variance = Unavailable(
+            "EKF2 variances",
+            "the autopilot sent no ODOMETRY with covariance and no ESTIMATOR_STATUS",
+            f"{remedies['variance']}",
+        )
     else:
         recording.record_stream("ekf2_variance", message)
     return Ekf2(
         state=state,
         variance=variance,
         innovations={
-            axis: missing_data("inside_not_sent", axis=axis, remedy=remedies["inside"])
+            axis: Unavailable(
+                f"EKF2 innovations, {axis}",
+                "MAVLink does not transmit EKF2 innovations",
+                f"{remedies['inside']}",
+            )
             for axis in AXIS_NAMES
         },
         innovation_topics=(),
-        fusing=missing_data("fusion_not_sent", remedy=remedies["inside"]),
+        fusing=Unavailable(
+            "EKF2 fusion flags",
+            "MAVLink does not transmit EKF2 fusion flags",
+            f"{remedies['inside']}",
+        ),
         resets=(),
         instances=NO_SELECTOR,
         gate=settings_in_force(parameters)[EV_POS.gate],

@@ -178,7 +178,13 @@ def read_frames(name: str, content: bytes) -> Frames:
     stamp = STAMP_BYTES if len(start) and _has_receive_stamps(start, end) else 0
     good_bytes = int(np.sum(end - start))
     if good_bytes < MIN_GOOD_SHARE * len(content) or not len(start):
-        raise LogError.of("not_a_log", name=name, frames=len(start), length=len(content))
+        raise LogError(
+            (
+                f"{name} is neither a PX4 ULog nor a MAVLink recording ({len(start)} frames "
+                f"with a valid checksum in {len(content)} bytes)."
+            ),
+            "Give the .ulg from the vehicle, or a .tlog or raw MAVLink stream.",
+        )
     source = np.frombuffer(content, dtype=np.uint8)
     is_version_2 = source[start] == MAGIC_2
     # sequence, system and component follow one another

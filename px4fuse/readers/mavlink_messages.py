@@ -12,15 +12,23 @@ import msgspec
 from px4fuse.flight import RECORD_NOT_LOGGED, Unavailable
 from px4fuse.origin import Origin, find_origin
 from px4fuse.readers.layouts import Layout, expand_layouts
-from px4fuse.record import missing_data, table
+from px4fuse.record import table
 
 AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: a ground station, a camera, a companion computer
 GROUND_STATION = 6  # MAV_TYPE_GCS
 LANDED = 1  # MAV_LANDED_STATE_ON_GROUND
 AUTO_MODE = 4  # PX4_CUSTOM_MAIN_MODE_AUTO
-NO_MODES = missing_data("modes_not_sent")
-ARDUPILOT_REPLAY = missing_data("replay_of_ardupilot")
+NO_MODES = Unavailable(
+    "flight modes",
+    "the recording has no HEARTBEAT of a PX4 autopilot",
+    "Record the link of a PX4 vehicle.",
+)
+ARDUPILOT_REPLAY = Unavailable(
+    "estimator replay",
+    "px4fuse has no model of ArduPilot's estimator (EKF3)",
+    "Use its logged state.",
+)
 # Messages whose time_usec is the autopilot's boot clock; GPS_RAW_INT's, say, is the receiver's
 STAMPED_BY_BOOT_CLOCK = ("HIGHRES_IMU", "ODOMETRY", "ESTIMATOR_STATUS")
 # What an autopilot sends of itself, and nobody else

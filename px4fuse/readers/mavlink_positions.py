@@ -20,7 +20,6 @@ from px4fuse.readers.mavlink_recording import BOOT_CLOCK, RECEIPT_CLOCK, Recordi
 from px4fuse.readers.mavlink_senders import senders_of
 from px4fuse.readers.parts import join_nearest, read_attitude, read_orientation
 from px4fuse.readers.px4_positions import GeodeticPosition, project_to_ned, unproject
-from px4fuse.record import missing_data
 
 # A boot clock's stamp is no further from its receipt
 OWN_CLOCK_S = 5.0
@@ -201,4 +200,8 @@ def read_truth(
     for track in positions:
         if mocap_truth and track.name == mocap_truth.name:
             recording.record_stream("truth", *track.topics, clock=track.clock)
-    return mocap_truth or missing_data("truth_not_recorded", remedy=remedies["truth"])
+    return mocap_truth or Unavailable(
+        "ground truth",
+        "the recording has neither simulation ground truth nor motion capture",
+        f"{remedies['truth']}",
+    )

@@ -79,7 +79,10 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
         candidates = [address for address in {*flying, *candidates} if address[0] == system]
         if not candidates:
             have = ", ".join(str(number) for number in sorted({s[0] for s in flying})) or "none"
-            raise SettingsError.of("no_such_system", frames=frames, system=system, have=have)
+            raise SettingsError(
+                f"{frames.name}: no autopilot has MAVLink system id {system}. Autopilots in "
+                f"this file: {have}."
+            )
     best = max(candidates, key=lambda address: counts.get(address, 0))
     name = messages.AUTOPILOTS.get(vehicles[best][1]) if best in vehicles else None
     return best, name or "unknown autopilot"

@@ -119,7 +119,9 @@ class _Table:
                 quoting=csv.QUOTE_NONE,
             )
         except ValueError as error:
-            raise LogError.of("no_numbers", file=self.file) from error
+            raise LogError(
+                f"{self.file} contains no table of numbers.", "Export it as CSV again."
+            ) from error
         return texts.dropna(how="all")
 
 
@@ -249,7 +251,10 @@ def _check_options(
             raise SettingsError(f"`{name}`: {value!r} is not one of {', '.join(units)}.")
     titles = columns or ("1", "2", "3")
     if "" in titles or not 3 <= len({*titles}) == len(titles) <= 5:
-        raise SettingsError.of("columns_wrong", option=_COLUMNS, titles=",".join(titles))
+        raise SettingsError(
+            f"{_COLUMNS}[,SIGMA]: {','.join(titles)!r} must name four or five different "
+            "columns (three if there is no height)."
+        )
 
 
 def _count_words(rows: int) -> str:
@@ -269,7 +274,13 @@ def _find_table(
     """Find separator, header and first row, and say whether a last line was left out."""
     text = decode_text(content)
     if text is None:
-        raise LogError.of("binary_table", file=file)
+        raise LogError(
+            (
+                f"{file} is a binary file, not a text table. Give the CSV file of the "
+                "positioning system."
+            ),
+            "A flight log is given as LOG, without --position.",
+        )
     notes = []
     whole_lines, _, last = text.replace('"', "").rpartition("\n")
     text = f"{whole_lines}\n"
@@ -287,19 +298,21 @@ def _find_table(
     line, separator, names = next(headers, (0, "", []))
     if not names:
         titles = ", ".join(map(quote, sorted(wanted_names))) or "time, x, y, z"
-        raise LogError.of(
-            "no_header",
-            file=file,
-            titles=titles,
-            n=len(lines),
-            first=quote(lines[0]),
-            option=_COLUMNS,
+        raise LogError(
+            (
+                f"{file}: the first {len(lines)} lines contain no header with the columns "
+                f"{titles}. The first line is {quote(lines[0])}."
+            ),
+            f"Give a CSV file with a header, or name its columns with {_COLUMNS}.",
         )
     body = re.sub(r"(?m)^[ \t]*[#%].*", "", text.split("\n", line)[line])
     head = body[:HEAD_CHARS].lstrip("\n").partition("\n")[0].rstrip(f"{separator} ")
     width = len(_split_line(head, separator))
     if width > len(names):
-        raise LogError.of("header_short", file=file, count=len(names), width=width)
+        raise LogError(
+            f"{file}: the header has {len(names)} columns, but the rows have {width}.",
+            "Export it with decimal points and a name for each column.",
+        )
     return _Table(file, separator, names, body, line), notes
 
 

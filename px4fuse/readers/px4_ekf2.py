@@ -22,7 +22,6 @@ from px4fuse.readers.layouts import Layout, expand_columns
 from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S, read_aids, read_enabled_aids
 from px4fuse.readers.px4_innovations import innovations_of
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
-from px4fuse.record import missing_data
 
 VISION = "vehicle_visual_odometry"
 STATES = 22  # attitude, velocity, position, biases, magnetic fields; the rest is wind and terrain
@@ -34,7 +33,14 @@ HALF = 0.05
 MAX_FLOW_S = 0.5
 # Horizontal aiding besides vision position
 OTHER_AIDING = ("gnss_pos", "gnss_vel", "optical_flow", "ev_vel", "aux_global_position", "airspeed")
-VARIANCES_NOT_LOGGED = missing_data("variances_not_logged")
+VARIANCES_NOT_LOGGED = Unavailable(
+    "EKF2 variances",
+    (
+        "estimator_states (estimator_status before v1.12) is not logged or not "
+        "usable. Record with SDLOG_PROFILE bit 0 (default)"
+    ),
+    "The topic is also missing if EKF2 had not started.",
+)
 _RESETS: tuple[tuple[Literal["position", "velocity"], str, tuple[str, str, str]], ...] = (
     ("position", "xy_reset_counter", ("delta_north_m", "delta_east_m", "")),
     ("position", "z_reset_counter", ("", "", "delta_down_m")),
@@ -49,13 +55,21 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     if parameters.get("EKF2_EN") == 0.0:
         return Unavailable("EKF2", "EKF2_EN is 0: EKF2 did not run", "Set EKF2_EN to 1.")
     if (group := parameters.get("SYS_MC_EST_GROUP", 2.0)) != 2.0:
-        return missing_data("other_estimator", group=group)
+        return Unavailable(
+            "EKF2",
+            f"SYS_MC_EST_GROUP is {group:.0f}, so another estimator was running",
+            "Set SYS_MC_EST_GROUP to 2.",
+        )
     local = topics.read(px4.LOCAL_POSITION)
     if topics.find(px4.LOCAL_POSITION) is None:
         return Unavailable("EKF2", "no topic vehicle_local_position", px4.DEFAULT_PROFILE)
     state = local[Columns.STATE].dropna()
     if state.empty:
-        return missing_data("state_not_finite")
+        return Unavailable(
+            "EKF2",
+            "vehicle_local_position has no finite sample",
+            "Wait until EKF2 has started before recording.",
+        )
     topics.record_stream("ekf2_state", px4.LOCAL_POSITION.topic)
     enabled = read_enabled_aids(topics)
     fusing = _read_fusing(topics, enabled)
@@ -122,7 +136,11 @@ def _read_delayed_state(topics: Topics, step_s: float) -> pd.DataFrame | Unavail
     if not topic:
         return VARIANCES_NOT_LOGGED
     if not attitude:
-        return missing_data("states_unknown", topic=topic)
+        return Unavailable(
+            "EKF2 variances",
+            f"the array lengths of {topic} are not known to px4fuse",
+            "Report the PX4 version in a px4fuse issue.",
+        )
     states = [f"states[{i}]" for i in range(STATES)]
     variances = [f"covariances[{i}]" for i in range(STATES - 4 + attitude)]
     raw = topics.primary_samples(
@@ -233,7 +251,11 @@ def _read_fusing(
     """What EKF2 means to fuse of external vision."""
     vision = {"horizontal": "ev_pos", "vertical": "ev_hgt", "yaw": "ev_yaw"}
     if not {*vision.values()} <= enabled.keys():
-        return missing_data("fusion_not_logged")
+        return Unavailable(
+            "EKF2 fusion flags",
+            "estimator_status_flags and estimator_status are not logged",
+            "Record with SDLOG_PROFILE bit 0 (default).",
+        )
     frame = pd.DataFrame({group: enabled[aid] for group, aid in vision.items()}).dropna()
     topic = px4.STATUS_FLAGS if topics.instances(px4.STATUS_FLAGS) else px4.STATUS
     if frame.empty:

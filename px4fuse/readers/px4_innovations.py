@@ -9,7 +9,6 @@ import pandas as pd
 
 from px4fuse.ekf2_parameters import GNSS_POS, TABLE
 from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Ekf2, Unavailable
-from px4fuse.record import missing_data
 
 Innovations = dict[AxisName, pd.DataFrame | Unavailable]
 
@@ -50,8 +49,8 @@ def with_gnss_innovations(ekf2: Ekf2, source: FusedSource = GNSS) -> Ekf2:
         for group, name in (("horizontal", source.horizontal), ("vertical", source.vertical))
         if (log := ekf2.aids.get(name)) is not None and log.enabled is not None
     }
-    fusing: pd.DataFrame | Unavailable = missing_data(
-        "fusion_of_gnss_not_logged", remedy=GNSS.to_log
+    fusing: pd.DataFrame | Unavailable = Unavailable(
+        "EKF2 fusion flags", "the log does not contain when EKF2 fused GNSS", f"{GNSS.to_log}"
     )
     if enabled:
         columns = ["horizontal", "vertical", "yaw"]

@@ -28,7 +28,6 @@ from px4fuse.readers.px4_ekf2 import target_step_s
 from px4fuse.readers.px4_fixes import read_unlogged_fixes, reconstruct_fixes
 from px4fuse.readers.px4_innovations import fused_aid
 from px4fuse.readers.ulog_topics import Topics
-from px4fuse.record import missing_data
 from px4fuse.recording import ClockMap
 
 MIN_TRACK_SAMPLES = 3
@@ -425,8 +424,19 @@ def read_truth(
         return Truth(px4.LAYOUTS["truth_global"].topic, samples, attitude)
     captured = motion_capture(positions, "vehicle_mocap_odometry")
     if captured is None and len(logged):
-        return missing_data("truth_unusable", topic=px4.LAYOUTS["truth_local"].topic)
-    return captured or missing_data("truth_not_logged")
+        return Unavailable(
+            "ground truth",
+            (
+                f"{px4.LAYOUTS['truth_local'].topic} has no sample with finite positions and "
+                "velocities below 1e9 m and m/s"
+            ),
+            "Check the simulation that writes the ground truth.",
+        )
+    return captured or Unavailable(
+        "ground truth",
+        "the log has neither simulation ground truth nor motion capture",
+        "On real flights, send motion capture as ATT_POS_MOCAP.",
+    )
 
 
 def _move_to_origin(local: pd.DataFrame, global_samples: pd.DataFrame) -> pd.DataFrame:

@@ -133,7 +133,13 @@ def tum_text(trajectory: Trajectory) -> str:
         It has no orientation, which the format demands.
     """
     if trajectory.rotation is None:
-        raise TrajectoryError.of("tum_without_orientation", trajectory=trajectory)
+        raise TrajectoryError(
+            (
+                f"{trajectory.name}: a TUM file needs orientations, but this track has "
+                "positions only."
+            ),
+            "Choose a track with orientation.",
+        )
     time = trajectory.time_s + (trajectory.unix_offset_s or 0.0)
     table = np.column_stack((time, trajectory.position_m, trajectory.rotation.as_quat()))
     rows = (" ".join(map(repr, row)) for row in table.tolist())
@@ -162,7 +168,13 @@ def _rows(name: str, content: bytes) -> tuple[Rows, str, str]:
         truncation_note = f"Line {data[-1][0]}, the last one, was dropped: it is cut."
         data.pop()
     if len(data) < MIN_POSES:
-        raise TrajectoryError.of("poses_few", name=name, count=len(data), least=MIN_POSES)
+        raise TrajectoryError(
+            (
+                f"{name} contains {len(data)} poses; at least {MIN_POSES} are needed. Export "
+                "the trajectory again."
+            ),
+            "The file is almost empty if SLAM lost tracking at the start.",
+        )
     return Rows(name, data), "\n".join(comments), truncation_note
 
 
@@ -220,7 +232,13 @@ def _stamps_in_seconds(rows: Rows, stamps: list[str]) -> tuple[Array, str]:
             words = f"Its stamps are {unit} and were divided by {per_second:.0e}."
             # in two parts, as float64 does not hold the digits of UNIX time in ns
             return ticks // per_second + ticks % per_second / per_second, words
-    raise TrajectoryError.of("stamps_apart", rows=rows, step=step)
+    raise TrajectoryError(
+        (
+            f"{rows.file}: the timestamps have a median spacing of {step:.3g}, not a "
+            "valid interval in seconds or nanoseconds."
+        ),
+        "Give timestamps in seconds.",
+    )
 
 
 def _increasing_rows(rows: Rows, time: Array) -> tuple[BoolArray, str]:

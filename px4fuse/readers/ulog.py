@@ -12,7 +12,6 @@ from px4fuse.readers.layouts import Layout
 from px4fuse.readers.px4_ekf2 import read_ekf2
 from px4fuse.readers.px4_positions import GPS_3D_FIX, barometer, read_positions, read_truth
 from px4fuse.readers.ulog_topics import Topics, dropped_note, longest_increasing_run, read_topics
-from px4fuse.record import missing_data
 from px4fuse.recording import Unused
 
 ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
@@ -132,7 +131,11 @@ def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavaila
     """Stretches of flight by the land detector, each from take-off to touch-down."""
     detected = topics.read(px4.LAYOUTS["land_detected"], step=True)
     if detected.empty:
-        return missing_data("landing_not_logged")
+        return Unavailable(
+            "land detector",
+            "vehicle_land_detected is not logged or not usable",
+            "Record with SDLOG_PROFILE bit 0 (default), or give --start and --end.",
+        )
     topics.record_stream("airborne", px4.LAYOUTS["land_detected"].topic)
     return parts.flight_spans(detected["landed"], topics.log.duration_s)
 

@@ -384,12 +384,19 @@ def read_topics(name: str, content: bytes) -> Topics:
             # a log of other topics can still be placed in time, by all that it holds
             time_tables = tables or _tables(_Reader(_Content(content)))
     except _PARSE_ERRORS as error:
-        raise LogError.of(
-            "ulog_unreadable", name=name, why=str(error) or type(error).__name__
+        raise LogError(
+            f"{name}: the ULog cannot be read ({str(error) or type(error).__name__}).",
+            "Copy the .ulg from the vehicle again.",
         ) from error
     notes: tuple[str, ...] = ()
     if not time_tables:
-        raise LogError.of("ulog_empty", name=name)
+        raise LogError(
+            (
+                f"{name}: this ULog contains no data (no IMU, no position, no EKF2). If it "
+                "was cut off, copy it again."
+            ),
+            "Otherwise record with SDLOG_PROFILE 129.",
+        )
     if not tables:
         names = sorted({topic for topic, _ in time_tables})
         notes += (f"none of its topics is one that px4fuse uses (it holds {join_first(names, 5)})",)
@@ -459,7 +466,13 @@ def _data_span(
             breaks = np.flatnonzero(np.diff(increasing_us) > MAX_DATA_GAP_S / _MICROSECOND) + 1
             stretch = max(np.split(increasing_us, breaks), key=len)
             return int(stretch[0]), int(stretch[-1])
-    raise LogError.of("stamps_zero", name=name)
+    raise LogError(
+        (
+            f"{name}: all timestamps are zero, so the data have no time. The logger "
+            "started before the clock."
+        ),
+        "Record again.",
+    )
 
 
 def _text(info: dict[str, Any], key: str, otherwise: str) -> str:

@@ -50,13 +50,19 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
     if schema is None or kind is None:
         raise ResultsError(f"{name} holds no results of px4fuse.")
     if (version := str(schema.get("version"))) != VERSION:
-        raise ResultsError.of(
-            "other_version", name=name, version=one_line(version, 20), reads=VERSION
+        raise ResultsError(
+            (
+                f"{name} uses schema version {one_line(version, 20)}; this px4fuse reads "
+                f"version {VERSION}."
+            ),
+            "Create the report again, or use the px4fuse version that wrote it.",
         )
     try:
         results: Results = msgspec.convert(value, kind, dec_hook=decode_record_or_unavailable)
     except msgspec.ValidationError as error:
-        raise ResultsError.of("not_of_schema", name=name, why=one_line(str(error), 300)) from error
+        raise ResultsError(
+            f"{name} does not follow the results schema: {one_line(str(error), 300)}."
+        ) from error
     return results
 
 

@@ -70,8 +70,10 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
     if scenario.aid == GNSS_POS and 0.0 < mistakes.ekf2_noise_m < (
         stated_m := sensors.reported_sigma_m(scenario, mistakes)
     ):
-        raise SettingsError.of(
-            "gnss_noisier", mistakes=mistakes, parameter=GNSS_POS.noise, stated_m=stated_m
+        raise SettingsError(
+            f"--mistake ekf2-noise={mistakes.ekf2_noise_m:g} has no effect outdoors: "
+            f"EKF2 uses the larger of {GNSS_POS.noise} and the receiver's accuracy ({stated_m:g} "
+            "m). Use a larger value."
         )
     motion = plan(scenario, mistakes, sensors.stream(scenario, sensors.Stream.WANDER))
     positions = sensors.positions(scenario, mistakes, motion)

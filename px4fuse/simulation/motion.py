@@ -280,7 +280,10 @@ def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Mo
     ramps.change(-up, CLIMB_RAMP_S, rise_s)
     touch_down_s = ramps.centre_s + CLIMB_RAMP_S / 2.0
     if touch_down_s > MAX_FLIGHT_S:
-        raise SettingsError.of("flight_long", touch_down_s=touch_down_s, longest_s=MAX_FLIGHT_S)
+        raise SettingsError(
+            f"This flight would take {touch_down_s:.0f} s; the simulation is limited to "
+            f"{MAX_FLIGHT_S:g} s. Reduce --passes or --length."
+        )
     ramps.change(up, CLIMB_RAMP_S, 0.0)
     return Motion(
         path=Ramps.of(ramps.path),

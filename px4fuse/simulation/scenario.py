@@ -183,8 +183,10 @@ class Scenario:
             bounds.check(getattr(self, name), bounds.typed or name)
         needed = self.speed_m_s * (START_STOP_S if self.kind == "aisle" else CORNER_S)
         if self.length_m < needed:
-            raise SettingsError.of(
-                "side_short", length_m=self.length_m, speed_m_s=self.speed_m_s, needed=needed
+            raise SettingsError(
+                f"--length {self.length_m:g} m is too short for --speed {self.speed_m_s:g} "
+                f"m/s: acceleration, braking and corners need {needed:g} m. Increase "
+                "--length or reduce --speed."
             )
 
     @property

@@ -81,7 +81,13 @@ def fit_alignment(estimate_m: Array, reference_m: Array, kind: AlignmentKind) ->
         along a line, about which any turn fits as well.
     """
     if len(estimate_m) < MIN_POSES:
-        raise TrajectoryError.of("matches_few", count=len(estimate_m), least=MIN_POSES)
+        raise TrajectoryError(
+            f"Only {len(estimate_m)} poses match in time; an alignment needs {MIN_POSES}.",
+            (
+                "Check that both trajectories are of the same flight and use the same clock "
+                "(--time-offset auto)."
+            ),
+        )
     if kind == "none":
         return Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 0)
     if kind == "yaw":
@@ -158,11 +164,11 @@ def _require_determined(
         motion = f"motion is along a line: {length:.2g} m (RMS) by"
         instead = "`alignment` yaw if z is vertical in both, or `alignment` none"
     if extent_m < max(MIN_SPREAD_M, MIN_SHARE * length) or residual_m > limit * extent_m:
-        raise TrajectoryError.of(
-            "alignment_open",
-            motion=motion,
-            extent_m=extent_m,
-            residual_m=residual_m,
-            kind=kind,
-            instead=instead,
+        raise TrajectoryError(
+            (
+                f"{kind} cannot be estimated: the {motion} {extent_m:.2g} m, and the "
+                f"alignment residual is {residual_m:.2g} m. The vehicle moved too little, or "
+                "the estimate does not follow it."
+            ),
+            f"Use {instead}.",
         )

@@ -14,7 +14,7 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.display import one_line_repr
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Unavailable
-from px4fuse.record import Count, NotNegative, OrUnavailable, Record, missing_data
+from px4fuse.record import Count, NotNegative, OrUnavailable, Record
 from px4fuse.trajectory.correlation import autocovariance
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
@@ -310,7 +310,14 @@ def rmse_interval(
     n = len(squares)
     length = max(int(np.ceil(BLOCK_TIMES * autocorrelation_time(squares))), min_block, 1)
     if n < MIN_BLOCKS * length:
-        return missing_data("rmse_correlated", what=what, length=length, n=n, min_blocks=MIN_BLOCKS)
+        return Unavailable(
+            f"interval of the {what} RMSE",
+            (
+                f"errors are correlated over {length} of {n} samples, so fewer than "
+                f"{MIN_BLOCKS:.0f} independent blocks remain"
+            ),
+            "Use a longer flight.",
+        )
     sums = np.concatenate(([0.0], np.cumsum(np.concatenate((squares, squares[: length - 1])))))
     block_means = (sums[length:] - sums[:-length]) / length  # one for each start, round the end
     blocks = n / length

@@ -269,9 +269,14 @@ def _attachment(reader: pypdf.PdfReader) -> bytes:
     if features:
         raise ResultsError(f"it contains {', '.join(sorted(features))}; no report does.")
     if not files and not streams:
-        raise ResultsError.of("no_results_attached", name=RESULTS_NAME)
+        raise ResultsError(
+            f"No {RESULTS_NAME} is attached to this PDF. It is not a px4fuse report, or "
+            "it was printed to PDF, which drops attachments. Hand in the original file."
+        )
     if len(files) != 1 or len(streams) != 1:
-        raise ResultsError.of("attachments_many")
+        raise ResultsError(
+            "The PDF has several attachments, or none that can be read. Hand in one report per PDF."
+        )
     (file,), (stream,) = files, streams.values()
     names = {
         str(_resolve(file.get(key)))

@@ -78,7 +78,13 @@ def gate(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -> list
     gap = np.flatnonzero(chain_edges < 0)
     if len(gap):
         at = low + int(gap[0])
-        raise TrajectoryError.of("odometry_gap", one=graph.ids[at], two=graph.ids[at + 1])
+        raise TrajectoryError(
+            (
+                f"No odometry edge connects vertices {graph.ids[at]} and {graph.ids[at + 1]}, "
+                "so the closure cannot be tested against odometry."
+            ),
+            "Add the edge, or test shorter closures.",
+        )
     poses = lie.chain(model.odometry_steps(graph, chain_edges))
     step_adjoints = lie.adjoint(poses[1:])
     step_covariances = (
@@ -112,7 +118,17 @@ def _test_edge(graph: model.PoseGraph, edge: int, residual: Array, covariance: A
         not is_testable
         or np.linalg.eigvalsh(model.scale_to_unit_diagonal(spread)[1])[0] <= _SINGULAR
     ):
-        raise TrajectoryError.of("closure_untestable", one=ends[0], two=ends[1])
+        raise TrajectoryError(
+            (
+                f"The closure from vertex {ends[0]} to {ends[1]} cannot be tested: it has no "
+                "information, or the ratio of odometry and closure covariance exceeds the "
+                "numerical precision."
+            ),
+            (
+                "Give the closure's inverse covariance, and odometry information of a "
+                "similar magnitude."
+            ),
+        )
     d2 = float(observed_residual @ np.linalg.solve(spread, observed_residual))
     p = float(chdtrc(freedom, d2))
     return GateResult(*ends, d2, freedom, p, p >= GATE_ALPHA)
@@ -124,8 +140,13 @@ def _covariances(graph: model.PoseGraph, chain_edges: IntArray) -> Array:
     is_full_rank = np.linalg.eigvalsh(scaled)[:, 0] > 1e-12
     if not np.all(is_full_rank):
         edge = chain_edges[int(np.argmin(is_full_rank))]
-        raise TrajectoryError.of(
-            "edge_unbound", one=graph.ids[graph.first[edge]], two=graph.ids[graph.second[edge]]
+        raise TrajectoryError(
+            (
+                f"The odometry edge from vertex {graph.ids[graph.first[edge]]} to "
+                f"{graph.ids[graph.second[edge]]} has no information in one direction, so "
+                "its error is unbounded."
+            ),
+            "Give information in all directions.",
         )
     covariance = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
     is_backward = graph.first[chain_edges] > graph.second[chain_edges]

@@ -166,12 +166,12 @@ def require_connected(graph: PoseGraph, used: BoolArray, what: str) -> None:
     component_count, component = connected_components(links, directed=False)
     if component_count > 1:
         other_vertex = graph.ids[np.flatnonzero(component != component[0])[0]]
-        raise TrajectoryError.of(
-            "graph_in_parts",
-            component_count=component_count,
-            other_vertex=other_vertex,
-            first=graph.ids[0],
-            what=what,
+        raise TrajectoryError(
+            (
+                f"The pose graph has {component_count} disconnected parts: vertex "
+                f"{other_vertex} is not connected to vertex {graph.ids[0]} by {what}."
+            ),
+            "Add an edge between the parts, or optimise them separately.",
         )
 
 

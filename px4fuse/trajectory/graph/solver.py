@@ -139,7 +139,10 @@ def solve(
     start = model.residuals(graph, graph.poses)
     cost_initial = 0.5 * float(np.sum(start.chi2))
     if not np.isfinite(cost_initial):
-        raise TrajectoryError.of("graph_not_finite")
+        raise TrajectoryError(
+            ("The pose graph contains a pose or measurement that is not finite or too large."),
+            "Correct it, or remove the edge.",
+        )
     plain_descent = _minimise(graph, start, _least_squares_kernel(np.ones(len(is_doubtful))))
     weights = np.ones(len(is_doubtful))
     descent = plain_descent
