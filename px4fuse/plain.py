@@ -1,15 +1,13 @@
 """Results as plain data: what JSON can hold, without NaN; and numbers as people read them."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
 from typing import Any
 
 import msgspec
-
-from px4fuse.record import table
 
 
 def to_json_types(value: object) -> Any:
@@ -113,24 +111,3 @@ def format_excess(factor: float) -> str:
         if factor < 2.0
         else (f"{format_factor(factor)} times")
     )
-
-
-def sentences(beside: str) -> Callable[..., str]:
-    """What says the sentences of the ``words.toml`` beside a module.
-
-    Parameters
-    ----------
-    beside : str
-        ``__file__`` of the module.
-
-    Returns
-    -------
-    callable
-        Takes the name of a sentence, and by name the facts that it is filled with.
-    """
-    texts = table(beside, "words.toml", dict[str, str])
-
-    def say(which: str, /, **facts: Any) -> str:
-        return texts[which].format_map(facts)
-
-    return say

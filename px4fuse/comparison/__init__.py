@@ -1,5 +1,1 @@
-"""Our filter against EKF2 and ground truth."""
-
-from px4fuse.plain import sentences
-
-say = sentences(__file__)
+"""Comparison of KF with EKF2 and with ground truth."""

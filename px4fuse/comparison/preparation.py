@@ -6,7 +6,6 @@ from typing import TypedDict, Unpack
 import numpy as np
 from msgspec import structs
 
-from px4fuse.comparison import say
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.projection import observation_variance
 from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
@@ -200,7 +199,11 @@ def _move_to_vehicle(track: PositionTrack, flight: Flight) -> PositionTrack:
     samples = track.samples.copy()
     samples[Columns.POSITION] -= lever_arm_ned
     forward, right, down = track.lever_arm_m
-    note = say("of_vehicle", forward=forward, right=right, down=down)
+    note = (
+        "positions refer to the vehicle's origin: lever arm of the sensor "
+        f"{forward:g} m forward, {right:g} m right, {down:g} m down (EKF2 "
+        "parameters)"
+    )
     return replace(track, samples=samples, notes=(*track.notes, note))
 
 
@@ -240,13 +243,19 @@ def explain_missing_source(flight: Flight) -> Unavailable:
     damaged = "the file is damaged, and " if flight.log.damage else ""
     unused = next((track.name for track in flight.positions if not track.origin.is_automatic), "")
     looked_for = "no vehicle_visual_odometry, motion capture or EKF2 innovations of external vision"
-    remedy = say("send_positions")
+    remedy = (
+        "set SDLOG_PROFILE to 129 and send the UWB position to PX4 as "
+        "VISION_POSITION_ESTIMATE, or give the position file with --position."
+    )
     if flight.log.format.startswith("MAVLink"):
         looked_for = "no VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP"
         ulog = ", or the ULog" if flight.log.has_ulog else ""
         remedy = f"give the positioning system's own file with `position`{ulog}."
     if unused:
-        remedy = say("gps_alone", unused=unused, remedy=remedy)
+        remedy = (
+            "The log contains only GPS, which EKF2 did not fuse: use it with "
+            f"--position-source {unused}, or {remedy}"
+        )
     reason = f"{damaged}no external position in this log ({looked_for})"
     return Unavailable("position source", reason, capitalise_first(remedy))
 

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from px4fuse.comparison import say
 from px4fuse.comparison.comparison import kf_error_statistics
 from px4fuse.comparison.estimates import Tuning, first_axis_tuning
 from px4fuse.comparison.model import Comparison
@@ -274,7 +273,10 @@ def format_kf_remedy(
     errors = filter_errors_m(comparison, changed)
     if errors is None:
         if unseen_nats is not None and unseen_nats <= 0.0:
-            return say("unseen", typed=typed)
+            return (
+                f"No change advised: {typed} is the maximum-likelihood estimate, but "
+                "settings estimated on the first half do not improve the second half."
+            )
         return f"{COMMAND} {typed}."
     before, after = errors
     effect = f"position error {before:.3f} → {after:.3f} m (replayed)"

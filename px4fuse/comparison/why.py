@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.comparison import say
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.comparison.remedy import noise_used_m
 from px4fuse.ekf2 import walk as ways
@@ -125,7 +124,11 @@ def add_sentences(why: Why, axis_label: str, reasons: dict[str, str]) -> Why:
     sentences += [_velocity_sentence(why), *_truth_sentences(why)]
     far_m = max(MIN_ELSEWHERE_M, MIN_ELSEWHERE_RATIO * float(np.max(np.abs(why.kf_minus_ekf2_m))))
     if why.outside is not None and why.outside.maximum_m > far_m:
-        sentences.append(say("elsewhere", why=why))
+        sentences.append(
+            "Outside the replayed parts (EKF2 starting or not fusing the source) KF and "
+            f"EKF2 differ by up to {why.outside.maximum_m:.1f} m (at "
+            f"{why.outside.at_s:.0f} s)."
+        )
     return structs.replace(why, sentences=tuple(sentences), cause=f"{cause}.")
 
 
@@ -137,7 +140,7 @@ def _format_share(part: Step, why: Why) -> str:
 
 
 def _moment_text(part: Step) -> str:
-    return say("moment", part=part)
+    return f"; largest effect at {part.moved_at_s:.1f} s ({part.position_moved_m:.2f} m)"
 
 
 def _rejection_text(why: Why) -> str:
@@ -145,7 +148,10 @@ def _rejection_text(why: Why) -> str:
     if coast is None:
         return ""
     samples = f"{coast.samples} samples in a row" if coast.samples > 1 else "a sample"
-    return say("coasted", coast=coast, samples=samples)
+    return (
+        f": at {coast.start_s:.0f} s it rejected {samples} and drifted "
+        f"{coast.distance_m:.2g} m in {coast.duration_s:.1f} s"
+    )
 
 
 def _step_reasons(

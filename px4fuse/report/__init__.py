@@ -1,5 +1,1 @@
-"""The report: PDF pages, terminal summary, results JSON."""
-
-from px4fuse.plain import sentences
-
-say = sentences(__file__)
+"""Report: PDF pages and terminal summary."""

@@ -10,7 +10,7 @@ from px4fuse.ekf2.aids import AidResult, flight_span
 from px4fuse.findings import Finding
 from px4fuse.flight import AidLog, Flight, Unavailable, step_values_at
 from px4fuse.plain import format_factor, format_number
-from px4fuse.report import say, style
+from px4fuse.report import style
 from px4fuse.report.cover import flight_line, write_findings
 from px4fuse.report.marks import GROUND_BAND
 from px4fuse.report.page import Cell, Page, appendix
@@ -27,7 +27,14 @@ OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw a page of the appendix where something besides external vision carried the flight."""
-    page = Page(appendix(TITLE), say("aids"))
+    page = Page(
+        appendix(TITLE),
+        (
+            "Each aid is tested with its own innovations in flight (mean NIS, expected "
+            "1). A small NIS does not prove accuracy: time-correlated errors, wrong "
+            "delays and wrong headings do not show in it."
+        ),
+    )
     aid_results = write_appendix(page, analysis)
     if aid_results:
         _draw_strips(page, analysis.flight, aid_results)
@@ -47,7 +54,14 @@ def write_appendix(page: Page, analysis: Analysis) -> Mapping[str, AidResult]:
 
 def draw_alone(alone: AidsOnlyAnalysis, results: AidsResults) -> Iterator[Page]:
     """Draw the page of a flight without a position source."""
-    page = Page(TITLE, say("aids"))
+    page = Page(
+        TITLE,
+        (
+            "Each aid is tested with its own innovations in flight (mean NIS, expected "
+            "1). A small NIS does not prove accuracy: time-correlated errors, wrong "
+            "delays and wrong headings do not show in it."
+        ),
+    )
     page.write(flight_line(results.student, alone.flight.log), colour=style.MUTED_COLOUR)
     write_alone(page, alone, results.findings)
     _draw_strips(page, alone.flight, alone.aids)
@@ -139,7 +153,11 @@ def _draw_strips(page: Page, flight: Flight, aids: Mapping[str, AidResult]) -> N
         return
     fused_names = [name for name, aid in aids.items() if aid.verdict != "idle"]
     page.heading("Innovations over √S, all axes of an aid", above=8.0)
-    page.numbers(say("strips", most=MAX_NORMALISED))
+    page.numbers(
+        "Normalised innovations ν/√S. Expected: 95 % within ±2 (lines). Hollow: not "
+        f"fused. Grey: fusion disabled. Values beyond ±{MAX_NORMALISED:g} are drawn "
+        "at the edge."
+    )
     for name in fused_names:
         _draw_strip(page, aids[name], flight.ekf2.aids[name], span, last=name == fused_names[-1])
 

@@ -10,7 +10,6 @@ from px4fuse.findings import Finding
 from px4fuse.findings.source_clock import typed_offset_s
 from px4fuse.flight import Unavailable
 from px4fuse.plain import format_p_value
-from px4fuse.report import say
 from px4fuse.report.page import Page, legend_above
 from px4fuse.report.style import KF_BAND_COLOUR, KF_LINE, Axes
 from px4fuse.results.contract import ComparisonResults
@@ -53,7 +52,10 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
         }
     offset, (low, high) = clock.offset_s, clock.interval_s
     advice = {
-        "Offset": say("clock_offset", offset=offset, low=low, high=high),
+        "Offset": (
+            f"{offset:+.3f} s (95 % {low:+.3f} to {high:+.3f} s), to add to the "
+            "timestamps of the source"
+        ),
         "Reading": "the stamps are right as far as this flight can tell",
     }
     if not (low <= 0.0 <= high or abs(offset) < NEGLIGIBLE_S):
@@ -70,8 +72,9 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
         advice["PX4"] = f"{name} is 0 ms and cannot be negative: correct the sender's clock"
     elif delay is not None:
         ml_delay_ms, least, most = (max(1e3 * s, 0.0) for s in (age_s - offset, least, most))
-        advice["PX4"] = say(
-            "delay_asked", name=name, delay=delay, asked=ml_delay_ms, least=least, most=most
+        advice["PX4"] = (
+            f"{name} is {delay:g} ms; the estimate is {ml_delay_ms:.0f} ms (95 % "
+            f"{least:.0f} to {most:.0f} ms). Set it, or correct the sender's clock."
         )
     if clock.change_p is not None and clock.change_p < MAX_CHANGE_P:
         offset_texts = ", ".join(f"{p.offset_s:+.2f} s from {p.start_s:.0f} s" for p in clock.parts)
@@ -88,10 +91,23 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
     clock = analysis.clock
     if isinstance(clock, Unavailable) or not has_page(analysis, results.findings):
         return
-    page = Page("Appendix: the clock of the position source", say("clock"))
+    page = Page(
+        "Appendix: the clock of the position source",
+        (
+            "Late or early timestamps hardly change the innovations: the filter follows "
+            "the positions. px4fuse maximises the likelihood of the positions over the "
+            "time offset, jointly with sensor biases, attitude errors and noises. The "
+            "attitude comes from the gyros alone. EKF2's attitude was corrected by the "
+            "same positions, so it is not used."
+        ),
+    )
     page.advice(clock_advice(analysis, clock), size=8.5)
     (low, high), best = clock.interval_s, clock.offset_s
-    curve_sentence = say("clock_best", best=best, low=low, high=high, clock=clock)
+    curve_sentence = (
+        f"Maximum at {best:+.3f} s; 95 % interval {low:+.3f} to {high:+.3f} s. The "
+        "interval also includes the IMU noise, so it is wider than the curve shows. "
+        f"{clock.count} measurements."
+    )
     title = "ln of how much less likely each offset is than the best"
     draw_curve(page.panel(title, curve_sentence, CURVE_HEIGHT, above=14.0), clock)
     yield page

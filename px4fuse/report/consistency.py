@@ -15,7 +15,7 @@ from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrela
 from px4fuse.findings.since import format_change, format_explained_share
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capitalise_first, format_number, format_p_value
-from px4fuse.report import marks, say
+from px4fuse.report import marks
 from px4fuse.report.page import Cell, Page, halves, legend_above
 from px4fuse.report.style import (
     DOTS,
@@ -58,7 +58,15 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw one page: the axis of the lab in three panels, all axes in a table."""
     result = analysis.main
     along = result.axis.called
-    page = Page("Appendix: consistency", say("consistency", along=along))
+    page = Page(
+        "Appendix: consistency",
+        (
+            "Innovations ν of a consistent filter have variance S (mean NIS = mean of "
+            "ν²/S = 1), are normally distributed with mean 0, and are white. Both "
+            f"filters are tested in the same way along {along}; the table lists all "
+            "axes."
+        ),
+    )
     series = _series(result)
     if series:
         axes = marks.panel(
@@ -116,7 +124,15 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
         return
     page.heading(f"Causes that were tried along {axis.called}", above=12.0)
     page.table(["filter", "cause", "number", "flown", "put right", "explains"], rows, right=(3, 4))
-    page.write(say("causes"), size=7.5, colour=MUTED_COLOUR)
+    page.write(
+        (
+            "Each row is a re-run with one change. 'all': the change brings the number "
+            "into its band. Otherwise the share of its logarithm (for distances: of its "
+            "mean square). A share of 50 % or more counts as the cause."
+        ),
+        size=7.5,
+        colour=MUTED_COLOUR,
+    )
 
 
 def _series(result: AxisComparison) -> list[Series]:
@@ -214,11 +230,9 @@ def _nis_sentence(series: list[Series]) -> str:
 
 def _shape_sentence(series: list[Series]) -> str:
     sentences = [
-        say(
-            "beyond",
-            who=capitalise_first(one.name),
-            one=one,
-            p=format_p_value(one.statement.bias_p),
+        (
+            f"{capitalise_first(one.name)}: {one.statement.outside_two_sigma:.1%} beyond "
+            f"2√S (expected 4.5 %), mean {one.statement.innovation_mean_m:+z.3f} m ({format_p_value(one.statement.bias_p)})."
         )
         for one in series
     ]

@@ -16,7 +16,6 @@ from px4fuse.findings import Finding, by_root
 from px4fuse.flight import Ekf2, Truth, Unavailable
 from px4fuse.plain import format_length
 from px4fuse.recording import LogInfo
-from px4fuse.report import say
 from px4fuse.report.marks import LANDING_MARK, TAKE_OFF_MARK
 from px4fuse.report.page import PAGE_WIDTH, Page, halves, legend_above, words
 from px4fuse.report.style import (
@@ -112,7 +111,12 @@ def _write_verdict(page: Page, analysis: Analysis) -> None:
             column.write(f"{one.reason}.", above=1.0)
         columns.append(column)
     page.beside(*columns, above=14.0)
-    notes = [say("nis")]
+    notes = [
+        (
+            "Mean NIS, expected 1. Below its 95 % band: underconfident (σ too large). "
+            "Above: overconfident (σ too small)."
+        )
+    ]
     if isinstance(result.ekf2_state, Unavailable):
         notes.append(f"There is no EKF2 to compare with: {result.ekf2_state.reason}.")
     if not isinstance(analysis.flight.truth, Truth):
@@ -124,7 +128,10 @@ def facts(comparison: Comparison) -> dict[str, str]:
     """What was compared, in labels and sentences."""
     flight = comparison.flight
     log, source, segment = flight.log, comparison.source, comparison.segment
-    position = say("position", source=source, comparison=comparison)
+    position = (
+        f"{source.name}: {source.description}, {source.rate_hz:.1f} Hz, "
+        f"{source.frame}; {comparison.source_reason}"
+    )
     placement, clock = "", ""
     if source.alignment is not None:
         alignment, clock = source.alignment, source.clock

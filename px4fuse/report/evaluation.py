@@ -9,7 +9,7 @@ import numpy as np
 from px4fuse.arrays import Array, IntArray
 from px4fuse.flight import Unavailable
 from px4fuse.loop.analysis import SMALLEST_STAMP_S
-from px4fuse.report import say, style
+from px4fuse.report import style
 from px4fuse.report.page import PAGE_WIDTH, Page, halves
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, MUTED_COLOUR, TRUTH_COLOUR, Axes, Colormap
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
@@ -86,7 +86,13 @@ def path_views(score: Evaluation) -> list[View]:
 
 def draw(score: Evaluation, _: object) -> Iterator[Page]:
     """Draw the page, and another where the table of a run over many deltas fills the first."""
-    page = Page("Trajectory error", say("errors"))
+    page = Page(
+        "Trajectory error",
+        (
+            "APE: distance of one pose from the reference (its RMSE over all poses is "
+            "the ATE). RPE: error of the relative motion over a fixed distance or time."
+        ),
+    )
     page.write(summary(score), size=9.0, bold=True)
     write_evaluation(page, score)
     _draw_maps(page, score)
@@ -341,7 +347,10 @@ def worst_moments_sentence(score: Evaluation) -> str:
     """Whether a few moments decide."""
     squares = np.sort(score.position_error_m**2)
     worst = squares[-max(1, len(squares) // 10) :].sum() / max(squares.sum(), NEGLIGIBLE_M**2)
-    return say("moments", worst=worst)
+    return (
+        f"The worst 10 % of the poses contribute {worst:.0%} of the squared error. "
+        "10 % means a constant error; much more means a few large errors."
+    )
 
 
 def quarter_rmse(score: Evaluation) -> list[float]:
@@ -356,7 +365,10 @@ def quarter_rmse(score: Evaluation) -> list[float]:
 def quarters_sentence(score: Evaluation) -> str:
     """Whether the error grows along the path."""
     found = ", ".join(f"{rmse_m:.3f}" for rmse_m in quarter_rmse(score))
-    return say("quarters", found=found)
+    return (
+        f"RMSE per quarter of the path: {found} m. Drift grows along the path; after "
+        "alignment it is large at both ends."
+    )
 
 
 def rpe_growth_sentence(rpe: tuple[PairwiseError, ...]) -> str:
@@ -388,7 +400,10 @@ def format_interval(interval: Interval | Unavailable) -> str:
 
 def describe_track(path: Trajectory) -> str:
     """A trajectory by its name, what it is, its length in time and its frame."""
-    return say("track", path=path, poses=len(path), span_s=path.time_s[-1] - path.time_s[0])
+    return (
+        f"{path.name}: {path.kind}, {len(path)} poses over "
+        f"{path.time_s[-1] - path.time_s[0]:.1f} s, frame {path.frame}"
+    )
 
 
 def describe_score(score: Evaluation) -> str:
@@ -396,6 +411,8 @@ def describe_score(score: Evaluation) -> str:
     matched = score.association
     offset = score.time_offset.offset_s
     clock = "" if not offset else f"; clocks matched by {offset:+.3f} s"
-    return say(
-        "how", score=score, reason=score.alignment_reason.rstrip("."), matched=matched, clock=clock
+    return (
+        f"alignment {score.alignment} ({score.alignment_reason.rstrip('.')}); "
+        f"{matched.poses} pose pairs, {matched.coverage_estimate:.0%} of the "
+        f"estimate and {matched.coverage_reference:.0%} of the reference's time{clock}"
     )

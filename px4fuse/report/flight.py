@@ -13,7 +13,7 @@ from px4fuse.comparison.model import AxisComparison, Difference
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Unavailable
 from px4fuse.record import Span
-from px4fuse.report import marks, panels, say, style
+from px4fuse.report import marks, panels, style
 from px4fuse.report.page import PAGE_WIDTH, Page
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, LINES, Artist, Axes
 from px4fuse.report.why import unexplained_note
@@ -150,7 +150,11 @@ def zoom_sentence(result: AxisComparison) -> str:
         shrink = 1.0 - after**2 / before**2
         shrinks = f"{name} {before:.3f} to {after:.3f} m, {shrink:.0%} of the variance"
         if name == "ours":
-            shrinks = say("predict_and_update", settings=result.replay.settings, shrinks=shrinks)
+            shrinks = (
+                "σ grows in each prediction (SIGMA_A "
+                f"{result.replay.settings.sigma_a_m_s2:g} m/s²) and decreases with each "
+                f"measurement ({shrinks})"
+            )
         texts.append(shrinks)
     return f"{'; '.join(texts)}." if texts else ""
 
@@ -160,7 +164,10 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
     others = analysis.others
     if not others:
         return
-    page = Page("Appendix: other axes", say("other_axes"))
+    page = Page(
+        "Appendix: other axes",
+        "The same panels for the other axes, with the same lines, bands and marks.",
+    )
     width = (PAGE_WIDTH - COLUMN_GAP * (len(others) - 1)) / max(len(others), 3)
     columns = [Page(width=width) for _ in others]
     for column, result in zip(columns, others, strict=True):

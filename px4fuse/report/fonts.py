@@ -10,8 +10,6 @@ from pathlib import Path
 from matplotlib import font_manager
 from matplotlib.font_manager import FontEntry, FontPath
 
-from px4fuse.report import say
-
 # Matplotlib's own, always there: Latin, Greek, Cyrillic, Arabic, Hebrew and symbols
 FONT = "DejaVu Sans"
 # These have a box for every character
@@ -51,7 +49,11 @@ def missing_characters(text: str) -> str:
 def font_advice(characters: str) -> str:
     """What to install for :func:`missing_characters` characters, as one sentence or two."""
     shown = characters[:MAX_SHOWN] + ("…" if len(characters) > MAX_SHOWN else "")
-    return say("install_font", shown=shown, sign=NO_GLYPH)
+    return (
+        f"No installed font has the characters {shown}; the report shows {NO_GLYPH} "
+        "instead. Install a font with them, for example Noto Sans of their script "
+        "(fonts.google.com/noto)."
+    )
 
 
 def _non_ascii(text: str) -> list[str]:

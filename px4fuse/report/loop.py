@@ -13,7 +13,7 @@ from px4fuse.loop.analysis import SMALLEST_STAMP_S
 from px4fuse.loop.corrections import SINGLE_LOOP
 from px4fuse.loop.model import LANDING, Closure, CorrectedPath, Loop
 from px4fuse.plain import capitalise_first, format_p_value
-from px4fuse.report import say, style
+from px4fuse.report import style
 from px4fuse.report.cover import student_line, write_finding
 from px4fuse.report.evaluation import describe_score, format_interval, plot_path
 from px4fuse.report.page import AXIS_LABEL_HEIGHT, TICKS_HEIGHT, Cell, Page, appendix
@@ -60,14 +60,32 @@ MAP_HEIGHT, LEGEND_HEIGHT = 290.0, 38.0  # of the axes, and of the legend below 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the loop's page; none where the flight holds no loop."""
     if isinstance(analysis.loop, Loop):
-        page = Page(appendix(TITLE), say("loop"))
+        page = Page(
+            appendix(TITLE),
+            (
+                "The closure error is the distance between the end of the odometry and the "
+                "true end. Each correction distributes it along the path: by distance "
+                "(positions only as in Example 2 of the lesson, or headings too), or by "
+                "pose graph optimisation. Each closure is tested first: a false one would "
+                "deform the whole path."
+            ),
+        )
         _write_page(page, analysis.loop)
         yield page
 
 
 def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
     """Draw the page of a report on a loop alone, with its findings."""
-    page = Page(TITLE, say("loop"))
+    page = Page(
+        TITLE,
+        (
+            "The closure error is the distance between the end of the odometry and the "
+            "true end. Each correction distributes it along the path: by distance "
+            "(positions only as in Example 2 of the lesson, or headings too), or by "
+            "pose graph optimisation. Each closure is tested first: a false one would "
+            "deform the whole path."
+        ),
+    )
     if student := student_line(results.student, ", "):
         page.labelled("Student", student)
     page.labelled("SHA-256", loop.odometry.trajectory.sha256)
@@ -80,7 +98,14 @@ def _write_page(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> N
     write_loop(page, loop, findings)
     _draw_map(page, loop)
     page.heading("Closures and scores", 10.5, above=14.0)
-    page.write(say("closures"), colour=MUTED_COLOUR)
+    page.write(
+        (
+            "d²: squared Mahalanobis distance of the closure given drift and closure "
+            "noise. p: probability of a larger d² for a true closure. DCS and GNC "
+            "weights: 1 keeps the closure, 0 drops it."
+        ),
+        colour=MUTED_COLOUR,
+    )
     write_scores(page, loop)
 
 
@@ -145,8 +170,9 @@ def summary(loop: Loop, findings: tuple[Finding, ...]) -> Page:
 def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
     """Write what was found, with every path, how far it moved, and its ATE to each reference."""
     path = loop.odometry.trajectory
-    track_text = say(
-        "loop_track", path=path, kind=TRACK_KINDS[path.kind], poses=len(path), loop=loop
+    track_text = (
+        f"{path.name}: {TRACK_KINDS[path.kind]}, {len(path)} poses, "
+        f"{loop.key_frames} key frames, spacing {loop.key_frame_spacing_m:.2g} m"
     )
     page.labelled("Track", track_text)
     page.labelled("Part", f"{_format_span(loop)}, {loop.part_reason}")
@@ -172,7 +198,17 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
             for part in loop.reported_paths
         ],
     )
-    page.numbers(say("ate") if names else say("no_reference"))
+    page.numbers(
+        (
+            "ATE: position RMSE after alignment, with its 95 % interval (block "
+            "bootstrap) if the flight is long enough."
+        )
+        if names
+        else (
+            "No ground truth and no reference trajectory, so the error of the path is "
+            "unknown. Give one with --reference FILE."
+        )
+    )
 
 
 def write_scores(page: Page, loop: Loop) -> None:
@@ -245,7 +281,10 @@ def describe_gate(closure: Closure) -> str:
     verdict = "as the stated drift allows"
     if not closure.accepted:
         verdict = "REJECTED: the drift cannot explain it"
-    return say("gate", closure=closure, least=GATE_ALPHA, verdict=verdict)
+    return (
+        f"d² {closure.d2:.1f} with {closure.degrees_of_freedom} degrees of freedom, "
+        f"p {closure.p:.2g} (rejected below {GATE_ALPHA:g}): {verdict}"
+    )
 
 
 def closure_name(closure: Closure, loop: Loop) -> str:
@@ -264,7 +303,10 @@ def by_distance_sentence(loop: Loop) -> str:
     headings = "Headings too: each step is first turned back by its share of the heading error."
     if isinstance(heading_deg, Unavailable):
         headings = f"Headings are not turned: {heading_deg.reason}."
-    return say("by_distance", headings=headings)
+    return (
+        "By distance, positions only (Example 2 of the lesson): each position moves "
+        f"by its share of the closure error; headings are not corrected. {headings}"
+    )
 
 
 def missing_corrections(loop: Loop) -> list[str]:
@@ -300,7 +342,13 @@ def format_correction(correction: CorrectedPath) -> str:
 def graph_summary(solved: SolvedGraph) -> Page:
     """How a pose graph was solved, and the closures that the gate rejects."""
     page = Page()
-    page.labelled("Graph", say("graph", solved=solved))
+    page.labelled(
+        "Graph",
+        (
+            f"{solved.name}: {solved.dimension}-D, {solved.poses} poses, {solved.edges} "
+            f"edges; initial poses: {solved.initialised}"
+        ),
+    )
     gates = solved.gates
     if isinstance(gates, Unavailable):
         page.labelled("Gate", f"none: {gates.reason}")

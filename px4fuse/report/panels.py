@@ -14,7 +14,7 @@ from px4fuse.comparison.model import AxisComparison, Difference
 from px4fuse.filter.consistency import Consistency
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capitalise_first
-from px4fuse.report import marks, say, style
+from px4fuse.report import marks, style
 from px4fuse.report.page import Page
 from px4fuse.report.style import DOTS, LINES, Axes, draw_curve, draw_sigma_band, set_log_scale
 from px4fuse.report.words import filters_by_name, format_verdict
@@ -154,7 +154,10 @@ def _position_sentence(_: Analysis, result: AxisComparison) -> str:
     if isinstance(result.ekf2_state, Unavailable) or isinstance(result.difference, Unavailable):
         return f"{words}; our filter follows them."
     distance = position_difference(result.ekf2_state, result.replay.steps).abs()
-    return say("farthest", words=words, most_m=distance.max(), at_s=distance.idxmax())
+    return (
+        f"{words}; the largest difference between KF and EKF2 is "
+        f"{distance.max():.2g} m at {distance.idxmax():.1f} s."
+    )
 
 
 def _velocity_sentence(_: Analysis, result: AxisComparison) -> str:
@@ -167,7 +170,10 @@ def _error_sentence(_: Analysis, result: AxisComparison) -> str:
     if isinstance(result.truth, pd.DataFrame):
         coverage_text = f"{share:.0%} of our error lies in our own ±2σ (blue), where 95% should."
         return f"{compare_rmse(result, POSITIONS)} {coverage_text}".lstrip()
-    return say("no_truth", share=share)
+    return (
+        "No ground truth in the log: this is the difference KF - EKF2, not an "
+        f"error. {share:.0%} of it is within ±2σ of KF (blue)."
+    )
 
 
 def compare_rmse(result: AxisComparison, quantity: Quantity) -> str:
@@ -209,7 +215,10 @@ def _position_numbers(result: AxisComparison) -> str:
     part = result.difference
     if isinstance(part, Unavailable):
         return f"{part.what}: {part.reason}"
-    return say("apart", part=part)
+    return (
+        f"KF - EKF2: RMS {part.position_rmse_m:.3f} m, mean "
+        f"{part.position_mean_m:+.3f} m, maximum {part.position_maximum_m:.2f} m"
+    )
 
 
 def _velocity_numbers(result: AxisComparison) -> str:
@@ -278,7 +287,8 @@ def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
             sentences.append(f"{capitalise_first(name)}: {one.reason}.")
         else:
             sentences.append(
-                say("outside", who=capitalise_first(name), one=one, verdict=format_verdict(one))
+                f"{capitalise_first(name)}: {one.outside_two_sigma:.1%} of {one.count} "
+                f"innovations outside ±2√S (expected 5 %): {format_verdict(one)}."
             )
     if isinstance(result.ekf2_state, Unavailable):
         sentences.append(f"EKF2: {result.ekf2_state.reason}.")
@@ -296,7 +306,10 @@ def _innovation_numbers(result: AxisComparison) -> str:
         if isinstance(one, Consistency) and isinstance(frame, pd.DataFrame):
             outside_count = int((frame["innovation_m"].abs() > edge).sum())
             texts.append(
-                say("innovations", name=name, one=one)
+                (
+                    f"{name}: mean {one.innovation_mean_m:+.3f} m, standard deviation "
+                    f"{one.innovation_std_m:.3f} m, median √S {one.sqrt_s_median_m:.3f} m"
+                )
                 + (f", {outside_count} beyond the axis (triangles)" if outside_count else "")
             )
     return "; ".join(texts)

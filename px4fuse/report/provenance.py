@@ -7,7 +7,7 @@ from px4fuse.analysis import AidsOnlyAnalysis, Analysis
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
 from px4fuse.flight import Flight, PositionTrack, Unavailable
 from px4fuse.loop.model import Loop
-from px4fuse.report import clock, fonts, say
+from px4fuse.report import clock, fonts
 from px4fuse.report.page import Page
 from px4fuse.report.style import MUTED_COLOUR
 from px4fuse.report.words import describe_alignment, format_clock_map
@@ -57,7 +57,10 @@ def _write_log(page: Page, flight: Flight, source: PositionTrack | None = None) 
         other_parameters = other_parameters.union(
             *(one.own_parameters for one in (EV_POS, GNSS_POS) if one != aid)
         )
-        facts["position source"] = say("source", source=source, topics=", ".join(source.topics))
+        facts["position source"] = (
+            f"{source.name} ({source.origin.kind}, {source.origin.passage}) from "
+            f"{', '.join(source.topics)}; clock: {source.clock}"
+        )
     parameters = (
         f"{n} {value:g}" for n, value in log.parameters.items() if n not in other_parameters
     )
@@ -111,7 +114,10 @@ def _start_page(title: str, results: ComparisonResults | AidsResults | LoopResul
         "results": "attached inside this PDF as results.json",
     }
     if fonts.missing_characters(student.name + student.id + student.notes):
-        facts["fonts"] = say("no_font", sign=fonts.NO_GLYPH)
+        facts["fonts"] = (
+            f"{fonts.NO_GLYPH} replaces characters for which no font is installed on "
+            "this computer; results.json contains the original text"
+        )
     _write_section(page, "Made with", facts.items())
     return page
 

@@ -11,7 +11,6 @@ from px4fuse.ekf2_parameters import AIDS, PARAMETERS
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
 from px4fuse.plain import format_number
-from px4fuse.report import say
 from px4fuse.report.page import Page
 from px4fuse.report.why import format_agreement, write_explanation
 from px4fuse.results.contract import WhatIfResults
@@ -146,16 +145,15 @@ def reading(counterfactual: WhatIfAnalysis) -> list[str]:
         if errors:
             least = min(errors)
             lines.append(
-                say("sweep_error", name=name, value=format_number(errors[least]), least=least)
+                f"The horizontal position RMSE against ground truth is smallest at {name} "
+                f"{format_number(errors[least])} ({least:.3f} m)."
             )
     if not all(one.steady for one in counterfactual.whatif.whatif):
         lines.append(
-            say(
-                "chaotic",
-                most=MAX_REJECTED_SHARE,
-                noise_mm=1e3 * DISTURBED_M,
-                for_s=HEIGHT_TIMEOUT_S,
-            )
+            f"Not predictable: more than {MAX_REJECTED_SHARE:.0%} of the samples would "
+            f"be rejected, {1000.0 * DISTURBED_M:.0f} mm of position noise would change "
+            f"the result, or heights would be rejected for {HEIGHT_TIMEOUT_S:g} s. Each "
+            "rejection then decides the next."
         )
     return [*lines, *(f"{note}." for note in counterfactual.whatif.notes)]
 
@@ -166,7 +164,13 @@ def _format_number(value: float | Unavailable, digits: int = 3) -> str:
 
 def draw(counterfactual: WhatIfAnalysis, results: WhatIfResults) -> Iterator[Page]:
     """One page of tables."""
-    page = Page("EKF2 with other parameters", say("whatif"))
+    page = Page(
+        "EKF2 with other parameters",
+        (
+            "EKF2 replayed from the log with px4fuse's model (not PX4's code): as flown "
+            "and with changed parameters. All columns use the same time span."
+        ),
+    )
     page.labelled("Command", results.provenance.command)
     _write_tables(page, counterfactual)
     yield page

@@ -14,7 +14,7 @@ from px4fuse.ekf2_parameters import AIDS
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capitalise_first
-from px4fuse.report import marks, say
+from px4fuse.report import marks
 from px4fuse.report.page import Page, halves
 from px4fuse.report.style import (
     EKF2_BAND_COLOUR,
@@ -43,7 +43,14 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     explanations = _explanations(analysis)
     if not any(isinstance(why, Why) for why in explanations.values()):
         return
-    page = Page(TITLE, say("why"))
+    page = Page(
+        TITLE,
+        (
+            "Replays that change KF into the logged EKF2, one step at a time (px4fuse's "
+            "model of EKF2). Each bar is the reduction of the mean square difference in "
+            "that step; hatched bars increase it. The bars add up to 100 %."
+        ),
+    )
     for name, why in explanations.items():
         if isinstance(why, Unavailable):
             page.heading(f"{name}: nothing is concluded", 9.5, above=10.0)

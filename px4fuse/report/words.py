@@ -14,7 +14,6 @@ from px4fuse.findings import Finding
 from px4fuse.flight import Alignment, Truth, Unavailable
 from px4fuse.plain import format_factor, format_number, format_p_value
 from px4fuse.recording import ClockMap
-from px4fuse.report import say
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 
 if TYPE_CHECKING:
@@ -29,7 +28,10 @@ RMSE_FIELDS = ("position_rmse_m", "velocity_rmse_m_s")
 def format_settings(settings: Settings) -> str:
     """The filter's settings in one phrase."""
     offset = f", clock offset {settings.clock_offset_s:+g} s" if settings.clock_offset_s else ""
-    return say("settings", settings=settings, offset=offset)
+    return (
+        f"SIGMA_A {settings.sigma_a_m_s2:g} m/s², SIGMA_Z {settings.sigma_z_m:g} m, "
+        f"DT {settings.dt_s:g} s, input {settings.input}{offset}"
+    )
 
 
 def format_verdict(statement: Consistency | Unavailable) -> str:
@@ -111,7 +113,10 @@ def verdict_notes(comparison: Comparison) -> list[str]:
     ]
     notes = []
     if comparison.source.origin.may_drift:
-        notes.append(say("follows_source"))
+        notes.append(
+            "The source may drift. The verdicts compare each filter with the source, "
+            "not with the true position. Check the error with ground truth or a loop."
+        )
     small_deviations = [
         f"{filter_name} {axis} {format_verdict(statement)}"
         for axis, filter_name, statement in statements
@@ -119,7 +124,8 @@ def verdict_notes(comparison: Comparison) -> list[str]:
     ]
     if small_deviations:
         notes.append(
-            say("small_factors", which=", ".join(small_deviations), least=SIGMA_FACTOR_FINDING)
+            f"{', '.join(small_deviations)}: statistically significant, but below "
+            f"{SIGMA_FACTOR_FINDING:g}×, the limit for a finding."
         )
     correlated = [
         f"{filter_name} {axis} {format_p_value(statement.ljung_box_p)}, lag-1 "
@@ -128,7 +134,12 @@ def verdict_notes(comparison: Comparison) -> list[str]:
         if statement.verdict == "consistent" and statement.ljung_box_p < MIN_WHITE_P
     ]
     if correlated:
-        notes.append(say("not_white", which="; ".join(correlated)))
+        notes.append(
+            "Innovations not white, although their size is consistent (Ljung-Box test): "
+            f"{'; '.join(correlated)}. Positive lag-1 autocorrelation: the filter lags, "
+            "SIGMA_A may be too small. Negative: it follows the measurement noise, "
+            "SIGMA_A may be too large."
+        )
     return notes
 
 
@@ -142,9 +153,11 @@ def format_clock_map(clock: ClockMap) -> str:
     is_note_sufficient = clock.method in ("boot clock", "arrival time") or "own speed" in clock.note
     if is_note_sufficient or clock.distinct_stamps is not None:
         return f"{clock.clock}: {clock.note}"
-    return say("clock_map", clock=clock, jitter_ms=clock.jitter_s * 1e3) + (
-        f"; {clock.note}" if clock.note else ""
-    )
+    return (
+        f"{clock.clock}, mapped by {clock.method}: offset {clock.offset_s:+.4f} s, "
+        f"drift {clock.drift_ppm:+.3g} ppm, jitter {clock.jitter_s * 1000.0:.2g} ms, "
+        f"{clock.pairs} pairs"
+    ) + (f"; {clock.note}" if clock.note else "")
 
 
 def describe_alignment(alignment: Alignment) -> dict[str, str]:
@@ -182,7 +195,11 @@ def tuning_advice(
     advice, sigma_a, sigma_z = {}, found.filter_sigma_a, found.sigma_z
     drifts, log = comparison.source.origin.may_drift, comparison.flight.log
     if drifts:
-        advice["Drift"] = say("tuned_drifts")
+        advice["Drift"] = (
+            "The source may drift. These noises describe its short-term noise, not its "
+            "error. Do not set SIGMA_Z or EKF2_EVP_NOISE below the error shown by "
+            "ground truth or a loop."
+        )
     options = [
         f" {option} {noise.value:.3g}"
         for option, noise in (("--sigma-a", sigma_a), ("--sigma-z", sigma_z))
@@ -195,7 +212,10 @@ def tuning_advice(
         advice["SIGMA_Z"] = f"is at least {sigma_z.low:.2g} m: is this a position source at all?"
     elif sigma_z.value is None:
         bound = "" if sigma_z.high is None else f" (at most {sigma_z.high:.2g} m)"
-        advice["SIGMA_Z"] = say("sigma_z_hidden", bound=bound)
+        advice["SIGMA_Z"] = (
+            f"cannot be estimated at this logging rate{bound}: the process noise between "
+            "samples masks it. Log the source at a higher rate."
+        )
     elif log.autopilot == "PX4" and not drifts and comparison.source.origin.is_vision:
         px4_value = log.parameters.get("EKF2_EVP_NOISE")
         current_value = "" if px4_value is None else f" (now {px4_value:g})"
@@ -208,9 +228,14 @@ def tuning_advice(
         )
     elif found.biases_fitted and (alone := found.sigma_a.value or found.sigma_a.high) is not None:
         bound = "" if found.sigma_a.value is not None else "at most "
-        advice["SIGMA_A"] = say("sigma_a_alone", bound=bound, alone=alone, sigma_a=sigma_a)
+        advice["SIGMA_A"] = (
+            f"accelerometer noise alone is {bound}{alone:.2g} m/s². KF has no state for "
+            "accelerometer bias and tilt error; to cover them it needs "
+            f"{sigma_a.value:.2g} m/s²."
+        )
     if len(found.outlier_time_s):
-        advice["Outliers"] = say(
-            "tuned_outliers", count=len(found.outlier_time_s), found=found, name=name
+        advice["Outliers"] = (
+            f"{len(found.outlier_time_s)} of {found.count} measurements ({name}), first "
+            f"at {found.outlier_time_s[0]:.1f} s; excluded from the noise estimates"
         )
     return advice
