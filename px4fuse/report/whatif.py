@@ -1,7 +1,7 @@
-"""What if EKF2 had had other parameters: side by side, and a row for each value of one."""
+"""Terminal tables of ``px4fuse whatif``: EKF2 side by side, and a row per value of the sweep."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 from px4fuse.analysis import Counterfactual
@@ -14,9 +14,7 @@ from px4fuse.plain import number_words
 from px4fuse.report import say
 from px4fuse.report.page import Page
 from px4fuse.report.why import agreement_words, write_why
-from px4fuse.results.contract import WhatIfResults
 
-SIZE = 8.0
 CHAOTIC = "chaotic"
 Rows = tuple[tuple[str, Callable[[Any], str]], ...]
 # Of each EKF2 along an axis or by one of its aids
@@ -149,34 +147,21 @@ def _number(value: float | Unavailable, digits: int = 3) -> str:
     return "n/a" if isinstance(value, Unavailable) else f"{value:.{digits}f}"
 
 
-def draw(made_of: Counterfactual, results: WhatIfResults) -> Iterator[Page]:
-    """One page of tables."""
-    page = Page("EKF2 with other parameters", say("whatif"))
-    page.labelled("Command", results.provenance.command)
-    _tables(page, made_of)
-    yield page
-
-
 def summary(made_of: Counterfactual) -> Page:
     """EKF2 as logged, as replayed and with other parameters, and a sweep where there is one."""
     page = Page()
     if AISLE in made_of.why:
         write_why(page, made_of.why[AISLE])
-    _tables(page, made_of)
-    page.write("Replays are of px4fuse's model of EKF2, not of PX4's own code.")
-    return page
-
-
-def _tables(page: Page, made_of: Counterfactual) -> None:
-    """All that is said in words and numbers."""
     log, found = made_of.flight.log, made_of.whatif
     page.labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
     spans = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in found.judged)
     page.labelled("Judged", spans)
     page.labelled("Replay", agreement_words(found.agreement))
     head = ["", *heads(made_of)]
-    page.table(head, rows(made_of), right=range(1, len(head)), size=SIZE)
+    page.table(head, rows(made_of), right=range(1, len(head)))
     if sweep_of(made_of):
-        page.table(*sweep_table(made_of), right=range(1, 7), size=SIZE)
+        page.table(*sweep_table(made_of), right=range(1, 7))
     for line in reading(made_of):
-        page.write(line, size=8.5, above=2.0)
+        page.write(line)
+    page.write("Replays are of px4fuse's model of EKF2, not of PX4's own code.")
+    return page
