@@ -229,6 +229,8 @@ def prepare(  # noqa: PLR0911, PLR0912 (a reason each)
     read = read_gnss(flight, ekf2, record) if gnss else read_vision(flight, ekf2, record, attitude)
     if isinstance(read, Unavailable):
         return read
+    if not len(read.stamp_s):
+        return lacking("replay_without_samples", fused=aid.label)
     besides = gnss and EV_POS.name not in doubtful
     vision = _besides(flight, given, record, attitude) if besides else None
     if isinstance(vision, Unavailable):

@@ -126,6 +126,7 @@ def _read_delayed(topics: Topics, step_s: float) -> pd.DataFrame | Unavailable:
     states = [f"states[{i}]" for i in range(STATES)]
     variances = [f"covariances[{i}]" for i in range(STATES - 4 + attitude)]
     raw = topics.of_primary(Layout(topic, {name: name for name in states + variances})).dropna()
+    raw = raw[(raw[variances] >= 0.0).all(axis=1)]
     state, variance = raw[states].to_numpy(copy=True), raw[variances].to_numpy(copy=True)
     if attitude == px4.QUATERNION_FILTER:
         state[:, 10:16] /= step_s
