@@ -29,7 +29,7 @@ RUNS = [
     ("info l.ulg", "l.ulg", "--json", None),
     ("tune l.ulg --position pos.csv", "l.ulg pos.csv", "--json", None),
     ("sync l.ulg", "l.ulg", "--json", None),
-    ("whatif l.ulg", "l.ulg", "--json -o.pdf", None),
+    ("whatif l.ulg", "l.ulg", "--json", None),
     ("loop l.ulg:ekf2", "l.ulg", "--json -o.pdf --tum --g2o", None),
     ("loop a.tum --reference b.tum", "a.tum b.tum", "--json -o.pdf --tum --g2o", None),
     ("loop g.g2o", "g.g2o", "--json --g2o", None),

@@ -419,6 +419,15 @@ def test_compare_of_damaged_part_writes_finite_results(tmp_path, damage):
         assert any(reason in missing.reason for missing in results.missing)
 
 
+def test_states_with_a_negative_variance_are_left_out(tmp_path):
+    """Their square root was NaN, with a warning."""
+    log = make_log("v1.16", 2.0)
+    states = log["estimator_states"]
+    states["states"][:, 0] = 1.0
+    states["covariances"][2, 7] = -1e-9
+    assert len(read_of(log, tmp_path).ekf2.record.delayed) == len(states["timestamp"]) - 1
+
+
 def test_info_of_an_aid_with_one_sample_gives_no_rate(tmp_path):
     log = make_log("v1.16", 20.0)
     name = "estimator_aid_src_ev_hgt"

@@ -104,7 +104,7 @@ def test_a_sweep_has_2_to_200_values():
 def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     """What is prepared of a flight of which only the parameters matter."""
     monkeypatch.setattr(
-        inputs_module, "read_vision", lambda *_: made(ReceivedPositions, stamp_s=None)
+        inputs_module, "read_vision", lambda *_: made(ReceivedPositions, stamp_s=np.zeros(1))
     )
     stretch = made(Stretch, field=None)
     monkeypatch.setattr(inputs_module, "find_stretches", lambda *_, **_more: (stretch,))

@@ -14,7 +14,7 @@ from exchange import replace
 from findings_tools import analysis as stand_in
 from findings_tools import late, made
 from scipy.spatial.transform import Rotation, Slerp
-from ulog_tools import Log, gnss_log, position, seconds_of, stamps, topic
+from ulog_tools import Log, gnss_log, position, seconds_of, stamps, take, topic
 
 import px4fuse
 from px4fuse.analysis import prepare_comparison
@@ -23,6 +23,7 @@ from px4fuse.comparison.preparation import choose_source, prepare
 from px4fuse.comparison.remedy import filter_errors_m
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.inputs import _rules, read_gnss
+from px4fuse.ekf2.inputs import prepare as prepare_replay
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.replay import inside_spans, rms
 from px4fuse.ekf2.whatif import Summary, what_if
@@ -608,6 +609,19 @@ def test_what_ekf2_received_of_gnss(parameters, fused, tmp_path):
     if found.velocity_m_s is not None and found.velocity_variance_m2_s2 is not None:
         np.testing.assert_allclose(found.velocity_m_s[0], [1.0, 2.0, 3.0])
         np.testing.assert_allclose(found.velocity_variance_m2_s2, 0.04, rtol=1e-6)
+
+
+def test_replay_without_a_fix_that_ekf2_meant_to_fuse_is_unavailable(tmp_path):
+    log = with_velocity(outdoors())
+    log["estimator_states"]["states"][:, 0] = 1.0
+    log["estimator_status_flags"]["cs_gnss_pos"][1:] = False  # off from 1 s on
+    log.topics = [
+        take(one, range(20, 99)) if one.name == "vehicle_gps_position" else one
+        for one in log.topics
+    ]
+    found = prepare_replay(flight_of(log, tmp_path))
+    assert isinstance(found, Unavailable)
+    assert "no sample of GNSS position at a time at which EKF2 reports its fusion" in found.reason
 
 
 def test_fixes_without_a_velocity_and_those_with_a_time_of_their_own(tmp_path):

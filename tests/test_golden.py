@@ -90,7 +90,7 @@ COMMANDS = {
     "info_mavlink": ("info sample_logs/aisle_uwb.tlog",),
     "verify": ("verify report.pdf sample_logs --json v.json",),
     "verify_other": ("verify report.pdf sample_logs/loop_vio.ulg",),
-    "whatif": ("whatif sample_logs/aisle_uwb.ulg --set EKF2_EV_DELAY=150 -o w.pdf",),
+    "whatif": ("whatif sample_logs/aisle_uwb.ulg --set EKF2_EV_DELAY=150 --json w.json",),
     "diff": (
         LATE,
         "compare late.ulg -o a.pdf",

@@ -135,7 +135,6 @@ REFUSED = {
             ("--sweep EKF2_EVP_NOISE=0.1:0.2:1", "not between 2 and 200"),
             ("--set EKF2_EVP_NOISE=0.1 --sweep EKF2_EVP_NOISE=0.1:0.2", "set and swept"),
             ("--from 60", "--from says when --without begins"),
-            ("-o page.txt", "ends in .pdf"),
         )
     },
     # batch and grade

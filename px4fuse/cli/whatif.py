@@ -19,15 +19,13 @@ if TYPE_CHECKING:
 @click.argument("log", type=inputs.InputPath())
 @inputs.options("whatif", since={"type": inputs.TypedQuantity("s", 60.0)})
 @inputs.flight_options
-@inputs.report_options("A page, and its results beside it.")
-@inputs.open_option
+@inputs.json_option
 def whatif(
     log: Path,
     changes: tuple[str, ...],
     sweep: str | None,
     without: tuple[str, ...],
     since: float | None,
-    output: Path | None,
     json_path: Path | None,
     **option_values: Any,
 ) -> None:
@@ -43,7 +41,7 @@ def whatif(
     from px4fuse.request import WhatIfRequest
     from px4fuse.results.build import whatif_results
 
-    outputs.report_paths(output, json_path)  # before the work, not after it
+    outputs.check_targets([json_path])
     if since is not None and not without:
         raise SettingsError("--from says when --without begins: give that too.")
     request = WhatIfRequest(
@@ -55,9 +53,8 @@ def whatif(
     )
     with outputs.progress(json_path) as step:
         counterfactual = run_what_if(request, step)
-        results = whatif_results(request, counterfactual)
-        contents = outputs.result_files(results, json_path, output, counterfactual, step)
-    outputs.write_and_print(contents, summary(counterfactual))
+    results = whatif_results(request, counterfactual)
+    outputs.write_and_print(outputs.result_files(results, json_path), summary(counterfactual))
 
 
 def _parse_changes(texts: tuple[str, ...]) -> dict[str, float]:

@@ -243,6 +243,12 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (a reason each)
     )
     if isinstance(position_samples, Unavailable):
         return position_samples
+    if not len(position_samples.stamp_s):
+        return Unavailable(
+            "EKF2 replay",
+            f"the log has no sample of {aid.label} at a time at which EKF2 reports its fusion",
+            "Record estimator_status_flags and the source for the whole flight.",
+        )
     uses_vision = gnss and EV_POS.name not in doubtful
     vision = (
         _read_vision_besides_gnss(flight, logged_ekf2, record, attitude) if uses_vision else None

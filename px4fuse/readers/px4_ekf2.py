@@ -146,6 +146,7 @@ def _read_delayed_state(topics: Topics, step_s: float) -> pd.DataFrame | Unavail
     raw = topics.primary_samples(
         Layout(topic, {name: name for name in states + variances})
     ).dropna()
+    raw = raw[(raw[variances] >= 0.0).all(axis=1)]
     state, variance = raw[states].to_numpy(copy=True), raw[variances].to_numpy(copy=True)
     if attitude == px4.QUATERNION_FILTER:
         state[:, 10:16] /= step_s

@@ -26,7 +26,6 @@ from px4fuse.report import (
     notes,
     provenance,
     sensitivity,
-    whatif,
     why,
 )
 from px4fuse.report.cover import student_line
@@ -55,7 +54,6 @@ PAGES: Mapping[type, tuple[Callable[[Any, Any], Iterator[Page]], ...]] = {
     ),
     contract.AidsResults: (aids.draw_alone, notes.draw, provenance.draw_aids),
     contract.LoopResults: (loop.draw_report, notes.draw, provenance.draw_loop),
-    contract.WhatIfResults: (whatif.draw,),
     contract.EvaluationResults: (evaluation.draw,),
 }
 
@@ -67,8 +65,8 @@ def _title_name_hash(results: Any) -> tuple[str, str, str]:
             return f"px4fuse loop {track.name}", track.name, track.sha256
         case contract.EvaluationResults(estimate=one, reference=other):
             return f"px4fuse evaluate {one.name} {other.name}", one.name, one.sha256
-    log, command = results.log, results.request.__struct_config__.tag
-    return f"px4fuse {command} {log.name}", log.name, log.sha256
+    log = results.log
+    return f"px4fuse compare {log.name}", log.name, log.sha256
 
 
 def render(content: Any, results: Any, results_json: str) -> bytes:
@@ -76,7 +74,7 @@ def render(content: Any, results: Any, results_json: str) -> bytes:
 
     Parameters
     ----------
-    content : Analysis, AidsAlone, Loop, Counterfactual or Evaluation
+    content : Analysis, AidsAlone, Loop or Evaluation
         What is drawn.
     results : Results
         What is written of it; each kind has its :data:`PAGES`.

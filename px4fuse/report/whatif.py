@@ -1,7 +1,7 @@
-"""What if EKF2 had had other parameters: side by side, and a row for each value of one."""
+"""Terminal tables of ``px4fuse whatif``: EKF2 side by side, and a row per value of the sweep."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 from px4fuse.analysis import WhatIfAnalysis
@@ -13,9 +13,7 @@ from px4fuse.flight import Unavailable
 from px4fuse.plain import format_number
 from px4fuse.report.page import Page
 from px4fuse.report.why import format_agreement, write_explanation
-from px4fuse.results.contract import WhatIfResults
 
-SIZE = 8.0
 CHAOTIC = "chaotic"
 Rows = tuple[tuple[str, Callable[[Any], str]], ...]
 # Of each EKF2 along an axis or by one of its aids
@@ -162,40 +160,21 @@ def _format_number(value: float | Unavailable, digits: int = 3) -> str:
     return "n/a" if isinstance(value, Unavailable) else f"{value:.{digits}f}"
 
 
-def draw(counterfactual: WhatIfAnalysis, results: WhatIfResults) -> Iterator[Page]:
-    """One page of tables."""
-    page = Page(
-        "EKF2 with other parameters",
-        (
-            "EKF2 replayed from the log with px4fuse's model (not PX4's code): as flown "
-            "and with changed parameters. All columns use the same time span."
-        ),
-    )
-    page.labelled("Command", results.provenance.command)
-    _write_tables(page, counterfactual)
-    yield page
-
-
 def summary(counterfactual: WhatIfAnalysis) -> Page:
-    """EKF2 as logged, as replayed and with other parameters, and a sweep where there is one."""
+    """Terminal page: EKF2 as logged, as replayed and with other parameters, and the sweep."""
     page = Page()
     if AISLE in counterfactual.why:
         write_explanation(page, counterfactual.why[AISLE])
-    _write_tables(page, counterfactual)
-    page.write("Replays are of px4fuse's model of EKF2, not of PX4's own code.")
-    return page
-
-
-def _write_tables(page: Page, counterfactual: WhatIfAnalysis) -> None:
-    """All that is said in words and numbers."""
     log, whatif_result = counterfactual.flight.log, counterfactual.whatif
     page.labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
     spans = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in whatif_result.judged)
     page.labelled("Judged", spans)
     page.labelled("Replay", format_agreement(whatif_result.agreement))
     head = ["", *column_heads(counterfactual)]
-    page.table(head, rows(counterfactual), right=range(1, len(head)), size=SIZE)
+    page.table(head, rows(counterfactual), right=range(1, len(head)))
     if sweep_summaries(counterfactual):
-        page.table(*sweep_table(counterfactual), right=range(1, 7), size=SIZE)
+        page.table(*sweep_table(counterfactual), right=range(1, 7))
     for line in reading(counterfactual):
-        page.write(line, size=8.5, above=2.0)
+        page.write(line)
+    page.write("Replays use px4fuse's model of EKF2, not PX4's own code.")
+    return page
