@@ -42,9 +42,7 @@ MAX_PLAN_POINTS = 2000
 KNOB_FINDINGS = frozenset(name for name in NOISES if not name.startswith("ekf2_"))
 
 
-def flight_data(
-    analysis: Analysis, packer: Packer, *, side_by_side: bool = False
-) -> dict[str, Any]:
+def flight_data(analysis: Analysis, packer: Packer) -> dict[str, Any]:
     """Everything about one flight, as JSON can hold it; arrays are places in the packer.
 
     Parameters
@@ -52,11 +50,8 @@ def flight_data(
     analysis : Analysis
         Made from a request.
     packer : Packer
-    side_by_side : bool
-        Whether it stands beside another flight: then times are from the start of its segment.
     """
     signals = replay_signals(analysis, packer)
-    settings, segment = analysis.settings, analysis.segment
     events, findings, request = analysis.events, find(analysis), analysis.request
     assert request is not None
     return {
@@ -64,9 +59,8 @@ def flight_data(
         "source": analysis.source.name,
         # what innovations ask for then is no noise
         "drifts": analysis.source.origin.may_drift,
-        "shift": segment.start_s if side_by_side else 0.0,
         "story": list(story(analysis, findings)),
-        "settings": _settings_data(settings),
+        "settings": _settings_data(analysis.settings),
         "main": analysis.main.axis.name,
         **signals,
         "axes": [

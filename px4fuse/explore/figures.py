@@ -83,38 +83,33 @@ class Figures(Record, frozen=True):
 FIGURES = table(__file__, "figures.toml", Figures)
 
 
-def document_json(
-    flights: list[dict[str, Any]], tunings: list[Tuning]
-) -> tuple[Any, dict[str, str]]:
+def document_json(data: dict[str, Any], tuning: Tuning) -> tuple[Any, dict[str, str]]:
     """Bokeh's document, and of each root the id of the element that it goes into.
 
     Parameters
     ----------
-    flights : list of dict
+    data : dict
         From :func:`px4fuse.explore.data.flight_data`.
-    tunings : list of mapping
-        Of each flight, for its likelihood maps.
+    tuning : mapping
+        For the likelihood maps.
     """
     document = Document()
     time_range = _page_range("time")
-    places: dict[str, str] = {}
-    for number, (data, tuning) in enumerate(zip(flights, tunings, strict=True)):
-        plots = _plots(number, data, time_range)
-        plots |= {
-            "strip": _event_strip(number, data, time_range),
-            "map": _likelihood_map(number, tuning),
-            "plan": _plan_plot(number),
-            "step": _phase_plot(number),
-        }
-        places |= {plot.id: f"{name}-{number}" for name, plot in plots.items()}
-        with document.models.freeze():  # what belongs to the roots is looked for once
-            for plot in plots.values():
-                document.add_root(plot)
-    return document.to_json(deferred=False), places
+    plots = _plots(data, time_range)
+    plots |= {
+        "strip": _event_strip(data, time_range),
+        "map": _likelihood_map(tuning),
+        "plan": _plan_plot(),
+        "step": _phase_plot(),
+    }
+    with document.models.freeze():  # what belongs to the roots is looked for once
+        for plot in plots.values():
+            document.add_root(plot)
+    return document.to_json(deferred=False), {plot.id: name for name, plot in plots.items()}
 
 
-def _plots(number: int, data: dict[str, Any], time_range: Range1d) -> dict[str, Any]:
-    """Every plot against time of one flight, by its name."""
+def _plots(data: dict[str, Any], time_range: Range1d) -> dict[str, Any]:
+    """Every plot against time, by its name."""
     missing_kinds = {
         kind
         for kind in ("ekf2", "truth")
@@ -124,9 +119,9 @@ def _plots(number: int, data: dict[str, Any], time_range: Range1d) -> dict[str, 
     for name, plot in FIGURES.plots.items():
         if name == "error" and "truth" in missing_kinds:
             continue
-        sources = _Sources(name, number)
+        sources = _Sources(name)
         fig = plots[name] = figure(
-            name=f"{name}-{number}",
+            name=name,
             height=TALL_HEIGHT if plot.tall else PLOT_HEIGHT,
             sizing_mode="stretch_width",
             x_range=time_range,
@@ -154,22 +149,19 @@ def _plots(number: int, data: dict[str, Any], time_range: Range1d) -> dict[str, 
             if hover_name:
                 _add_hover(fig, line_renderer, (hover_name, f"@{column}{{0.000}} {plot.unit}"))
         fig.add_layout(Span(dimension="height", location=0.0, visible=False, name="cursor"))
-        shift = data["shift"]
         for low, high, style in _event_bands(data):
-            fig.add_layout(
-                BoxAnnotation(left=low - shift, right=high - shift, level="underlay", **style)
-            )
+            fig.add_layout(BoxAnnotation(left=low, right=high, level="underlay", **style))
     return plots
 
 
 class _Sources(dict[str, ColumnDataSource]):
     """The sources of one plot, each made when it is first asked for."""
 
-    def __init__(self, plot: str, number: int) -> None:
-        self.plot, self.number = plot, number
+    def __init__(self, plot: str) -> None:
+        self.plot = plot
 
     def __missing__(self, name: str) -> ColumnDataSource:
-        self[name] = _empty_source(f"{self.plot}:{name}", self.number, FIGURES.sources[name])
+        self[name] = _empty_source(f"{self.plot}:{name}", FIGURES.sources[name])
         return self[name]
 
 
@@ -225,10 +217,10 @@ def _page_range(name: str | None = None) -> Range1d:
     return Range1d(start=0.1, end=1.0, name=name)
 
 
-def _empty_source(name: str, number: int, columns: str) -> ColumnDataSource:
+def _empty_source(name: str, columns: str) -> ColumnDataSource:
     """Empty, for the page to fill."""
     empty: dict[str, Any] = {column: [] for column in columns.split()}
-    return ColumnDataSource(empty, name=f"{name}-source-{number}")
+    return ColumnDataSource(empty, name=f"{name}-source")
 
 
 def _event_bands(data: dict[str, Any]) -> list[tuple[float, float, dict[str, Any]]]:
@@ -250,13 +242,13 @@ def _event_bands(data: dict[str, Any]) -> list[tuple[float, float, dict[str, Any
     ]
 
 
-def _event_strip(number: int, data: dict[str, Any], time_range: Range1d) -> Any:
+def _event_strip(data: dict[str, Any], time_range: Range1d) -> Any:
     """What happened when, a row for each kind, so that no colour is needed to tell them apart."""
-    source = _empty_source("strip", number, "row left right text")
+    source = _empty_source("strip", "row left right text")
     has_ekf2 = any(isinstance(axis["ekf2"], dict) for axis in data["axes"])
     rows = FIGURES.strip if has_ekf2 else FIGURES.strip[2:]
     fig = figure(
-        name=f"strip-{number}",
+        name="strip",
         height=28 * len(rows) + 24,
         sizing_mode="stretch_width",
         x_range=time_range,
@@ -291,10 +283,10 @@ def _event_strip(number: int, data: dict[str, Any], time_range: Range1d) -> Any:
     return fig
 
 
-def _likelihood_map(number: int, tuning: Tuning) -> Any:
+def _likelihood_map(tuning: Tuning) -> Any:
     """How likely the innovations are over both noises, and where the sliders stand."""
     fig = figure(
-        name=f"map-{number}",
+        name="map",
         height=250,
         sizing_mode="stretch_width",
         x_axis_type="log",
@@ -315,9 +307,9 @@ def _likelihood_map(number: int, tuning: Tuning) -> Any:
             image = np.sqrt(2.0 * np.maximum(tuned.map.drop.T, 0.0)).astype(np.float32)
             draw: Any = fig.image  # its colours stand in no signature
             draw([image], x, y, dw, dh, color_mapper=mapper, name=f"map:{name}", visible=False)
-    trail = _empty_source("trail", number, "x y")
-    best = _empty_source("best", number, "x y")
-    point = _empty_source("point", number, "x y")
+    trail = _empty_source("trail", "x y")
+    best = _empty_source("best", "x y")
+    point = _empty_source("point", "x y")
     white: dict[str, Any] = {"line_color": "white"}
     fig.line("x", "y", source=trail, line_color=EKF2_COLOUR, line_width=1.2, name="ekf2")
     _draw_dots(fig, trail, EKF2_COLOUR, 3, name="ekf2")
@@ -341,10 +333,10 @@ def _pixel_extent(values: Array) -> tuple[float, float]:
     return float(values[0]) / half, float(values[-1]) * half - float(values[0]) / half
 
 
-def _plan_plot(number: int) -> Any:
+def _plan_plot() -> Any:
     """The track seen from above; what is chosen on it is the time that all plots show."""
     fig = figure(
-        name=f"plan-{number}",
+        name="plan",
         height=250,
         sizing_mode="stretch_width",
         match_aspect=True,
@@ -354,9 +346,9 @@ def _plan_plot(number: int) -> Any:
         x_axis_label="east (m)",
         y_axis_label="north (m)",
     )
-    track = _empty_source("plan", number, "t east north")
-    shown_source = _empty_source("shown", number, "east north")
-    cursor = _empty_source("here", number, "east north")
+    track = _empty_source("plan", "t east north")
+    shown_source = _empty_source("shown", "east north")
+    cursor = _empty_source("here", "east north")
     fig.line("east", "north", source=track, line_color=MEASUREMENT_COLOUR, line_width=1.0)
     _draw_dots(fig, track, MEASUREMENT_COLOUR, 3, nonselection_fill_alpha=0.6)
     _draw_dots(fig, shown_source, KF_COLOUR, 4, name="ours")
@@ -373,10 +365,10 @@ def _plan_plot(number: int) -> Any:
     return fig
 
 
-def _phase_plot(number: int) -> Any:
+def _phase_plot() -> Any:
     """The phase plane: position and velocity with their ellipse of 2σ, and what was measured."""
     fig = figure(
-        name=f"step-{number}",
+        name="step",
         height=330,
         sizing_mode="stretch_width",
         x_range=_page_range(),
@@ -395,9 +387,9 @@ def _phase_plot(number: int) -> Any:
     fig.add_layout(
         Span(dimension="height", location=0.0, visible=False, name="measurement", line_dash=[2, 2])
     )
-    trail = _empty_source("trail-means", number, "p v")
-    before, current = _empty_source("before", number, "p v"), _empty_source("now", number, "p v")
-    mean = _empty_source("mean", number, "p v")
+    trail = _empty_source("trail-means", "p v")
+    before, current = _empty_source("before", "p v"), _empty_source("now", "p v")
+    mean = _empty_source("mean", "p v")
     fig.line("p", "v", source=trail, line_color=MEASUREMENT_COLOUR, line_width=1.0, name="measured")
     fig.line("p", "v", source=before, **KF_LINE | {"line_dash": [6, 3]})
     fig.patch("p", "v", source=current, fill_color=KF_COLOUR, fill_alpha=0.25, **KF_LINE)
